@@ -1,0 +1,41 @@
+"""Exceptions raised by zwidth, all below one base class.
+
+A message names the field, the value received, what is allowed and the remedy.
+"""
+
+from __future__ import annotations
+
+
+class ZwidthError(Exception):
+    """Base class of every error that zwidth raises on purpose."""
+
+
+class InputError(ZwidthError, ValueError):
+    """An argument that cannot be used as given."""
+
+
+class ConfigError(ZwidthError, ValueError):
+    """A configuration file that cannot be used; the message lists every fault with its place."""
+
+
+class StoreExistsError(ZwidthError, FileExistsError):
+    """An output folder that already holds a run."""
+
+
+class TracedDelayError(ZwidthError, TypeError):
+    """A traced delay where the number of poles, hence an array shape, depends on its value."""
+
+
+def describe_choice(value: object, allowed: tuple[str, ...]) -> str:
+    """Say which values are allowed and which of them looks most like the one received."""
+    import difflib
+
+    nearest = difflib.get_close_matches(str(value), allowed, n=1)
+    hint = f"; did you mean {nearest[0]!r}?" if nearest else ""
+    return f"got {value!r}, allowed are {', '.join(repr(name) for name in allowed)}{hint}"
+
+
+def check_choice(field: str, value: object, allowed: tuple[str, ...]) -> None:
+    """Raise `InputError` unless ``value`` is one of ``allowed``."""
+    if value not in allowed:
+        raise InputError(f"{field}: {describe_choice(value, allowed)}")

@@ -1,0 +1,115 @@
+"""Grouping of points by the degree of their polynomial, so that none is padded before its computation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth import batching
+from zwidth._types import ArrayLike
+
+NAMES = ("alpha", "beta", "delta", "d")
+
+
+class Degree(NamedTuple):
+    """What decides the shape of the polynomial: whole periods of delay, and whether a fraction remains."""
+
+    whole: int
+    fractional: bool
+
+    @property
+    def poles(self) -> int:
+        """The degree of P: 3 + d for whole d, 4 + n otherwise."""
+        return self.whole + (4 if self.fractional else 3)
+
+
+def degree_of(d: float) -> Degree:
+    """The `Degree` of one concrete delay; an impossible delay gets the smallest one."""
+    if not (np.isfinite(d) and d >= 0):
+        return Degree(0, False)
+    whole = int(np.floor(d))
+    return Degree(whole, bool(d != whole))
+
+
+def groups(d: np.ndarray) -> Iterator[tuple[Degree, np.ndarray]]:
+    """The degrees that occur in a flat array of delays, each with the positions where it does."""
+    defined = np.where(np.isfinite(d) & (d >= 0), d, 0.0)
+    # Twice the whole part, plus one where a fraction remains, orders the degrees.
+    code = 2.0 * np.floor(defined) + (defined != np.floor(defined))
+    for value in np.unique(code):
+        yield Degree(int(value // 2), bool(value % 2)), np.flatnonzero(code == value)
+
+
+def by_degree(
+    kernel: Callable[..., Any],
+    values: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike],
+    *,
+    static: tuple[Any, ...] = (),
+    lead: bool = False,
+    chunk: Callable[[Degree], int] = lambda degree: batching.CHUNK,
+) -> Any:
+    """Apply ``kernel(alpha, beta, delta, d, degree, *static)`` to points whose delays may differ.
+
+    Results that are vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for
+    coefficients) or NaN behind (for poles).
+    """
+    if batching.is_traced(*values):
+        return _by_degree_traced(kernel, values, static, lead)
+    arrays = batching.broadcast(NAMES, values)
+    columns = [array.ravel() for array in arrays]
+    parts, places = [], []
+    for degree, index in groups(columns[3]):
+        picked = [column[index] for column in columns]
+        parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree)))
+        places.append(index)
+    if not parts:
+        parts, places = [batching.map_flat(kernel, columns, (Degree(0, False), *static))], [np.arange(0)]
+    order = np.argsort(np.concatenate(places), kind="stable")
+    shape = arrays[0].shape
+
+    def gather(*leaves: np.ndarray) -> np.ndarray:
+        joined = np.concatenate(_same_length(list(leaves), lead, np))[order]
+        return joined.reshape(shape + joined.shape[1:])
+
+    return batching.to_caller(jax.tree.map(gather, *parts), values)
+
+
+def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
+    """Fill vectors of different length to the longest one."""
+    if leaves[0].ndim == 1:
+        return leaves
+    longest = max(leaf.shape[1] for leaf in leaves)
+    filler = 0.0 if lead else np.nan
+    filled = []
+    for leaf in leaves:
+        missing = longest - leaf.shape[1]
+        width = ((0, 0), (missing, 0) if lead else (0, missing))
+        filled.append(numpy.pad(leaf, width, constant_values=filler))
+    return filled
+
+
+def _by_degree_traced(kernel: Callable[..., Any], values: tuple, static: tuple, lead: bool) -> Any:
+    delays = batching.concrete_delay(values[3])
+    dtype = jnp.result_type(float)
+    arrays = jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
+    shape = arrays[0].shape
+    flat_delays = np.broadcast_to(delays, shape).ravel()
+    columns = [array.reshape(-1) for array in arrays]
+    parts, places = [], []
+    for degree, index in groups(flat_delays):
+        picked = [column[index] for column in columns]
+        parts.append(jax.vmap(lambda *point, degree=degree: kernel(*point, degree, *static))(*picked))
+        places.append(index)
+    if not parts:
+        raise batching.InputError("alpha, beta, delta, d: got no point at all inside a JAX transformation")
+    order = np.argsort(np.concatenate(places), kind="stable")
+
+    def gather(*leaves: jax.Array) -> jax.Array:
+        joined = jnp.concatenate(_same_length(list(leaves), lead, jnp))[order]
+        return joined.reshape(shape + joined.shape[1:])
+
+    return jax.tree.map(gather, *parts)

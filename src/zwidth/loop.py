@@ -1,0 +1,225 @@
+"""The closed loop of device and virtual wall, affine in (alpha, beta).
+
+Held delay d = n + f, with N(z) = a2 z^2 + a1 z + a0 of `zwidth.plant`:
+
+    P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1))
+
+For whole d, a0 = 0 and one factor z cancels; that is the paper's polynomial (17) over -delta^2, monic and
+factored. Pole methods use the coefficients `coefficients`, frequency methods `frequency_boundary`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth._types import DELAY_MODELS, Array, ArrayLike
+from zwidth.errors import InputError, check_choice
+from zwidth.grouping import Degree, by_degree
+from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
+
+class Affine(NamedTuple):
+    """``P = D + alpha N1 + beta N2``: three coefficient vectors of one length, highest power first."""
+
+    D: Array
+    N1: Array
+    N2: Array
+
+
+def plant_of(delta: Array, d: Array, degree: Degree) -> Plant:
+    """The plant with the part of the delay that is not whole periods."""
+    return held_plant(delta, d - degree.whole) if degree.fractional else undelayed_plant(delta)
+
+
+def affine(delta: Array, d: Array, degree: Degree) -> Affine:
+    """The three coefficient vectors of one point; shapes (degree.poles + 1,)."""
+    plant = plant_of(delta, d, degree)
+    zero = jnp.zeros_like(plant.a2)
+    head = [jnp.ones_like(plant.a2), -(1.0 + plant.c), plant.c]
+    # The numerator without the common factor z that a whole delay leaves in it.
+    n = [plant.a2, plant.a1, plant.a0] if degree.fractional else [plant.a2, plant.a1]
+    pad = [zero] * (degree.poles - len(n))
+    n1 = [*pad, *n, zero]
+    n2 = [*pad, n[0], *(right - left for left, right in zip(n, n[1:], strict=False)), -n[-1]]
+    d0 = head + [zero] * (degree.poles - 2)
+    return Affine(jnp.stack(d0), jnp.stack(n1), jnp.stack(n2))
+
+
+def coefficients(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
+    """Coefficients of P, highest power first, shape (degree.poles + 1,); P is monic."""
+    parts = affine(delta, d, degree)
+    return parts.D + alpha * parts.N1 + beta * parts.N2
+
+
+def evaluate(z: Array, alpha: Array, beta: Array, plant: Plant, degree: Degree) -> tuple[Array, Array]:
+    """P(z) and P'(z) in the factored form, whose rounding errors stay small where the coefficients cancel."""
+    power = degree.whole + (2 if degree.fractional else 1)
+    lag = z ** (power - 1)
+    quadratic = (z - 1.0) * (z - plant.c)
+    if degree.fractional:
+        n = (plant.a2 * z + plant.a1) * z + plant.a0
+        dn = 2.0 * plant.a2 * z + plant.a1
+    else:
+        n = plant.a2 * z + plant.a1
+        dn = plant.a2
+    wall = alpha * z + beta * (z - 1.0)
+    value = z * lag * quadratic + n * wall
+    slope = lag * (power * quadratic + z * (2.0 * z - (1.0 + plant.c))) + dn * wall + n * (alpha + beta)
+    return value, slope
+
+
+class BoundaryCurve(NamedTuple):
+    """A point of the boundary curve: the wall whose loop has a pole pair at e^(+-j omega)."""
+
+    alpha: Array
+    beta: Array
+
+
+class FrequencyLoop(NamedTuple):
+    """What the frequency methods need of a point: computed once, then evaluated at many frequencies."""
+
+    plant: Plant
+    lag: Array  # whole periods of delay; the whole exponent d in the fractional-power model
+
+
+def frequency_loop(delta: Array, d: Array, delay: str) -> FrequencyLoop:
+    """The loop of one (delta, d) for evaluation on the unit circle."""
+    if delay == "fractional_power":
+        return FrequencyLoop(undelayed_plant(delta), d)
+    whole, fraction = split_delay(d)
+    return FrequencyLoop(held_plant(delta, fraction), whole)
+
+
+def frequency_boundary(omega: Array, loop: FrequencyLoop, delay: str) -> BoundaryCurve:
+    """The wall (alpha, beta) that puts a pole at z = e^(j omega), in closed form, for one point.
+
+    On the unit circle P = 0 is a real linear 2x2 system. With s = sin(omega/2), C = cos(omega/2), M = N(z)/z,
+    G = (z - c)/M, W = e^(j k omega) G and k = n + 1/2, it solves to
+
+        beta = -Re W / C          alpha = 2 s (Im W - s beta)
+
+    Re W vanishes with C at omega = pi. cos(k omega)/C and Im G/C are therefore formed as ratios that stay finite.
+    """
+    plant, whole = loop
+    half = 0.5 * omega
+    s, cos_half, sin_w = jnp.sin(half), jnp.cos(half), jnp.sin(omega)
+    below_pi = cos_half > 0
+    c_safe = jnp.where(below_pi, cos_half, 1.0)
+    k = whole + 0.5
+    re_m = -plant.gap + 2.0 * (plant.a2 + plant.a0) * cos_half * cos_half
+    im_m_over_sin = plant.a2 - plant.a0
+    re_z = plant.em - 2.0 * s * s
+    norm = re_m * re_m + (im_m_over_sin * sin_w) ** 2
+    finite = norm > 0
+    norm = jnp.where(finite, norm, 1.0)
+    re_g = (re_z * re_m + sin_w * im_m_over_sin * sin_w) / norm
+    # sin_w/C = 2 s
+    im_g_over_c = 2.0 * s * (re_m - re_z * im_m_over_sin) / norm
+    sin_k, cos_k = jnp.sin(k * omega), jnp.cos(k * omega)
+    ratio = _cosine_ratio(omega, k, whole, cos_k / c_safe, delay)
+    beta = -(ratio * re_g - sin_k * im_g_over_c)
+    alpha = 2.0 * s * (sin_k * re_g + cos_k * im_g_over_c * cos_half - s * beta)
+    return BoundaryCurve(*_limits_at_pi(alpha, beta, finite, omega, whole))
+
+
+def _cosine_ratio(omega: Array, k: Array, whole: Array, direct: Array, delay: str) -> Array:
+    """``cos(k omega)/cos(omega/2)``; near pi, for k = n + 1/2, as ``(-1)^n sin(k v)/sin(v/2)``, v = pi - omega."""
+    if delay == "fractional_power":
+        return direct
+    # pi is not a float64: its second half keeps v exact to the last digit.
+    v = (np.pi - omega) + 1.2246467991473532e-16
+    at_pi = jnp.abs(v) < 1e-30
+    v_safe = jnp.where(at_pi, 1.0, v)
+    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
+    near = sign * jnp.where(at_pi, 2.0 * k, jnp.sin(k * v_safe) / jnp.sin(0.5 * v_safe))
+    return jnp.where(omega > 2.0, near, direct)
+
+
+def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole: Array) -> tuple[Array, Array]:
+    """Where N(z) vanishes (delta = 0 at omega = pi) the curve runs to infinity with alternating sign."""
+    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
+    inside = (omega >= 0) & (omega <= np.pi)
+    alpha = jnp.where(finite, alpha, -sign * jnp.inf)
+    beta = jnp.where(finite, beta, sign * jnp.inf)
+    return jnp.where(inside, alpha, jnp.nan), jnp.where(inside, beta, jnp.nan)
+
+
+def line_at_minus_one(delta: Array, d: Array) -> Array:
+    """``alpha + 2 beta`` on the line where a real pole crosses at z = -1 (held delay), for one point.
+
+    ``alpha + 2 beta = (-1)^n 2 (1 + c)/N(-1)``; infinite where N(-1) = 0.
+    """
+    whole, fraction = split_delay(d)
+    plant = held_plant(delta, fraction)
+    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
+    return sign * 2.0 * (1.0 + plant.c) / plant.gap
+
+
+def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """Whether one point lies where the model is defined."""
+    return jnp.isfinite(alpha) & jnp.isfinite(beta) & valid_device(delta, d)
+
+
+def valid_device(delta: Array, d: Array) -> Array:
+    """Whether delta and d are finite and not negative."""
+    return jnp.isfinite(delta) & jnp.isfinite(d) & (delta >= 0) & (d >= 0)
+
+
+def check_delay_model(delay: str) -> None:
+    """Raise `InputError` unless the name of a delay model is known."""
+    check_choice("delay", delay, DELAY_MODELS)
+
+
+def check_has_poles(delay: str) -> None:
+    """Refuse the fractional power where poles are asked for."""
+    check_delay_model(delay)
+    if delay == "fractional_power":
+        raise InputError(
+            "delay: 'fractional_power' has no poles (z^d has other sheets, always with roots outside the unit "
+            "circle); use delay='held' for poles, radius and stability, or ask for the boundary or the ridge"
+        )
+
+
+def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: str = "held") -> Array:
+    """Return the coefficients of the monic characteristic polynomial, highest power first.
+
+    ``P(z) = z^(2+n) (z - 1)(z - c) + (z n0(z) + n1(z)) (alpha z + beta (z - 1))``, d = n + f, ``c = e^-delta``; for
+    whole d the paper's (17) over ``-delta^2``, delta = 0 included. Stable means: all zeros inside the unit circle.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not; concrete also inside `jit`, because it decides the degree.
+            All four broadcast.
+        delay: only "held" has a polynomial.
+
+    Returns:
+        Array of the broadcast shape with one more axis at the end: 4 + d coefficients for whole d, 5 + n
+        otherwise. Where degrees are mixed, shorter polynomials have zeros in front. A point out of range is NaN.
+
+    Raises:
+        InputError: an argument is no real number, shapes do not broadcast, or ``delay="fractional_power"``.
+        TracedDelayError: d is traced.
+
+    Numerics:
+        Every coefficient of P's parts D, N1, N2 is accurate to a few units in the last place for every delta.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (15), (17).
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> print(np.array2string(zwidth.char_poly(0.5, 0.5, 0.0, 0), precision=2))
+        [ 1.   -1.5   1.25 -0.25]
+    """
+    check_has_poles(delay)
+    return by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
+
+
+def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
+    ok = valid_wall(alpha, beta, delta, d)
+    safe = jnp.where(ok, jnp.stack([alpha, beta, delta]), 0.0)
+    return jnp.where(ok, coefficients(*safe, d, degree), jnp.nan)

@@ -1,0 +1,131 @@
+"""The device between two samples: exact discretization of a damped mass under a delayed, held force.
+
+Normalized to T = 1 and m = 1. With d = n + f (n whole, 0 <= f < 1) the force computed at sample k acts from
+k + d on: in each period the older force holds during [0, f), the newer one during [f, 1). From computed
+force to sampled position that is
+
+    x/F = N(z) / (z^(1+n) (z - 1)(z - c))     with N(z) = z n0(z) + n1(z) = a2 z^2 + a1 z + a0,
+
+``phi2 z^2 + psi z`` at f = 0. All three coefficients are sums of positive terms, so none of them cancels:
+
+    t = 1 - f
+    a2 = t^2 phi2(delta t)
+    a1 = t^2 psi(delta t) + t f e^(-delta t) phi1(delta f) + f^2 phi2(delta f) + t f phi1(delta t) phi1(delta f)
+    a0 = e^(-delta t) f^2 psi(delta f)
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+
+from zwidth import phi
+from zwidth._types import Array, ArrayLike
+
+
+class Plant(NamedTuple):
+    """What the loop needs to know of device and delay; scalars, normalized."""
+
+    c: Array  # e^-delta, the pole of the velocity
+    em: Array  # 1 - c without cancellation
+    a2: Array
+    a1: Array
+    a0: Array
+    gap: Array  # N(-1) = a2 - a1 + a0 without cancellation
+
+
+def held_plant(delta: Array, fraction: Array) -> Plant:
+    """Discretize for a delay whose fractional part is ``fraction``, in [0, 1)."""
+    f = fraction
+    t = 1.0 - f
+    e_t = phi.decay(delta * t)
+    p1_t, p1_f = phi.phi1(delta * t), phi.phi1(delta * f)
+    p2_t, p2_f = phi.phi2(delta * t), phi.phi2(delta * f)
+    psi_t, psi_f = phi.psi(delta * t), phi.psi(delta * f)
+    a2 = t * t * p2_t
+    a1 = t * t * psi_t + t * f * e_t * p1_f + f * f * p2_f + t * f * p1_t * p1_f
+    a0 = e_t * f * f * psi_f
+    gap = (
+        t * t * phi.gap(delta * t)
+        - t * f * p1_f * (e_t + p1_t)
+        - f * f * (phi.gap(delta * f) + delta * t * p1_t * psi_f)
+    )
+    return Plant(phi.decay(delta), delta * phi.phi1(delta), a2, a1, a0, gap)
+
+
+def undelayed_plant(delta: Array) -> Plant:
+    """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
+    return Plant(
+        phi.decay(delta),
+        delta * phi.phi1(delta),
+        phi.phi2(delta),
+        phi.psi(delta),
+        jnp.zeros_like(delta),
+        phi.gap(delta),
+    )
+
+
+def split_delay(d: Array) -> tuple[Array, Array]:
+    """``d = n + f``; the difference is exact in floating point. Derivatives are those from the right."""
+    whole = jnp.floor(d)
+    return whole, d - whole
+
+
+class Transfer(NamedTuple):
+    """A discrete transfer function, coefficients highest power first along the last axis."""
+
+    numerator: Array
+    denominator: Array
+
+
+def velocity_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) -> Transfer:
+    """Return H_v(z), from held force (N) to sampled velocity (m/s).
+
+    ``H_v = (T/m) phi1(delta) / (z - c)`` with ``delta = b T/m``, the paper's ``(1 - c)/(b (z - c))`` and, for
+    b = 0, its limit ``T/(m (z - 1))``.
+
+    Args:
+        mass: m in kg, > 0, scalar.
+        damping: b in N s/m, >= 0, scalar.
+        period: T in s, > 0, scalar.
+
+    Returns:
+        Transfer: ``numerator`` (1,), ``denominator`` (2,).
+
+    Numerics:
+        No cancellation for any b; float64 or the ambient precision of the arguments.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (5), (12).
+    """
+    delta = jnp.asarray(damping * period / mass)
+    numerator = jnp.stack([period / mass * phi.phi1(delta)])
+    return Transfer(numerator, jnp.stack([jnp.ones_like(delta), -phi.decay(delta)]))
+
+
+def position_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) -> Transfer:
+    """Return H_x(z), from held force (N) to sampled position (m).
+
+    ``H_x = (T^2/m) (phi2 z + psi) / ((z - 1)(z - c))``, the paper's eq. (9) and, for b = 0, its limit
+    ``T^2 (z + 1) / (2 m (z - 1)^2)``.
+
+    Args:
+        mass: m in kg, > 0, scalar.
+        damping: b in N s/m, >= 0, scalar.
+        period: T in s, > 0, scalar.
+
+    Returns:
+        Transfer: ``numerator`` (2,), ``denominator`` (3,).
+
+    Numerics:
+        No cancellation for any b; float64 or the ambient precision of the arguments.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (9), (13).
+    """
+    delta = jnp.asarray(damping * period / mass)
+    c = phi.decay(delta)
+    gain = period * period / mass
+    numerator = jnp.stack([gain * phi.phi2(delta), gain * phi.psi(delta)])
+    return Transfer(numerator, jnp.stack([jnp.ones_like(delta), -(1.0 + c), c]))

@@ -1,0 +1,297 @@
+"""What the user describes: a device, a virtual wall and their timing, in SI units and normalized.
+
+The normalization is the paper's eqs. (14) and (16): ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``,
+``d = t_d/T``.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth._types import DELAY_MODELS, Array, ArrayLike, DelayModel
+from zwidth.errors import InputError, check_choice
+
+
+class Normalized(NamedTuple):
+    """The four dimensionless numbers that the stability of the wall depends on."""
+
+    alpha: Array
+    beta: Array
+    delta: Array
+    d: Array
+
+
+class Physical(NamedTuple):
+    """The same wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
+
+    mass: Array
+    damping: Array
+    period: Array
+    delay: Array
+    stiffness: Array
+    virtual_damping: Array
+
+
+# field -> (unit, lowest value, whether the lowest value itself is excluded)
+_RANGES: dict[str, tuple[str, float, bool]] = {
+    "mass": ("kg", 0.0, True),
+    "damping": ("N s/m", 0.0, False),
+    "period": ("s", 0.0, True),
+    "delay": ("s", 0.0, False),
+    "stiffness": ("N/m", -math.inf, False),
+    "virtual_damping": ("N s/m", -math.inf, False),
+    "delta": ("", 0.0, False),
+    "d": ("", 0.0, False),
+    "alpha": ("", -math.inf, False),
+    "beta": ("", -math.inf, False),
+}
+
+
+def _is_plain(value: ArrayLike) -> bool:
+    """True for Python and NumPy numbers and arrays; a JAX array, traced or not, is left to JAX."""
+    return isinstance(value, int | float | np.ndarray | np.generic | list | tuple)
+
+
+def _checked(name: str, value: ArrayLike) -> ArrayLike:
+    """Return ``value`` as float64; a scalar out of range raises, such an entry of an array becomes NaN."""
+    if not _is_plain(value):
+        if isinstance(value, str | bytes | complex | dict | set | type(None)):
+            raise InputError(f"{name}: got {value!r}, a real number is needed")
+        return value
+    try:
+        number = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed") from error
+    unit, lowest, excluded = _RANGES[name]
+    good = np.isfinite(number) & ((number > lowest) if excluded else (number >= lowest))
+    if number.ndim == 0:
+        if not good:
+            bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
+            raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
+        return number[()]
+    return number if good.all() else np.where(good, number, np.nan)
+
+
+def _periods(delay: ArrayLike, period: ArrayLike) -> ArrayLike:
+    """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number.
+
+    1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
+    """
+    quotient = delay / period
+    if not (_is_plain(delay) and _is_plain(period)):
+        return quotient
+    whole = np.round(quotient)
+    near = np.abs(quotient - whole) <= 4 * np.finfo(np.float64).eps * np.maximum(whole, 1.0)
+    return np.where(near & (whole > 0), whole, quotient)[()]
+
+
+def normalize(
+    *,
+    mass: ArrayLike,
+    damping: ArrayLike = 0.0,
+    period: ArrayLike,
+    delay: ArrayLike = 0.0,
+    stiffness: ArrayLike = 0.0,
+    virtual_damping: ArrayLike = 0.0,
+) -> Normalized:
+    """Turn SI quantities into the normalized ones.
+
+    ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``, ``d = t_d/T``.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b, the physical damping of the device, in N s/m, >= 0.
+        period: T, the sampling period, in s, > 0.
+        delay: t_d, from the sample to the moment its force acts, in s, >= 0.
+        stiffness: K of the virtual wall in N/m.
+        virtual_damping: B of the virtual wall in N s/m.
+            All broadcast against each other.
+
+    Returns:
+        ``alpha``, ``beta``, ``delta``, ``d``. ``d`` is taken as whole where the quotient is whole but for rounding.
+        An entry of an array that is out of range gives NaN.
+
+    Raises:
+        InputError: a scalar is out of range, or an argument is no number.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
+
+    Example:
+        >>> import zwidth
+        >>> wall = zwidth.normalize(mass=0.1, damping=10, period=1e-3, delay=1e-3, stiffness=14.9e3)
+        >>> print(f"{wall.alpha:.3f} {wall.delta:.1f} {wall.d:.0f}")
+        0.149 0.1 1
+    """
+    m = _checked("mass", mass)
+    t = _checked("period", period)
+    alpha = _checked("stiffness", stiffness) * t * t / m
+    beta = _checked("virtual_damping", virtual_damping) * t / m
+    delta = _checked("damping", damping) * t / m
+    return Normalized(alpha, beta, delta, _periods(_checked("delay", delay), t))
+
+
+def denormalize(
+    *,
+    mass: ArrayLike,
+    period: ArrayLike,
+    alpha: ArrayLike = 0.0,
+    beta: ArrayLike = 0.0,
+    delta: ArrayLike = 0.0,
+    d: ArrayLike = 0.0,
+) -> Physical:
+    """Turn normalized quantities back into SI ones, for a device of this mass and sampling period.
+
+    ``K = alpha m/T^2``, ``B = beta m/T``, ``b = delta m/T``, ``t_d = d T``.
+
+    Args:
+        mass: m in kg, > 0.
+        period: T in s, > 0.
+        alpha: normalized stiffness.
+        beta: normalized virtual damping.
+        delta: normalized physical damping, >= 0.
+        d: delay in periods, >= 0.
+
+    Returns:
+        ``mass``, ``damping``, ``period``, ``delay``, ``stiffness``, ``virtual_damping`` in SI units.
+
+    Raises:
+        InputError: a scalar is out of range, or an argument is no number.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.149).stiffness:.0f} N/m")
+        14900 N/m
+    """
+    m = _checked("mass", mass)
+    t = _checked("period", period)
+    return Physical(
+        mass=m,
+        damping=_checked("delta", delta) * m / t,
+        period=t,
+        delay=_checked("d", d) * t,
+        stiffness=_checked("alpha", alpha) * m / (t * t),
+        virtual_damping=_checked("beta", beta) * m / t,
+    )
+
+
+def _require_scalar(name: str, value: float) -> None:
+    if np.ndim(value) != 0:
+        raise InputError(f"{name}: got an array of shape {np.shape(value)}; a scene holds single numbers")
+    _checked(name, value)
+
+
+@dataclass(frozen=True)
+class Device:
+    """The haptic device: a mass with viscous damping.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b in N s/m, >= 0.
+    """
+
+    mass: float
+    damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_scalar("mass", self.mass)
+        _require_scalar("damping", self.damping)
+
+
+@dataclass(frozen=True)
+class VirtualWall:
+    """The wall that is rendered: a spring and a damper, the damper acting on the backward difference.
+
+    Args:
+        stiffness: K in N/m.
+        virtual_damping: B in N s/m.
+    """
+
+    stiffness: float
+    virtual_damping: float = 0.0
+
+    def __post_init__(self) -> None:
+        _require_scalar("stiffness", self.stiffness)
+        _require_scalar("virtual_damping", self.virtual_damping)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """When the wall's force is computed and when it acts.
+
+    Args:
+        period: T in s, > 0.
+        delay: t_d in s, >= 0, whole periods or not.
+        delay_model: "held" (exact for every delay) or "fractional_power" (the paper's z^(1+d), boundary and
+            ridge only).
+    """
+
+    period: float
+    delay: float = 0.0
+    delay_model: DelayModel = "held"
+
+    def __post_init__(self) -> None:
+        _require_scalar("period", self.period)
+        _require_scalar("delay", self.delay)
+        check_choice("delay_model", self.delay_model, DELAY_MODELS)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A device, its timing and, where one is chosen, the wall it renders.
+
+    Example:
+        >>> import zwidth
+        >>> scene = zwidth.Scene(zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3))
+        >>> print(f"{scene.delta:.1f} {scene.d:.0f}")
+        0.1 1
+    """
+
+    device: Device
+    timing: Timing
+    wall: VirtualWall = field(default_factory=lambda: VirtualWall(stiffness=0.0))
+
+    @property
+    def normalized(self) -> Normalized:
+        """``alpha``, ``beta``, ``delta``, ``d`` of this scene."""
+        return normalize(
+            mass=self.device.mass,
+            damping=self.device.damping,
+            period=self.timing.period,
+            delay=self.timing.delay,
+            stiffness=self.wall.stiffness,
+            virtual_damping=self.wall.virtual_damping,
+        )
+
+    @property
+    def alpha(self) -> float:
+        """Normalized stiffness of the wall."""
+        return self.normalized.alpha
+
+    @property
+    def beta(self) -> float:
+        """Normalized damping of the wall."""
+        return self.normalized.beta
+
+    @property
+    def delta(self) -> float:
+        """Normalized damping of the device."""
+        return self.normalized.delta
+
+    @property
+    def d(self) -> float:
+        """Delay in periods."""
+        return self.normalized.d
+
+    def to_si(self, *, alpha: ArrayLike = 0.0, beta: ArrayLike = 0.0) -> Physical:
+        """Stiffness in N/m and damping in N s/m of a normalized wall on this device."""
+        return denormalize(
+            mass=self.device.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
+        )

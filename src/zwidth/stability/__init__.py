@@ -1,0 +1,1 @@
+"""Stability of the loop: one method a file."""

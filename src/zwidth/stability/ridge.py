@@ -1,0 +1,90 @@
+"""The stiffest stable wall, alpha_max(delta, d)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from zwidth._types import Array, ArrayLike, DelayModel
+from zwidth.batching import pointwise
+from zwidth.loop import check_delay_model, frequency_boundary, frequency_loop, valid_device
+from zwidth.stability.curve import corner
+from zwidth.stability.ridge_kkt import ridge_omega
+from zwidth.status import Status
+
+
+class RidgeKind(IntEnum):
+    """Which kind of optimum the ridge is."""
+
+    SMOOTH = 0
+    CORNER = 1
+
+
+class RidgePoint(NamedTuple):
+    """The stiffest stable wall of a device, or an array of them."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    kind: Array
+    status: Array
+
+
+def alpha_max(delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> RidgePoint:
+    """Find the stiffest stable virtual wall.
+
+    ``alpha_max(delta, d) = sup {alpha : some beta is stable}``; in SI units ``K_max = alpha_max m/T^2``.
+
+    Args:
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not. Both broadcast.
+        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
+
+    Returns:
+        RidgePoint with arrays of the broadcast shape: ``alpha``; ``beta``, the damping that goes with it; ``omega``,
+        the frequency in radians a period at which the loop then oscillates; ``kind``, 0 smooth or 1 corner (a double
+        pole at z = -1); ``status``, see `zwidth.Status`. NaN where the status is not 0.
+
+    Raises:
+        InputError: an argument is no real number, shapes do not broadcast, or ``delay`` is unknown.
+
+    Numerics:
+        alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable: `jit`, `vmap`,
+        `grad`, `jvp` and second derivatives, in delta and d. Derivatives at whole d are those from the right.
+        Float64 when called directly; the ambient precision inside somebody's own `jit`.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII, eqs. (24), (25).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.alpha_max(0.0, 1).alpha:.4f}")
+        0.1445
+    """
+    check_delay_model(delay)
+    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay,))
+
+
+def ridge_kernel(delta: Array, d: Array, delay: str) -> RidgePoint:
+    """`alpha_max` of one point."""
+    ok = valid_device(delta, d)
+    poison = jnp.where(ok, 0.0, jnp.nan) * (delta + d) * (1.0 + delta + d)
+    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
+    loop = frequency_loop(delta, d, delay)
+    at_corner = corner(loop)
+    is_corner = at_corner.is_ridge
+    omega, found = ridge_omega(loop, d, delay)
+    wall = frequency_boundary(omega, loop, delay)
+    converged = is_corner | found
+    poison = poison + jnp.where(converged, 0.0, jnp.nan) * (delta + d) * (1.0 + delta + d)
+    status = jnp.where(ok, jnp.where(converged, Status.OK, Status.NOT_CONVERGED), Status.INVALID_INPUT)
+    return RidgePoint(
+        jnp.where(is_corner, at_corner.alpha, wall.alpha) + poison,
+        jnp.where(is_corner, at_corner.beta, wall.beta) + poison,
+        jnp.where(is_corner, jnp.pi, omega) + poison,
+        jnp.where(is_corner, RidgeKind.CORNER, RidgeKind.SMOOTH),
+        jax.lax.stop_gradient(status),
+    )

@@ -1,0 +1,39 @@
+"""Status codes that accompany a result point by point, with their messages.
+
+Traced code cannot raise, and one bad point must not spoil a batch: it gets NaN and one of these codes.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+
+class Status(IntEnum):
+    """Why a point has the value it has; 0 is success."""
+
+    OK = 0
+    INVALID_INPUT = 1
+    NOT_CONVERGED = 2
+    NO_BOUNDARY = 3
+    UNDECIDED = 4
+    ON_BOUNDARY = 5
+
+    @property
+    def message(self) -> str:
+        """One sentence: the cause, then the remedy."""
+        return _MESSAGES[self]
+
+
+_MESSAGES = {
+    Status.OK: "The value is right to the stated accuracy.",
+    Status.INVALID_INPUT: (
+        "An input is NaN, infinite or out of range; alpha and beta are finite, delta and d finite and >= 0."
+    ),
+    Status.NOT_CONVERGED: "The solver stopped before its tolerance; ask for a nearby point or another method.",
+    Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha, beta or ray.",
+    Status.UNDECIDED: (
+        "The chosen precision cannot tell stable from unstable; use method='certified' "
+        "with the extra 'certified' installed."
+    ),
+    Status.ON_BOUNDARY: "A pole lies exactly on the unit circle, or too close to it for the largest precision allowed.",
+}

@@ -1,0 +1,171 @@
+"""Faults of a configuration: what is wrong, where, what is allowed and what to do about it.
+
+A validator knows what is wrong but not where its value stands in the file. It raises a `problem`, pydantic
+adds the path of fields that leads there, and `locate` turns path and problem into a `Fault` with a place.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from pydantic import ValidationError
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from zwidth.errors import ConfigError
+
+FieldPath: TypeAlias = tuple[str | int, ...]
+LocatedProblem: TypeAlias = tuple[FieldPath, PydanticCustomError]
+
+_LONGEST_VALUE = 60
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of a configuration file.
+
+    Args:
+        file: the file as the user named it.
+        line: line in the file, from 1; None where the fault has no place in it, as for a missing file.
+        column: column in characters, from 1; None as for ``line``.
+        field: path of the field, such as ``studies[0].delta``; empty for the file as a whole.
+        problem: what is wrong, with the value received.
+        allowed: what is allowed.
+        remedy: what to do.
+    """
+
+    file: str
+    line: int | None
+    column: int | None
+    field: str
+    problem: str
+    allowed: str = ""
+    remedy: str = ""
+
+    def __str__(self) -> str:
+        place = printable(self.file)
+        if self.line is not None:
+            place += f":{self.line}:{self.column}"
+        text = "; ".join(part for part in (self.problem, self.allowed, self.remedy) if part)
+        return f"{place}: {self.field}: {text}" if self.field else f"{place}: {text}"
+
+
+class ConfigFileError(ConfigError):
+    """A configuration file with faults: one line of the message for each of them.
+
+    Args:
+        message: the whole message.
+        faults: the faults one by one, in the order of their places.
+    """
+
+    def __init__(self, message: str, faults: Sequence[Fault] = ()) -> None:
+        # The message alone goes into args, so that a copy sent to another process can be rebuilt.
+        super().__init__(message)
+        self.faults = tuple(faults)
+
+    @classmethod
+    def of(cls, faults: Iterable[Fault]) -> ConfigFileError:
+        """The error that reports ``faults``, sorted by place."""
+        ordered = sorted(faults, key=lambda fault: (fault.line or 0, fault.column or 0))
+        return cls("\n".join(str(fault) for fault in ordered), ordered)
+
+
+def problem(what: str, allowed: str = "", remedy: str = "", *, on_key: bool = False) -> PydanticCustomError:
+    """What a validator raises; ``on_key`` points at the key of the field instead of its value."""
+    context = {"what": what, "allowed": allowed, "remedy": remedy, "on_key": on_key}
+    return PydanticCustomError("zwidth", "{what}; {allowed}; {remedy}", context)
+
+
+def problems_of(error: ValidationError) -> list[LocatedProblem]:
+    """Every problem of a pydantic error with the path to its field."""
+    found = []
+    for detail in error.errors(include_url=False):
+        if detail["type"] == "zwidth":
+            found.append((detail["loc"], problem(**detail["ctx"])))
+        else:
+            found.append((detail["loc"], problem(f"got {describe(detail['input'])}", detail["msg"])))
+    return found
+
+
+def validation_error(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:
+    """Put located problems into one pydantic error; raised in a validator, it keeps all of them apart."""
+    details = [InitErrorDetails(type=what, loc=path, input=None) for path, what in problems]
+    return ValidationError.from_exception_data(title, details)
+
+
+def describe(value: Any) -> str:
+    """The value received, as YAML spells it, on one line."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Mapping):
+        return f"a mapping of {_count(len(value), 'key')}"
+    if isinstance(value, list | tuple):
+        return f"a list of {_count(len(value), 'item')}"
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else (".inf" if value > 0 else "-.inf")
+    if isinstance(value, int) and abs(value) >= 10**_LONGEST_VALUE:
+        return f"a whole number beyond 1e{_LONGEST_VALUE}"
+    text = repr(value)
+    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 4]}...{text[-1]}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """A question for the known name that looks most like ``name``, or nothing."""
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    found = difflib.get_close_matches(str(name).lower(), by_lower, n=1)
+    return f"did you mean {by_lower[found[0]]!r}?" if found else ""
+
+
+def listing(names: Iterable[str]) -> str:
+    """Names for a message: ``'a', 'b', 'c'``."""
+    return ", ".join(repr(name) for name in names)
+
+
+def printable(text: str) -> str:
+    """The text itself where it fits on one line of a terminal, else an escaped form of it."""
+    return text if text.isprintable() else ascii(text)
+
+
+def dotted(path: FieldPath) -> str:
+    """``("studies", 0, "delta")`` as ``studies[0].delta``."""
+    text = ""
+    for part in path:
+        if isinstance(part, int):
+            text += f"[{part}]"
+        else:
+            short = part if len(part) <= _LONGEST_VALUE else f"{part[:_LONGEST_VALUE]}..."
+            text += ("." if text else "") + printable(short)
+    return text
+
+
+def locate(
+    file: str,
+    problems: Iterable[LocatedProblem],
+    values: Mapping[FieldPath, tuple[int, int]],
+    keys: Mapping[FieldPath, tuple[int, int]],
+) -> list[Fault]:
+    """Give problems their places, from the places of the file's values and keys.
+
+    A field that is missing stands nowhere: it gets the place of the mapping that lacks it.
+    """
+    faults = []
+    for path, what in problems:
+        context = what.context or {}
+        place = keys.get(path) if context["on_key"] else None
+        above = path
+        while place is None:
+            place = values.get(above) or (None if above else (1, 1))
+            above = above[:-1]
+        line, column = place
+        parts = (context["what"], context["allowed"], context["remedy"])
+        faults.append(Fault(file, line, column, dotted(path), *parts))
+    return faults

@@ -1,0 +1,160 @@
+"""Studies in the time domain: step responses, and a recommended wall with its response."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, WrapValidator
+
+from zwidth.sweep.devices import (
+    AnyDevice,
+    AnyScene,
+    AnyWall,
+    DeviceField,
+    NormalizedDevice,
+    PhysicalDevice,
+    PhysicalWall,
+    WallField,
+    normalized_wall,
+)
+from zwidth.sweep.faults import LocatedProblem, problem
+from zwidth.sweep.fields import Fraction, Range, members, whole_number
+from zwidth.sweep.studies import HeldOnly, Study, figure_layout
+from zwidth.sweep.units import Duration, Span
+
+
+class _Response(Study):
+    """Base of the studies that compute responses."""
+
+    duration: Duration = Span(100.0, "periods")
+    """Length of the response, in s or in periods."""
+
+    substeps: Annotated[int, BeforeValidator(whole_number(Range(1, 10_000)))] = 10
+    """Points computed per period."""
+
+    delay_model: HeldOnly = "held"
+    """How a delay that is not whole is modelled; poles exist in the model 'held' only."""
+
+    def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
+        """Each device with its wall; the wall is None where stiffness_fraction decides it."""
+        raise NotImplementedError
+
+    def periods(self, device: AnyDevice) -> float:
+        """Length of the response of a device in sampling periods."""
+        # By plain division: seconds may be many more periods than the rounding of a delay is made for.
+        seconds = self.duration.unit == "s" and isinstance(device, PhysicalDevice)
+        return self.duration.value / (device.period if seconds else 1.0)
+
+    @property
+    def extent(self) -> str:
+        """Responses x points a period."""
+        count = len(self.pairs())
+        return f"{count} response{'' if count == 1 else 's'} of {self.duration} with {self.substeps} points a period"
+
+    @property
+    def points(self) -> int:
+        """Points of all responses together."""
+        periods = sum(min(self.periods(device), 1e15) for device, _ in self.pairs())
+        return int(periods * self.substeps) + len(self.pairs())
+
+    @property
+    def nbytes(self) -> int:
+        """Time, position, velocity and force a point."""
+        return self.points * 32
+
+
+class StepStudy(_Response):
+    """Response of the position to a step of force, for one or more devices."""
+
+    what: ClassVar[str] = "a step study"
+    from_scene: ClassVar[tuple[str, ...]] = ("devices", "delay_model")
+
+    kind: Literal["step"]
+
+    devices: Annotated[tuple[DeviceField, ...], WrapValidator(members("devices"))]
+    """Devices; the scene's where left out."""
+
+    stiffness_fraction: Fraction | None = None
+    """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
+
+    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
+    """Walls, one for all devices or one for each; a single device takes any number of them."""
+
+    figure: Annotated[Literal["fig11"] | None, figure_layout("fig11")] = None
+    """Layout of the figure; a generic one where left out."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        filled = {"delay_model": scene.delay_model, **raw}
+        if "devices" not in raw:
+            filled["devices"] = [scene.device]
+            if scene.wall is not None and "walls" not in raw and "stiffness_fraction" not in raw:
+                filled["walls"] = [scene.wall]
+        return filled
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        given = [key for key in raw if key in ("stiffness_fraction", "walls")]
+        if len(given) == 2:
+            allowed = "the wall is a share of the maximum stiffness or given outright"
+            what = "stiffness_fraction and walls are both given"
+            yield (given[1],), problem(what, allowed, "remove one", on_key=True)
+        elif not given:
+            allowed = "the study needs a wall to respond to"
+            yield (), problem("stiffness_fraction or walls is missing", allowed, "add 'stiffness_fraction: 0.75'")
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        sizes = len(self.devices), len(self.walls or (None,))
+        if min(sizes) > 1 and sizes[0] != sizes[1]:
+            allowed = "one wall for all devices, one for each, or one device for all walls"
+            yield ("walls",), problem(f"got {sizes[1]} walls for {sizes[0]} devices", allowed, "make the numbers equal")
+            return
+        if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
+            allowed = "a normalized device has no period to measure seconds in"
+            yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
+        for index, (device, wall) in enumerate(self.pairs()):
+            if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
+                allowed = "a wall in SI units needs a device with mass and period"
+                where = index if len(self.walls or ()) > 1 else 0
+                yield ("walls", where), problem("got a wall in SI units", allowed, "write alpha and beta")
+
+    def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
+        """Each device with its wall; the wall is None where stiffness_fraction decides it."""
+        walls = self.walls or (None,)
+        count = max(len(self.devices), len(walls))
+        return tuple((self.devices[k % len(self.devices)], walls[k % len(walls)]) for k in range(count))
+
+
+class RecommendStudy(_Response):
+    """Maximum stiffness and recommended damping of a device in SI units, and its response."""
+
+    what: ClassVar[str] = "a recommend study"
+    from_scene: ClassVar[tuple[str, ...]] = ("device", "delay_model")
+
+    kind: Literal["recommend"]
+
+    device: PhysicalDevice
+    """Device in SI units; the scene's where left out."""
+
+    stiffness_fraction: Fraction = 0.75
+    """Stiffness of the recommended wall as a share of the maximum."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        filled = {"delay_model": scene.delay_model, **raw}
+        if isinstance(scene.device, PhysicalDevice):
+            filled.setdefault("device", scene.device)
+        return filled
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        if name == "device":
+            return "a recommendation in N/m needs a device in SI units", "give the scene mass and period"
+        return super().missing(name)
+
+    def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
+        """The one device; its wall is a share of the maximum."""
+        return ((self.device, None),)

@@ -1,0 +1,35 @@
+"""Settings shared by all tests.
+
+JAX keeps its default precision: the library's float64 must not depend on anyone's settings.
+"""
+
+import os
+
+# Set before anything imports matplotlib, and inherited by the programs that tests start.
+os.environ["MPLBACKEND"] = "Agg"
+
+import jax
+import pytest
+from hypothesis import HealthCheck, settings
+
+# Silent broadcasting across ranks hides transposed axes.
+jax.config.update("jax_numpy_rank_promotion", "raise")
+
+settings.register_profile(
+    "zwidth",
+    # The same examples on every run: a failure is then a change in the code, not luck.
+    derandomize=True,
+    # The first example of a shape pays for its compilation.
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+    max_examples=60,
+    print_blob=True,
+)
+settings.load_profile("zwidth")
+
+
+@pytest.fixture
+def x64():
+    """Enable float64 in JAX for one test, as a user who traces the library's functions would."""
+    with jax.enable_x64(True):
+        yield
