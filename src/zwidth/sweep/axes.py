@@ -13,12 +13,12 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema, create_model
+from pydantic_core import PydanticCustomError
 
-from zwidth.sweep.faults import LocatedProblem, describe, nearest, problem, problems_of, validation_error
+from zwidth.sweep.faults import LocatedProblem, describe, problem, problems_of, short, suggestion, validation_error
 from zwidth.sweep.fields import (
     ANY,
     NOT_NEGATIVE,
-    POSITIVE,
     Range,
     Strict,
     ValidationError,
@@ -165,7 +165,7 @@ class _Spacing(Strict):
         start, stop, num = (getattr(self, name) for name in ("start", "stop", "num"))
         if start == stop:
             where = "start and stop must differ"
-            return [(("stop",), problem(f"got {describe(stop)}, as start", where, "write a number alone"))]
+            return [(("stop",), problem(f"got {short(stop)}, as start", where, "write a number alone"))]
         # Neighbors must differ in float64, or the axis would hold one value twice.
         if num > 1 and abs(stop - start) / (num - 1) <= 4 * np.spacing(max(abs(start), abs(stop))):
             return [(("num",), problem(f"got {num}", "the steps are below float64's resolution", "lower num"))]
@@ -189,7 +189,7 @@ def _parse_list(raw: list[Any] | tuple[Any, ...], entry: Callable[[Any], float])
     for index, value in enumerate(raw):
         try:
             entries.append(entry(value))
-        except ValueError as error:
+        except PydanticCustomError as error:
             found.append(((index,), error))
     if found:
         raise validation_error("axis", found)
@@ -215,9 +215,14 @@ def axis(allowed: Range = ANY) -> Callable[[Any], Axis]:
             return PointAxis(entry(raw))
         if len(raw) != 1:
             raise problem(f"got {describe(raw)}", f"an axis is {_FORMS}", "keep one of these forms")
-        (key, ends), = raw.items()
+        ((key, ends),) = raw.items()
         if key not in spellings:
-            unknown = problem("unknown key", f"an axis is {_FORMS}", nearest(key, spellings), on_key=True)
+            unknown = problem(
+                "unknown key",
+                f"an axis is {_FORMS}",
+                suggestion(key, spellings, "write one of these forms"),
+                on_key=True,
+            )
             raise validation_error("axis", [((key,), unknown)])
         model, kind = spellings[key]
         try:

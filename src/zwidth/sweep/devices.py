@@ -6,12 +6,13 @@ from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PlainValidator, ValidationInfo
+from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DELAY_MODELS, DelayModel
+from zwidth.errors import InputError
 from zwidth.scene import Device, Scene, Timing, VirtualWall, normalize
 from zwidth.sweep.axes import MAX_DELAY_PERIODS
-from zwidth.sweep.faults import LocatedProblem, describe, listing, problem
+from zwidth.sweep.faults import LocatedProblem, describe, listing, problem, short
 from zwidth.sweep.fields import NonNegative, Number, Range, Strict, Text, number, one_of
 from zwidth.sweep.units import (
     PERIOD_SCHEMA,
@@ -43,15 +44,14 @@ class _OneKind(Strict):
     foreign: ClassVar[frozenset[str]]
 
     @classmethod
-    def unknown(cls, name: str) -> tuple[str, str]:
+    def unknown(cls, name: str) -> tuple[str, str, str]:
         if name not in cls.foreign:
             return super().unknown(name)
-        own = [key for key in cls.known_keys() if key in _PHYSICAL | _NORMALIZED]
         kind, other = ("physical", "normalized") if name in _NORMALIZED else ("normalized", "physical")
         return (
-            f"{cls.what} is either physical or normalized, never both; this one began as {kind}",
-            f"remove this {other} key, or describe everything with {listing(sorted(cls.foreign))} in place of "
-            f"{listing(own)}",
+            f"{other} key, after {kind} ones",
+            f"{cls.what} is described in SI units or normalized, never both",
+            f"remove it, or write all keys {'normalized' if other == 'normalized' else 'in SI units'}",
         )
 
 
@@ -71,13 +71,21 @@ class _PhysicalPlant(_OneKind):
 
     foreign: ClassVar[frozenset[str]] = _NORMALIZED
 
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        if name != "mass":
+            return super().missing(name)
+        return f"{cls.what} has mass and period or rate, or, normalized, delta", "add 'mass: 0.1 kg'"
+
     mass: Mass
     """Moving mass m of the device in kg, > 0."""
 
     damping: Damping = 0.0
     """Physical damping b of the device in N s/m, >= 0."""
 
-    rate: Annotated[float, BeforeValidator(quantity(RATE, _RATES)), RATE_SCHEMA] | None = Field(default=None, exclude=True)
+    rate: Annotated[float, BeforeValidator(quantity(RATE, _RATES)), RATE_SCHEMA] | None = Field(
+        default=None, exclude=True
+    )
     """Sampling rate 1/T in Hz; give it or the period."""
 
     period: Annotated[float, BeforeValidator(_period), PERIOD_SCHEMA] = Field(default=None, validate_default=True)
@@ -97,13 +105,13 @@ class _PhysicalPlant(_OneKind):
         delay = self.delay.value / (self.period if self.delay.unit == "s" else 1.0)
         if not delay <= MAX_DELAY_PERIODS:
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
-            yield ("delay",), problem(f"got {self.delay}, which is {delay:.6g} periods", allowed)
+            yield ("delay",), problem(f"got {self.delay}, which is {short(delay)} periods", allowed, "check the units")
             return
         with np.errstate(all="ignore"):
             numbers = self.to_scene().normalized
         for field, name in (("damping", "delta"), ("stiffness", "alpha"), ("virtual_damping", "beta")):
             if not np.isfinite(getattr(numbers, name)):
-                what = f"got {getattr(self, field)!r}, whose normalized value {name} is beyond float64"
+                what = f"got {short(getattr(self, field))}, whose normalized value {name} is beyond float64"
                 yield (field,), problem(what, f"{name} must be finite", "check the units and the mass")
 
     @property
@@ -243,6 +251,8 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
     """``alpha`` and ``beta`` of a wall on a device; a wall in SI units needs a device in SI units."""
     if isinstance(wall, NormalizedWall):
         return wall.alpha, wall.beta
+    if isinstance(device, NormalizedDevice):
+        raise InputError("wall: got one in SI units for a normalized device; give alpha and beta")
     with np.errstate(over="ignore"):
         plain = normalize(
             mass=device.mass, period=device.period, stiffness=wall.stiffness, virtual_damping=wall.virtual_damping
@@ -256,24 +266,29 @@ def is_normalized(raw: dict[str, Any]) -> bool:
     return bool(telling) and telling[0] in _NORMALIZED
 
 
-def either(physical: type[_OneKind], normalized: type[_OneKind]) -> PlainValidator:
-    """A validator that reads a mapping as the kind that its first telling key belongs to."""
-    Kinds: Any = physical | normalized
-
-    def validate(raw: Any) -> Any:
-        if isinstance(raw, physical | normalized):
-            return raw
-        if not isinstance(raw, dict):
-            needed = f"{physical.what} is a mapping, with mass and period in SI units or with delta and d"
-            raise problem(f"got {describe(raw)}", needed)
-        return (normalized if is_normalized(raw) else physical).model_validate(raw)
-
-    return PlainValidator(validate, json_schema_input_type=Kinds)
+def _as_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
+    """Read a mapping as the kind that its first telling key belongs to."""
+    if isinstance(raw, physical | normalized):
+        return raw
+    if not isinstance(raw, dict):
+        keys = f"{listing(physical.model_fields)} or, normalized, {listing(normalized.model_fields)}"
+        raise problem(
+            f"got {describe(raw)}", f"{physical.what} is a mapping with the keys {keys}", "write 'key: value' lines"
+        )
+    return (normalized if is_normalized(raw) else physical).model_validate(raw)
 
 
 AnyScene: TypeAlias = PhysicalScene | NormalizedScene
 AnyDevice: TypeAlias = PhysicalDevice | NormalizedDevice
 AnyWall: TypeAlias = PhysicalWall | NormalizedWall
-SceneField = Annotated[AnyScene, either(PhysicalScene, NormalizedScene)]
-DeviceField = Annotated[AnyDevice, either(PhysicalDevice, NormalizedDevice)]
-WallField = Annotated[AnyWall, either(PhysicalWall, NormalizedWall)]
+
+
+def read_scene(raw: Any) -> AnyScene:
+    """A scene of either kind."""
+    return _as_either(raw, PhysicalScene, NormalizedScene)
+
+
+# The handler, which would try one kind after the other and report the faults of both, is never called.
+SceneField = Annotated[AnyScene, WrapValidator(lambda raw, _: read_scene(raw))]
+DeviceField = Annotated[AnyDevice, WrapValidator(lambda raw, _: _as_either(raw, PhysicalDevice, NormalizedDevice))]
+WallField = Annotated[AnyWall, WrapValidator(lambda raw, _: _as_either(raw, PhysicalWall, NormalizedWall))]

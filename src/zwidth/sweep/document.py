@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, TypeAlias
 
-from pydantic import BeforeValidator, Field, PlainValidator, ValidationError, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, Field, WithJsonSchema, WrapValidator
 
-from zwidth.sweep.devices import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized
+from zwidth.sweep.devices import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.sweep.faults import (
     LocatedProblem,
     describe,
     listing,
-    nearest,
     problem,
-    problems_of,
+    suggestion,
     validation_error,
 )
 from zwidth.sweep.fields import Name, Strict, Text, looks_like_number, members
@@ -47,7 +46,11 @@ def _study(raw: Any) -> Any:
     if "kind" not in raw:
         raise validation_error("study", [(("kind",), problem("missing", kinds, "add 'kind: boundary'"))])
     if not isinstance(kind, str) or kind not in STUDIES:
-        what = problem(f"got {describe(kind)}", f"the kinds are {listing(STUDIES)}", nearest(kind, STUDIES))
+        what = problem(
+            f"got {describe(kind)}",
+            f"the kinds are {listing(STUDIES)}",
+            suggestion(kind, STUDIES, "write one of these"),
+        )
         raise validation_error("study", [(("kind",), what)])
     return STUDIES[kind].model_validate(raw)
 
@@ -63,9 +66,8 @@ def _version(value: Any) -> int:
     raise problem(f"got {describe(value)}", f"this release reads version {FORMAT_VERSION} of the format", remedy)
 
 
-StudyField = Annotated[
-    AnyStudy, PlainValidator(_study, json_schema_input_type=Annotated[AnyStudy, Field(discriminator="kind")])
-]
+# The discriminator is for the JSON Schema; the handler, whose messages know no remedy, is never called.
+StudyField = Annotated[Annotated[AnyStudy, Field(discriminator="kind")], WrapValidator(lambda raw, _: _study(raw))]
 
 
 class Config(Strict):
@@ -128,8 +130,9 @@ class Config(Strict):
 def _scene_or_stand_in(raw: Any) -> AnyScene:
     """The file's scene; where it is faulty, one that only keeps its faults from repeating in every study."""
     try:
-        return Config.__pydantic_validator__.validate_assignment(Config.model_construct(), "scene", raw).scene
-    except ValidationError:
+        return read_scene(raw)
+    except ValueError:
+        # The same faults are reported where the scene itself is read.
         pass
     if isinstance(raw, dict) and is_normalized(raw):
         return NormalizedScene(delta=0.0, alpha=0.0)
@@ -156,8 +159,14 @@ def config_json_schema() -> dict[str, Any]:
         >>> sorted(config_json_schema()["required"])
         ['name', 'studies', 'version']
     """
-    schema = Config.model_json_schema()
+    schema = _without_null(Config.model_json_schema())
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-__all__ = ["AnyStudy", "Config", "config_json_schema", "problems_of"]
+def _without_null(schema: Any) -> Any:
+    """The schema without null, which stands for "not given" in the models and is never written in a file."""
+    if isinstance(schema, list):
+        return [_without_null(item) for item in schema if item != {"type": "null"}]
+    if not isinstance(schema, dict):
+        return schema
+    return {key: _without_null(value) for key, value in schema.items() if key != "default" or value is not None}

@@ -84,7 +84,7 @@ def problems_of(error: ValidationError) -> list[LocatedProblem]:
     found = []
     for detail in error.errors(include_url=False):
         if detail["type"] == "zwidth":
-            found.append((detail["loc"], problem(**detail["ctx"])))
+            found.append((detail["loc"], problem(**detail.get("ctx", {}))))
         else:
             found.append((detail["loc"], problem(f"got {describe(detail['input'])}", detail["msg"])))
     return found
@@ -118,11 +118,25 @@ def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
-def nearest(name: object, known: Iterable[str]) -> str:
-    """A question for the known name that looks most like ``name``, or nothing."""
+def resembling(name: Any, known: Iterable[str]) -> str | None:
+    """The known name that looks most like ``name``, if any does."""
+    if not isinstance(name, str):
+        return None
     by_lower = {candidate.lower(): candidate for candidate in known}
-    found = difflib.get_close_matches(str(name).lower(), by_lower, n=1)
-    return f"did you mean {by_lower[found[0]]!r}?" if found else ""
+    found = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    return by_lower[found[0]] if found else None
+
+
+def suggestion(name: Any, known: Iterable[str], otherwise: str) -> str:
+    """A remedy: a question for the known name that ``name`` may stand for, else what is given."""
+    found = resembling(name, known)
+    return f"did you mean {found!r}?" if found else otherwise
+
+
+def short(value: float) -> str:
+    """The shortest text of a number, without ``.0`` where it is whole."""
+    text = f"{value:g}"
+    return text if float(text) == value else repr(value)
 
 
 def listing(names: Iterable[str]) -> str:

@@ -7,17 +7,18 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Annotated, Any, ClassVar, NamedTuple
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, WithJsonSchema
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, WithJsonSchema, model_validator
 from pydantic import ModelWrapValidatorHandler as Handler
-from pydantic import model_validator
 
 from zwidth.sweep.faults import (
     LocatedProblem,
     describe,
     listing,
-    nearest,
     problem,
     problems_of,
+    resembling,
+    short,
+    suggestion,
     validation_error,
 )
 
@@ -51,15 +52,15 @@ class Strict(BaseModel):
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
         """Hook: what is allowed and the remedy where the required key ``name`` is absent."""
-        return "", f"add {name!r}"
+        return f"{cls.what} needs it", f"add {name!r}"
 
     @classmethod
-    def unknown(cls, name: str) -> tuple[str, str]:
-        """Hook: what is allowed and the remedy for a key that does not exist."""
+    def unknown(cls, name: str) -> tuple[str, str, str]:
+        """Hook: what is wrong with a key that does not belong here, what is allowed and the remedy."""
         if name == "<<":
-            return "YAML 1.2 has no merge keys", "write the keys out"
+            return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
         known = cls.known_keys()
-        return f"{cls.what} has the keys {listing(known)}", nearest(name, known) or "remove it"
+        return "unknown key", f"{cls.what} has the keys {listing(known)}", suggestion(name, known, "remove it")
 
     def limits(self) -> Iterable[LocatedProblem]:
         """Hook: faults that only valid values show."""
@@ -72,27 +73,43 @@ class Strict(BaseModel):
             return raw
         if not isinstance(raw, dict):
             known = listing(cls.known_keys())
-            raise problem(f"got {describe(raw)}", f"{cls.what} is a mapping with the keys {known}")
+            allowed = f"{cls.what} is a mapping with the keys {known}"
+            raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines, or {key: value}")
         raw = cls.prepare(raw)
-        unknown = [key for key in raw if key not in cls.known_keys()]
-        found: list[LocatedProblem] = [
-            ((key,), problem("unknown key", *cls.unknown(key), on_key=True)) for key in unknown
-        ]
+        found = list(cls._unusable(raw))
+        skipped = {path[0] for path, _ in found}
         found.extend(cls.conflicts(raw))
         try:
-            model = handler({key: value for key, value in raw.items() if key not in unknown})
+            model = handler({key: value for key, value in raw.items() if key not in skipped})
         except ValidationError as error:
-            absent = {
-                detail["loc"][0] for detail in error.errors(include_url=False) if detail["type"] == "missing"
-            }
-            for path, what in problems_of(error):
-                lacking = len(path) == 1 and path[0] in absent
-                found.append((path, problem("missing", *cls.missing(str(path[0]))) if lacking else what))
+            found.extend(cls._with_remedies(error, skipped))
         else:
             found.extend(model.limits())
             if not found:
                 return model
         raise validation_error(cls.__name__, found)
+
+    @classmethod
+    def _unusable(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        """Keys that do not exist, and keys without a value."""
+        for key, value in raw.items():
+            if key not in cls.known_keys():
+                yield (key,), problem(*cls.unknown(key), on_key=True)
+            elif value is None:
+                yield (key,), problem("got nothing", "a key that is written has a value", "add one or remove the key")
+
+    @classmethod
+    def _with_remedies(cls, error: ValidationError, skipped: set[Any]) -> Iterable[LocatedProblem]:
+        """The problems of an error, those of keys that lack in this mapping with what its class knows of them."""
+        known = cls.known_keys()
+        # Faults of their own: a key without a value, and one that is misspelled.
+        explained = skipped | {resembling(key, known) for key in skipped}
+        details = error.errors(include_url=False, include_input=False, include_context=False)
+        for detail, (path, what) in zip(details, problems_of(error), strict=True):
+            absent = detail["type"] == "missing" or (len(path) == 1 and (what.context or {})["what"] == "missing")
+            if absent and path[0] in explained:
+                continue
+            yield path, problem("missing", *cls.missing(str(path[0]))) if detail["type"] == "missing" else what
 
 
 class Range(NamedTuple):
@@ -136,7 +153,9 @@ def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") 
         needed = f"it must be finite{f' and {bounds}' if bounds else ''}"
         raise problem(f"got {describe(value)}", needed, remedy or "write a finite number")
     if not allowed.holds(value):
-        raise problem(f"got {value:.17g}{f' {unit}' if unit else ''}", needed, remedy)
+        raise problem(
+            f"got {short(value)}{f' {unit}' if unit else ''}", needed, remedy or "write a number in this range"
+        )
     return value
 
 
@@ -191,7 +210,7 @@ def one_of(*names: str) -> Callable[[Any], str]:
         if isinstance(value, str) and value in names:
             return value
         allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
-        raise problem(f"got {describe(value)}", allowed, nearest(value, names))
+        raise problem(f"got {describe(value)}", allowed, suggestion(value, names, "write one of these"))
 
     return validate
 
@@ -223,15 +242,17 @@ def members(what: str) -> Callable[[Any, Callable[[Any], Any]], Any]:
 
     def validate(raw: Any, handler: Callable[[Any], Any]) -> Any:
         if not isinstance(raw, list | tuple):
-            hint = f"write [{raw}]" if isinstance(raw, str) and raw.isprintable() else ""
+            hint = "write '- ' before each of them"
+            if isinstance(raw, str) and raw.isprintable() and len(raw) < 60:
+                hint = f"write [{raw}]"
             raise problem(f"got {describe(raw)}", f"it must be a list of {what}", hint)
         if not raw:
-            raise problem("got an empty list", f"at least one of {what} is needed", "fill the list")
+            raise problem("got an empty list", f"one of the {what} at least is needed", "fill the list")
         found = list(repeated(raw, "remove it"))
         try:
             value = handler(tuple(raw))
         except ValidationError as error:
-            found.extend(problems_of(error))
+            raise validation_error(what, [*found, *problems_of(error)]) from None
         if found:
             raise validation_error(what, found)
         return value
@@ -253,13 +274,9 @@ def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
 
 Boolean = Annotated[bool, BeforeValidator(_boolean)]
 Text = Annotated[str, BeforeValidator(_text)]
-Name = Annotated[
-    str, BeforeValidator(_name), WithJsonSchema({"type": "string", "pattern": "^[a-z0-9_-]{1,64}$"})
-]
+Name = Annotated[str, BeforeValidator(_name), WithJsonSchema({"type": "string", "pattern": "^[a-z0-9_-]{1,64}$"})]
 Number = Annotated[float, BeforeValidator(number())]
-NonNegative = Annotated[
-    float, BeforeValidator(number(NOT_NEGATIVE)), WithJsonSchema({"type": "number", "minimum": 0})
-]
+NonNegative = Annotated[float, BeforeValidator(number(NOT_NEGATIVE)), WithJsonSchema({"type": "number", "minimum": 0})]
 Fraction = Annotated[
     float,
     BeforeValidator(number(FRACTION, "write 75 % as 0.75")),

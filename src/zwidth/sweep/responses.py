@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BeforeValidator, WrapValidator
+from pydantic_core import PydanticCustomError
 
 from zwidth.sweep.devices import (
     AnyDevice,
@@ -28,6 +29,8 @@ from zwidth.sweep.units import Duration, Span
 class _Response(Study):
     """Base of the studies that compute responses."""
 
+    remedy_if_too_large: ClassVar[str] = "shorten the duration, or lower substeps"
+
     duration: Duration = Span(100.0, "periods")
     """Length of the response, in s or in periods."""
 
@@ -44,8 +47,9 @@ class _Response(Study):
     def periods(self, device: AnyDevice) -> float:
         """Length of the response of a device in sampling periods."""
         # By plain division: seconds may be many more periods than the rounding of a delay is made for.
-        seconds = self.duration.unit == "s" and isinstance(device, PhysicalDevice)
-        return self.duration.value / (device.period if seconds else 1.0)
+        if self.duration.unit == "s" and isinstance(device, PhysicalDevice):
+            return self.duration.value / device.period
+        return self.duration.value
 
     @property
     def extent(self) -> str:
@@ -115,11 +119,25 @@ class StepStudy(_Response):
         if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
             allowed = "a normalized device has no period to measure seconds in"
             yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
+        yield from self._wall_limits()
+
+    def _wall_limits(self) -> Iterable[LocatedProblem]:
+        """Walls that do not fit their device, each reported once."""
+        several = self.walls is not None and len(self.walls) > 1
+        faulty: dict[int, PydanticCustomError] = {}
         for index, (device, wall) in enumerate(self.pairs()):
+            if wall is None:
+                continue
             if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
                 allowed = "a wall in SI units needs a device with mass and period"
-                where = index if len(self.walls or ()) > 1 else 0
-                yield ("walls", where), problem("got a wall in SI units", allowed, "write alpha and beta")
+                fault = problem("got a wall in SI units", allowed, "write alpha and beta")
+            elif not all(math.isfinite(value) for value in normalized_wall(device, wall)):
+                allowed = "alpha and beta must be finite"
+                fault = problem("got a wall whose normalized values are beyond float64", allowed, "check the units")
+            else:
+                continue
+            faulty[index if several else 0] = fault
+        yield from ((("walls", index), fault) for index, fault in faulty.items())
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         """Each device with its wall; the wall is None where stiffness_fraction decides it."""

@@ -8,9 +8,9 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
 
 from zwidth._types import DELAY_MODELS
-from zwidth.sweep.axes import AnyAxis, Axis, DelayAxis, DeltaAxis
+from zwidth.sweep.axes import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.sweep.devices import AnyDelayModel, AnyScene
-from zwidth.sweep.faults import LocatedProblem, describe, listing, nearest, problem
+from zwidth.sweep.faults import LocatedProblem, describe, listing, problem
 from zwidth.sweep.fields import Boolean, Name, Strict, members, one_of
 
 MAX_POINTS = 150_000_000
@@ -28,7 +28,7 @@ def _only_held(value: Any) -> str:
     """A validator for a study that needs poles."""
     if one_of(*DELAY_MODELS)(value) == "fractional_power":
         raise problem(
-            f"got {describe(value)}",
+            f"got {describe(value)}, the study's own or the scene's",
             "poles do not exist in this delay model, only the boundary and the ridge do; allowed is 'held'",
             "write 'delay_model: held' in this study, or use the kind 'boundary' or 'ridge'",
         )
@@ -40,9 +40,8 @@ DelayModels = Annotated[tuple[AnyDelayModel, ...], WrapValidator(members("delay 
 
 
 def figure_layout(*names: str) -> BeforeValidator:
-    """A validator for the layout of a figure; null stands for the generic one."""
-    check = one_of(*names)
-    return BeforeValidator(lambda value: None if value is None else check(value))
+    """A validator for the layout of a figure."""
+    return BeforeValidator(one_of(*names))
 
 
 def _drop_supplied(schema: dict[str, Any], model: type[Study]) -> None:
@@ -58,6 +57,8 @@ class Study(Strict):
 
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")
     """Fields that the file's scene supplies where the study leaves them out."""
+
+    remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
 
     name: Name
     """Name of the study, unique in the file; its results are stored under it."""
@@ -99,7 +100,7 @@ class Study(Strict):
             return
         what = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"
         allowed = f"at most {MAX_POINTS:.4g} points and {MAX_BYTES / 2**30:g} GiB a study"
-        yield (), problem(what, allowed, "use fewer values on an axis, or split the study")
+        yield (), problem(what, allowed, self.remedy_if_too_large)
 
 
 class _Curves(Study):
@@ -160,13 +161,14 @@ class BoundaryStudy(_Curves):
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         plane = raw.get("plane", "alpha_beta")
+        plane = plane if isinstance(plane, str) else ""
         if plane == "delta_beta" and raw.get("ridge_path") is True:
             allowed = "the path of maximum stiffness lies in the plane alpha_beta; at alpha -> 0 there is none"
             yield ("ridge_path",), problem("got true with plane delta_beta", allowed, "remove ridge_path")
         figure = raw.get("figure")
         layouts = {"alpha_beta": ("fig5", "fig7", "fig8"), "delta_beta": ("fig6", "fig9")}
-        if plane in ("alpha_beta", "delta_beta") and figure in ("fig5", "fig6", "fig7", "fig8", "fig9"):
-            if figure not in layouts[plane]:
+        for other, names in layouts.items():
+            if figure in names and plane in layouts and plane != other:
                 allowed = f"the layouts for this plane are {listing(layouts[plane])}"
                 remedy = "choose one of these, or change the plane"
                 yield ("figure",), problem(f"got {figure!r} with plane {plane}", allowed, remedy)

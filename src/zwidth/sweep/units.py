@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
 
 from zwidth.scene import normalize
-from zwidth.sweep.faults import describe, nearest, problem
+from zwidth.sweep.faults import describe, problem, short, suggestion
 from zwidth.sweep.fields import ANY, NOT_NEGATIVE, POSITIVE, Range, check_range, looks_like_number, to_float
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
@@ -57,7 +57,7 @@ class Span(NamedTuple):
         return float(normalize(mass=1.0, period=period, delay=self.value).d)
 
     def __str__(self) -> str:
-        return f"{self.value!r} {self.unit}"
+        return f"{short(self.value)} {self.unit}"
 
 
 def _canonical(unit: str) -> str:
@@ -79,9 +79,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     if not isinstance(value, str):
         raise problem(f"got {describe(value)}", allowed, remedy)
     if looks_like_number(value):
-        raise problem(
-            f"got the text {describe(value)}", allowed, f"drop the quotes (it is then in {dimension.base})"
-        )
+        raise problem(f"got the text {describe(value)}", allowed, f"drop the quotes (it is then in {dimension.base})")
     match = _QUANTITY.fullmatch(value)
     if match is None:
         raise problem(f"got {describe(value)}", allowed, remedy)
@@ -91,7 +89,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     powers = {_canonical(name): power for name, power in dimension.units.items()}
     power = powers.get(_canonical(unit))
     if power is None:
-        raise problem(f"got {describe(value)}", f"the units allowed are {names}", nearest(unit, units) or remedy)
+        raise problem(f"got {describe(value)}", f"the units allowed are {names}", suggestion(unit, units, remedy))
     # Shifting the decimal exponent rounds once: 0.3 ms is exactly the float64 of 0.0003.
     return float(f"{mantissa}e{int(exponent or 0) + power}"), dimension.base
 

@@ -1,0 +1,289 @@
+"""The stability boundary: its closed form, and exact points on a given line."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+
+from zwidth._types import Array, ArrayLike, DelayModel
+from zwidth.batching import is_traced, pointwise, to_caller
+from zwidth.errors import InputError, check_choice
+from zwidth.loop import (
+    BoundaryCurve,
+    FrequencyLoop,
+    check_delay_model,
+    frequency_boundary,
+    frequency_loop,
+    valid_device,
+)
+from zwidth.stability.bracketing import bisect
+from zwidth.stability.curve import lobe_end
+from zwidth.stability.poles import unstable_poles
+from zwidth.stability.ridge import ridge_kernel
+from zwidth.stability.ridge_kkt import frequency_residual
+from zwidth.status import Status
+
+# Cells into which the lobe is cut to bracket its crossings with a line.
+_CELLS = 256
+# Pole counts are taken this far (relative) before and behind a boundary point: beyond the count's own rounding.
+_SIDE_STEP = 1e-8
+
+
+def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> BoundaryCurve:
+    """Return the wall that puts a pole pair of the loop at ``e^(+-j omega)``, in closed form.
+
+    With ``q = -z^n (z - 1)(z - c)/(n0(z) + n1(z)/z)`` on ``z = e^(j omega)``: ``beta = Im q / sin omega``,
+    ``alpha = Re q - tan(omega/2) Im q``. The curve starts at (0, -delta), eq. (19). It lists candidates: which of its
+    pieces bound the stable set is decided by counting poles, see `zwidth.stable_region`.
+
+    Args:
+        omega: frequency in radians a period, 0 <= omega <= pi.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not. All three broadcast.
+        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d), principal branch).
+
+    Returns:
+        BoundaryCurve with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega -> 0 and -> pi the
+        values are the limits; for delta = 0, or a fractional power, the curve runs to infinity at pi.
+
+    Raises:
+        InputError: an argument is no real number, shapes do not broadcast, or ``delay`` is unknown.
+
+    Numerics:
+        A few units in the last place, at a cost that does not grow with d. Traceable, also in d (derivatives at whole
+        d are those from the right). Float64 when called directly; the ambient precision inside `jit`.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V; D-decomposition.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.boundary(0.0, 0.25, 2).beta:.2f}")
+        -0.25
+    """
+    check_delay_model(delay)
+    return pointwise(_boundary_kernel, ("omega", "delta", "d"), (omega, delta, d), (delay,))
+
+
+def _boundary_kernel(omega: Array, delta: Array, d: Array, delay: str) -> BoundaryCurve:
+    ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
+    spread = omega + delta + d
+    poison = jnp.where(ok, 0.0, jnp.nan) * spread * (1.0 + spread)
+    omega, delta, d = (jnp.where(ok, value, 1.0) for value in (omega, delta, d))
+    curve = frequency_boundary(omega, frequency_loop(delta, d, delay), delay)
+    return BoundaryCurve(curve.alpha + poison, curve.beta + poison)
+
+
+class BoundaryPoint(NamedTuple):
+    """A wall on the edge of stability, or an array of them."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    status: Array
+
+
+def boundary_point(
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    beta: ArrayLike | None = None,
+    alpha: ArrayLike | None = None,
+    side: str = "lower",
+    ray: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike] | None = None,
+    delay: DelayModel = "held",
+) -> BoundaryPoint:
+    """Find the exact boundary point on a line, by an optimistix solve of ``P(e^(j omega)) = 0`` in real unknowns.
+
+    Exactly one of ``beta``, ``alpha`` and ``ray`` is given: the stiffest stable wall of that damping; the smallest
+    (``side="lower"``) or largest (``"upper"``) stable damping of that stiffness; or the first boundary point on the
+    ray ``(alpha0, beta0) + s (dalpha, dbeta)``, s > 0, from a stable wall (alpha0, beta0).
+
+    Args:
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0.
+        beta: normalized virtual damping of a row.
+        alpha: normalized stiffness of a column, > 0.
+        side: which end of the column.
+        ray: (alpha0, beta0, dalpha, dbeta). Everything broadcasts.
+        delay: "held" or "fractional_power".
+
+    Returns:
+        BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (0 and pi: the real ones);
+        ``status``, NO_BOUNDARY with NaN where the line has no stable part.
+
+    Raises:
+        InputError: not exactly one line is given, an argument is no real number, or a name is unknown.
+
+    Numerics:
+        Agrees with the closed form to 1e-12. Called directly with a held delay, the poles on both sides are counted
+        and the point is accepted only where the inner side is stable and the outer is not. Traced calls rely on the
+        single-lobe shape of the stable set instead. Traceable, also in d.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section V.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.boundary_point(0.0, 0, beta=0.5).alpha:.4f}")
+        0.6000
+    """
+    check_delay_model(delay)
+    check_choice("side", side, ("lower", "upper"))
+    given = [name for name, value in (("beta", beta), ("alpha", alpha), ("ray", ray)) if value is not None]
+    if len(given) != 1:
+        raise InputError(f"beta, alpha, ray: got {' and '.join(given) or 'none'}; give exactly one of the three")
+    if beta is not None:
+        values, search = (0.0, beta, 1.0, 0.0), "ray"
+    elif alpha is not None:
+        values, search = (alpha, 0.0, 0.0, 1.0), side
+    else:
+        if not isinstance(ray, tuple | list) or len(ray) != 4:
+            raise InputError(f"ray: got {ray!r}; give the four numbers (alpha0, beta0, dalpha, dbeta)")
+        values, search = tuple(ray), "ray"
+    names = ("delta", "d", "alpha0", "beta0", "dalpha", "dbeta")
+    everything = (delta, d, *values)
+    point = pointwise(_point_kernel, names, everything, (search, delay))
+    if is_traced(*everything) or delay != "held":
+        return point
+    return _counted(point, everything, search)
+
+
+class _Line(NamedTuple):
+    """A line in the (alpha, beta) plane, walked in one direction from its origin."""
+
+    alpha: Array
+    beta: Array
+    dalpha: Array
+    dbeta: Array
+
+    def offset(self, wall: BoundaryCurve) -> Array:
+        """Zero where a wall lies on the line, of opposite sign on its two sides."""
+        return self.dalpha * (wall.beta - self.beta) - self.dbeta * (wall.alpha - self.alpha)
+
+    def distance(self, wall: BoundaryCurve) -> Array:
+        """How far along the line a wall on it lies, in lengths of the direction."""
+        along = (wall.alpha - self.alpha) * self.dalpha + (wall.beta - self.beta) * self.dbeta
+        return along / (self.dalpha**2 + self.dbeta**2)
+
+
+def _point_kernel(
+    delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array, search: str, delay: str
+) -> BoundaryPoint:
+    inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
+    total = sum(inputs)
+    ok = valid_device(delta, d) & jnp.isfinite(total) & ((dalpha != 0) | (dbeta != 0))
+    delta, d, *direction = (jnp.where(ok, value, 1.0) for value in inputs)
+    line = _Line(*direction)
+    loop = frequency_loop(delta, d, delay)
+    omegas = _lobe_frequencies(delta, d, loop, delay)
+    on_curve = _curve_crossings(line, omegas, loop, delay)
+    real = _real_pole_crossings(line, loop)
+    index, exists = _choose(on_curve, real, search)
+    cell = jnp.minimum(index, _CELLS - 1)
+    omega, distance, converged = _polish(line, omegas[cell], omegas[cell + 1], loop, delay)
+    is_real = index >= _CELLS
+    omega = jnp.where(is_real, jnp.where(index == _CELLS, 0.0, jnp.pi), omega)
+    distance = jnp.where(is_real, real[jnp.clip(index - _CELLS, 0, 1)], distance)
+    found = exists & (is_real | converged)
+    status = jnp.where(ok, jnp.where(found, Status.OK, Status.NO_BOUNDARY), Status.INVALID_INPUT)
+    poison = jnp.where(ok & found, 0.0, jnp.nan) * total * (1.0 + total)
+    return BoundaryPoint(
+        line.alpha + distance * line.dalpha + poison,
+        line.beta + distance * line.dbeta + poison,
+        omega + poison,
+        jax.lax.stop_gradient(status),
+    )
+
+
+def _lobe_frequencies(delta: Array, d: Array, loop: FrequencyLoop, delay: str) -> Array:
+    """Cell edges along the lobe; the ridge is one of them, so that a column meets at most one edge a cell."""
+    top = jax.lax.stop_gradient(ridge_kernel(delta, d, delay).omega)
+    end = lobe_end(loop, d, delay)
+    part = jnp.linspace(0.0, 1.0, _CELLS // 2 + 1)
+    return jnp.concatenate([top * part, top + (end - top) * part[1:]])
+
+
+def _curve_crossings(line: _Line, omegas: Array, loop: FrequencyLoop, delay: str) -> Array:
+    """The distance along the line at which each cell of the lobe crosses it, infinite where it does not."""
+    walls = jax.vmap(lambda omega: frequency_boundary(omega, loop, delay))(jax.lax.stop_gradient(omegas))
+    offset, distance = line.offset(walls), line.distance(walls)
+    before, after = offset[:-1], offset[1:]
+    crosses = ((before < 0) & (after >= 0)) | ((before > 0) & (after <= 0))
+    share = before / jnp.where(crosses, before - after, 1.0)
+    return jnp.where(crosses, distance[:-1] + share * (distance[1:] - distance[:-1]), jnp.inf)
+
+
+def _real_pole_crossings(line: _Line, loop: FrequencyLoop) -> Array:
+    """The distances at which the line meets alpha = 0 (a pole at z = 1) and P(-1) = 0."""
+    at_one = -line.alpha / jnp.where(line.dalpha == 0, 1.0, line.dalpha)
+    plant, lag = loop
+    whole = lag == jnp.floor(lag)
+    sign = 1.0 - 2.0 * jnp.mod(lag, 2.0)
+    usable = whole & (plant.gap != 0)
+    sum_at_minus_one = sign * 2.0 * (1.0 + plant.c) / jnp.where(usable, plant.gap, 1.0)
+    rate = line.dalpha + 2.0 * line.dbeta
+    at_minus_one = (sum_at_minus_one - line.alpha - 2.0 * line.beta) / jnp.where(rate == 0, 1.0, rate)
+    exists = jnp.stack([line.dalpha != 0, usable & (rate != 0)])
+    return jnp.where(exists, jnp.stack([at_one, at_minus_one]), jnp.inf)
+
+
+def _choose(on_curve: Array, real: Array, search: str) -> tuple[Array, Array]:
+    """Which crossing bounds the stable part of the line: a cell, then z = 1, then z = -1; and whether there is one."""
+    lowest = jnp.argmin(on_curve)
+    if search == "lower":
+        return lowest, jnp.isfinite(on_curve[lowest])
+    candidates = jnp.concatenate([on_curve, real])
+    # A column is left upwards, beyond its lower end; a ray is left at the first crossing ahead.
+    start = on_curve[lowest] if search == "upper" else 0.0
+    ahead = jnp.where(candidates > start, candidates, jnp.inf)
+    first = jnp.argmin(ahead)
+    return first, jnp.isfinite(ahead[first])
+
+
+def _polish(
+    line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay: str
+) -> tuple[Array, Array, Array]:
+    """Solve P = 0 for the frequency and the distance along the line, from a bracket of the frequency."""
+    start, bracketed = bisect(
+        lambda omega, line, loop: line.offset(frequency_boundary(omega, loop, delay)), lower, upper, line, loop
+    )
+    distance = jax.lax.stop_gradient(line.distance(frequency_boundary(start, loop, delay)))
+    scale = jnp.where(distance == 0, 1.0, jnp.abs(distance))
+
+    def residual(unknowns: Array, args: tuple[_Line, FrequencyLoop]) -> Array:
+        line, loop = args
+        s = unknowns[0] * scale
+        return frequency_residual(unknowns[1], line.alpha + s * line.dalpha, line.beta + s * line.dbeta, loop)
+
+    tolerance = 16 * jnp.finfo(start.dtype).eps
+    solution = optimistix.root_find(
+        residual,
+        optimistix.Newton(rtol=tolerance, atol=tolerance),
+        jnp.stack([distance / scale, start]),
+        args=(line, loop),
+        max_steps=8,
+        throw=False,
+    )
+    close = jnp.abs(solution.value[1] - start) <= 1e-6
+    return solution.value[1], solution.value[0] * scale, bracketed & close
+
+
+def _counted(point: BoundaryPoint, everything: tuple[ArrayLike, ...], search: str) -> BoundaryPoint:
+    """Keep a point only where counting poles finds the inner side stable and the outer one not."""
+    delta, d, _, _, dalpha, dbeta = (np.asarray(value, dtype=np.float64) for value in everything)
+    alpha, beta = np.asarray(point.alpha), np.asarray(point.beta)
+    outward = -1.0 if search == "lower" else 1.0
+    length = np.hypot(dalpha, dbeta)
+    step = outward * _SIDE_STEP * np.hypot(alpha, beta) / np.where(length > 0, length, 1.0)
+    inner = np.asarray(unstable_poles(alpha - step * dalpha, beta - step * dbeta, delta, d))
+    outer = np.asarray(unstable_poles(alpha + step * dalpha, beta + step * dbeta, delta, d))
+    found = np.asarray(point.status) == Status.OK
+    right = found & (inner == 0) & (outer > 0)
+    status = np.where(found & ~right, Status.NO_BOUNDARY, np.asarray(point.status))
+    alpha, beta, omega = (np.where(right, value, np.nan) for value in (alpha, beta, np.asarray(point.omega)))
+    return to_caller(BoundaryPoint(alpha, beta, omega, status), everything)
