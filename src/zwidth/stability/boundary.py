@@ -31,6 +31,8 @@ from zwidth.status import Status
 _CELLS = 256
 # Pole counts are taken this far (relative) before and behind a boundary point: beyond the count's own rounding.
 _SIDE_STEP = 1e-8
+# What to look for on a line: its lowest crossing, the next one above that, or the first one ahead of its origin.
+_LOWEST, _ABOVE_LOWEST, _AHEAD = 0.0, 1.0, 2.0
 
 
 def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> BoundaryCurve:
@@ -138,16 +140,17 @@ def boundary_point(
     if len(given) != 1:
         raise InputError(f"beta, alpha, ray: got {' and '.join(given) or 'none'}; give exactly one of the three")
     if beta is not None:
-        values, search = (0.0, beta, 1.0, 0.0), "ray"
+        values, search = (0.0, beta, 1.0, 0.0), _AHEAD
     elif alpha is not None:
-        values, search = (alpha, 0.0, 0.0, 1.0), side
+        values, search = (alpha, 0.0, 0.0, 1.0), _LOWEST if side == "lower" else _ABOVE_LOWEST
     else:
         if not isinstance(ray, tuple | list) or len(ray) != 4:
             raise InputError(f"ray: got {ray!r}; give the four numbers (alpha0, beta0, dalpha, dbeta)")
-        values, search = tuple(ray), "ray"
-    names = ("delta", "d", "alpha0", "beta0", "dalpha", "dbeta")
+        values, search = tuple(ray), _AHEAD
+    names = ("delta", "d", "alpha0", "beta0", "dalpha", "dbeta", "search")
     everything = (delta, d, *values)
-    point = pointwise(_point_kernel, names, everything, (search, delay))
+    # What to search for travels as a number: one compilation serves rows, columns and rays.
+    point = pointwise(_point_kernel, names, (*everything, search), (delay,))
     if is_traced(*everything) or delay != "held":
         return point
     return _counted(point, everything, search)
@@ -172,7 +175,7 @@ class _Line(NamedTuple):
 
 
 def _point_kernel(
-    delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array, search: str, delay: str
+    delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array, search: Array, delay: str
 ) -> BoundaryPoint:
     inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
     total = sum(inputs)
@@ -232,17 +235,16 @@ def _real_pole_crossings(line: _Line, loop: FrequencyLoop) -> Array:
     return jnp.where(exists, jnp.stack([at_one, at_minus_one]), jnp.inf)
 
 
-def _choose(on_curve: Array, real: Array, search: str) -> tuple[Array, Array]:
+def _choose(on_curve: Array, real: Array, search: Array) -> tuple[Array, Array]:
     """Which crossing bounds the stable part of the line: a cell, then z = 1, then z = -1; and whether there is one."""
     lowest = jnp.argmin(on_curve)
-    if search == "lower":
-        return lowest, jnp.isfinite(on_curve[lowest])
     candidates = jnp.concatenate([on_curve, real])
     # A column is left upwards, beyond its lower end; a ray is left at the first crossing ahead.
-    start = on_curve[lowest] if search == "upper" else 0.0
+    start = jnp.where(search == _ABOVE_LOWEST, on_curve[lowest], 0.0)
     ahead = jnp.where(candidates > start, candidates, jnp.inf)
-    first = jnp.argmin(ahead)
-    return first, jnp.isfinite(ahead[first])
+    index = jnp.where(search == _LOWEST, lowest, jnp.argmin(ahead))
+    chosen = jnp.where(search == _LOWEST, on_curve[lowest], ahead[index])
+    return index, jnp.isfinite(chosen)
 
 
 def _polish(
@@ -273,11 +275,11 @@ def _polish(
     return solution.value[1], solution.value[0] * scale, bracketed & close
 
 
-def _counted(point: BoundaryPoint, everything: tuple[ArrayLike, ...], search: str) -> BoundaryPoint:
+def _counted(point: BoundaryPoint, everything: tuple[ArrayLike, ...], search: float) -> BoundaryPoint:
     """Keep a point only where counting poles finds the inner side stable and the outer one not."""
     delta, d, _, _, dalpha, dbeta = (np.asarray(value, dtype=np.float64) for value in everything)
     alpha, beta = np.asarray(point.alpha), np.asarray(point.beta)
-    outward = -1.0 if search == "lower" else 1.0
+    outward = -1.0 if search == _LOWEST else 1.0
     length = np.hypot(dalpha, dbeta)
     step = outward * _SIDE_STEP * np.hypot(alpha, beta) / np.where(length > 0, length, 1.0)
     inner = np.asarray(unstable_poles(alpha - step * dalpha, beta - step * dbeta, delta, d))

@@ -6,6 +6,7 @@ A new spelling is one more class here and one more entry in `_spellings`.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -166,6 +167,9 @@ class _Spacing(Strict):
         if start == stop:
             where = "start and stop must differ"
             return [(("stop",), problem(f"got {short(stop)}, as start", where, "write a number alone"))]
+        if not math.isfinite(stop - start):
+            allowed = "the distance from start to stop must be finite"
+            return [(("stop",), problem(f"got {short(stop)}", allowed, "bring the ends closer together"))]
         # Neighbors must differ in float64, or the axis would hold one value twice.
         if num > 1 and abs(stop - start) / (num - 1) <= 4 * np.spacing(max(abs(start), abs(stop))):
             return [(("num",), problem(f"got {num}", "the steps are below float64's resolution", "lower num"))]
@@ -184,7 +188,7 @@ def _spacing_model(name: str, allowed: Range) -> type[_Spacing]:
 def _parse_list(raw: list[Any] | tuple[Any, ...], entry: Callable[[Any], float]) -> ListAxis:
     if not raw:
         raise problem("got an empty list", "an axis has at least one value", "fill the list")
-    found = list(repeated(raw, "remove it; an axis has each value once"))
+    found = list(repeated(raw, "remove it"))
     entries = []
     for index, value in enumerate(raw):
         try:

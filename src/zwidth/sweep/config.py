@@ -82,10 +82,10 @@ def load_config(path: str | bytes | os.PathLike[str]) -> Config:
     return config
 
 
-def _fail(file: str, place: tuple[int, int] | None, *parts: str, field: str = "") -> ConfigFileError:
+def _fail(file: str, place: tuple[int, int] | None, *parts: str) -> ConfigFileError:
     """An error with a single fault."""
     line, column = place or (None, None)
-    return ConfigFileError.of([Fault(file, line, column, field, *parts)])
+    return ConfigFileError.of([Fault(file, line, column, "", *parts)])
 
 
 def _read_text(file: str) -> str:
@@ -103,6 +103,8 @@ def _read_text(file: str) -> str:
         raise _fail(file, None, "no such file", "", "check the path") from error
     except PermissionError as error:
         raise _fail(file, None, "permission denied", "", "make the file readable") from error
+    except ConfigFileError:
+        raise
     except (OSError, ValueError) as error:
         # ValueError: a path with a null character.
         reason = getattr(error, "strerror", None) or str(error)

@@ -172,7 +172,7 @@ class PhysicalScene(_PhysicalPlant):
     """Damping B of the wall in N s/m."""
 
     delay_model: AnyDelayModel = "held"
-    """How a delay that is not whole is modelled."""
+    """How a delay that is not whole is modeled."""
 
     def to_scene(self) -> Scene:
         """Device, timing and wall; a wall that is not given has no stiffness and no damping."""
@@ -206,7 +206,7 @@ class NormalizedScene(_NormalizedPlant):
     """Normalized damping B T/m of the wall."""
 
     delay_model: AnyDelayModel = "held"
-    """How a delay that is not whole is modelled."""
+    """How a delay that is not whole is modeled."""
 
     @property
     def device(self) -> NormalizedDevice:

@@ -22,7 +22,8 @@ from zwidth.sweep.faults import (
     validation_error,
 )
 
-_NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
+# One way only to match a run of digits: a second one costs quadratic time on a long run that fails in the end.
+_NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 _NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
 
 
@@ -100,7 +101,7 @@ class Strict(BaseModel):
 
     @classmethod
     def _with_remedies(cls, error: ValidationError, skipped: set[Any]) -> Iterable[LocatedProblem]:
-        """The problems of an error, those of keys that lack in this mapping with what its class knows of them."""
+        """The problems of an error; a key that is absent is reported with what this class knows of it."""
         known = cls.known_keys()
         # Faults of their own: a key without a value, and one that is misspelled.
         explained = skipped | {resembling(key, known) for key in skipped}
@@ -267,7 +268,8 @@ def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
         if isinstance(value, bool) or not isinstance(value, str | int | float):
             continue
         if value in seen:
-            yield (index,), problem(f"got {describe(value)} twice, here and at [{seen[value]}]", "", remedy)
+            what = f"got {describe(value)} twice, here and at [{seen[value]}]"
+            yield (index,), problem(what, "each value once", remedy)
         else:
             seen[value] = index
 

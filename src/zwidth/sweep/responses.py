@@ -38,7 +38,7 @@ class _Response(Study):
     """Points computed per period."""
 
     delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modelled; poles exist in the model 'held' only."""
+    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         """Each device with its wall; the wall is None where stiffness_fraction decides it."""

@@ -215,7 +215,7 @@ class MapStudy(Study):
     """What is computed at every point."""
 
     delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modelled; poles exist in the model 'held' only."""
+    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
 
     @property
     def shape(self) -> tuple[int, int, int, int]:
@@ -263,7 +263,7 @@ class PassivityStudy(_Curves):
     kind: Literal["passivity"]
 
     delay_model: HeldOnly = "held"
-    """How a delay that is not whole is modelled; passivity is known for the model 'held'."""
+    """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
 
     figure: Annotated[Literal["passivity_cost"] | None, figure_layout("passivity_cost")] = None
     """Layout of the figure; a generic one where left out."""

@@ -14,7 +14,7 @@ from zwidth.sweep.faults import describe, problem, short, suggestion
 from zwidth.sweep.fields import ANY, NOT_NEGATIVE, POSITIVE, Range, check_range, looks_like_number, to_float
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
-_QUANTITY = re.compile(r"\s*([-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.*?)\s*", re.DOTALL)
+_QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,20})", re.DOTALL)
 
 
 class Dimension(NamedTuple):
@@ -80,7 +80,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
         raise problem(f"got {describe(value)}", allowed, remedy)
     if looks_like_number(value):
         raise problem(f"got the text {describe(value)}", allowed, f"drop the quotes (it is then in {dimension.base})")
-    match = _QUANTITY.fullmatch(value)
+    match = _QUANTITY.fullmatch(value.strip())
     if match is None:
         raise problem(f"got {describe(value)}", allowed, remedy)
     mantissa, exponent, unit = match.groups()
@@ -117,7 +117,7 @@ def _span(allowed: Range) -> Callable[[Any], Span]:
 def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
     units = ", ".join((*dimension.units, *more))
     text = f"A number in {dimension.base}, or a number with one of the units {units}."
-    pattern = r"^\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
+    pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
     return WithJsonSchema(
         {
             "description": text,

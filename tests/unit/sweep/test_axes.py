@@ -33,6 +33,11 @@ def test_size_needs_no_memory():
     assert axis()({"linear": {"start": 0, "stop": 1, "num": 10_000_000}}).size == 10_000_000
 
 
+def test_ends_too_far_apart_are_refused():
+    with pytest.raises(ValueError, match="must be finite"):
+        axis()({"linear": {"start": -1e308, "stop": 1e308, "num": 3}})
+
+
 def test_steps_below_the_resolution_are_refused():
     with pytest.raises(ValueError, match="below float64's resolution"):
         axis()({"linear": {"start": 1.0, "stop": 1.0 + 1e-14, "num": 1000}})

@@ -1,6 +1,7 @@
 """Every faulty file is reported in full, at the exact place, with a remedy."""
 
 import pickle
+import time
 from pathlib import Path
 
 import pytest
@@ -27,7 +28,7 @@ FAULTS = {
     "axis_nested_list": [("7:13: studies[0].delta[0]: got a list of 2 items", "write a number such as 0.5")],
     "axis_nothing": [("7:11: studies[0].delta: got nothing", "add one or remove the key")],
     "axis_number_quoted": [("7:12: studies[0].delta: got '1e-3'", "drop the quotes")],
-    "axis_twice": [("7:19: studies[0].delta[2]: got 0.0 twice, here and at [0]", "remove it; an axis has each")],
+    "axis_twice": [("7:19: studies[0].delta[2]: got 0.0 twice, here and at [0]", "remove it")],
     "axis_two_forms": [("7:12: studies[0].delta: got a mapping of 2 keys", "keep one of these forms")],
     "axis_unknown_form": [("7:13: studies[0].delta.lin: unknown key", "did you mean 'linear'?")],
     "axis_with_unit": [("7:12: studies[0].delta: got '10 N s/m'", "this field has no unit; write the number")],
@@ -189,7 +190,7 @@ def test_a_missing_file():
 
 
 def test_a_folder(tmp_path):
-    assert "got a folder" in str(faults_of(tmp_path))
+    assert str(faults_of(tmp_path)).startswith(f"{tmp_path}: got a folder; ")
 
 
 def test_a_file_that_is_too_large(tmp_path):
@@ -206,7 +207,7 @@ def test_a_path_that_cannot_be(path):
 
 
 def test_a_device_instead_of_a_file():
-    assert "no regular file" in str(faults_of("/dev/zero"))
+    assert str(faults_of("/dev/zero")).startswith("/dev/zero: got no regular file; ")
 
 
 def test_the_error_travels_between_processes():
@@ -214,6 +215,16 @@ def test_the_error_travels_between_processes():
     copy = pickle.loads(pickle.dumps(error))
     assert str(copy) == str(error)
     assert copy.faults == error.faults
+
+
+@pytest.mark.parametrize("value", ["9" * 10**6, "1" + " x" * 10**5, "N" + "*" * 10**6, "1 N" + " " * 10**6 + "x"])
+@pytest.mark.parametrize("start", ["scene: {mass: '", "studies: [{kind: ridge, name: r, d: 0, delta: '"])
+def test_long_values_are_refused_soon(tmp_path, start, value):
+    path = tmp_path / "long.yaml"
+    path.write_text(f"{start}{value}'" + ("}" if "scene" in start else "}]"))
+    before = time.perf_counter()
+    faults_of(path)
+    assert time.perf_counter() - before < 10
 
 
 def test_values_are_shown_in_one_line(tmp_path):

@@ -1,0 +1,6 @@
+"""`python -m zwidth`."""
+
+from zwidth.cli import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,34 @@
+"""Figures in matplotlib, one a file: plain data in, a `matplotlib.figure.Figure` out.
+
+No module here imports JAX, touches pyplot's figures or changes matplotlib's global settings. Each function draws into
+an Axes of yours where one is given:
+
+    draw_boundary         Figs. 5, 7, 8: boundaries over alpha and beta
+    draw_zero_stiffness   Figs. 6, 9: boundaries over delta and beta for alpha -> 0
+    draw_ridge            Fig. 10: maximum stiffness over delta
+    draw_step             Fig. 11: step responses
+    draw_passivity_cost   stiffest passive and stiffest stable wall over delta
+    draw_map              stable, spectral radius or passive over alpha and beta
+    draw_recommendation   the recommended wall of a device, in SI units
+"""
+
+from zwidth.figures.boundary import draw_boundary
+from zwidth.figures.passivity_cost import draw_passivity_cost
+from zwidth.figures.recommendation import draw_recommendation
+from zwidth.figures.ridge import draw_ridge
+from zwidth.figures.stability_map import draw_map
+from zwidth.figures.step import draw_step
+from zwidth.figures.style import house_style, save
+from zwidth.figures.zero_stiffness import draw_zero_stiffness
+
+__all__ = [
+    "draw_boundary",
+    "draw_map",
+    "draw_passivity_cost",
+    "draw_recommendation",
+    "draw_ridge",
+    "draw_step",
+    "draw_zero_stiffness",
+    "house_style",
+    "save",
+]

@@ -1,0 +1,164 @@
+"""One look for all figures: sizes, lines, colors, axis labels, and how files are written.
+
+Everything is applied within a context; matplotlib's global settings stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from zwidth.figures.data import SIScale
+
+# Okabe and Ito's palette, told apart with any color vision.
+BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
+YELLOW, BLUE, VERMILION, PURPLE = "#F0E442", "#0072B2", "#D55E00", "#CC79A7"
+GRAY = "#6E6E6E"
+
+# Line styles carry the meaning that the paper gives them, so that it survives in gray.
+SOLID = "-"
+DASHED = (0, (5.0, 2.2))
+DASH_DOTTED = (0, (6.0, 1.8, 1.2, 1.8))
+DOTTED = (0, (1.2, 1.6))
+
+ALPHA_LABEL = r"normalized stiffness  $\alpha = K\,T^2\!/m$"
+BETA_LABEL = r"normalized virtual damping  $\beta = B\,T/m$"
+DELTA_LABEL = r"normalized physical damping  $\delta = b\,T/m$"
+ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
+
+WIDTH = 7.0  # inches: both columns of a journal page
+PNG_DPI = 180
+
+_RC: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "mathtext.fontset": "dejavusans",
+    "font.size": 9.0,
+    "axes.labelsize": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.titlepad": 5.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.axisbelow": True,
+    "axes.grid": False,
+    "axes.formatter.use_mathtext": True,
+    "xtick.labelsize": 8.0,
+    "ytick.labelsize": 8.0,
+    "xtick.direction": "out",
+    "ytick.direction": "out",
+    "xtick.major.width": 0.7,
+    "ytick.major.width": 0.7,
+    "xtick.major.size": 3.0,
+    "ytick.major.size": 3.0,
+    "lines.linewidth": 1.5,
+    "lines.solid_capstyle": "round",
+    "lines.solid_joinstyle": "round",
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "legend.handlelength": 2.4,
+    "legend.borderaxespad": 0.4,
+    "figure.facecolor": "white",
+    "figure.dpi": 100.0,
+    "savefig.facecolor": "white",
+    # Text as outlines: an SVG looks the same on a machine without the font.
+    "svg.fonttype": "path",
+    "svg.hashsalt": "zwidth",
+}
+
+
+@contextmanager
+def house_style() -> Iterator[None]:
+    """Draw and save within this look; the settings of before return at the end."""
+    with matplotlib.rc_context(_RC):
+        yield
+
+
+def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
+    """A figure of its own, unknown to pyplot, and its axes as a 2-D array."""
+    figure = Figure(figsize=(width, height), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)  # type: ignore[union-attr]
+    return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
+
+
+def figure_of(ax: Axes) -> Figure:
+    """The figure that an Axes belongs to."""
+    figure = ax.get_figure(root=True)
+    assert isinstance(figure, Figure), "an Axes belongs to a figure"
+    return figure
+
+
+def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
+    """Write ``stem.png`` and ``stem.svg``; the same figure gives the same bytes."""
+    png, svg = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+    with house_style():
+        figure.savefig(png, dpi=PNG_DPI, metadata={"Software": None})
+        figure.savefig(svg, metadata={"Date": None})
+    return png, svg
+
+
+def ordered_colors(count: int) -> list[Any]:
+    """Colors for values in ascending order: the larger the value, the darker."""
+    shades = np.linspace(0.80, 0.0, count) if count > 1 else np.array([0.25])
+    return [matplotlib.colormaps["viridis"](shade) for shade in shades]
+
+
+def color_by_value(values: Sequence[float]) -> dict[float, Any]:
+    """A color for every value that occurs, `ordered_colors` in ascending order."""
+    distinct = sorted(set(values))
+    return dict(zip(distinct, ordered_colors(len(distinct)), strict=True))
+
+
+def span(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
+    """An axis range with a margin on both sides."""
+    width = (high - low) or abs(high) or 1.0
+    return low - margin * width, high + margin * width
+
+
+def spread(positions: Sequence[float], gap: float) -> np.ndarray:
+    """Positions at least ``gap`` apart, as close to the given ones as their order allows."""
+    order = np.argsort(positions, kind="stable")
+    wanted = np.asarray(positions, dtype=np.float64)[order] - gap * np.arange(len(positions))
+    # Pooling adjacent violators: the least-squares fit of a nondecreasing sequence.
+    blocks: list[list[float]] = []
+    for value in wanted:
+        blocks.append([value, 1.0])
+        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
+            mean, size = blocks.pop()
+            blocks[-1] = [(blocks[-1][0] * blocks[-1][1] + mean * size) / (blocks[-1][1] + size), blocks[-1][1] + size]
+    fitted = np.concatenate([np.full(int(size), mean) for mean, size in blocks]) + gap * np.arange(len(positions))
+    placed = np.empty_like(fitted)
+    placed[order] = fitted
+    return placed
+
+
+def add_si_axes(ax: Axes, si: SIScale) -> None:
+    """Read the normalized axes of an (alpha, beta) plane in kN/m and N s/m as well, at the top and the right."""
+    ax.spines[["top", "right"]].set_visible(True)
+    top = ax.secondary_xaxis("top", functions=_scaled(si.stiffness / 1e3))
+    top.set_xlabel(r"stiffness  $K$  in kN/m")
+    right = ax.secondary_yaxis("right", functions=_scaled(si.virtual_damping))
+    right.set_ylabel(r"virtual damping  $B$  in N s/m")
+
+
+def _scaled(factor: float) -> tuple[Any, Any]:
+    return (lambda value: value * factor), (lambda value: value / factor)
+
+
+_PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+
+
+def si_unit(largest: float, unit: str) -> tuple[float, str]:
+    """The factor and the unit in which values up to ``largest`` have one to three digits before the point."""
+    if not np.isfinite(largest) or largest <= 0:
+        return 1.0, unit
+    power = int(np.clip(3 * np.floor(np.log10(largest) / 3), -12, 9))
+    return 10.0**-power, _PREFIXES[power] + unit
