@@ -11,40 +11,101 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from zwidth.assess import Assessment as Assessment
+    from zwidth.assess import assess as assess
     from zwidth.errors import ConfigError as ConfigError
     from zwidth.errors import InputError as InputError
     from zwidth.errors import StoreExistsError as StoreExistsError
+    from zwidth.errors import TracedDelayError as TracedDelayError
     from zwidth.errors import ZwidthError as ZwidthError
     from zwidth.loop import char_poly as char_poly
+    from zwidth.response import StepResponse as StepResponse
+    from zwidth.response import step_response as step_response
     from zwidth.scene import Device as Device
     from zwidth.scene import Scene as Scene
     from zwidth.scene import Timing as Timing
     from zwidth.scene import VirtualWall as VirtualWall
     from zwidth.scene import denormalize as denormalize
     from zwidth.scene import normalize as normalize
+    from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
+    from zwidth.stability.boundary import boundary as boundary
+    from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.passivity import is_passive as is_passive
+    from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
+    from zwidth.stability.region import StableRegion as StableRegion
+    from zwidth.stability.region import stable_region as stable_region
+    from zwidth.stability.ridge import RidgeKind as RidgeKind
+    from zwidth.stability.ridge import RidgePoint as RidgePoint
     from zwidth.stability.ridge import alpha_max as alpha_max
     from zwidth.status import Status as Status
+    from zwidth.sweep.config import load_config as load_config
 
 # public name -> the module that defines it
 _HOME = {
+    "Assessment": "zwidth.assess",
+    "assess": "zwidth.assess",
     "ConfigError": "zwidth.errors",
     "InputError": "zwidth.errors",
     "StoreExistsError": "zwidth.errors",
+    "TracedDelayError": "zwidth.errors",
     "ZwidthError": "zwidth.errors",
+    "char_poly": "zwidth.loop",
+    "StepResponse": "zwidth.response",
+    "step_response": "zwidth.response",
     "Device": "zwidth.scene",
     "Scene": "zwidth.scene",
     "Timing": "zwidth.scene",
     "VirtualWall": "zwidth.scene",
     "denormalize": "zwidth.scene",
     "normalize": "zwidth.scene",
-    "Status": "zwidth.status",
-    "char_poly": "zwidth.loop",
+    "BoundaryPoint": "zwidth.stability.boundary",
+    "boundary": "zwidth.stability.boundary",
+    "boundary_point": "zwidth.stability.boundary",
+    "is_passive": "zwidth.stability.passivity",
+    "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
+    "StableRegion": "zwidth.stability.region",
+    "stable_region": "zwidth.stability.region",
+    "RidgeKind": "zwidth.stability.ridge",
+    "RidgePoint": "zwidth.stability.ridge",
     "alpha_max": "zwidth.stability.ridge",
+    "Status": "zwidth.status",
+    "load_config": "zwidth.sweep.config",
 }
 
-__all__ = ["__version__", *_HOME]
+__all__ = [
+    "__version__",
+    "Assessment",
+    "BoundaryPoint",
+    "ConfigError",
+    "Device",
+    "InputError",
+    "RidgeKind",
+    "RidgePoint",
+    "Scene",
+    "StableRegion",
+    "Status",
+    "StepResponse",
+    "StoreExistsError",
+    "Timing",
+    "TracedDelayError",
+    "VirtualWall",
+    "ZwidthError",
+    "alpha_max",
+    "assess",
+    "boundary",
+    "boundary_point",
+    "char_poly",
+    "denormalize",
+    "is_passive",
+    "load_config",
+    "normalize",
+    "passivity_margin",
+    "poles",
+    "stable_region",
+    "step_response",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -12,6 +12,7 @@ from functools import cache
 from typing import Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
 import numpy as np
 
@@ -45,7 +46,7 @@ def broadcast(names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> list[np.
     """Convert concrete arguments to float64 arrays of one common shape."""
     arrays = [as_float64(name, value) for name, value in zip(names, values, strict=True)]
     try:
-        return np.broadcast_arrays(*arrays)
+        return list(np.broadcast_arrays(*arrays))
     except ValueError as error:
         shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(names, arrays, strict=True))
         raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
@@ -58,9 +59,15 @@ def to_caller(result: Any, values: tuple[ArrayLike, ...]) -> Any:
     return jax.tree.map(lambda leaf: np.asarray(leaf)[()], result)
 
 
+# Kernels that iterate over long formulas compile 2 to 5 times faster without XLA's fusion, and run no slower:
+# fused, XLA computes shared parts of the formula again for each of their uses.
+_UNFUSED = {"xla_disable_hlo_passes": "fusion"}
+
+
 @cache
-def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
-    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)))
+def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
+    options = None if fused else _UNFUSED
+    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)), compiler_options=options)
 
 
 def _padded_size(count: int, chunk: int) -> int:
@@ -69,11 +76,15 @@ def _padded_size(count: int, chunk: int) -> int:
 
 
 def map_flat(
-    kernel: Callable[..., Any], columns: list[np.ndarray], static: tuple[Any, ...] = (), chunk: int = CHUNK
+    kernel: Callable[..., Any],
+    columns: list[np.ndarray],
+    static: tuple[Any, ...] = (),
+    chunk: int = CHUNK,
+    fused: bool = True,
 ) -> Any:
     """Apply a one-point kernel to every row of equally long columns, in float64; NumPy leaves come back."""
     count = columns[0].size
-    function = _compiled(kernel, static)
+    function = _compiled(kernel, static, fused)
     size = _padded_size(count, chunk)
     pieces = []
     with jax.enable_x64(True):
@@ -93,13 +104,14 @@ def pointwise(
     values: tuple[ArrayLike, ...],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
+    fused: bool = True,
 ) -> Any:
     """Broadcast ``values``, apply the one-point ``kernel`` to each point, and restore the common shape."""
     if is_traced(*values):
         return _traced(kernel, values, static)
     arrays = broadcast(names, values)
     shape = arrays[0].shape
-    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk)
+    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, fused)
     return to_caller(jax.tree.map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 

@@ -122,12 +122,20 @@ def _row(label: str, text: str) -> str:
 
 def _verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     wall, device, timing = scene.wall, scene.device, scene.timing
-    stable = click.style("stable", fg="green", bold=True) if verdict.stable else click.style("UNSTABLE", fg="red", bold=True)
+    stable = (
+        click.style("stable", fg="green", bold=True) if verdict.stable else click.style("UNSTABLE", fg="red", bold=True)
+    )
     lines = [
         _row("device", f"m = {with_unit(device.mass * 1e3, 'g')}, b = {with_unit(device.damping, 'N s/m')}"),
-        _row("timing", f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(verdict.d)})"),
+        _row(
+            "timing",
+            f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(verdict.d)})",
+        ),
         _row("wall", f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
-        _row("normalized", f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}"),
+        _row(
+            "normalized",
+            f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}",
+        ),
         "",
         _row("verdict", f"{stable}, spectral radius {verdict.spectral_radius:.6f}"),
         *_distance_lines(wall.stiffness, wall.virtual_damping, verdict),

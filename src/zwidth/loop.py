@@ -20,6 +20,7 @@ from zwidth.errors import InputError, check_choice
 from zwidth.grouping import Degree, by_degree
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 
+
 class Affine(NamedTuple):
     """``P = D + alpha N1 + beta N2``: three coefficient vectors of one length, highest power first."""
 
@@ -221,5 +222,5 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
 
 def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
     ok = valid_wall(alpha, beta, delta, d)
-    safe = jnp.where(ok, jnp.stack([alpha, beta, delta]), 0.0)
-    return jnp.where(ok, coefficients(*safe, d, degree), jnp.nan)
+    alpha, beta, delta = (jnp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    return jnp.where(ok, coefficients(alpha, beta, delta, d, degree), jnp.nan)

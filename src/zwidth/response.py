@@ -148,9 +148,7 @@ def scene_step_response(scene: Scene, *, duration: float, substeps: int = 10, fo
     period, mass = scene.timing.period, scene.device.mass
     alpha, beta, delta, d = scene.normalized
     length = period * period / mass
-    raw = step_response(
-        alpha, beta, delta, d, periods=max(1, round(duration / period)), substeps=substeps, force=force
-    )
+    raw = step_response(alpha, beta, delta, d, periods=max(1, round(duration / period)), substeps=substeps, force=force)
     return StepResponse(
         raw.time * period,
         raw.position * length,

@@ -150,7 +150,7 @@ def boundary_point(
     names = ("delta", "d", "alpha0", "beta0", "dalpha", "dbeta", "search")
     everything = (delta, d, *values)
     # What to search for travels as a number: one compilation serves rows, columns and rays.
-    point = pointwise(_point_kernel, names, (*everything, search), (delay,))
+    point = pointwise(_point_kernel, names, (*everything, search), (delay,), fused=False)
     if is_traced(*everything) or delay != "held":
         return point
     return _counted(point, everything, search)
@@ -247,9 +247,7 @@ def _choose(on_curve: Array, real: Array, search: Array) -> tuple[Array, Array]:
     return index, jnp.isfinite(chosen)
 
 
-def _polish(
-    line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay: str
-) -> tuple[Array, Array, Array]:
+def _polish(line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay: str) -> tuple[Array, Array, Array]:
     """Solve P = 0 for the frequency and the distance along the line, from a bracket of the frequency."""
     start, bracketed = bisect(
         lambda omega, line, loop: line.offset(frequency_boundary(omega, loop, delay)), lower, upper, line, loop
@@ -262,7 +260,7 @@ def _polish(
         s = unknowns[0] * scale
         return frequency_residual(unknowns[1], line.alpha + s * line.dalpha, line.beta + s * line.dbeta, loop)
 
-    tolerance = 16 * jnp.finfo(start.dtype).eps
+    tolerance = float(16 * jnp.finfo(start.dtype).eps)
     solution = optimistix.root_find(
         residual,
         optimistix.Newton(rtol=tolerance, atol=tolerance),

@@ -100,7 +100,9 @@ def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, samples: i
 def _sample_count(d: ArrayLike) -> int:
     """Enough samples for the longest delay, rounded up so that few different counts are compiled."""
     if is_traced(d):
-        raise TracedDelayError("d: got a traced value, but the number of frequencies depends on it; pass a plain number")
+        raise TracedDelayError(
+            "d: got a traced value, but the number of frequencies depends on it; pass a plain number"
+        )
     delays = as_float64("d", d)
     longest = np.max(delays, initial=0.0, where=np.isfinite(delays))
     return 1 << int(np.ceil(np.log2(_SAMPLES_PER_LAG * (longest + 3.0))))

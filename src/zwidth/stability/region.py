@@ -49,7 +49,7 @@ def lobe(delta: float, d: float, *, delay: DelayModel = "held", points: int = 40
         if np.ndim(value) != 0 or not (np.isfinite(value) and value >= 0):
             raise InputError(f"{name}: got {value!r}; a single finite number of at least 0 is needed")
     columns = [np.array([float(delta)]), np.array([float(d)])]
-    end = float(map_flat(_lobe_end_kernel, columns, (delay,))[0])
+    end = float(map_flat(_lobe_end_kernel, columns, (delay,), fused=False)[0])
     top = float(alpha_max(delta, d, delay=delay).omega)
     # Closer together at both ends and round the ridge, where the outline bends most.
     half = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))

@@ -1,0 +1,231 @@
+"""Every number that the paper prints, beside the same number computed.
+
+Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+from scipy.optimize import brentq
+
+from zwidth.scene import normalize
+from zwidth.stability.boundary import boundary
+from zwidth.stability.ridge import alpha_max
+
+SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
+
+# The example of section VIII: given, not computed.
+MASS, PERIOD, DELAY_FACTOR = 0.1, 1e-3, 1
+DAMPINGS = (0.0, 10.0, 100.0)
+STIFFNESS_FRACTION = 0.75
+# Massie and Salisbury's maximum for the PHANToM, in N/m, to which section VIII compares.
+MASSIE_SALISBURY = 3.5e3
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A number as the paper prints it, and as the library computes it."""
+
+    quantity: str
+    where: str
+    printed: str
+    computed: float
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the computed number lies within half a unit of the last printed digit."""
+        if not np.isfinite(self.computed):
+            return False
+        printed = Decimal(self.printed)
+        return abs(Decimal(self.computed) - printed) <= Decimal(5).scaleb(int(printed.as_tuple().exponent) - 1)
+
+
+@dataclass(frozen=True)
+class Sharpened:
+    """A number that the paper gives roughly or not at all, and how it is found."""
+
+    quantity: str
+    where: str
+    computed: float
+    how: str
+
+
+def published_numbers() -> list[Comparison]:
+    """Compare every number that the paper prints with the computed one."""
+    return [*_undamped(), *_example(), *_factors(), _line()]
+
+
+def _ridge(delta: float, d: float) -> tuple[float, float]:
+    point = alpha_max(delta, d)
+    return float(point.alpha), float(point.beta)
+
+
+def _undamped() -> list[Comparison]:
+    """Remark 4: K_max T^2/m without physical damping."""
+    printed = ((0, "eq. (24)", "0.6863"), (1, "eq. (25)", "0.1445"))
+    return [Comparison(f"alpha_max(delta = 0, d = {d})", where, text, _ridge(0.0, d)[0]) for d, where, text in printed]
+
+
+def _example() -> list[Comparison]:
+    """Section VIII: the normalized damping, 75 % of the maximum stiffness and the damping at the maximum."""
+    rows = []
+    printed = {"delta": ("0", "0.1", "1"), "alpha": ("0.108", "0.149", "0.656"), "beta": ("0.425", "0.416", "0.388")}
+    for index, damping in enumerate(DAMPINGS):
+        delta = float(normalize(mass=MASS, damping=damping, period=PERIOD).delta)
+        alpha, beta = _ridge(delta, DELAY_FACTOR)
+        found = {"delta": delta, "alpha": STIFFNESS_FRACTION * alpha, "beta": beta}
+        names = {"delta": "delta", "alpha": "0.75 alpha_max", "beta": "beta at alpha_max"}
+        rows += [
+            Comparison(f"{names[key]}, b = {damping:g} N s/m", "section VIII", printed[key][index], found[key])
+            for key in printed
+        ]
+    return sorted(rows, key=lambda row: list(names.values()).index(row.quantity.partition(",")[0]))
+
+
+def _factors() -> list[Comparison]:
+    """Section VIII: how much stiffer damping makes the wall, and how much stiffer it is than in practice."""
+    undamped, damped = (STIFFNESS_FRACTION * _ridge(delta, DELAY_FACTOR)[0] for delta in (0.0, 1.0))
+    stiffness = undamped * MASS / PERIOD**2
+    return [
+        Comparison("stiffness for b = 100 N s/m over that for b = 0", "section VIII", "6", damped / undamped),
+        Comparison("stiffness for b = 0 over 3.5 kN/m", "section VIII", "3", stiffness / MASSIE_SALISBURY),
+    ]
+
+
+def _line() -> Comparison:
+    quantity = "delta above which the line appears for d = 0"
+    return Comparison(quantity, "section V, remark 3", "2.3", line_appears())
+
+
+def line_appears() -> float:
+    """The delta from which, for d = 0, the line of a real pole at z = -1 bounds the stable set.
+
+    The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
+    bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
+    """
+    return _root(lambda delta: float(boundary(np.pi, delta, 0).alpha), 1.0, 6.0)
+
+
+def corner_takes_over() -> float:
+    """The delta from which, for d = 0, the stiffest stable wall sits in the corner at z = -1.
+
+    For d = 0 the curve is a graph over beta, ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2
+    beta))``. Its maximum passes the corner, where the curve ends, when ``d alpha/d beta = 0`` there.
+    """
+
+    def slope(delta: float) -> float:
+        # Far from delta = 0, where these quotients would cancel.
+        c = math.exp(-delta)
+        p1 = -math.expm1(-delta) / delta
+        p2 = (1.0 - p1) / delta
+        psi = p1 - p2
+        beta = float(boundary(np.pi, delta, 0).beta)
+        numerator = (1.0 - c) + beta * (p2 + c * psi) - beta**2 * psi * p1
+        denominator = psi * (1.0 + p2 * beta)
+        return ((p2 + c * psi) - 2.0 * beta * psi * p1) * denominator - numerator * psi * p2
+
+    return _root(slope, 2.5, 6.0)
+
+
+def _root(function: Callable[[float], float], low: float, high: float) -> float:
+    """The root in a bracket, to the last digits of float64."""
+    return float(brentq(function, low, high, xtol=1e-15, rtol=4 * np.finfo(np.float64).eps))
+
+
+def sharpened_numbers() -> list[Sharpened]:
+    """Compute what the paper leaves open."""
+    alpha, beta = _ridge(0.0, 0)
+    return [
+        Sharpened(
+            "delta above which the line z = -1 bounds the stable region, d = 0",
+            "remark 3: 'delta > 2.3'",
+            line_appears(),
+            "root of alpha at the curve's end, omega = pi",
+        ),
+        Sharpened(
+            "delta above which alpha_max is the corner at z = -1, d = 0",
+            "not in the paper",
+            corner_takes_over(),
+            "root of d alpha/d beta at the curve's end, omega = pi",
+        ),
+        Sharpened("alpha_max(delta = 0, d = 0)", "eq. (24): 0.6863", alpha, "exactly 12 - 8 sqrt(2)"),
+        Sharpened("beta at alpha_max(delta = 0, d = 0)", "not in the paper", beta, "exactly 2 sqrt(2) - 2"),
+    ]
+
+
+def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
+    """The report for machines."""
+    example: dict[str, Any] = {
+        "mass_kg": MASS,
+        "period_s": PERIOD,
+        "d": DELAY_FACTOR,
+        "damping_N_s_per_m": list(DAMPINGS),
+        "stiffness_fraction": STIFFNESS_FRACTION,
+    }
+    content = {
+        "source": SOURCE,
+        "all_agree": all(row.agrees for row in printed),
+        "given": {"where": "section VIII", **example},
+        "published": [
+            {
+                "quantity": row.quantity,
+                "where": row.where,
+                "printed": row.printed,
+                "computed": row.computed,
+                "agrees": row.agrees,
+            }
+            for row in printed
+        ],
+        "sharpened": [
+            {"quantity": row.quantity, "where": row.where, "computed": row.computed, "how": row.how}
+            for row in sharpened
+        ],
+    }
+    return json.dumps(content, indent=2) + "\n"
+
+
+def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
+    """The report for readers."""
+    agreeing = sum(row.agrees for row in printed)
+    lines = [
+        "# The paper's numbers, computed",
+        "",
+        f"{SOURCE}.",
+        "",
+        f"{agreeing} of {len(printed)} printed numbers agree: the computed value rounds to the printed one, within half",
+        "a unit of its last digit.",
+        "",
+        "| quantity | where | printed | computed | agrees |",
+        "|---|---|---|---|---|",
+        *(
+            f"| {row.quantity} | {row.where} | {row.printed} | {_digits(row.computed)} | {_word(row.agrees)} |"
+            for row in printed
+        ),
+        "",
+        f"Given in section VIII: m = {MASS:g} kg, T = {PERIOD:g} s, d = {DELAY_FACTOR}, "
+        f"b = {', '.join(f'{damping:g}' for damping in DAMPINGS)} N s/m, {100 * STIFFNESS_FRACTION:g} % of alpha_max.",
+        "",
+        "## Sharpened",
+        "",
+        "| quantity | in the paper | computed | how |",
+        "|---|---|---|---|",
+        *(f"| {row.quantity} | {row.where} | {row.computed:.15f} | {row.how} |" for row in sharpened),
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _digits(value: float) -> str:
+    """Ten significant digits; zero as it is."""
+    return f"{value:.10g}" if value == 0 else f"{value:#.10g}"
+
+
+def _word(agrees: bool) -> str:
+    return "yes" if agrees else "**NO**"
