@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from zwidth.stability.ridge import RidgePoint as RidgePoint
     from zwidth.stability.ridge import alpha_max as alpha_max
     from zwidth.status import Status as Status
+    from zwidth.studies import run as run
     from zwidth.sweep.config import load_config as load_config
 
 # public name -> the module that defines it
@@ -72,6 +73,7 @@ _HOME = {
     "alpha_max": "zwidth.stability.ridge",
     "Status": "zwidth.status",
     "load_config": "zwidth.sweep.config",
+    "run": "zwidth.studies",
 }
 
 __all__ = [
@@ -103,6 +105,7 @@ __all__ = [
     "normalize",
     "passivity_margin",
     "poles",
+    "run",
     "stable_region",
     "step_response",
 ]

@@ -55,7 +55,9 @@ def broadcast(names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> list[np.
 def to_caller(result: Any, values: tuple[ArrayLike, ...]) -> Any:
     """Hand NumPy results to a caller who passed NumPy or plain numbers, JAX arrays to one who passed any."""
     if any(isinstance(value, jax.Array) for value in values):
-        return jax.tree.map(jnp.asarray, result)
+        # Without this a caller with JAX's default precision would lose half of the digits on the way out.
+        with jax.enable_x64(True):
+            return jax.tree.map(jnp.asarray, result)
     return jax.tree.map(lambda leaf: np.asarray(leaf)[()], result)
 
 

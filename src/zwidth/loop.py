@@ -119,23 +119,34 @@ def frequency_boundary(omega: Array, loop: FrequencyLoop, delay: str) -> Boundar
     # sin_w/C = 2 s
     im_g_over_c = 2.0 * s * (re_m - re_z * im_m_over_sin) / norm
     sin_k, cos_k = jnp.sin(k * omega), jnp.cos(k * omega)
-    ratio = _cosine_ratio(omega, k, whole, cos_k / c_safe, delay)
+    ratio = _cosine_ratio(omega, whole, c_safe, delay)
     beta = -(ratio * re_g - sin_k * im_g_over_c)
     alpha = 2.0 * s * (sin_k * re_g + cos_k * im_g_over_c * cos_half - s * beta)
     return BoundaryCurve(*_limits_at_pi(alpha, beta, finite, omega, whole))
 
 
-def _cosine_ratio(omega: Array, k: Array, whole: Array, direct: Array, delay: str) -> Array:
-    """``cos(k omega)/cos(omega/2)``; near pi, for k = n + 1/2, as ``(-1)^n sin(k v)/sin(v/2)``, v = pi - omega."""
-    if delay == "fractional_power":
-        return direct
+def _cosine_ratio(omega: Array, lag: Array, cos_half: Array, delay: str) -> Array:
+    """``cos((lag + 1/2) omega)/cos(omega/2)``, finite at pi for a whole lag."""
+    if delay == "held":
+        return _whole_cosine_ratio(omega, lag, cos_half)
+    # With lag = n + e, n the nearest whole number: only the part with sin(e omega) is unbounded towards pi, and it
+    # vanishes with e.
+    nearest = jnp.round(lag)
+    excess = (lag - nearest) * omega
+    unbounded = jnp.sin((nearest + 0.5) * omega) * jnp.sin(excess) / cos_half
+    return _whole_cosine_ratio(omega, nearest, cos_half) * jnp.cos(excess) - unbounded
+
+
+def _whole_cosine_ratio(omega: Array, n: Array, cos_half: Array) -> Array:
+    """The ratio for a whole lag n: near pi as ``(-1)^n sin(k v)/sin(v/2)``, k = n + 1/2, v = pi - omega."""
+    k = n + 0.5
     # pi is not a float64: its second half keeps v exact to the last digit.
     v = (np.pi - omega) + 1.2246467991473532e-16
     at_pi = jnp.abs(v) < 1e-30
     v_safe = jnp.where(at_pi, 1.0, v)
-    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
+    sign = 1.0 - 2.0 * jnp.mod(n, 2.0)
     near = sign * jnp.where(at_pi, 2.0 * k, jnp.sin(k * v_safe) / jnp.sin(0.5 * v_safe))
-    return jnp.where(omega > 2.0, near, direct)
+    return jnp.where(omega > 2.0, near, jnp.cos(k * omega) / cos_half)
 
 
 def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole: Array) -> tuple[Array, Array]:
@@ -166,6 +177,13 @@ def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
 def valid_device(delta: Array, d: Array) -> Array:
     """Whether delta and d are finite and not negative."""
     return jnp.isfinite(delta) & jnp.isfinite(d) & (delta >= 0) & (d >= 0)
+
+
+def poison(ok: Array, *inputs: Array) -> Array:
+    """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
+    # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
+    total = sum(jnp.where(ok, 0.0, value) for value in inputs)
+    return jnp.where(ok, 0.0, jnp.nan) * total * (1.0 + total)
 
 
 def check_delay_model(delay: str) -> None:
@@ -224,3 +242,115 @@ def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree:
     ok = valid_wall(alpha, beta, delta, d)
     alpha, beta, delta = (jnp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     return jnp.where(ok, coefficients(alpha, beta, delta, d, degree), jnp.nan)
+
+
+def char_poly_si(
+    mass: ArrayLike,
+    damping: ArrayLike,
+    period: ArrayLike,
+    stiffness: ArrayLike,
+    virtual_damping: ArrayLike,
+    delay: ArrayLike = 0.0,
+) -> Array:
+    """Return the monic characteristic polynomial of a loop in SI units, highest power first.
+
+    Eq. (11) over its leading coefficient ``-T b^2``, which leaves its zeros alone and, unlike (11) itself, has the
+    limit of the undamped device for b = 0. With ``delta = b T/m`` and ``c = e^-delta``, for whole ``d = t_d/T``,
+    ``p(z)/(-T b^2) = z^(1+d) (z - 1)(z - c) + (T^2/m) (phi2 z + psi) (K z + (B/T) (z - 1))``.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b in N s/m, >= 0.
+        period: T in s, > 0.
+        stiffness: K in N/m.
+        virtual_damping: B in N s/m.
+        delay: t_d in s, >= 0, whole periods or not (held); concrete also inside `jit`. All six broadcast.
+
+    Returns:
+        As `char_poly`, dimensionless. A point out of range is NaN.
+
+    Raises:
+        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
+        TracedDelayError: the delay or the period is traced.
+
+    Numerics:
+        No cancellation for any b: see `char_poly`.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (11), (13).
+
+    Example:
+        >>> import numpy as np
+        >>> from zwidth.loop import char_poly_si
+        >>> print(np.array2string(char_poly_si(0.1, 0.0, 1e-3, 50e3, 50.0), precision=2))
+        [ 1.   -1.5   1.25 -0.25]
+    """
+    wall = normalize(
+        mass=mass,
+        damping=damping,
+        period=period,
+        delay=delay,
+        stiffness=stiffness,
+        virtual_damping=virtual_damping,
+    )
+    return char_poly(*wall)
+
+
+def closed_loop_transfer(
+    mass: ArrayLike,
+    damping: ArrayLike,
+    period: ArrayLike,
+    stiffness: ArrayLike,
+    virtual_damping: ArrayLike,
+    d: int,
+) -> Transfer:
+    """Return G_x(z), from a held force on the device (N) to its sampled position (m), in contact with the wall.
+
+    ``G_x = H_x/(1 + H_x z^-d (K + (B/T) (z - 1)/z))`` with `zwidth.plant.position_transfer`: eq. (10) with numerator
+    and denominator over ``-T b^2``, so that the denominator is monic and b = 0 is the limit of the undamped device.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b in N s/m, >= 0.
+        period: T in s, > 0.
+        stiffness: K in N/m.
+        virtual_damping: B in N s/m. All five broadcast.
+        d: delay of the wall's force in periods, one whole number >= 0.
+
+    Returns:
+        Transfer: ``numerator`` (..., 3 + d), ``(T^2/m) (phi2 z + psi) z^(1+d)``; ``denominator`` (..., 4 + d), see
+        `char_poly_si`. A point out of range is NaN.
+
+    Raises:
+        InputError: d is no whole number, a scalar is out of range, an argument is no real number, or shapes do not
+            broadcast.
+        TracedDelayError: d is traced.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (10), (11), (13).
+
+    Example:
+        >>> from zwidth.loop import closed_loop_transfer
+        >>> loop = closed_loop_transfer(0.1, 0.0, 1e-3, 50e3, 50.0, 1)
+        >>> loop.numerator.size, loop.denominator.size
+        (4, 5)
+    """
+    delay = concrete_delay(d)
+    if delay.ndim or not (np.isfinite(delay) and delay >= 0 and delay == np.floor(delay)):
+        raise InputError(f"d: got {d!r}; one whole number of at least 0 is needed, a fraction has no eq. (10)")
+    alpha, beta, delta, _ = normalize(
+        mass=mass, damping=damping, period=period, stiffness=stiffness, virtual_damping=virtual_damping
+    )
+    names = ("mass", "period", "alpha", "beta", "delta")
+    return pointwise(_closed_loop_kernel, names, (mass, period, alpha, beta, delta), (degree_of(float(delay)),))
+
+
+def _closed_loop_kernel(
+    mass: Array, period: Array, alpha: Array, beta: Array, delta: Array, degree: Degree
+) -> Transfer:
+    lag = jnp.full_like(delta, float(degree.whole))
+    plant = undelayed_plant(delta)
+    gain = period * period / mass
+    zeros = jnp.zeros(degree.whole + 1, dtype=delta.dtype)
+    numerator = jnp.concatenate([gain * jnp.stack([plant.a2, plant.a1]), zeros + 0.0 * delta])
+    return Transfer(numerator, _char_poly_kernel(alpha, beta, delta, lag, degree))

@@ -78,9 +78,7 @@ def _draw_radius(ax: Axes, data: MapData, values: np.ndarray) -> Any:
     low = float(np.min(finite, initial=0.9))
     high = max(2.0 - low, 1.0 + 1e-6)
     norm = TwoSlopeNorm(1.0, min(low, 1.0 - 1e-6), high)
-    image = ax.pcolormesh(
-        data.alpha, data.beta, values, cmap="PuOr_r", norm=norm, shading="nearest", rasterized=True
-    )
+    image = ax.pcolormesh(data.alpha, data.beta, values, cmap="PuOr_r", norm=norm, shading="nearest", rasterized=True)
     _draw_edge(ax, data, values, 1.0)
     return image
 

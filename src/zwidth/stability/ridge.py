@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Literal, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 
 from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import pointwise
-from zwidth.loop import check_delay_model, frequency_boundary, frequency_loop, valid_device
-from zwidth.stability.curve import corner
-from zwidth.stability.ridge_kkt import ridge_omega
+from zwidth.errors import check_choice
+from zwidth.loop import check_delay_model, frequency_loop, valid_device
+from zwidth.stability.ridge_newton import newton_ridge, start_of
 from zwidth.status import Status
+
+RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
+_METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
+# Small enough for the second-level cache, large enough to pay for its dispatch.
+_CHUNK = 1 << 13
 
 
 class RidgeKind(IntEnum):
@@ -33,7 +38,9 @@ class RidgePoint(NamedTuple):
     status: Array
 
 
-def alpha_max(delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> RidgePoint:
+def alpha_max(
+    delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held", method: RidgeMethod = "auto"
+) -> RidgePoint:
     """Find the stiffest stable virtual wall.
 
     ``alpha_max(delta, d) = sup {alpha : some beta is stable}``; in SI units ``K_max = alpha_max m/T^2``.
@@ -65,26 +72,29 @@ def alpha_max(delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> 
         0.1445
     """
     check_delay_model(delay)
-    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay,))
+    check_choice("method", method, _METHODS)
+    # "auto" and "newton" share one compilation.
+    route = "kkt" if method == "kkt" else "newton"
+    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, route), _CHUNK)
 
 
-def ridge_kernel(delta: Array, d: Array, delay: str) -> RidgePoint:
+def ridge_kernel(delta: Array, d: Array, delay: str, method: str = "newton") -> RidgePoint:
     """`alpha_max` of one point."""
     ok = valid_device(delta, d)
-    poison = jnp.where(ok, 0.0, jnp.nan) * (delta + d) * (1.0 + delta + d)
-    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
-    loop = frequency_loop(delta, d, delay)
-    at_corner = corner(loop)
-    is_corner = at_corner.is_ridge
-    omega, found = ridge_omega(loop, d, delay)
-    wall = frequency_boundary(omega, loop, delay)
-    converged = is_corner | found
-    poison = poison + jnp.where(converged, 0.0, jnp.nan) * (delta + d) * (1.0 + delta + d)
+    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
+    mask = jnp.where(ok, 1.0, jnp.nan)
+    delta, d = delta * mask, d * mask
+    if method == "kkt":
+        # Its solvers take a second to import.
+        from zwidth.stability.ridge_kkt import kkt_ridge
+
+        alpha, beta, omega, is_corner, converged = kkt_ridge(delta, d, delay)
+    else:
+        loop = frequency_loop(delta, d, delay)
+        alpha, beta, omega, is_corner, converged = newton_ridge(loop.plant, loop.lag, start_of(delta, d), delay)
+    found = jnp.where(converged, 1.0, jnp.nan)
     status = jnp.where(ok, jnp.where(converged, Status.OK, Status.NOT_CONVERGED), Status.INVALID_INPUT)
+    kind = jnp.where(is_corner, RidgeKind.CORNER, RidgeKind.SMOOTH)
     return RidgePoint(
-        jnp.where(is_corner, at_corner.alpha, wall.alpha) + poison,
-        jnp.where(is_corner, at_corner.beta, wall.beta) + poison,
-        jnp.where(is_corner, jnp.pi, omega) + poison,
-        jnp.where(is_corner, RidgeKind.CORNER, RidgeKind.SMOOTH),
-        jax.lax.stop_gradient(status),
+        alpha * found, beta * found, omega * found, kind.astype(jnp.int32), status.astype(jnp.int32)
     )

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import optimistix
 
 from zwidth._types import Array
-from zwidth.loop import FrequencyLoop, frequency_boundary
+from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
 from zwidth.stability.bracketing import bisect
-from zwidth.stability.curve import lobe_end
+from zwidth.stability.curve import corner, lobe_end
 
 _MAX_STEPS = 16
 
@@ -64,7 +64,26 @@ def kkt_residual(unknowns: Array, args: KktArguments) -> Array:
     return jnp.stack([value[0], value[1], stationary])
 
 
-def ridge_omega(loop: FrequencyLoop, d: Array, delay: str) -> tuple[Array, Array]:
+def kkt_ridge(delta: Array, d: Array, delay: str) -> tuple[Array, Array, Array, Array, Array]:
+    """alpha, beta, omega of the ridge of one point, whether it is a corner, and whether it was found."""
+    # A solver that sees NaN in one lane may spoil or stop the others; NaN is put back behind it.
+    poison = 0.0 * (delta + d)
+    delta, d = jnp.where(jnp.isnan(delta), 1.0, delta), jnp.where(jnp.isnan(d), 1.0, d)
+    loop = frequency_loop(delta, d, delay)
+    at_corner = corner(loop)
+    is_corner = at_corner.is_ridge
+    omega, found = _smooth_omega(loop, d, delay)
+    smooth = frequency_boundary(omega, loop, delay)
+    return (
+        jnp.where(is_corner, at_corner.alpha, smooth.alpha) + poison,
+        jnp.where(is_corner, at_corner.beta, smooth.beta) + poison,
+        jnp.where(is_corner, jnp.pi, omega) + poison,
+        is_corner,
+        is_corner | found,
+    )
+
+
+def _smooth_omega(loop: FrequencyLoop, d: Array, delay: str) -> tuple[Array, Array]:
     """The frequency of the smooth optimum of one point, differentiable in ``loop``, and whether it was found."""
 
     def slope(omega: Array, loop: FrequencyLoop) -> Array:

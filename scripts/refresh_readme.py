@@ -1,0 +1,59 @@
+#!/usr/bin/env python3
+"""Write into README.md what its commands print, so that no output there is typed by hand.
+
+In every block fenced as ``console``, each line that starts with ``$ zwidth`` or ``$ cat`` is run from the project's
+root and followed by its output. ``--check`` changes nothing and fails where README.md is out of date.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+README = ROOT / "README.md"
+_BLOCK = re.compile(r"^```console\n(.*?)^```$", re.DOTALL | re.MULTILINE)
+
+
+def output_of(command: str) -> str:
+    """What one command prints, without colors."""
+    words = shlex.split(command)
+    if words[0] == "cat":
+        return "".join((ROOT / name).read_text(encoding="utf-8") for name in words[1:])
+    if words[0] != "zwidth":
+        raise SystemExit(f"README.md: {command!r} is neither zwidth nor cat")
+    call = [sys.executable, "-m", "zwidth", *words[1:]]
+    environment = {**os.environ, "NO_COLOR": "1", "COLUMNS": "100"}
+    return subprocess.run(call, cwd=ROOT, env=environment, check=True, capture_output=True, text=True).stdout
+
+
+def refreshed(text: str) -> str:
+    """The text with the output of every command in its console blocks."""
+
+    def fill(block: re.Match[str]) -> str:
+        commands = [line[2:] for line in block.group(1).splitlines() if line.startswith("$ ")]
+        parts = [f"$ {command}\n{output_of(command).rstrip()}\n" for command in commands]
+        return "```console\n" + "\n".join(parts) + "```"
+
+    return _BLOCK.sub(fill, text)
+
+
+def main() -> None:
+    """Refresh README.md, or check it."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--check", action="store_true", help="change nothing; fail where README.md is out of date")
+    check = parser.parse_args().check
+    old = README.read_text(encoding="utf-8")
+    new = refreshed(old)
+    if check and new != old:
+        raise SystemExit("README.md is out of date: run scripts/refresh_readme.py")
+    README.write_text(new, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

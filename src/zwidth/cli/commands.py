@@ -1,0 +1,139 @@
+"""The commands: thin shells over the library, which they import only when they run."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from zwidth import __version__
+from zwidth.cli.options import json_option, physical_options
+from zwidth.cli.words import row, verdict_lines
+from zwidth.quantities import plain, with_unit
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(__version__, prog_name="zwidth")
+def cli() -> None:
+    """Stability of haptic virtual walls: what stiffness and damping a sampled, delayed device can render.
+
+    A quantity is a number in SI base units (10e3) or a number with a unit ("10 kN/m").
+    """
+
+
+@cli.command()
+@physical_options(wall=True, required=True)
+@json_option
+def check(
+    stiffness: float,
+    virtual_damping: float,
+    mass: float,
+    damping: float,
+    period: float,
+    delay: float,
+    as_json: bool,
+) -> None:
+    """Judge one wall: stable, passive, how far from the boundary."""
+    from zwidth.assess import assess
+    from zwidth.scene import Device, Scene, Timing, VirtualWall
+
+    scene = Scene(Device(mass, damping), Timing(period, delay), VirtualWall(stiffness, virtual_damping))
+    verdict = assess(scene)
+    if as_json:
+        click.echo(json.dumps(verdict.as_dict(), indent=2, allow_nan=False))
+        return
+    for line in verdict_lines(scene, verdict):
+        click.echo(line)
+
+
+@cli.command()
+@click.option("--delta", type=float, help="Normalized physical damping b T/m.")
+@click.option("--d", type=float, help="Delay in periods.")
+@physical_options(wall=False, required=False)
+@click.option(
+    "--delay-model",
+    type=click.Choice(["held", "fractional_power"]),
+    default="held",
+    show_default=True,
+    help="How a delay that is not whole is modelled.",
+)
+@json_option
+def ridge(
+    delta: float | None,
+    d: float | None,
+    mass: float | None,
+    damping: float,
+    period: float | None,
+    delay: float,
+    delay_model: str,
+    as_json: bool,
+) -> None:
+    """Print the stiffest stable wall of a device.
+
+    The device is given by --delta and --d, or by its physical data.
+    """
+    import numpy as np
+
+    from zwidth.scene import Device, Scene, Timing
+    from zwidth.stability.ridge import RidgeKind, alpha_max
+    from zwidth.status import Status
+
+    physical = mass is not None and period is not None
+    if physical == (delta is not None) or (delta is None) != (d is None):
+        raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
+    scene = Scene(Device(mass, damping), Timing(period, delay)) if mass is not None and period is not None else None
+    at_delta, at_d = (scene.delta, scene.d) if scene is not None else (delta, d)
+    point = alpha_max(at_delta, at_d, delay=delay_model)  # pyright: ignore[reportArgumentType]  (click checked it)
+    if int(point.status) != Status.OK:
+        raise click.UsageError(f"--delta {at_delta}, --d {at_d}: {Status(int(point.status)).message}")
+    result: dict[str, Any] = {
+        "delta": float(np.asarray(at_delta)),
+        "d": float(np.asarray(at_d)),
+        "alpha_max": float(point.alpha),
+        "beta": float(point.beta),
+        "omega": float(point.omega),
+        "kind": RidgeKind(int(point.kind)).name.lower(),
+    }
+    if scene is not None:
+        wall = scene.to_si(alpha=point.alpha, beta=point.beta)
+        result |= {"stiffness_max": float(wall.stiffness), "virtual_damping": float(wall.virtual_damping)}
+    if as_json:
+        click.echo(json.dumps(result, indent=2, allow_nan=False))
+        return
+    click.echo(row("device", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"))
+    click.echo(row("alpha_max", f"{result['alpha_max']:.12g} ({result['kind']} optimum)"))
+    click.echo(row("beta", f"{result['beta']:.12g}"))
+    if scene is not None:
+        click.echo(row("K_max", with_unit(result["stiffness_max"], "N/m")))
+        click.echo(row("B", with_unit(result["virtual_damping"], "N s/m")))
+
+
+@cli.command()
+def schema() -> None:
+    """Print the JSON Schema of configuration files, for editors."""
+    from zwidth.sweep.document import config_json_schema
+
+    click.echo(json.dumps(config_json_schema(), indent=2))
+
+
+@cli.command()
+@click.argument("config", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.  [default: runs/NAME]")
+@click.option("--overwrite", is_flag=True, help="Replace a run that the folder already holds.")
+def run(config: Path, out: Path | None, overwrite: bool) -> None:
+    """Run the studies of a CONFIG file.
+
+    Data, figures and a record of the run go into one folder.
+    """
+    from zwidth.cli.progress import reporter
+    from zwidth.studies import run as run_studies
+
+    with reporter() as progress:
+        result = run_studies(config, out=out, overwrite=overwrite, progress=progress)
+    click.echo(f"{len(result.studies) - len(result.failed)} of {len(result.studies)} done, results in {result.folder}")
+    for study in result.failed:
+        click.echo(f"zwidth: study {study.name!r} failed: {study.error}", err=True)
+    if not result.ok:
+        raise SystemExit(1)

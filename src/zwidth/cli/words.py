@@ -1,0 +1,86 @@
+"""What the commands say, in plain words."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import click
+
+from zwidth.quantities import plain, with_unit
+
+if TYPE_CHECKING:
+    from zwidth.assess import Assessment
+    from zwidth.scene import Scene
+
+
+def row(label: str, text: str) -> str:
+    return f"{label:<22}{text}"
+
+
+def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
+    wall, device, timing = scene.wall, scene.device, scene.timing
+    stable = (
+        click.style("stable", fg="green", bold=True) if verdict.stable else click.style("UNSTABLE", fg="red", bold=True)
+    )
+    lines = [
+        row("device", f"m = {with_unit(device.mass * 1e3, 'g')}, b = {with_unit(device.damping, 'N s/m')}"),
+        row(
+            "timing",
+            f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(verdict.d)})",
+        ),
+        row("wall", f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
+        row(
+            "normalized",
+            f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}",
+        ),
+        "",
+        row("verdict", f"{stable}, spectral radius {verdict.spectral_radius:.6f}"),
+        *_distance_lines(wall.stiffness, wall.virtual_damping, verdict),
+        row("passive", _passivity_words(verdict)),
+        row(
+            "stiffest stable wall",
+            f"K_max = {with_unit(verdict.stiffness_max, 'N/m')} "
+            f"at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')} (alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)})",
+        ),
+        row("slowest pole", _pole_words(verdict)),
+    ]
+    return lines
+
+
+def _distance_lines(stiffness: float, virtual_damping: float, verdict: Assessment) -> list[str]:
+    limit, lower, upper = verdict.stiffness_limit, verdict.virtual_damping_lower, verdict.virtual_damping_upper
+    if limit != limit:
+        in_k = "no stiffness is stable at this B"
+    elif verdict.stable:
+        in_k = f"K may rise by {with_unit(limit - stiffness, 'N/m')}, to {with_unit(limit, 'N/m')} (at this B)"
+    elif stiffness <= 0:
+        in_k = f"K must be greater than 0, up to {with_unit(limit, 'N/m')} (at this B)"
+    else:
+        in_k = f"K must fall by {with_unit(stiffness - limit, 'N/m')}, below {with_unit(limit, 'N/m')} (at this B)"
+    if lower != lower or upper != upper:
+        in_b = "no damping makes this K stable"
+    else:
+        span = f"between {with_unit(lower, 'N s/m')} and {with_unit(upper, 'N s/m')} (at this K)"
+        if verdict.stable:
+            in_b = (
+                f"B may fall by {with_unit(virtual_damping - lower, 'N s/m')} or rise by "
+                f"{with_unit(upper - virtual_damping, 'N s/m')}: {span}"
+            )
+        else:
+            in_b = f"B must lie {span}"
+    return [row("to the boundary in K", in_k), row("to the boundary in B", in_b)]
+
+
+def _passivity_words(verdict: Assessment) -> str:
+    if verdict.passive:
+        return f"yes, with {with_unit(verdict.passivity_margin, 'N s/m')} of physical damping to spare"
+    return f"no, for want of {with_unit(-verdict.passivity_margin, 'N s/m')} of physical damping"
+
+
+def _pole_words(verdict: Assessment) -> str:
+    swing = f", oscillating at {with_unit(verdict.frequency, 'Hz')}" if verdict.frequency else ""
+    constant = verdict.time_constant
+    if constant == float("inf"):
+        return f"neither decays nor grows{swing}"
+    verb = "decays" if constant >= 0 else "grows"
+    return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"

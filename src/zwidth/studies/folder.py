@@ -1,0 +1,62 @@
+"""The output folder of a run: never overwritten by accident, never half finished under its own name."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from zwidth.errors import StoreExistsError
+
+RUN_FILE = "run.json"
+"""The file that marks a folder as a finished run."""
+
+
+def check_free(folder: Path, overwrite: bool) -> None:
+    """Refuse a folder that holds something, unless it is a run that may be overwritten."""
+    if not (folder.exists() or folder.is_symlink()):
+        return
+    if not folder.is_dir():
+        raise StoreExistsError(f"out: {folder} is a file, a folder is needed; choose another with --out DIR")
+    if not any(folder.iterdir()):
+        return
+    if not (folder / RUN_FILE).is_file():
+        # Whatever it is, it was not written by a run: not ours to remove.
+        raise StoreExistsError(
+            f"out: {folder} is not empty and holds no run (no {RUN_FILE}); choose another folder with --out DIR"
+        )
+    if not overwrite:
+        raise StoreExistsError(
+            f"out: {folder} already holds a run; choose another folder with --out DIR, remove it, or replace it with "
+            "--overwrite"
+        )
+
+
+@contextmanager
+def staged(folder: Path, overwrite: bool) -> Iterator[Path]:
+    """A new folder beside ``folder``, which takes its place when the block ends well and vanishes when it does not.
+
+    Its name ends in ``.partial``: what is left of a killed run is recognized, and never taken for a finished one.
+    """
+    check_free(folder, overwrite)
+    partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
+    partial.mkdir(parents=True)
+    try:
+        yield partial
+        _replace(folder, partial, overwrite)
+    except BaseException:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise
+
+
+def _replace(folder: Path, partial: Path, overwrite: bool) -> None:
+    """Give the finished folder its name; another run may have taken it in the meantime."""
+    check_free(folder, overwrite)
+    old = partial.with_suffix(".old")
+    if folder.exists():
+        os.rename(folder, old)
+    os.rename(partial, folder)
+    shutil.rmtree(old, ignore_errors=True)

@@ -1,0 +1,89 @@
+"""The passive set of walls, and the study of what passivity costs.
+
+The passivity condition is homogeneous: a wall (alpha, beta) needs damping in proportion to its distance from the
+origin. The damping that a unit circle of walls needs therefore gives the whole set, for every delta.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.figures import draw_passivity_cost
+from zwidth.figures.data import DampingInterval, PassiveOutline, PassivityCost, PassivityData
+from zwidth.stability.passivity import passivity_margin
+from zwidth.studies.outcome import Outcome, stack
+from zwidth.studies.ridges import ridge_paths
+from zwidth.sweep.studies import PassivityStudy
+
+_DIRECTIONS = 721
+# Each search among the directions narrows the bracket 360-fold; six exhaust float64.
+_ROUNDS = 6
+
+
+class PassiveWall(NamedTuple):
+    """A wall on the edge of the passive set, over delta."""
+
+    alpha: float
+    beta: float
+
+
+def passive_edge(angles: np.ndarray, d: float) -> tuple[np.ndarray, np.ndarray]:
+    """alpha and beta, both over delta, of the passive set's edge in given directions of the plane."""
+    alpha, beta = np.maximum(np.cos(angles), 0.0), np.sin(angles)
+    needed = 1.0 - np.asarray(passivity_margin(alpha, beta, 1.0, d))
+    return alpha / needed, beta / needed
+
+
+def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
+    """The edge of the passive set for delta = 1, from the smallest beta to the largest."""
+    return passive_edge(np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS), d)
+
+
+def passive_outlines(deltas: np.ndarray, delays: np.ndarray) -> tuple[PassiveOutline, ...]:
+    """The edge of the passive set of every device that has damping; without it nothing is passive."""
+    found = []
+    for d in delays:
+        alpha, beta = unit_outline(float(d))
+        found += [PassiveOutline(float(delta), float(d), delta * alpha, delta * beta) for delta in deltas if delta > 0]
+    return tuple(found)
+
+
+def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> tuple[DampingInterval, ...]:
+    """The virtual damping that is passive for alpha -> 0, over delta."""
+    found = []
+    for d in delays:
+        _, (lower, upper) = passive_edge(np.array([-0.5 * np.pi, 0.5 * np.pi]), float(d))
+        found.append(DampingInterval(float(d), "held", deltas, deltas * lower, deltas * upper))
+    return tuple(found)
+
+
+def stiffest_passive(d: float) -> PassiveWall:
+    """The stiffest passive wall, over delta; the passive set is convex, so the search cannot miss it."""
+    low, high = -0.5 * np.pi, 0.5 * np.pi
+    alpha = beta = np.zeros(1)
+    best = 0
+    for _ in range(_ROUNDS):
+        angles = np.linspace(low, high, _DIRECTIONS)
+        alpha, beta = passive_edge(angles, d)
+        best = int(np.argmax(alpha))
+        low, high = angles[max(best - 1, 0)], angles[min(best + 1, _DIRECTIONS - 1)]
+    return PassiveWall(float(alpha[best]), float(beta[best]))
+
+
+def run_passivity(study: PassivityStudy) -> Outcome:
+    """Compare the stiffest passive wall with the stiffest stable one."""
+    delta, delays = study.delta.values(), study.d.values()
+    paths, notes = ridge_paths(delta, delays, study.delay_model)
+    costs = []
+    for path in paths:
+        wall = stiffest_passive(path.d)
+        passive = (wall.alpha * delta, wall.beta * delta)
+        costs.append(PassivityCost(path.d, delta, path.alpha_max, path.beta, *passive))
+    names = ("d", "delta", "alpha_max", "beta", "alpha_max_passive", "beta_passive")
+    table = stack({name: getattr(cost, name) for name in names} for cost in costs)
+    return Outcome(
+        table=table, figures={"": partial(draw_passivity_cost, PassivityData(tuple(costs)))}, notes=tuple(notes)
+    )

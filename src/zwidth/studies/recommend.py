@@ -1,0 +1,155 @@
+"""The recommend study: the stiffest wall of a device, and one with some margin, in SI units."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from zwidth.assess import Assessment, assess
+from zwidth.figures import draw_recommendation
+from zwidth.figures.data import BoundaryData, RecommendationData, Response, SIScale
+from zwidth.quantities import plain, with_unit
+from zwidth.scene import Scene, VirtualWall
+from zwidth.stability.ridge import alpha_max
+from zwidth.studies.boundaries import outline
+from zwidth.studies.outcome import Outcome, stack
+from zwidth.studies.passivity import passive_outlines
+from zwidth.studies.steps import respond, response_columns
+from zwidth.sweep.devices import PhysicalDevice
+from zwidth.sweep.responses import RecommendStudy
+
+
+def si_scale(device: PhysicalDevice) -> SIScale:
+    """How normalized walls of a device read in N/m and N s/m."""
+    return SIScale(device.mass / device.period**2, device.mass / device.period)
+
+
+def run_recommend(study: RecommendStudy, stem: str) -> Outcome:
+    """Recommend a wall, judge it, and write both down as ``stem.md`` and ``stem.json``."""
+    device, si = study.device, si_scale(study.device)
+    bare = device.to_scene()
+    ridge = alpha_max(device.delta, device.d)
+    alpha, beta = study.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
+    wall = VirtualWall(stiffness=alpha * si.stiffness, virtual_damping=beta * si.virtual_damping)
+    verdict = assess(Scene(bare.device, bare.timing, wall))
+    times = {"periods": study.periods(device), "substeps": study.substeps}
+    response = respond(device, alpha, beta, label=device.label or study.name, physical=True, **times)
+    edge, verified = outline(device.delta, device.d, "held")
+    passive = passive_outlines(np.array([device.delta]), np.array([device.d]))
+    data = RecommendationData(
+        stiffness=wall.stiffness,
+        virtual_damping=wall.virtual_damping,
+        stiffness_fraction=study.stiffness_fraction,
+        stiffness_max=verdict.stiffness_max,
+        virtual_damping_at_max=verdict.virtual_damping_at_max,
+        virtual_damping_lower=verdict.virtual_damping_lower,
+        virtual_damping_upper=verdict.virtual_damping_upper,
+        region=BoundaryData((edge,), passive=passive, si=si),
+        response=response,
+    )
+    documents = {
+        f"{stem}.json": json.dumps(_summary(device, data, verdict), indent=2, allow_nan=False) + "\n",
+        f"{stem}.md": _markdown(device, data, verdict),
+    }
+    notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
+    if not math.isfinite(response.settling_time):
+        notes.append(f"the response does not settle within {study.duration}")
+    table = stack([response_columns(response, physical=True)])
+    return Outcome(
+        table=table, figures={"": partial(draw_recommendation, data)}, documents=documents, notes=tuple(notes)
+    )
+
+
+def _finite(value: float) -> float | None:
+    """A number as JSON has it: none that is infinite or missing."""
+    return value if math.isfinite(value) else None
+
+
+def _summary(device: PhysicalDevice, data: RecommendationData, verdict: Assessment) -> dict[str, Any]:
+    """All numbers of the recommendation in SI units, with the normalized ones beside them."""
+    return {
+        "units": {
+            "stiffness": "N/m",
+            "damping": "N s/m",
+            "virtual_damping": "N s/m",
+            "mass": "kg",
+            "time": "s",
+            "frequency": "Hz",
+        },
+        "device": {
+            "mass": device.mass,
+            "damping": device.damping,
+            "period": device.period,
+            "delay": device.delay.seconds(device.period),
+            "delta": verdict.delta,
+            "d": verdict.d,
+        },
+        "maximum": {
+            "stiffness": verdict.stiffness_max,
+            "virtual_damping": verdict.virtual_damping_at_max,
+            "alpha": verdict.alpha_max,
+            "beta": verdict.beta_at_max,
+            "kind": verdict.ridge_kind,
+        },
+        "recommended": {
+            "stiffness_fraction": data.stiffness_fraction,
+            "stiffness": data.stiffness,
+            "virtual_damping": data.virtual_damping,
+            "alpha": verdict.alpha,
+            "beta": verdict.beta,
+            "virtual_damping_lower": _finite(verdict.virtual_damping_lower),
+            "virtual_damping_upper": _finite(verdict.virtual_damping_upper),
+            "stable": verdict.stable,
+            "spectral_radius": verdict.spectral_radius,
+            "passive": verdict.passive,
+            "passivity_margin": _finite(verdict.passivity_margin),
+            "settling_time": _finite(data.response.settling_time),
+            "time_constant": _finite(verdict.time_constant),
+            "frequency": _finite(verdict.frequency),
+        },
+    }
+
+
+def _markdown(device: PhysicalDevice, data: RecommendationData, verdict: Assessment) -> str:
+    """The recommendation for a reader."""
+    force_per_speed = "N s/m"
+    delay = with_unit(device.delay.seconds(device.period), "s")
+    settling = _settling(data.response)
+    missing = with_unit(-verdict.passivity_margin, force_per_speed)
+    passive = "yes" if verdict.passive else f"no; that would take {missing} more physical damping"
+    lower, upper = (
+        with_unit(value, force_per_speed) for value in (data.virtual_damping_lower, data.virtual_damping_upper)
+    )
+    share = f"{100 * data.stiffness_fraction:g} %"
+    return f"""# Recommended virtual wall
+
+Device: m = {with_unit(1e3 * device.mass, "g")}, b = {with_unit(device.damping, force_per_speed)}, sampled every \
+{with_unit(device.period, "s")}, force delayed by {delay}
+(normalized: delta = {plain(verdict.delta)}, d = {plain(verdict.d)}).
+
+| | stiffness K | virtual damping B | alpha | beta |
+|---|---|---|---|---|
+| stiffest stable wall | {with_unit(verdict.stiffness_max, "N/m")} | \
+{with_unit(verdict.virtual_damping_at_max, force_per_speed)} | {plain(verdict.alpha_max)} | {plain(verdict.beta_at_max)} |
+| **recommended, {share} of it** | **{with_unit(data.stiffness, "N/m")}** | \
+**{with_unit(data.virtual_damping, force_per_speed)}** | {plain(verdict.alpha)} | {plain(verdict.beta)} |
+
+The recommended wall
+
+- is {"stable" if verdict.stable else "NOT stable"}: spectral radius {verdict.spectral_radius:.6f};
+- stays stable for B between {lower} and {upper};
+- settles (2 % band) {settling};
+- is passive: {passive}.
+
+No stiffness above the maximum can be made stable by any virtual damping.
+"""
+
+
+def _settling(response: Response) -> str:
+    if math.isfinite(response.settling_time):
+        return f"{with_unit(response.settling_time, 's', 3)} after a step of force"
+    return "later than the simulated time"

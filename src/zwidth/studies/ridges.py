@@ -1,0 +1,74 @@
+"""The stiffest stable wall over delta, and the ridge study."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from zwidth.figures import draw_ridge
+from zwidth.figures.data import DelayModel, RidgeData, RidgePath
+from zwidth.stability.ridge import RidgeKind, RidgePoint, alpha_max
+from zwidth.status import Status
+from zwidth.studies.outcome import Outcome, stack
+from zwidth.sweep.studies import RidgeStudy
+
+# Every batch has this size, so that a run with many of them compiles the ridge once for each delay model.
+_BATCH = 4096
+
+
+def ridges(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> RidgePoint:
+    """`zwidth.alpha_max` of flat arrays, in batches of one size."""
+    delta, d = np.broadcast_arrays(np.asarray(delta, dtype=np.float64), np.asarray(d, dtype=np.float64))
+    count = delta.size
+    missing = -count % _BATCH
+    padded = [np.pad(column, (0, missing), mode="edge") for column in (delta, d)]
+    pieces = [
+        alpha_max(*(column[start : start + _BATCH] for column in padded), delay=delay)
+        for start in range(0, count + missing, _BATCH)
+    ]
+    return RidgePoint(*(np.concatenate(column)[:count] for column in zip(*pieces, strict=True)))
+
+
+def ridge_paths(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[list[RidgePath], list[str]]:
+    """One path over ``delta`` for every delay, and notes about points without an answer."""
+    points = ridges(np.tile(delta, d.size), np.repeat(d, delta.size), delay)
+    rows = RidgePoint(*(column.reshape(d.size, delta.size) for column in points))
+    paths, notes = [], []
+    for index, delay_factor in enumerate(d):
+        alpha, beta, omega, kind, status = (column[index] for column in rows)
+        names = np.array([RidgeKind(int(code)).name.lower() for code in kind])
+        paths.append(RidgePath(float(delay_factor), delay, delta, alpha, beta, omega, names))
+        failed = int(np.count_nonzero(status != Status.OK))
+        if failed:
+            notes.append(
+                f"alpha_max: {failed} of {delta.size} points have no answer for d = {delay_factor:g} ({delay})"
+            )
+    return paths, notes
+
+
+def needed_models(models: tuple[DelayModel, ...], d: np.ndarray) -> list[tuple[DelayModel, np.ndarray]]:
+    """The delays to compute in each model: for whole periods the models agree, and one of them is enough."""
+    chosen: list[tuple[DelayModel, np.ndarray]] = []
+    for model in models:
+        delays = d[d != np.floor(d)] if model == "fractional_power" and "held" in models else d
+        if delays.size:
+            chosen.append((model, delays))
+    return chosen
+
+
+def ridge_columns(path: RidgePath) -> dict[str, object]:
+    """The columns of one path in a data file."""
+    names = ("d", "delay_model", "delta", "alpha_max", "beta", "omega", "kind")
+    return {name: getattr(path, name) for name in names}
+
+
+def run_ridge(study: RidgeStudy) -> Outcome:
+    """Compute and draw the maximum stiffness over delta."""
+    paths, notes = [], []
+    for model, delays in needed_models(study.delay_models, study.d.values()):
+        more, remarks = ridge_paths(study.delta.values(), delays, model)
+        paths += more
+        notes += remarks
+    draw = partial(draw_ridge, RidgeData(tuple(paths)), two_scalings=study.figure == "fig10")
+    return Outcome(table=stack(ridge_columns(path) for path in paths), figures={"": draw}, notes=tuple(notes))

@@ -1,0 +1,138 @@
+"""Independent formulas in mpmath: what the library computes in float64, here with 60 digits and more.
+
+Each is written from the model's definitions as printed (quotients, powers, sums), never from the rearranged
+forms that the library uses. Where a printed formula cancels, more digits are carried instead.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from mpmath import mp, mpc, mpf
+
+DIGITS = 60
+# The smallest float64 squared has 647 zeros: digits enough to see it beside 1.
+WIDE = 1400
+
+
+def digits_for(delta: float) -> int:
+    """Decimal digits that survive the cancellation of order delta^2 in the printed formulas."""
+    if delta == 0:
+        return DIGITS
+    return DIGITS + max(0, math.ceil(-4 * math.log10(delta)))
+
+
+class Phi(NamedTuple):
+    """c, phi1, phi2, psi of one argument, as printed."""
+
+    c: mpf
+    phi1: mpf
+    phi2: mpf
+    psi: mpf
+
+
+def phi(x) -> Phi:
+    """The quotients as printed; their limits at 0. Call it with the digits of `digits_for` at work."""
+    x = mpf(x)
+    if x == 0:
+        return Phi(mpf(1), mpf(1), mpf(1) / 2, mpf(1) / 2)
+    c = mp.exp(-x)
+    phi1 = (1 - c) / x
+    phi2 = (1 - phi1) / x
+    return Phi(c, phi1, phi2, phi1 - phi2)
+
+
+def numerator(delta, fraction) -> tuple[mpf, mpf, mpf]:
+    """z n0(z) + n1(z) of the held plant, highest power first, from the g's of the exact discretization."""
+    delta, f = mpf(delta), mpf(fraction)
+    whole, late, early = phi(delta), phi(delta * (1 - f)), phi(delta * f)
+    t = 1 - f
+    g0x, g0v = t**2 * late.phi2, t * late.phi1
+    g1x = f**2 * early.phi2 + t * late.phi1 * f * early.phi1
+    g1v = mp.exp(-delta * t) * f * early.phi1
+    c, phi1 = whole.c, whole.phi1
+    return g0x, (phi1 * g0v - c * g0x) + g1x, phi1 * g1v - c * g1x
+
+
+def polynomial(alpha, beta, delta, d) -> list[mpf]:
+    """P of a held delay, highest power first: degree 3 + d for whole d, 4 + n otherwise."""
+    alpha, beta, delta, d = mpf(alpha), mpf(beta), mpf(delta), mpf(d)
+    n = int(mp.floor(d))
+    f = d - n
+    c = phi(delta).c
+    g = list(numerator(delta, f))
+    wall = [alpha + beta, -beta]
+    product = [mpf(0)] * 4
+    for i, left in enumerate(g):
+        for j, right in enumerate(wall):
+            product[i + j] += left * right
+    total = [mpf(1), -(1 + c), c] + [mpf(0)] * (n + 2)
+    for k in range(4):
+        total[len(total) - 4 + k] += product[k]
+    return total if f else total[:-1]
+
+
+def paper_polynomial(alpha, beta, delta, d: int) -> list[mpf]:
+    """Eq. (17) as printed, for whole d and delta > 0: degree 3 + d, not monic."""
+    alpha, beta, delta = mpf(alpha), mpf(beta), mpf(delta)
+    c = mp.exp(-delta)
+    total = [-(delta**2), delta**2 * (1 + c), -(delta**2) * c] + [mpf(0)] * (d + 1)
+    total[-3] += (1 - c - delta) * (alpha + beta)
+    total[-2] += (c * delta - 1 + c) * alpha + ((1 + c) * delta - 2 * (1 - c)) * beta
+    total[-1] += (1 - c - c * delta) * beta
+    return total
+
+
+def paper_polynomial_si(mass, damping, period, stiffness, virtual_damping, d: int) -> list[mpf]:
+    """Eq. (11) as printed, for whole d and b > 0."""
+    m, b, T, K, B = (mpf(value) for value in (mass, damping, period, stiffness, virtual_damping))
+    c = mp.exp(-T * b / m)
+    lead = -T * b**2
+    total = [lead, -lead * (1 + c), lead * c] + [mpf(0)] * (d + 1)
+    total[-3] += (m * (1 - c) - T * b) * (K * T + B)
+    total[-2] += (T * b * c - m * (1 - c)) * K * T + (T * b + T * b * c - 2 * m * (1 - c)) * B
+    total[-1] += (-T * b * c + m * (1 - c)) * B
+    return total
+
+
+def boundary(omega, delta, d, delay: str = "held") -> tuple[mpf, mpf]:
+    """(alpha, beta) from the 2x2 system Re P = Im P = 0 at z = e^(j omega), 0 < omega < pi."""
+    omega, delta, d = mpf(omega), mpf(delta), mpf(d)
+    z = mp.expj(omega)
+    c = mp.exp(-delta)
+    if delay == "held":
+        n = mp.floor(d)
+        a2, a1, a0 = numerator(delta, d - n)
+        # z^-(1+n) P: a power of z does not move the zeros, and keeps d = 500 as cheap as d = 0
+        gain = ((a2 * z + a1) * z + a0) / z ** (2 + n)
+    else:
+        values = phi(delta)
+        gain = (values.phi2 * z + values.psi) * mp.expj(-omega * (1 + d))
+    free = (z - 1) * (z - c)
+    by_alpha, by_beta = gain * z, gain * (z - 1)
+    determinant = by_alpha.real * by_beta.imag - by_alpha.imag * by_beta.real
+    alpha = (-free.real * by_beta.imag + free.imag * by_beta.real) / determinant
+    beta = (-by_alpha.real * free.imag + by_alpha.imag * free.real) / determinant
+    return alpha, beta
+
+
+def evaluate(coefficients, z) -> mpc:
+    """Horner's rule, highest power first."""
+    total = mpc(0)
+    for coefficient in coefficients:
+        total = total * z + coefficient
+    return total
+
+
+def relative_error(got, exact, floor=0) -> float:
+    """|got - exact| over |exact| (or over ``floor``, where that is larger)."""
+    scale = max(abs(exact), mpf(floor))
+    difference = abs(mpf(float(got)) - exact)
+    return float(difference / scale) if scale else float(difference)
+
+
+def worst(got, exact, floor=0) -> float:
+    """The largest `relative_error` of two sequences."""
+    return max(relative_error(g, e, floor) for g, e in zip(np.ravel(got), exact, strict=True))
