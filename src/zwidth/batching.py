@@ -16,7 +16,7 @@ import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth._types import Array, ArrayLike
+from zwidth._types import ArrayLike
 from zwidth.errors import InputError, TracedDelayError
 
 # Large batches run in pieces of one size: one compilation, bounded memory, and a point's value does not depend

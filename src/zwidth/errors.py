@@ -22,6 +22,14 @@ class StoreExistsError(ZwidthError, FileExistsError):
     """An output folder that already holds a run."""
 
 
+class StoreError(ZwidthError):
+    """A store that cannot be used: damaged, of another configuration, or of another version."""
+
+
+class ResourceError(ZwidthError):
+    """Work that does not fit into the memory or onto the disk there is."""
+
+
 class TracedDelayError(ZwidthError, TypeError):
     """A traced delay where the number of poles, hence an array shape, depends on its value."""
 

@@ -10,15 +10,18 @@ factored. Pole methods use the coefficients `coefficients`, frequency methods `f
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike
+from zwidth.batching import concrete_delay, pointwise
 from zwidth.errors import InputError, check_choice
-from zwidth.grouping import Degree, by_degree
+from zwidth.grouping import Degree, by_degree, degree_of
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
+from zwidth.scene import normalize
 
 
 class Affine(NamedTuple):
@@ -43,7 +46,7 @@ def affine(delta: Array, d: Array, degree: Degree) -> Affine:
     n = [plant.a2, plant.a1, plant.a0] if degree.fractional else [plant.a2, plant.a1]
     pad = [zero] * (degree.poles - len(n))
     n1 = [*pad, *n, zero]
-    n2 = [*pad, n[0], *(right - left for left, right in zip(n, n[1:], strict=False)), -n[-1]]
+    n2 = [*pad, n[0], *(right - left for left, right in pairwise(n)), -n[-1]]
     d0 = head + [zero] * (degree.poles - 2)
     return Affine(jnp.stack(d0), jnp.stack(n1), jnp.stack(n2))
 
@@ -351,6 +354,7 @@ def _closed_loop_kernel(
     lag = jnp.full_like(delta, float(degree.whole))
     plant = undelayed_plant(delta)
     gain = period * period / mass
-    zeros = jnp.zeros(degree.whole + 1, dtype=delta.dtype)
-    numerator = jnp.concatenate([gain * jnp.stack([plant.a2, plant.a1]), zeros + 0.0 * delta])
-    return Transfer(numerator, _char_poly_kernel(alpha, beta, delta, lag, degree))
+    numerator = jnp.stack([gain * plant.a2, gain * plant.a1] + [jnp.zeros_like(gain)] * (degree.whole + 1))
+    # Bad masses and periods have become bad alphas.
+    spoiled = poison(valid_wall(alpha, beta, delta, lag), alpha, beta, delta)
+    return Transfer(numerator + spoiled, _char_poly_kernel(alpha, beta, delta, lag, degree))

@@ -22,6 +22,8 @@ import jax.numpy as jnp
 
 from zwidth import phi
 from zwidth._types import Array, ArrayLike
+from zwidth.batching import pointwise
+from zwidth.scene import normalize
 
 
 class Plant(NamedTuple):
@@ -86,22 +88,41 @@ def velocity_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) ->
     b = 0, its limit ``T/(m (z - 1))``.
 
     Args:
-        mass: m in kg, > 0, scalar.
-        damping: b in N s/m, >= 0, scalar.
-        period: T in s, > 0, scalar.
+        mass: m in kg, > 0.
+        damping: b in N s/m, >= 0.
+        period: T in s, > 0. All three broadcast.
 
     Returns:
-        Transfer: ``numerator`` (1,), ``denominator`` (2,).
+        Transfer: ``numerator`` (..., 1), ``denominator`` (..., 2). A point out of range is NaN.
+
+    Raises:
+        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
-        No cancellation for any b; float64 or the ambient precision of the arguments.
+        No cancellation for any b. Float64 when called directly; the ambient precision inside `jit`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eqs. (5), (12).
+
+    Example:
+        >>> from zwidth.plant import velocity_transfer
+        >>> velocity_transfer(0.5, 0.0, 1e-3).denominator
+        array([ 1., -1.])
     """
-    delta = jnp.asarray(damping * period / mass)
-    numerator = jnp.stack([period / mass * phi.phi1(delta)])
-    return Transfer(numerator, jnp.stack([jnp.ones_like(delta), -phi.decay(delta)]))
+    delta = normalize(mass=mass, damping=damping, period=period).delta
+    return pointwise(_velocity_kernel, ("mass", "period", "delta"), (mass, period, delta))
+
+
+def _velocity_kernel(mass: Array, period: Array, delta: Array) -> Transfer:
+    return Transfer(
+        jnp.stack([period / mass * phi.phi1(delta)]),
+        jnp.stack([_one_at(delta), -phi.decay(delta)]),
+    )
+
+
+def _one_at(delta: Array) -> Array:
+    """The leading coefficient: 1, or NaN where the damping is."""
+    return jnp.where(jnp.isnan(delta), delta, 1.0)
 
 
 def position_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) -> Transfer:
@@ -111,21 +132,35 @@ def position_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) ->
     ``T^2 (z + 1) / (2 m (z - 1)^2)``.
 
     Args:
-        mass: m in kg, > 0, scalar.
-        damping: b in N s/m, >= 0, scalar.
-        period: T in s, > 0, scalar.
+        mass: m in kg, > 0.
+        damping: b in N s/m, >= 0.
+        period: T in s, > 0. All three broadcast.
 
     Returns:
-        Transfer: ``numerator`` (2,), ``denominator`` (3,).
+        Transfer: ``numerator`` (..., 2), ``denominator`` (..., 3). A point out of range is NaN.
+
+    Raises:
+        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
-        No cancellation for any b; float64 or the ambient precision of the arguments.
+        No cancellation for any b. Float64 when called directly; the ambient precision inside `jit`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eqs. (9), (13).
+
+    Example:
+        >>> from zwidth.plant import position_transfer
+        >>> position_transfer(0.5, 0.0, 1.0).numerator
+        array([1., 1.])
     """
-    delta = jnp.asarray(damping * period / mass)
+    delta = normalize(mass=mass, damping=damping, period=period).delta
+    return pointwise(_position_kernel, ("mass", "period", "delta"), (mass, period, delta))
+
+
+def _position_kernel(mass: Array, period: Array, delta: Array) -> Transfer:
     c = phi.decay(delta)
     gain = period * period / mass
-    numerator = jnp.stack([gain * phi.phi2(delta), gain * phi.psi(delta)])
-    return Transfer(numerator, jnp.stack([jnp.ones_like(delta), -(1.0 + c), c]))
+    return Transfer(
+        jnp.stack([gain * phi.phi2(delta), gain * phi.psi(delta)]),
+        jnp.stack([_one_at(delta), -(1.0 + c), c]),
+    )

@@ -13,11 +13,12 @@ from decimal import Decimal
 from typing import Any
 
 import numpy as np
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from zwidth.scene import normalize
 from zwidth.stability.boundary import boundary
 from zwidth.stability.ridge import alpha_max
+from zwidth.stability.slope import stiffness_slope
 
 SOURCE = "Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence of Physical Damping, 2006"
 
@@ -27,6 +28,8 @@ DAMPINGS = (0.0, 10.0, 100.0)
 STIFFNESS_FRACTION = 0.75
 # Massie and Salisbury's maximum for the PHANToM, in N/m, to which section VIII compares.
 MASSIE_SALISBURY = 3.5e3
+# The delays of Fig. 5, and of Fig. 10 as far as they are whole.
+SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)
 
 
 @dataclass(frozen=True)
@@ -75,18 +78,18 @@ def _undamped() -> list[Comparison]:
 
 def _example() -> list[Comparison]:
     """Section VIII: the normalized damping, 75 % of the maximum stiffness and the damping at the maximum."""
-    rows = []
-    printed = {"delta": ("0", "0.1", "1"), "alpha": ("0.108", "0.149", "0.656"), "beta": ("0.425", "0.416", "0.388")}
-    for index, damping in enumerate(DAMPINGS):
-        delta = float(normalize(mass=MASS, damping=damping, period=PERIOD).delta)
-        alpha, beta = _ridge(delta, DELAY_FACTOR)
-        found = {"delta": delta, "alpha": STIFFNESS_FRACTION * alpha, "beta": beta}
-        names = {"delta": "delta", "alpha": "0.75 alpha_max", "beta": "beta at alpha_max"}
-        rows += [
-            Comparison(f"{names[key]}, b = {damping:g} N s/m", "section VIII", printed[key][index], found[key])
-            for key in printed
-        ]
-    return sorted(rows, key=lambda row: list(names.values()).index(row.quantity.partition(",")[0]))
+    deltas = [float(normalize(mass=MASS, damping=damping, period=PERIOD).delta) for damping in DAMPINGS]
+    ridge = [_ridge(delta, DELAY_FACTOR) for delta in deltas]
+    columns = (
+        ("delta", ("0", "0.1", "1"), deltas),
+        ("0.75 alpha_max", ("0.108", "0.149", "0.656"), [STIFFNESS_FRACTION * alpha for alpha, _ in ridge]),
+        ("beta at alpha_max", ("0.425", "0.416", "0.388"), [beta for _, beta in ridge]),
+    )
+    return [
+        Comparison(f"{name}, b = {damping:g} N s/m", "section VIII", text, computed)
+        for name, printed, found in columns
+        for damping, text, computed in zip(DAMPINGS, printed, found, strict=True)
+    ]
 
 
 def _factors() -> list[Comparison]:
@@ -136,12 +139,14 @@ def corner_takes_over() -> float:
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:
     """The root in a bracket, to the last digits of float64."""
-    return float(brentq(function, low, high, xtol=1e-15, rtol=4 * np.finfo(np.float64).eps))
+    solution = root_scalar(function, bracket=(low, high), method="brentq", xtol=1e-15, rtol=1e-15)
+    return float(solution.root)
 
 
 def sharpened_numbers() -> list[Sharpened]:
     """Compute what the paper leaves open."""
     alpha, beta = _ridge(0.0, 0)
+    slopes = np.asarray(stiffness_slope(np.array(SLOPE_DELAYS)))
     return [
         Sharpened(
             "delta above which the line z = -1 bounds the stable region, d = 0",
@@ -157,6 +162,10 @@ def sharpened_numbers() -> list[Sharpened]:
         ),
         Sharpened("alpha_max(delta = 0, d = 0)", "eq. (24): 0.6863", alpha, "exactly 12 - 8 sqrt(2)"),
         Sharpened("beta at alpha_max(delta = 0, d = 0)", "not in the paper", beta, "exactly 2 sqrt(2) - 2"),
+        *(
+            Sharpened(f"slope g, d = {d:g}", "eq. (22), no number", float(slope), "limit of alpha_max/delta")
+            for d, slope in zip(SLOPE_DELAYS, slopes, strict=True)
+        ),
     ]
 
 
@@ -199,8 +208,8 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         "",
         f"{SOURCE}.",
         "",
-        f"{agreeing} of {len(printed)} printed numbers agree: the computed value rounds to the printed one, within half",
-        "a unit of its last digit.",
+        f"{agreeing} of {len(printed)} printed numbers agree: the computed value lies within half a unit of the last",
+        "printed digit.",
         "",
         "| quantity | where | printed | computed | agrees |",
         "|---|---|---|---|---|",

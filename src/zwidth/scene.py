@@ -7,8 +7,9 @@ The normalization is the paper's eqs. (14) and (16): ``alpha = K T^2/m``, ``beta
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -51,42 +52,101 @@ _RANGES: dict[str, tuple[str, float, bool]] = {
 }
 
 
-def _is_plain(value: ArrayLike) -> bool:
-    """True for Python and NumPy numbers and arrays; a JAX array, traced or not, is left to JAX."""
-    return isinstance(value, int | float | np.ndarray | np.generic | list | tuple)
-
-
 def _checked(name: str, value: ArrayLike) -> ArrayLike:
-    """Return ``value`` as float64; a scalar out of range raises, such an entry of an array becomes NaN."""
-    if not _is_plain(value):
-        if isinstance(value, str | bytes | complex | dict | set | type(None)):
-            raise InputError(f"{name}: got {value!r}, a real number is needed")
-        return value
+    """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
     try:
-        number = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed") from error
-    unit, lowest, excluded = _RANGES[name]
-    good = np.isfinite(number) & ((number > lowest) if excluded else (number >= lowest))
-    if number.ndim == 0:
-        if not good:
-            bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
-            raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
-        return number[()]
-    return number if good.all() else np.where(good, number, np.nan)
+        number = np.asarray(value) if not _is_traced(value) else None
+    except ValueError as error:
+        raise InputError(f"{name}: got {value!r}, a rectangular array of real numbers is needed") from error
+    if number is None:
+        return value
+    if number.dtype.kind not in "biuf":
+        raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed")
+    if number.ndim == 0 and not _in_range(name, number, np):
+        unit, lowest, excluded = _RANGES[name]
+        bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
+        raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
+    return number.astype(np.float64, copy=False)
 
 
-def _periods(delay: ArrayLike, period: ArrayLike) -> ArrayLike:
+def _in_range(name: str, value: Array, xp: Any) -> Array:
+    _, lowest, excluded = _RANGES[name]
+    return xp.isfinite(value) & ((value > lowest) if excluded else (value >= lowest))
+
+
+def _is_jax(value: ArrayLike) -> bool:
+    """Whether a value is a JAX array, traced or not; found out without importing JAX for plain numbers."""
+    if isinstance(value, int | float | str | np.ndarray | np.generic | list | tuple):
+        return False
+    import jax
+
+    return isinstance(value, jax.Array)
+
+
+def _is_traced(value: ArrayLike) -> bool:
+    if not _is_jax(value):
+        return False
+    from zwidth.batching import is_traced
+
+    return is_traced(value)
+
+
+def _converted(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
+    """Check the arguments, put NaN where an array's entry is out of range, and apply ``formula``."""
+    checked = {name: _checked(name, value) for name, value in values.items()}
+    try:
+        np.broadcast_shapes(*(np.shape(value) for value in checked.values()))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in checked.items())
+        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+    if any(map(_is_jax, values.values())):
+        import jax.numpy as jnp
+
+        from zwidth.batching import pointwise
+
+        return pointwise(_formula_at, tuple(values), tuple(values.values()), (formula, tuple(values), jnp))
+    result = _formula_at(*checked.values(), formula, tuple(values), np)
+    return tuple(part[()] for part in result)
+
+
+def _formula_at(*arguments: Any) -> tuple[Array, ...]:
+    """``formula`` with NaN for what is out of range; the last three arguments are the formula, the names, and NumPy."""
+    *values, formula, names, xp = arguments
+    good = (xp.where(_in_range(name, value, xp), value, np.nan) for name, value in zip(names, values, strict=True))
+    return formula(*good, xp)
+
+
+def _periods(delay: Array, period: Array, xp: Any) -> Array:
     """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number.
 
     1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
     """
     quotient = delay / period
-    if not (_is_plain(delay) and _is_plain(period)):
-        return quotient
-    whole = np.round(quotient)
-    near = np.abs(quotient - whole) <= 4 * np.finfo(np.float64).eps * np.maximum(whole, 1.0)
-    return np.where(near & (whole > 0), whole, quotient)[()]
+    whole = xp.round(quotient)
+    near = xp.abs(quotient - whole) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(whole, 1.0)
+    excess = xp.where(near & (whole > 0), quotient - whole, 0.0)
+    if xp is not np:
+        from jax.lax import stop_gradient
+
+        # Rounding is flat; the quotient it corrects is not.
+        excess = stop_gradient(excess)
+    return quotient - excess
+
+
+def _to_normalized(mass, damping, period, delay, stiffness, virtual_damping, xp) -> tuple[Array, ...]:
+    """Eqs. (14), (16)."""
+    return (
+        stiffness * period * period / mass,
+        virtual_damping * period / mass,
+        damping * period / mass,
+        _periods(delay, period, xp),
+    )
+
+
+def _to_physical(mass, period, alpha, beta, delta, d, xp) -> tuple[Array, ...]:
+    """Eqs. (14), (16) solved for the SI quantities, in the order of `Physical`."""
+    rate = mass / period
+    return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
 
 
 def normalize(
@@ -127,12 +187,16 @@ def normalize(
         >>> print(f"{wall.alpha:.3f} {wall.delta:.1f} {wall.d:.0f}")
         0.149 0.1 1
     """
-    m = _checked("mass", mass)
-    t = _checked("period", period)
-    alpha = _checked("stiffness", stiffness) * t * t / m
-    beta = _checked("virtual_damping", virtual_damping) * t / m
-    delta = _checked("damping", damping) * t / m
-    return Normalized(alpha, beta, delta, _periods(_checked("delay", delay), t))
+    numbers = _converted(
+        _to_normalized,
+        mass=mass,
+        damping=damping,
+        period=period,
+        delay=delay,
+        stiffness=stiffness,
+        virtual_damping=virtual_damping,
+    )
+    return Normalized(*numbers)
 
 
 def denormalize(
@@ -170,16 +234,8 @@ def denormalize(
         >>> print(f"{zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.149).stiffness:.0f} N/m")
         14900 N/m
     """
-    m = _checked("mass", mass)
-    t = _checked("period", period)
-    return Physical(
-        mass=m,
-        damping=_checked("delta", delta) * m / t,
-        period=t,
-        delay=_checked("d", d) * t,
-        stiffness=_checked("alpha", alpha) * m / (t * t),
-        virtual_damping=_checked("beta", beta) * m / t,
-    )
+    numbers = _converted(_to_physical, mass=mass, period=period, alpha=alpha, beta=beta, delta=delta, d=d)
+    return Physical(*numbers)
 
 
 def _require_scalar(name: str, value: float) -> None:

@@ -49,10 +49,10 @@ def _draw_maxima(ax: Axes, data: PassivityData) -> None:
     ends = [float(cost.alpha_max[-1]) for cost in data.costs]
     _label_ends(ax, data, ends, colors)
     ax.set_xlabel(style.DELTA_LABEL)
-    ax.set_ylabel(r"maximum stiffness  $K_{\max}\,T^2\!/m$")
+    ax.set_ylabel(style.ALPHA_LABEL)
     handles = [
-        Line2D([], [], color=style.GRAY, label=r"stable: $\alpha_{\max}$"),
-        Line2D([], [], color=style.GRAY, linestyle=style.DASH_DOTTED, label="passive"),
+        Line2D([], [], color=style.GRAY, label=r"stiffest stable wall, $\alpha_{\max}$"),
+        Line2D([], [], color=style.GRAY, linestyle=style.DASH_DOTTED, label="stiffest passive wall"),
     ]
     ax.legend(handles=handles, loc="upper left")
 
@@ -69,18 +69,8 @@ def _draw_ratio(ax: Axes, data: PassivityData) -> None:
     ax.set_ylim(0.0, 100.0)
     _label_ends(ax, data, [float(ratio[-1]) for ratio in ratios], colors)
     ax.set_xlabel(style.DELTA_LABEL)
-    ax.set_ylabel("stiffest passive wall in % of the stiffest stable one")
+    ax.set_ylabel(r"stiffest passive wall in % of $\alpha_{\max}$")
 
 
 def _label_ends(ax: Axes, data: PassivityData, ends: list[float], colors: dict[float, object]) -> None:
-    low, high = ax.get_ylim()
-    for cost, place in zip(data.costs, style.spread(ends, 0.05 * (high - low)), strict=True):
-        ax.annotate(
-            f"$d = {cost.d:g}$",
-            (1.015, (place - low) / (high - low)),
-            xycoords="axes fraction",
-            color=colors[cost.d],
-            fontsize=8,
-            va="center",
-            annotation_clip=False,
-        )
+    style.label_ends(ax, [f"$d = {cost.d:g}$" for cost in data.costs], ends, [colors[cost.d] for cost in data.costs])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from zwidth.figures import style
 from zwidth.figures.data import RidgeData, RidgePath
@@ -55,34 +54,16 @@ def _draw_panel(ax: Axes, data: RidgeData, share: float) -> None:
             ax.fill_between(path.delta, 0.0, path.alpha_max, color=colors[path.d], alpha=0.07, linewidth=0.0, zorder=1)
     ax.set_xlim(min(float(path.delta.min()) for path in shown), end)
     ax.set_ylim(0.0, 1.04 * max(float(np.nanmax(path.alpha_max)) for path in shown))
-    _label_curves(ax, [path for path in shown if path.delay_model == "held"] or shown, colors)
+    named = [path for path in shown if path.delay_model == "held"] or shown
+    ends = [float(path.alpha_max[-1]) for path in named]
+    style.label_ends(ax, [f"$d = {path.d:g}$" for path in named], ends, [colors[path.d] for path in named])
     ax.set_xlabel(style.DELTA_LABEL)
     ax.set_ylabel(style.ALPHA_MAX_LABEL)
     if any(path.delay_model == "fractional_power" for path in shown):
-        handles = [
-            Line2D([], [], color=style.GRAY, label="held delay (exact)"),
-            Line2D([], [], color=style.GRAY, linestyle=style.DASHED, label=r"fractional power $z^{1+d}$"),
-        ]
-        ax.legend(handles=handles, loc="upper left")
+        ax.legend(handles=style.delay_model_handles(), loc="upper left")
 
 
 def _up_to(path: RidgePath, end: float) -> RidgePath:
     keep = path.delta <= end * (1.0 + 1e-12)
     columns = (path.delta, path.alpha_max, path.beta, path.omega, path.kind)
     return RidgePath(path.d, path.delay_model, *(column[keep] for column in columns))
-
-
-def _label_curves(ax: Axes, paths: list[RidgePath], colors: dict[float, object]) -> None:
-    """Name the delay of each curve beside its right end."""
-    _, high = ax.get_ylim()
-    places = style.spread([float(path.alpha_max[-1]) for path in paths], 0.05 * high)
-    for path, place in zip(paths, places, strict=True):
-        ax.annotate(
-            f"$d = {path.d:g}$",
-            (1.015, place / high),
-            xycoords="axes fraction",
-            color=colors[path.d],
-            fontsize=8,
-            va="center",
-            annotation_clip=False,
-        )

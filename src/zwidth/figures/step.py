@@ -7,12 +7,17 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from zwidth.figures import style
 from zwidth.figures.data import Response, StepData
 
-_COLORS = (style.BLUE, style.VERMILION, style.BLACK, style.GREEN, style.ORANGE, style.PURPLE, style.SKY)
+# In gray these differ in lightness from one to the next.
+_COLORS = (style.BLUE, style.ORANGE, style.BLACK, style.GREEN, style.VERMILION, style.SKY, style.PURPLE)
 _STYLES = (style.SOLID, style.DASHED, style.DASH_DOTTED, style.DOTTED)
+
+
+SETTLED = "settled to 2 %"
 
 
 def draw_step(data: StepData, ax: Axes | None = None) -> Figure:
@@ -29,14 +34,14 @@ def draw_step(data: StepData, ax: Axes | None = None) -> Figure:
         if ax is not None:
             draw_positions(ax, data)
             _label_time(ax, data)
-            ax.legend(loc="best")
+            ax.legend(handles=_legend_handles(ax, data))
             return style.figure_of(ax)
-        keywords = {"height_ratios": (2.0, 1.15), "sharex": True}
-        figure, axes = style.new_figure(5.6, 5.0, 2, 1, **keywords)
+        figure, axes = style.new_figure(5.6, 5.0, 2, 1, height_ratios=(1.8, 1.2), sharex=True)
         draw_positions(axes[0, 0], data)
         draw_forces(axes[1, 0], data)
         _label_time(axes[1, 0], data)
-        axes[0, 0].legend(loc="best")
+        # Responses swing over all of the panel.
+        figure.legend(handles=_legend_handles(axes[0, 0], data), loc="outside upper center", ncols=2)
         return figure
 
 
@@ -60,20 +65,31 @@ def draw_forces(ax: Axes, data: StepData) -> None:
     clock, _ = _time_unit(data)
     for response, look in zip(data.responses, _looks(len(data.responses)), strict=True):
         label = f"wall_force, {response.label}"
-        ax.plot(response.time * clock, response.wall_force, **(look | {"linewidth": 1.0}), label=label, zorder=3)
+        # Steps are too short for dashes: lightness has to do.
+        ax.plot(response.time * clock, response.wall_force, color=look["color"], linewidth=1.1, label=label, zorder=3)
     ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
     ax.set_ylabel("wall force in N" if data.physical else r"wall force  in $F$")
 
 
 def _label_time(ax: Axes, data: StepData) -> None:
     clock, unit = _time_unit(data)
-    ax.set_xlim(0.0, max(float(response.time[-1]) for response in data.responses) * clock)
+    # The last sample ends before the time that was asked for.
+    ax.set_xlim(0.0, max(float(response.time[-1] + response.time[1]) for response in data.responses) * clock)
     ax.set_xlabel(f"time  $t$  in {unit}" if data.physical else "time  $t/T$  in sampling periods")
 
 
 def _looks(count: int) -> list[dict[str, Any]]:
     """A color and a line style for every response."""
     return [{"color": _COLORS[k % len(_COLORS)], "linestyle": _STYLES[k % len(_STYLES)]} for k in range(count)]
+
+
+def _legend_handles(ax: Axes, data: StepData) -> list[Line2D]:
+    """The responses, and what the dots mean."""
+    handles, _ = ax.get_legend_handles_labels()
+    lines = [handle for handle in handles if isinstance(handle, Line2D)]
+    if any(np.isfinite(response.settling_time) for response in data.responses):
+        lines.append(Line2D([], [], linestyle="", marker="o", markersize=4.5, color=style.GRAY, label=SETTLED))
+    return lines
 
 
 def _text(response: Response) -> str:

@@ -14,6 +14,8 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.lines import Line2D
 
 from zwidth.figures.data import SIScale
 
@@ -36,7 +38,7 @@ ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
 WIDTH = 7.0  # inches: both columns of a journal page
 PNG_DPI = 180
 
-_RC: dict[str, Any] = {
+_RC: Any = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "mathtext.fontset": "dejavusans",
@@ -84,9 +86,33 @@ def house_style() -> Iterator[None]:
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
     """A figure of its own, unknown to pyplot, and its axes as a 2-D array."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)  # type: ignore[union-attr]
+    engine = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)
+    figure = Figure(figsize=(width, height), layout=engine)
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
+
+
+def label_ends(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: Sequence[Any]) -> None:
+    """Write the name of each curve to the right of its end, moved apart where they would overlap."""
+    low, high = ax.get_ylim()
+    places = spread(ends, 0.05 * (high - low) * 3.6 / figure_of(ax).get_figheight())
+    for name, place, color in zip(names, places, colors, strict=True):
+        ax.annotate(
+            name,
+            (1.015, (place - low) / (high - low)),
+            xycoords="axes fraction",
+            color=color,
+            fontsize=8,
+            va="center",
+            annotation_clip=False,
+        )
+
+
+def delay_model_handles() -> list[Line2D]:
+    """What solid and dashed mean where both delay models are drawn."""
+    return [
+        Line2D([], [], color=GRAY, label="held delay (exact)"),
+        Line2D([], [], color=GRAY, linestyle=DASHED, label=r"fractional power $z^{1+d}$"),
+    ]
 
 
 def figure_of(ax: Axes) -> Figure:
@@ -107,7 +133,7 @@ def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
 
 def ordered_colors(count: int) -> list[Any]:
     """Colors for values in ascending order: the larger the value, the darker."""
-    shades = np.linspace(0.80, 0.0, count) if count > 1 else np.array([0.25])
+    shades = np.linspace(0.76, 0.0, count) if count > 1 else np.array([0.25])
     return [matplotlib.colormaps["viridis"](shade) for shade in shades]
 
 

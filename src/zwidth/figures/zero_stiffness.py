@@ -65,8 +65,9 @@ def _draw_lower_bound(ax: Axes, data: ZeroStiffnessData) -> None:
     first = data.stable[0]
     ax.plot(first.delta, first.beta_lower, color=style.BLACK, label="beta_lower", zorder=2.5)
     middle = int(0.55 * first.delta.size)
+    several = len({interval.d for interval in data.stable}) > 1
     ax.annotate(
-        r"$\beta = -\delta$ for every $d$",
+        r"$\beta = -\delta$ for every $d$" if several else r"$\beta = -\delta$",
         (first.delta[middle], first.beta_lower[middle]),
         xytext=(8, 6),
         textcoords="offset points",
@@ -75,6 +76,9 @@ def _draw_lower_bound(ax: Axes, data: ZeroStiffnessData) -> None:
 
 
 def _draw_passive(ax: Axes, interval: DampingInterval) -> None:
+    ax.fill_between(
+        interval.delta, interval.beta_lower, interval.beta_upper, color=style.VERMILION, alpha=0.08, linewidth=0.0
+    )
     for name, values in (("beta_lower", interval.beta_lower), ("beta_upper", interval.beta_upper)):
         label = f"passive {name}, d = {interval.d:g}"
         ax.plot(
@@ -90,30 +94,16 @@ def _draw_passive(ax: Axes, interval: DampingInterval) -> None:
 
 def _label_curves(ax: Axes, intervals: tuple[DampingInterval, ...], colors: dict[float, object]) -> None:
     """Name the delay of each curve at its right end; the two models of one delay share a name."""
-    low, high = ax.get_ylim()
     solid = [interval for interval in intervals if interval.delay_model == "held"] or list(intervals)
+    names = [f"$d = {interval.d:g}$" for interval in solid]
     ends = [float(interval.beta_upper[-1]) for interval in solid]
-    places = style.spread(ends, 0.042 * (high - low))
-    for interval, end, place in zip(solid, ends, places, strict=True):
-        ax.annotate(
-            f"$d = {interval.d:g}$",
-            (float(interval.delta[-1]), end),
-            xytext=(1.015, (place - low) / (high - low)),
-            textcoords="axes fraction",
-            color=colors[interval.d],
-            fontsize=8,
-            va="center",
-            annotation_clip=False,
-        )
+    style.label_ends(ax, names, ends, [colors[interval.d] for interval in solid])
 
 
 def _legend_handles(data: ZeroStiffnessData) -> list[Line2D]:
     handles = []
     if any(interval.delay_model == "fractional_power" for interval in data.stable):
-        handles = [
-            Line2D([], [], color=style.GRAY, label="held delay (exact)"),
-            Line2D([], [], color=style.GRAY, linestyle=style.DASHED, label=r"fractional power $z^{1+d}$"),
-        ]
+        handles = style.delay_model_handles()
     if data.passive:
         label = "passivity condition"
         handles.append(Line2D([], [], color=style.VERMILION, linestyle=style.DASH_DOTTED, linewidth=1.3, label=label))

@@ -18,19 +18,23 @@ from zwidth.loop import (
     check_delay_model,
     frequency_boundary,
     frequency_loop,
+    poison,
     valid_device,
 )
 from zwidth.stability.bracketing import bisect
 from zwidth.stability.curve import lobe_end
-from zwidth.stability.poles import unstable_poles
+from zwidth.stability.poles import radius_by_companion
 from zwidth.stability.ridge import ridge_kernel
 from zwidth.stability.ridge_kkt import frequency_residual
 from zwidth.status import Status
 
 # Cells into which the lobe is cut to bracket its crossings with a line.
 _CELLS = 256
-# Pole counts are taken this far (relative) before and behind a boundary point: beyond the count's own rounding.
-_SIDE_STEP = 1e-8
+# Poles are looked at this far (relative) before and behind a boundary point, until they tell the sides apart. A small
+# step does not leave the tip of a corner on its far side; a large one still moves the poles of a very soft wall.
+_SIDE_STEPS = (1e-8, 1e-5, 1e-11, 1e-14)
+# Below this distance from the unit circle the magnitude of a pole, double ones included, may be rounding.
+_ROUNDING = 1e-10
 # What to look for on a line: its lowest crossing, the next one above that, or the first one ahead of its origin.
 _LOWEST, _ABOVE_LOWEST, _AHEAD = 0.0, 1.0, 2.0
 
@@ -73,11 +77,10 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
 
 def _boundary_kernel(omega: Array, delta: Array, d: Array, delay: str) -> BoundaryCurve:
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
-    spread = omega + delta + d
-    poison = jnp.where(ok, 0.0, jnp.nan) * spread * (1.0 + spread)
+    spoiled = poison(ok, omega, delta, d)
     omega, delta, d = (jnp.where(ok, value, 1.0) for value in (omega, delta, d))
     curve = frequency_boundary(omega, frequency_loop(delta, d, delay), delay)
-    return BoundaryCurve(curve.alpha + poison, curve.beta + poison)
+    return BoundaryCurve(curve.alpha + spoiled, curve.beta + spoiled)
 
 
 class BoundaryPoint(NamedTuple):
@@ -116,14 +119,15 @@ def boundary_point(
 
     Returns:
         BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (0 and pi: the real ones);
-        ``status``, NO_BOUNDARY with NaN where the line has no stable part.
+        ``status``, NO_BOUNDARY with NaN where the line has no stable part, NOT_CONVERGED with NaN where the wall is
+        too soft (alpha below about 1e-30) for its frequency to be found.
 
     Raises:
         InputError: not exactly one line is given, an argument is no real number, or a name is unknown.
 
     Numerics:
-        Agrees with the closed form to 1e-12. Called directly with a held delay, the poles on both sides are counted
-        and the point is accepted only where the inner side is stable and the outer is not. Traced calls rely on the
+        Agrees with the closed form to 1e-12. Called directly with a held delay, a point is refused where the poles a
+        little before and behind it contradict that the line leaves the stable set there. Traced calls rely on the
         single-lobe shape of the stable set instead. Traceable, also in d.
 
     References:
@@ -178,8 +182,7 @@ def _point_kernel(
     delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array, search: Array, delay: str
 ) -> BoundaryPoint:
     inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
-    total = sum(inputs)
-    ok = valid_device(delta, d) & jnp.isfinite(total) & ((dalpha != 0) | (dbeta != 0))
+    ok = valid_device(delta, d) & jnp.isfinite(sum(inputs)) & ((dalpha != 0) | (dbeta != 0))
     delta, d, *direction = (jnp.where(ok, value, 1.0) for value in inputs)
     line = _Line(*direction)
     loop = frequency_loop(delta, d, delay)
@@ -187,19 +190,23 @@ def _point_kernel(
     on_curve = _curve_crossings(line, omegas, loop, delay)
     real = _real_pole_crossings(line, loop)
     index, exists = _choose(on_curve, real, search)
+    # For alpha <= 0 a real pole is at 1 or beyond, whatever beta.
+    exists = exists & ((line.dalpha != 0) | (line.alpha > 0))
     cell = jnp.minimum(index, _CELLS - 1)
     omega, distance, converged = _polish(line, omegas[cell], omegas[cell + 1], loop, delay)
     is_real = index >= _CELLS
     omega = jnp.where(is_real, jnp.where(index == _CELLS, 0.0, jnp.pi), omega)
     distance = jnp.where(is_real, real[jnp.clip(index - _CELLS, 0, 1)], distance)
-    found = exists & (is_real | converged)
-    status = jnp.where(ok, jnp.where(found, Status.OK, Status.NO_BOUNDARY), Status.INVALID_INPUT)
-    poison = jnp.where(ok & found, 0.0, jnp.nan) * total * (1.0 + total)
+    solved = is_real | converged
+    found = ok & exists & solved
+    status = jnp.where(exists, jnp.where(solved, Status.OK, Status.NOT_CONVERGED), Status.NO_BOUNDARY)
+    status = jnp.where(ok, status, Status.INVALID_INPUT)
+    spoiled = poison(found, *inputs)
     return BoundaryPoint(
-        line.alpha + distance * line.dalpha + poison,
-        line.beta + distance * line.dbeta + poison,
-        omega + poison,
-        jax.lax.stop_gradient(status),
+        line.alpha + distance * line.dalpha + spoiled,
+        line.beta + distance * line.dbeta + spoiled,
+        omega + spoiled,
+        status.astype(jnp.int32),
     )
 
 
@@ -269,21 +276,38 @@ def _polish(line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay:
         max_steps=8,
         throw=False,
     )
-    close = jnp.abs(solution.value[1] - start) <= 1e-6
-    return solution.value[1], solution.value[0] * scale, bracketed & close
+    omega, distance = solution.value[1], solution.value[0] * scale
+    # Of a wall softer than about 1e-30 the frequency is below what a bracket resolves.
+    wall = frequency_boundary(omega, loop, delay)
+    missed = jnp.abs(line.offset(wall)) / jnp.hypot(line.dalpha, line.dbeta)
+    hit = missed <= 1e-9 * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
+    return omega, distance, bracketed & hit & (jnp.abs(omega - start) <= 1e-6)
 
 
 def _counted(point: BoundaryPoint, everything: tuple[ArrayLike, ...], search: float) -> BoundaryPoint:
-    """Keep a point only where counting poles finds the inner side stable and the outer one not."""
-    delta, d, _, _, dalpha, dbeta = (np.asarray(value, dtype=np.float64) for value in everything)
-    alpha, beta = np.asarray(point.alpha), np.asarray(point.beta)
+    """Keep a point unless the poles beside it say that the inner side is unstable or the outer one stable."""
+    numbers = [np.asarray(value, dtype=np.float64) for value in everything]
+    status = np.asarray(point.status)
+    delta, d, _, _, dalpha, dbeta = (np.broadcast_to(number, status.shape).ravel() for number in numbers)
+    alpha, beta = np.asarray(point.alpha).ravel(), np.asarray(point.beta).ravel()
     outward = -1.0 if search == _LOWEST else 1.0
-    length = np.hypot(dalpha, dbeta)
-    step = outward * _SIDE_STEP * np.hypot(alpha, beta) / np.where(length > 0, length, 1.0)
-    inner = np.asarray(unstable_poles(alpha - step * dalpha, beta - step * dbeta, delta, d))
-    outer = np.asarray(unstable_poles(alpha + step * dalpha, beta + step * dbeta, delta, d))
-    found = np.asarray(point.status) == Status.OK
-    right = found & (inner == 0) & (outer > 0)
-    status = np.where(found & ~right, Status.NO_BOUNDARY, np.asarray(point.status))
-    alpha, beta, omega = (np.where(right, value, np.nan) for value in (alpha, beta, np.asarray(point.omega)))
-    return to_caller(BoundaryPoint(alpha, beta, omega, status), everything)
+    found = status.ravel() == Status.OK
+    confirmed, possible, refuted = (np.zeros(found.shape, dtype=bool) for _ in range(3))
+    for share in _SIDE_STEPS:
+        open_ = np.flatnonzero(found & ~confirmed & ~refuted)
+        if not open_.size:
+            break
+        rows = (alpha, beta, delta, d, dalpha, dbeta)
+        here_alpha, here_beta, here_delta, here_d, right, up = (row[open_] for row in rows)
+        step = outward * share * np.hypot(here_alpha, here_beta) / np.hypot(right, up)
+        inner, outer = (
+            np.asarray(radius_by_companion(here_alpha + away * right, here_beta + away * up, here_delta, here_d)) - 1.0
+            for away in (-step, step)
+        )
+        confirmed[open_] = (inner < -_ROUNDING) & (outer > _ROUNDING)
+        refuted[open_] = outer < -_ROUNDING
+        possible[open_] |= inner <= _ROUNDING
+    kept = (found & ~refuted & (confirmed | possible)).reshape(status.shape)
+    status = np.where((status == Status.OK) & ~kept, Status.NO_BOUNDARY, status)
+    walls = (np.where(kept, np.asarray(value), np.nan) for value in (point.alpha, point.beta, point.omega))
+    return to_caller(BoundaryPoint(*walls, status.astype(np.int32)), everything)

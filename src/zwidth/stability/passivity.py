@@ -24,7 +24,7 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64, is_traced, pointwise
 from zwidth.errors import TracedDelayError
-from zwidth.loop import valid_wall
+from zwidth.loop import poison, valid_wall
 from zwidth.plant import split_delay
 
 # Samples per half wave of the fastest term, how many peaks are refined, and by how many steps.
@@ -90,11 +90,10 @@ def _refined_peak(cost: Callable[[Array], Array], center: Array, step: float) ->
 def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, samples: int) -> Array:
     ok = valid_wall(alpha, beta, delta, d)
     safe_alpha, safe_beta, safe_d = (jnp.where(ok, value, 0.0) for value in (alpha, beta, d))
-    total = alpha + beta + delta + d
-    poison = jnp.where(ok, 0.0, jnp.nan) * total
+    spoiled = poison(ok, alpha, beta, delta, d)
     # A spring of negative stiffness stores unbounded energy, which the frequency condition does not see.
     margin = delta - needed_damping(safe_alpha, safe_beta, safe_d, samples)
-    return jnp.where(alpha < 0, jnp.minimum(margin, alpha), margin) + poison
+    return jnp.where(alpha < 0, jnp.minimum(margin, alpha), margin) + spoiled
 
 
 def _sample_count(d: ArrayLike) -> int:

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from zwidth._types import Array, ArrayLike
 from zwidth.grouping import Degree, by_degree
-from zwidth.loop import check_has_poles, coefficients, evaluate, plant_of, valid_wall
+from zwidth.loop import check_has_poles, coefficients, evaluate, plant_of, poison, valid_wall
 
 # The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
 _POLISHING_STEPS = 3
@@ -21,6 +21,7 @@ def companion(monic: Array) -> Array:
 def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
     """All poles of one point, shape (degree.poles,); NaN where the input is out of range."""
     ok = valid_wall(alpha, beta, delta, d)
+    spoiled = poison(ok, alpha, beta, delta, d)
     alpha, beta, delta = (jnp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     d = jnp.where(ok, d, float(degree.whole))
     plant = plant_of(delta, d, degree)
@@ -28,7 +29,7 @@ def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degre
     for _ in range(_POLISHING_STEPS):
         value, slope = evaluate(z, alpha, beta, plant, degree)
         z = _safe_step(z, value, slope, alpha, beta, plant, degree)
-    return jnp.where(ok, z, jnp.nan)
+    return z + spoiled
 
 
 def _safe_step(z, value, slope, alpha, beta, plant, degree: Degree) -> Array:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Literal, NamedTuple, TypeAlias
 
-import jax
 import jax.numpy as jnp
 
 from zwidth._types import Array, ArrayLike, DelayModel
@@ -95,6 +94,4 @@ def ridge_kernel(delta: Array, d: Array, delay: str, method: str = "newton") -> 
     found = jnp.where(converged, 1.0, jnp.nan)
     status = jnp.where(ok, jnp.where(converged, Status.OK, Status.NOT_CONVERGED), Status.INVALID_INPUT)
     kind = jnp.where(is_corner, RidgeKind.CORNER, RidgeKind.SMOOTH)
-    return RidgePoint(
-        alpha * found, beta * found, omega * found, kind.astype(jnp.int32), status.astype(jnp.int32)
-    )
+    return RidgePoint(alpha * found, beta * found, omega * found, kind.astype(jnp.int32), status.astype(jnp.int32))

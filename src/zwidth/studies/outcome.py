@@ -31,7 +31,7 @@ class Outcome:
 
     table: Table = field(default_factory=dict)
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
-    figures: dict[str, Callable[[], Figure]] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 

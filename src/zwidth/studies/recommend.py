@@ -116,37 +116,42 @@ def _summary(device: PhysicalDevice, data: RecommendationData, verdict: Assessme
 
 def _markdown(device: PhysicalDevice, data: RecommendationData, verdict: Assessment) -> str:
     """The recommendation for a reader."""
-    force_per_speed = "N s/m"
-    delay = with_unit(device.delay.seconds(device.period), "s")
-    settling = _settling(data.response)
-    missing = with_unit(-verdict.passivity_margin, force_per_speed)
-    passive = "yes" if verdict.passive else f"no; that would take {missing} more physical damping"
-    lower, upper = (
-        with_unit(value, force_per_speed) for value in (data.virtual_damping_lower, data.virtual_damping_upper)
+    stiffness, stiffness_max = (with_unit(value, "N/m") for value in (data.stiffness, data.stiffness_max))
+    dampings = (
+        data.virtual_damping,
+        data.virtual_damping_at_max,
+        data.virtual_damping_lower,
+        data.virtual_damping_upper,
+        device.damping,
+        -verdict.passivity_margin,
     )
-    share = f"{100 * data.stiffness_fraction:g} %"
-    return f"""# Recommended virtual wall
-
-Device: m = {with_unit(1e3 * device.mass, "g")}, b = {with_unit(device.damping, force_per_speed)}, sampled every \
-{with_unit(device.period, "s")}, force delayed by {delay}
-(normalized: delta = {plain(verdict.delta)}, d = {plain(verdict.d)}).
-
-| | stiffness K | virtual damping B | alpha | beta |
-|---|---|---|---|---|
-| stiffest stable wall | {with_unit(verdict.stiffness_max, "N/m")} | \
-{with_unit(verdict.virtual_damping_at_max, force_per_speed)} | {plain(verdict.alpha_max)} | {plain(verdict.beta_at_max)} |
-| **recommended, {share} of it** | **{with_unit(data.stiffness, "N/m")}** | \
-**{with_unit(data.virtual_damping, force_per_speed)}** | {plain(verdict.alpha)} | {plain(verdict.beta)} |
-
-The recommended wall
-
-- is {"stable" if verdict.stable else "NOT stable"}: spectral radius {verdict.spectral_radius:.6f};
-- stays stable for B between {lower} and {upper};
-- settles (2 % band) {settling};
-- is passive: {passive}.
-
-No stiffness above the maximum can be made stable by any virtual damping.
-"""
+    recommended, at_max, lower, upper, physical, missing = (with_unit(value, "N s/m") for value in dampings)
+    period, delay = (with_unit(value, "s") for value in (device.period, device.delay.seconds(device.period)))
+    passive = "yes" if verdict.passive else f"no, that would take {missing} more physical damping"
+    lines = [
+        "# Recommended virtual wall",
+        "",
+        f"Device: m = {with_unit(1e3 * device.mass, 'g')}, b = {physical}, sampled every {period}, force delayed by",
+        f"{delay} (normalized: delta = {plain(verdict.delta)}, d = {plain(verdict.d)}).",
+        "",
+        "| | stiffness K | virtual damping B | alpha | beta |",
+        "|---|---|---|---|---|",
+        f"| stiffest stable wall | {stiffness_max} | {at_max} "
+        f"| {plain(verdict.alpha_max)} | {plain(verdict.beta_at_max)} |",
+        f"| **recommended, {100 * data.stiffness_fraction:g} % of it** | **{stiffness}** | **{recommended}** "
+        f"| {plain(verdict.alpha)} | {plain(verdict.beta)} |",
+        "",
+        "The recommended wall",
+        "",
+        f"- is {'stable' if verdict.stable else 'NOT stable'}: spectral radius {verdict.spectral_radius:.6f};",
+        f"- stays stable at this K for B between {lower} and {upper};",
+        f"- settles to 2 % {_settling(data.response)};",
+        f"- is passive: {passive}.",
+        "",
+        "No virtual damping makes a stiffness above the maximum stable.",
+        "",
+    ]
+    return "\n".join(lines)
 
 
 def _settling(response: Response) -> str:

@@ -8,6 +8,7 @@ import numpy as np
 
 from zwidth.figures import draw_step
 from zwidth.figures.data import Response, StepData
+from zwidth.quantities import with_unit
 from zwidth.response import step_response
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.outcome import Outcome, stack
@@ -44,13 +45,13 @@ def run_step(study: StepStudy) -> Outcome:
     physical = all(isinstance(device, PhysicalDevice) for device in study.devices)
     responses, notes = [], []
     for number, (device, given) in enumerate(study.pairs(), start=1):
-        label = device.label or rf"device {number}"
         if given is not None:
             alpha, beta = normalized_wall(device, given)
         else:
             ridge = alpha_max(device.delta, device.d)
             assert study.stiffness_fraction is not None, "a study without walls has a fraction"
             alpha, beta = study.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
+        label = device.label or _wall_text(device, alpha, beta) or f"device {number}"
         times = {"periods": study.periods(device), "substeps": study.substeps}
         responses.append(respond(device, alpha, beta, label=label, physical=physical, **times))
         if not np.isfinite(responses[-1].settling_time):
@@ -61,6 +62,14 @@ def run_step(study: StepStudy) -> Outcome:
         figures={"": partial(draw_step, data)},
         notes=tuple(notes),
     )
+
+
+def _wall_text(device: AnyDevice, alpha: float, beta: float) -> str:
+    """The wall in SI units, the name of a response whose device has none."""
+    if not isinstance(device, PhysicalDevice):
+        return ""
+    wall = device.to_scene().to_si(alpha=alpha, beta=beta)
+    return f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"
 
 
 def response_columns(response: Response, physical: bool) -> dict[str, object]:

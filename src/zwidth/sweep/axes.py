@@ -10,7 +10,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema, create_model
@@ -33,6 +33,9 @@ LONGEST_AXIS = 10_000_000
 
 MAX_DELAY_PERIODS = 10_000.0
 """A loop has as many poles as its delay has periods, and a few more."""
+
+Entry: TypeAlias = Callable[[Any], float]
+"""Reads one value of an axis, or raises a problem."""
 
 _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
 
@@ -176,37 +179,44 @@ class _Spacing(Strict):
         return []
 
 
-def _spacing_model(name: str, allowed: Range) -> type[_Spacing]:
-    """The mapping below ``linear`` or ``log`` for entries in a given range."""
-    end = Annotated[float, BeforeValidator(number(allowed))]
+def _spacing_model(name: str, entry: Entry) -> type[_Spacing]:
+    """The mapping below ``linear`` or ``log`` for ends that ``entry`` reads."""
+    end = Annotated[float, BeforeValidator(entry)]
     count = Annotated[int, BeforeValidator(whole_number(Range(2, LONGEST_AXIS)))]
     model = create_model(name, __base__=_Spacing, start=(end, ...), stop=(end, ...), num=(count, ...))
     model.what = f"an axis with {name!r}"
     return model
 
 
-def _parse_list(raw: list[Any] | tuple[Any, ...], entry: Callable[[Any], float]) -> ListAxis:
+def entries_of(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
+    """The entries of a list, each read by ``entry``; all faults are reported with their positions."""
     if not raw:
         raise problem("got an empty list", "an axis has at least one value", "fill the list")
-    found = list(repeated(raw, "remove it"))
+    found = list(repeated(raw, "remove it")) if distinct else []
     entries = []
     for index, value in enumerate(raw):
         try:
             entries.append(entry(value))
         except PydanticCustomError as error:
             found.append(((index,), error))
+    if distinct and not found:
+        # Two spellings of one value, as 1 ms and 0.001.
+        found = list(repeated(entries, "remove it"))
     if found:
         raise validation_error("axis", found)
-    return ListAxis(tuple(entries))
+    return tuple(entries)
 
 
 def axis(allowed: Range = ANY) -> Callable[[Any], Axis]:
     """A validator for an axis whose values lie in a given range."""
-    entry = number(allowed)
     # Equal ratios need values of one sign; a log axis of negative numbers has no use here.
-    positive = Range(0.0, allowed.high, low_open=True)
+    return axis_of(number(allowed), number(Range(0.0, allowed.high, low_open=True)))
+
+
+def axis_of(entry: Entry, positive: Entry) -> Callable[[Any], Axis]:
+    """A validator for an axis of what ``entry`` reads; ``positive`` reads the ends of equal ratios."""
     spellings: dict[str, tuple[type[_Spacing], type[_SpacedAxis]]] = {
-        "linear": (_spacing_model("linear", allowed), LinearAxis),
+        "linear": (_spacing_model("linear", entry), LinearAxis),
         "log": (_spacing_model("log", positive), LogAxis),
     }
 
@@ -214,7 +224,7 @@ def axis(allowed: Range = ANY) -> Callable[[Any], Axis]:
         if isinstance(raw, Axis):
             return raw
         if isinstance(raw, list | tuple):
-            return _parse_list(raw, entry)
+            return ListAxis(entries_of(raw, entry))
         if not isinstance(raw, dict):
             return PointAxis(entry(raw))
         if len(raw) != 1:
@@ -245,6 +255,12 @@ def _schema(allowed: Range) -> WithJsonSchema:
         entry["minimum"] = 0
     if allowed.high < np.inf:
         entry["maximum"] = allowed.high
+    positive = {**{key: entry[key] for key in entry if key != "minimum"}, "exclusiveMinimum": 0}
+    return axis_schema(entry, positive)
+
+
+def axis_schema(entry: dict[str, Any], positive: dict[str, Any]) -> WithJsonSchema:
+    """The JSON Schema of an axis, from those of an entry and of the end of a log axis."""
 
     def spaced(end: dict[str, Any]) -> dict[str, Any]:
         count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
@@ -255,7 +271,6 @@ def _schema(allowed: Range) -> WithJsonSchema:
             "additionalProperties": False,
         }
 
-    positive = {**{key: entry[key] for key in entry if key != "minimum"}, "exclusiveMinimum": 0}
     keyed = [
         {"type": "object", "properties": {key: spec}, "required": [key], "additionalProperties": False}
         for key, spec in (("linear", spaced(entry)), ("log", spaced(positive)))

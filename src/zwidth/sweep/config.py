@@ -33,6 +33,7 @@ from zwidth.sweep.faults import (
     printable,
     problems_of,
 )
+from zwidth.sweep.table import files_relative_to
 
 __all__ = ["Config", "ConfigFileError", "Fault", "config_json_schema", "load_config"]
 
@@ -73,7 +74,8 @@ def load_config(path: str | bytes | os.PathLike[str]) -> Config:
     problems = []
     config = None
     try:
-        config = Config.model_validate(tree.data)
+        with files_relative_to(Path(file).parent):
+            config = Config.model_validate(tree.data)
     except ValidationError as error:
         problems = problems_of(error)
     faults = tree.faults + locate(file, problems, tree.values, tree.keys)

@@ -32,8 +32,8 @@ _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness"
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
 
 # Wide enough for any sampled loop, narrow enough that T^2 and 1/T^2 stay within float64.
-_PERIODS = Range(1e-12, 1e9)
-_RATES = Range(1e-9, 1e12)
+PERIODS = Range(1e-12, 1e9)
+RATES = Range(1e-9, 1e12)
 
 AnyDelayModel = Annotated[DelayModel, BeforeValidator(one_of(*DELAY_MODELS))]
 
@@ -58,7 +58,7 @@ class _OneKind(Strict):
 def _period(value: Any, info: ValidationInfo) -> float:
     """The period itself, or one over the rate."""
     if value is not None:
-        return quantity(TIME, _PERIODS)(value)
+        return quantity(TIME, PERIODS)(value)
     # A rate that failed its own check is absent from the data; that fault is enough.
     rate = info.data.get("rate", 1.0)
     if rate is None:
@@ -83,7 +83,7 @@ class _PhysicalPlant(_OneKind):
     damping: Damping = 0.0
     """Physical damping b of the device in N s/m, >= 0."""
 
-    rate: Annotated[float, BeforeValidator(quantity(RATE, _RATES)), RATE_SCHEMA] | None = Field(
+    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), RATE_SCHEMA] | None = Field(
         default=None, exclude=True
     )
     """Sampling rate 1/T in Hz; give it or the period."""

@@ -19,10 +19,11 @@ from zwidth.sweep.faults import (
 from zwidth.sweep.fields import Name, Strict, Text, looks_like_number, members
 from zwidth.sweep.responses import RecommendStudy, StepStudy
 from zwidth.sweep.studies import BoundaryStudy, MapStudy, PassivityStudy, RidgeStudy, Study
+from zwidth.sweep.sweeps import SweepStudy
 
 FORMAT_VERSION = 1
 
-AnyStudy: TypeAlias = BoundaryStudy | MapStudy | RidgeStudy | PassivityStudy | StepStudy | RecommendStudy
+AnyStudy: TypeAlias = BoundaryStudy | MapStudy | RidgeStudy | PassivityStudy | StepStudy | RecommendStudy | SweepStudy
 
 STUDIES: dict[str, type[Study]] = {
     "boundary": BoundaryStudy,
@@ -31,6 +32,7 @@ STUDIES: dict[str, type[Study]] = {
     "passivity": PassivityStudy,
     "step": StepStudy,
     "recommend": RecommendStudy,
+    "sweep": SweepStudy,
 }
 """The models of the studies by the name of their kind."""
 

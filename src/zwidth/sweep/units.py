@@ -104,7 +104,7 @@ def quantity(dimension: Dimension, allowed: Range = ANY) -> Callable[[Any], floa
     return validate
 
 
-def _span(allowed: Range) -> Callable[[Any], Span]:
+def span(allowed: Range) -> Callable[[Any], Span]:
     def validate(value: Any) -> Span:
         if isinstance(value, Span):
             return value
@@ -114,7 +114,7 @@ def _span(allowed: Range) -> Callable[[Any], Span]:
     return validate
 
 
-def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
+def unit_schema(dimension: Dimension, *more: str) -> WithJsonSchema:
     units = ", ".join((*dimension.units, *more))
     text = f"A number in {dimension.base}, or a number with one of the units {units}."
     pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
@@ -127,18 +127,18 @@ def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
     )
 
 
-Mass = Annotated[float, BeforeValidator(quantity(MASS, POSITIVE)), _schema(MASS)]
-Damping = Annotated[float, BeforeValidator(quantity(DAMPING, NOT_NEGATIVE)), _schema(DAMPING)]
-VirtualDamping = Annotated[float, BeforeValidator(quantity(DAMPING)), _schema(DAMPING)]
-Stiffness = Annotated[float, BeforeValidator(quantity(STIFFNESS)), _schema(STIFFNESS)]
+Mass = Annotated[float, BeforeValidator(quantity(MASS, POSITIVE)), unit_schema(MASS)]
+Damping = Annotated[float, BeforeValidator(quantity(DAMPING, NOT_NEGATIVE)), unit_schema(DAMPING)]
+VirtualDamping = Annotated[float, BeforeValidator(quantity(DAMPING)), unit_schema(DAMPING)]
+Stiffness = Annotated[float, BeforeValidator(quantity(STIFFNESS)), unit_schema(STIFFNESS)]
 Delay = Annotated[
     Span,
-    PlainValidator(_span(NOT_NEGATIVE)),
+    PlainValidator(span(NOT_NEGATIVE)),
     PlainSerializer(str, return_type=str),
-    _schema(TIME, *_PERIODS),
+    unit_schema(TIME, *_PERIODS),
 ]
 Duration = Annotated[
-    Span, PlainValidator(_span(POSITIVE)), PlainSerializer(str, return_type=str), _schema(TIME, *_PERIODS)
+    Span, PlainValidator(span(POSITIVE)), PlainSerializer(str, return_type=str), unit_schema(TIME, *_PERIODS)
 ]
-PERIOD_SCHEMA = _schema(TIME)
-RATE_SCHEMA = _schema(RATE)
+PERIOD_SCHEMA = unit_schema(TIME)
+RATE_SCHEMA = unit_schema(RATE)

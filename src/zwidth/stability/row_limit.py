@@ -1,0 +1,228 @@
+"""The stiffest stable wall of each virtual damping, in closed form: where a row of the (alpha, beta) plane ends.
+
+For a held delay d = n + f the stable walls of one (beta, delta, d) were found to be ``0 < alpha < limit``: the limit is
+the first lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1. Seen, not proved: pole
+counts on some 700,000 random walls, on both sides of the limit and far from it, with delta = 0 and 1e-6 to 1e6, n = 0
+to 60, f anywhere, down to 1e-16 beside whole numbers. `VERIFIED_DELAY` and `VERIFIED_DAMPING` state the range.
+
+Notation: ``N(z) = a2 z^2 + a1 z + a0`` of `zwidth.plant`, ``em = 1 - c``, ``sigma = a2 + a0``, ``mu = a2 - a0``,
+``y = sin(w/2)^2``, ``k = n + 1/2``, and the boundary at ``z = e^(j w)`` in the form
+
+    alpha = 2 sin(w/2)/V (sin((n+1) w)/cos(w/2) E + 2 sin(w/2) cos((n+1) w) H)
+    beta  = -(cos(k w)/cos(w/2) E - 2 sin(w/2) sin(k w) H)/V
+
+    V = |N|^2          = phi1^2 - 4 (a1 sigma + 4 a2 a0) y + 16 a2 a0 y^2
+    E = V Re (z - c)z/N = em phi1 - 2 (phi1 + sigma em - 2 mu) y + 8 a0 y^2
+    H = V Im (z - c)z/N / sin w = phi1 (phi1 + f em) - 4 a0 y
+
+Rows are told apart by ``b = beta + delta``, which vanishes with w^2: ``V b = delta V - cos(k w)/cos(w/2) E + ...`` is
+rearranged below so that nothing cancels, for every damping.
+"""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from zwidth import phi
+from zwidth._types import Array
+from zwidth.loop import valid_device
+from zwidth.plant import held_plant, split_delay
+
+# Beyond these the single lobe is not assumed.
+VERIFIED_DELAY = 500.0
+VERIFIED_DAMPING = 1e6
+
+# From the starting points below each sequence doubles its digits a step; the last step only confirms.
+_END_STEPS = 6
+_ROW_STEPS = 5
+
+_SIN = [1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800, -1 / 1307674368000]
+_COS = [1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600, -1 / 87178291200, 1 / 20922789888000]
+
+SHORT_FIELDS = ("ok", "delta", "f", "p1", "p2", "psi", "em", "a1", "a2", "a0", "u0", "u1", "v1", "tilt", "start")
+LONG_FIELDS = (
+    *("ok", "delta", "k", "g0", "g1", "g2", "h0", "h1", "v0", "v1", "v2", "b1", "b2"),
+    *("end", "top", "bend"),
+)
+
+
+def _horner(coefficients: list[float], x: Array) -> Array:
+    total = jnp.full_like(x, coefficients[-1])
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * x + coefficient
+    return total
+
+
+def _sin_cos(x: Array) -> tuple[Array, Array]:
+    """Sine and cosine for 0 <= x <= pi/4 by their series, several times faster than XLA's own for float64."""
+    square = x * x
+    return x * _horner(_SIN, square), _horner(_COS, square)
+
+
+def short_device(delta: Array, d: Array) -> Array:
+    """What rows with d < 1 need of a device: `SHORT_FIELDS` along a new first axis."""
+    ok = valid_device(delta, d) & (d < 1)
+    delta, f = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 0.0)
+    plant = held_plant(delta, f)
+    t = 1.0 - f
+    p1 = phi.phi1(delta)
+    p1_t, psi_t = phi.phi1(delta * t), phi.psi(delta * t)
+    # V b = y (u0 + u1 y): both coefficients are sums of terms of one sign.
+    u0 = 4.0 * p1 * (f * f * plant.em + f * p1 + t * (f * p1_t + t * psi_t) + plant.a0)
+    u1 = -16.0 * plant.a0 * (f + t * p1_t)
+    v1 = -4.0 * (plant.a1 * (plant.a2 + plant.a0) + 4.0 * plant.a2 * plant.a0)
+    tilt = 0.5 * plant.gap / (1.0 + plant.c)
+    start = p1 * ((1.0 + f) * plant.em + p1)
+    fields = (ok, delta, f, p1, phi.phi2(delta), phi.psi(delta), plant.em, plant.a1, plant.a2, plant.a0)
+    return jnp.stack([jnp.asarray(field, delta.dtype) for field in (*fields, u0, u1, v1, tilt, start)])
+
+
+def short_row(beta: Array, fields: Array) -> Array:
+    """The limit for d < 1, where the lobe is a quadratic in y; 0 where no alpha is stable, NaN for bad input.
+
+    Beyond the corner, the double pole at z = -1, only the line bounds the row.
+    """
+    ok, delta, f, p1, p2, psi, em, a1, a2, a0, u0, u1, v1, tilt, start = fields
+    b = beta + delta
+    whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + p2 * b))
+    linear = u0 - b * v1
+    square = linear * linear + 4.0 * b * p1 * p1 * (u1 - 16.0 * b * a2 * a0)
+    y = 2.0 * b * p1 * p1 / (linear + jnp.sqrt(jnp.maximum(square, 0.0)))
+    slope = -4.0 * (a1 + (3.0 + em) * a0)
+    curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / (p1 * p1 + y * (v1 + 16.0 * a2 * a0 * y))
+    corner_reached = (tilt > 0) & (start + slope + 16.0 * a0 > 0)
+    beyond = jnp.where(corner_reached, jnp.inf, 0.0)
+    fractional = jnp.where((square >= 0) & (y <= 1), curve, beyond)
+    limit = jnp.where(f == 0, whole, fractional)
+    line = 1.0 / jnp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
+    limit = jnp.where(tilt > 0, jnp.minimum(limit, line), limit)
+    return _finish(limit, b, beta, ok)
+
+
+def _finish(limit: Array, b: Array, beta: Array, ok: Array) -> Array:
+    limit = jnp.where((b > 0) & (limit > 0), limit, 0.0)
+    return jnp.where((ok > 0) & jnp.isfinite(beta), limit, jnp.nan)
+
+
+def long_device(delta: Array, d: Array) -> Array:
+    """What rows with d >= 1 need of a device, its lobe's end included: `LONG_FIELDS` along a new first axis."""
+    ok = valid_device(delta, d) & (d >= 1)
+    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
+    whole, f = split_delay(d)
+    plant = held_plant(delta, f)
+    c, em, a2, a1, a0, _ = plant
+    k = whole + 0.5
+    p1 = phi.phi1(delta)
+    sigma, mu = a2 + a0, a2 - a0
+    g = (em * p1, -2.0 * (p1 + sigma * em - 2.0 * mu), 8.0 * a0)
+    h = (p1 * (p1 + f * em), -4.0 * a0)
+    v = (p1 * p1, -4.0 * (a1 * sigma + 4.0 * a2 * a0), 16.0 * a2 * a0)
+    b1 = 2.0 * p1 - 4.0 * mu + 2.0 * delta * (sigma * (sigma - a1) - 8.0 * a2 * a0)
+    b2 = -8.0 * a0 * (1.0 - 2.0 * delta * a2)
+    fields = [jnp.asarray(ok, delta.dtype), delta, k, *g, *h, *v, b1, b2]
+    end = _lobe_end(fields, em / (p1 + f * em), d)
+    total, _, scale, _ = _offset(end, fields)
+    top = total / scale
+    # sqrt(b) starts in proportion to w, with this factor.
+    start = jnp.sqrt((0.25 * b1 + 0.5 * g[0] * (k * k - 0.25) + k * h[0]) / v[0])
+    bend = jnp.sqrt(top) / (end * start) - 2.0 / jnp.pi
+    return jnp.stack([*fields, end, top, bend])
+
+
+class _Angles:
+    """The trigonometric terms of one frequency, from two short series."""
+
+    def __init__(self, omega: Array, fields: list[Array] | Array):
+        _, _, k, g0, g1, g2, h0, h1, v0, v1, v2, b1, b2, *_ = fields
+        s4, c4 = _sin_cos(0.25 * omega)
+        sk4, ck4 = _sin_cos(0.25 * k * omega)
+        # Differences of cosines are formed from half angles, which keeps their relative accuracy at small w.
+        s_half = 2.0 * sk4 * ck4
+        self.s, self.c = 2.0 * s4 * c4, 1.0 - 2.0 * s4 * s4
+        self.sin_k = 2.0 * s_half * (1.0 - 2.0 * sk4 * sk4)
+        self.cos_k = 1.0 - 2.0 * s_half * s_half
+        # cos(w/2) - cos(k w)
+        self.drop = 2.0 * (s_half * s_half - s4 * s4)
+        y = self.s * self.s
+        self.E, self.H, self.V = g0 + y * (g1 + y * g2), h0 + y * h1, v0 + y * (v1 + y * v2)
+        # Derivatives with respect to w: dy/dw = sin(w/2) cos(w/2).
+        dy = self.s * self.c
+        self.dE, self.dH, self.dV = dy * (g1 + 2.0 * y * g2), dy * h1, dy * (v1 + 2.0 * y * v2)
+        self.base, self.dbase = y * (b1 + y * b2), dy * (b1 + 2.0 * y * b2)
+
+
+def _offset(omega: Array, fields: list[Array] | Array) -> tuple[Array, Array, Array, Array]:
+    """``b = beta + delta`` on the curve as T/Q, accurate relative to b itself, with the derivatives of T and Q."""
+    at = _Angles(omega, fields)
+    k, s, c = fields[2], at.s, at.c
+    total = c * at.base + at.E * at.drop + s * c * 2.0 * at.sin_k * at.H
+    d_total = c * at.dbase - 0.5 * s * at.base + at.dE * at.drop + at.E * (k * at.sin_k - 0.5 * s)
+    d_total += at.H * (at.sin_k * (1.0 - 2.0 * s * s) + 2.0 * k * s * c * at.cos_k) + 2.0 * s * c * at.sin_k * at.dH
+    return total, d_total, c * at.V, c * at.dV - 0.5 * s * at.V
+
+
+def _alpha(omega: Array, fields: list[Array] | Array) -> Array:
+    at = _Angles(omega, fields)
+    # (n + 1) w = k w + w/2
+    sine = at.sin_k * at.c + at.cos_k * at.s
+    cosine = at.cos_k * at.c - at.sin_k * at.s
+    return 2.0 * at.s * (sine / at.c * at.E + 2.0 * at.s * cosine * at.H) / at.V
+
+
+def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
+    """The first w at which alpha returns to 0: the phase of ``e^(j (n+1) w) (E + j sin w H)`` reaches pi there.
+
+    Newton's method on that phase, nearly linear in w; ``ratio`` is E/H at w = 0 and places the start between
+    pi/(2 (n+1)), for no damping, and pi/(n+1).
+    """
+    turns = fields[2] + 0.5
+    limit = jnp.pi / (d + 0.5)
+    omega = 0.5 * jnp.pi / turns * (1.0 + 0.7 * ratio / (ratio + 1.0 / turns))
+    for _ in range(_END_STEPS):
+        at = _Angles(omega, fields)
+        sine = at.sin_k * at.c + at.cos_k * at.s
+        cosine = at.cos_k * at.c - at.sin_k * at.s
+        sin_w, cos_w = 2.0 * at.s * at.c, 1.0 - 2.0 * at.s * at.s
+        F, dF = sin_w * at.H, cos_w * at.H + sin_w * at.dH
+        imaginary, real = sine * at.E + cosine * F, cosine * at.E - sine * F
+        size = at.E * at.E + F * F
+        # Less than a quarter turn away sin cos is a safe stand-in for the phase left; farther off, creep up.
+        left = jnp.where(real < 0, imaginary * real, -0.2 * size)
+        step = left / (turns * size + (at.E * dF - F * at.dE))
+        omega = jnp.minimum(omega - step, limit)
+    return omega
+
+
+def long_row(beta: Array, fields: Array) -> Array:
+    """The limit for d >= 1; 0 where no alpha is stable, NaN for bad input.
+
+    b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
+    lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
+    """
+    ok, delta, end, top, bend = fields[0], fields[1], fields[-3], fields[-2], fields[-1]
+    b = beta + delta
+    inside = (b > 0) & (b < top)
+    goal = jnp.where(inside, b, 0.5 * top)
+    r = jnp.sqrt(goal / top)
+    rest = jnp.sqrt((1.0 - r) * (1.0 + r))
+    # w/end = 2/pi arcsin r for strong damping; `bend` corrects the slope at 0 for the rest. The arcsine needs three
+    # digits only: half of the angle by its tangent, in a short series.
+    x = r / (1.0 + rest)
+    arcsine = 2.0 * x * (1.0 - x * x * (0.3323 - x * x * (0.1848 - 0.0691 * x * x)))
+    omega = end * jnp.minimum(2.0 / jnp.pi * arcsine + bend * r * rest, 1.0)
+    for _ in range(_ROW_STEPS):
+        total, d_total, scale, d_scale = _offset(omega, fields)
+        # 2 (b - sqrt(goal b))/b' with the root of goal/b as (1 + 3 x)/(3 + x): a single division.
+        part = goal * scale
+        step = 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))
+        omega = jnp.clip(omega - step, 0.0, end)
+    limit = jnp.where(inside, _alpha(omega, fields), 0.0)
+    return _finish(limit, b, beta, ok)
+
+
+def limit_kernel(beta: Array, delta: Array, d: Array) -> Array:
+    """The limit for any delay, elementwise, for use inside a transformation; NaN outside the verified range."""
+    short = short_row(beta, short_device(delta, d))
+    long = long_row(beta, long_device(delta, d))
+    known = (delta <= VERIFIED_DAMPING) & (d <= VERIFIED_DELAY)
+    return jnp.where(known, jnp.where(d < 1, short, long), jnp.nan)

@@ -1,0 +1,36 @@
+"""One chunk of one store, from nothing to done: the same function in this process, a worker and a cluster."""
+
+from __future__ import annotations
+
+import os
+from functools import lru_cache
+from pathlib import Path
+
+from zwidth.sweep.plan import Task
+from zwidth.sweep.store import Store
+
+
+@lru_cache(maxsize=4)
+def _opened(path: str, made: int) -> Store:
+    """A store that this process works on; ``made`` tells it from another one that took its place."""
+    return Store(Path(path))
+
+
+def perform(path: str, family: str, index: int) -> None:
+    """Compute and write one chunk, unless it is done already.
+
+    Args:
+        path: the store.
+        family: the family of outputs, "wall" or "device".
+        index: number of the chunk in that family.
+    """
+    store = _opened(path, os.stat(os.path.join(path, "zarr.json")).st_ino)
+    task = Task("device" if family == "device" else "wall", index)
+    if store.is_done(task):
+        return
+    # Loads JAX, which a process that only hands out work has no use for.
+    from zwidth.sweep.compute import compute
+
+    plan = store.plan.family(family)
+    block = store.grid.block(plan.place(index))
+    store.write(task, compute(plan.family, plan.outputs, block, store.plan.methods))

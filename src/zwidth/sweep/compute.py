@@ -1,0 +1,153 @@
+"""The outputs of one block of a sweep.
+
+A point's value must not depend on which other points its chunk holds, nor on who computes it. Every kernel therefore
+runs on pieces of one fixed size, of points that share what decides its shape: two compilations of one kernel, for
+batches of two sizes, may round differently.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from itertools import product
+from typing import TypeAlias
+
+import numpy as np
+
+from zwidth.stability.passivity import _sample_count as sample_count
+from zwidth.stability.passivity import passivity_margin
+from zwidth.stability.poles import companion_chunk, radius_by_companion
+from zwidth.stability.ridge import alpha_max
+from zwidth.status import Status
+from zwidth.sweep.grid import Block
+from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
+from zwidth.grouping import degree_of, groups
+
+Columns: TypeAlias = tuple[np.ndarray, ...]
+
+_PIECE = 1 << 12
+# Points whose columns are laid out at one time; more of them run one after the other.
+_LAID_OUT = 1 << 20
+_DECAY = math.log(50.0)
+
+
+def compute(family: Family, outputs: tuple[str, ...], block: Block, methods: dict[str, str]) -> dict[str, np.ndarray]:
+    """Every output of a family on a block, and its status; walls in shape (D, A, B), devices in shape (D,)."""
+    found = _devices(block) if family == "device" else _walls(outputs, block, methods)
+    return {name: found[name] for name in (*outputs, STATUS_OF[family])}
+
+
+def in_pieces(function: Callable[..., tuple[np.ndarray, ...]], columns: Columns, size: int) -> tuple[np.ndarray, ...]:
+    """Apply a function of equally long columns to pieces of exactly ``size`` points; the last one is filled up."""
+    count = columns[0].size
+    parts = []
+    for start in range(0, count, size):
+        piece = [column[start : start + size] for column in columns]
+        kept = piece[0].size
+        filled = [np.pad(column, (0, size - kept), mode="edge") for column in piece]
+        parts.append(tuple(np.asarray(leaf)[:kept] for leaf in function(*filled)))
+    return parts[0] if len(parts) == 1 else tuple(np.concatenate(leaves) for leaves in zip(*parts, strict=True))
+
+
+def _devices(block: Block) -> dict[str, np.ndarray]:
+    """What belongs to devices."""
+    alpha, beta, _, kind, status = in_pieces(lambda *columns: tuple(alpha_max(*columns)), (block.delta, block.d), _PIECE)
+    good = status == Status.OK
+    found = {
+        "alpha_max": alpha,
+        "beta_at_max": beta,
+        "kind": np.where(good, kind, 255).astype(np.uint8),
+        "ridge_status": status.astype(np.uint8),
+    }
+    if block.mass.size:
+        rate = block.mass / block.period
+        found |= {"stiffness_max": alpha * rate / block.period, "virtual_damping_at_max": beta * rate}
+    return found
+
+
+def _walls(outputs: tuple[str, ...], block: Block, methods: dict[str, str]) -> dict[str, np.ndarray]:
+    """What belongs to walls."""
+    shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
+    found: dict[str, np.ndarray] = {}
+    if {"spectral_radius", "margin", "settling_time"} & set(outputs):
+        found["spectral_radius"] = radius = _radius(block, shape)
+        found["margin"] = 1.0 - radius
+        if "settling_time" in outputs:
+            found["settling_time"] = _settling_time(radius, block)
+    if "stable" in outputs:
+        radius = found.get("spectral_radius")
+        found["stable"] = (_radius(block, shape) if radius is None else radius) < 1.0
+    if {"passive", "passivity_margin"} & set(outputs):
+        margin = _by_device(_passivity, block, shape, _passivity_groups)
+        found |= {"passivity_margin": margin, "passive": margin > 0}
+    found["status"] = _status(outputs, found, block, shape)
+    return found
+
+
+def _status(outputs: tuple[str, ...], found: dict[str, np.ndarray], block: Block, shape: tuple[int, ...]) -> np.ndarray:
+    """Why each wall has its values."""
+    status = np.full(shape, Status.OK, dtype=np.uint8)
+    for name in outputs:
+        if OUTPUTS[name].dtype == "float64":
+            status[np.isnan(found[name])] = Status.NOT_CONVERGED
+    device = np.isfinite(block.delta) & np.isfinite(block.d)
+    alpha, beta = np.isfinite(block.alpha), np.isfinite(block.beta)
+    if not (device.all() and alpha.all() and beta.all()):
+        status[~(device[:, None, None] & alpha[:, :, None] & beta[:, None, :])] = Status.INVALID_INPUT
+    return status
+
+
+def _settling_time(radius: np.ndarray, block: Block) -> np.ndarray:
+    """The time in which the slowest pole decays to 2 %, in seconds where there is a period."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        periods = np.where(radius < 1.0, _DECAY / -np.log(radius), np.where(np.isnan(radius), np.nan, np.inf))
+    return periods * block.period[:, None, None] if block.period.size else periods
+
+
+def _by_device(
+    function: Callable[[Columns], np.ndarray],
+    block: Block,
+    shape: tuple[int, ...],
+    grouped: Callable[[np.ndarray], Iterator[np.ndarray]],
+) -> np.ndarray:
+    """Apply a function of columns to the walls of a block, group by group of devices."""
+    result = np.empty(shape)
+    rows = min(shape[1], max(1, _LAID_OUT // shape[2]))
+    for group in grouped(block.d):
+        step = max(1, _LAID_OUT // (rows * shape[2]))
+        for start, row in product(range(0, group.size, step), range(0, shape[1], rows)):
+            devices, alphas = group[start : start + step], slice(row, row + rows)
+            parameters = np.broadcast_arrays(
+                block.alpha[devices, alphas, None],
+                block.beta[devices, None, :],
+                block.delta[devices, None, None],
+                block.d[devices, None, None],
+            )
+            columns = tuple(parameter.ravel() for parameter in parameters)
+            result[devices, alphas] = function(columns).reshape(parameters[0].shape)
+    return result
+
+
+def _radius(block: Block, shape: tuple[int, ...]) -> np.ndarray:
+    return _by_device(_radius_columns, block, shape, _degrees)
+
+
+def _radius_columns(columns: Columns) -> np.ndarray:
+    size = min(_PIECE, companion_chunk(degree_of(columns[3][0])))
+    return in_pieces(lambda *piece: (radius_by_companion(*piece),), columns, size)[0]
+
+
+def _degrees(d: np.ndarray) -> Iterator[np.ndarray]:
+    return (index for _, index in groups(d))
+
+
+def _passivity(columns: Columns) -> np.ndarray:
+    size = max(1, min(_PIECE, (1 << 20) // sample_count(columns[3])))
+    return in_pieces(lambda *piece: (passivity_margin(*piece),), columns, size)[0]
+
+
+def _passivity_groups(d: np.ndarray) -> Iterator[np.ndarray]:
+    """Devices whose delays call for the same number of frequencies: it is chosen for a whole batch."""
+    counts = np.array([sample_count(value) for value in d])
+    for count in np.unique(counts):
+        yield np.flatnonzero(counts == count)

@@ -1,0 +1,98 @@
+"""An existing dask.distributed cluster as the engine; the only module that imports distributed."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Generator, Iterable
+from typing import TYPE_CHECKING, Any
+
+from zwidth.errors import InputError
+from zwidth.sweep.jobs import MAX_ATTEMPTS, Finished, Job, Perform, attempt
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+_CONNECT_SECONDS = 30
+# Enough to keep every worker busy, few enough that a scheduler never holds a whole sweep.
+_AHEAD = 4
+
+
+def on_cluster(jobs: Iterable[Job], address: str, perform: Perform) -> Generator[Finished]:
+    """Do jobs on the workers of a scheduler; they must see the stores under the same path.
+
+    A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
+    again at the end, one by one, before it is called a failure.
+    """
+    from distributed import Client
+
+    try:
+        client = Client(address, timeout=_CONNECT_SECONDS)
+    except (OSError, ValueError) as error:
+        raise InputError(f"scheduler: no answer from {address!r} ({error}); check the address") from error
+    try:
+        _check_folder(client, address, jobs := list(jobs))
+        given_up = []
+        for finished in _many(client, jobs, perform):
+            if finished.error and _is_death(finished.error):
+                given_up.append(finished.job)
+            else:
+                yield finished
+        for job in given_up:
+            yield from _many(client, [job], perform)
+    finally:
+        client.close()
+
+
+def _is_death(error: str) -> bool:
+    return error.startswith("KilledWorker")
+
+
+def _many(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finished]:
+    """Keep a bounded number of chunks on the cluster; only their names travel."""
+    from distributed import as_completed
+
+    waiting = iter(jobs)
+    of_future: dict[str, Job] = {}
+    # A cluster that is still starting has no workers yet, and may have more later.
+    ahead = _AHEAD * max(4, sum(client.nthreads().values()))
+    completed = as_completed(with_results=False)
+
+    def hand_out() -> None:
+        job = next(waiting, None)
+        if job is not None:
+            future = client.submit(attempt, perform, job, key=f"{_name(job)}-{os.urandom(4).hex()}", pure=False)
+            of_future[future.key] = job
+            completed.add(future)
+
+    for _ in range(ahead):
+        hand_out()
+    for future in completed:
+        job = of_future.pop(future.key)
+        error: Any = future.exception() if future.status != "finished" else None
+        yield future.result() if error is None else Finished(job, _explained(error))
+        hand_out()
+
+
+def _explained(error: BaseException) -> str:
+    """What dask says of a task that it could not do, in words of ours where its worker died."""
+    name = type(error).__name__
+    if name == "KilledWorker":
+        return f"KilledWorker: its worker died every time it was tried, at least {MAX_ATTEMPTS} times"
+    return f"{name}: {error}"
+
+
+def _name(job: Job) -> str:
+    return f"{os.path.basename(job.path)}-{job.task.family}-{job.task.index}"
+
+
+def _check_folder(client: Client, address: str, jobs: list[Job]) -> None:
+    """Refuse workers that do not see the stores."""
+    if not jobs or not client.nthreads():
+        return
+    path = jobs[0].path
+    blind = [worker for worker, sees in client.run(os.path.exists, path).items() if not sees]
+    if blind:
+        raise InputError(
+            f"scheduler: the worker {blind[0]} of {address} does not see {path}; choose a folder that all machines "
+            "share with --out DIR"
+        )

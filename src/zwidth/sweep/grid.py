@@ -1,0 +1,157 @@
+"""The grid of a sweep: its dimensions, their values, and the normalized parameters of any block of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from zwidth.scene import normalize
+from zwidth.sweep.outputs import Family
+from zwidth.sweep.parameters import PARAMETERS, WALL
+from zwidth.sweep.sweeps import SweepStudy
+from zwidth.sweep.table import LABEL
+
+
+@dataclass(frozen=True)
+class Block:
+    """A block of the grid, normalized: D devices, each with the same number of walls.
+
+    Attributes:
+        delta: of the devices, shape (D,).
+        d: their delays in periods, shape (D,).
+        alpha: of their walls, shape (D, A).
+        beta: of their walls, shape (D, B); every alpha of a device meets every beta.
+        mass, period: of the devices in SI units, shape (D,); empty in a normalized sweep.
+    """
+
+    delta: np.ndarray
+    d: np.ndarray
+    alpha: np.ndarray
+    beta: np.ndarray
+    mass: np.ndarray
+    period: np.ndarray
+
+
+class Grid:
+    """The dimensions of a sweep, those of walls last, and what lies at each of their points.
+
+    Args:
+        study: the study that spans the grid.
+    """
+
+    def __init__(self, study: SweepStudy) -> None:
+        self.axes = study.axes
+        self.physical = study.axes.physical
+        sizes = study.axes.sizes
+        self.wall_dims = tuple(name for name in sizes if name in WALL)
+        self.device_dims = tuple(name for name in sizes if name not in WALL)
+        self.dims = (*self.device_dims, *self.wall_dims)
+        self.sizes = sizes
+
+    def dims_of(self, family: Family) -> tuple[str, ...]:
+        """The dimensions that the outputs of a family have."""
+        return self.dims if family == "wall" else self.device_dims
+
+    def shape_of(self, family: Family) -> tuple[int, ...]:
+        """The sizes of these dimensions."""
+        return tuple(self.sizes[name] for name in self.dims_of(family))
+
+    @cached_property
+    def _values(self) -> dict[str, np.ndarray]:
+        """Every parameter that is given, as a flat array."""
+        table = self.axes.devices
+        columns = {name: table.values(name) for name in table.columns} if table else {}
+        own = {name: getattr(self.axes, name) for name in PARAMETERS}
+        return columns | {name: axis.values() for name, axis in own.items() if axis is not None}
+
+    @property
+    def delay_in_periods(self) -> bool:
+        """Whether the parameter ``delay`` counts sampling periods."""
+        table = self.axes.devices
+        if self.axes.delay is not None:
+            return self.axes.delay.unit == "periods"
+        return table is not None and table.delay_unit == "periods"
+
+    def coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]]:
+        """Dimensions, values and attributes of every parameter, and the labels of the devices."""
+        table = self.axes.devices
+        found: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
+        if table is not None:
+            labels = table.labels or tuple(str(row) for row in range(1, table.size + 1))
+            found["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
+        for name, values in self._values.items():
+            units = "sampling periods" if name == "delay" and self.delay_in_periods else PARAMETERS[name].units
+            attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
+            if table is not None and name in table.columns:
+                found[name] = (("device",), values, attributes)
+            elif name in self.sizes:
+                found[name] = ((name,), values, attributes)
+            else:
+                found[name] = ((), values[0], attributes)
+        return found
+
+    def block(self, place: tuple[slice, ...]) -> Block:
+        """The normalized parameters of a block, given one slice for every dimension, or for those of devices."""
+        slices = dict(zip(self.dims, place, strict=False))
+        for name in self.wall_dims:
+            slices.setdefault(name, slice(0, 1))
+        shape = tuple(len(range(*slices[name].indices(self.sizes[name]))) for name in self.device_dims)
+        if not self.physical:
+            delta, d = (self._device(name, slices, shape) for name in ("delta", "d"))
+            alpha, beta = (self._wall(name, slices, shape) for name in ("alpha", "beta"))
+            return Block(delta, d, *self._paired(alpha, beta, delta.size), np.empty(0), np.empty(0))
+        return self._physical_block(slices, shape)
+
+    def _physical_block(self, slices: dict[str, slice], shape: tuple[int, ...]) -> Block:
+        mass, damping, delay = (self._device(name, slices, shape) for name in ("mass", "damping", "delay"))
+        period = (
+            1.0 / self._device("rate", slices, shape)
+            if "rate" in self._values
+            else self._device("period", slices, shape)
+        )
+        in_periods = self.delay_in_periods
+        # Beyond float64 is a status of the point, not a warning.
+        with np.errstate(all="ignore"):
+            device = normalize(mass=mass, damping=damping, period=period, delay=np.zeros(1) if in_periods else delay)
+            stiffness, virtual_damping = (self._wall(name, slices, shape) for name in ("stiffness", "virtual_damping"))
+            walls = normalize(
+                mass=mass[:, None], period=period[:, None], stiffness=stiffness, virtual_damping=np.zeros((1, 1))
+            )
+            damped = normalize(mass=mass[:, None], period=period[:, None], virtual_damping=virtual_damping)
+        d = delay if in_periods else device.d
+        alpha, beta = self._paired(walls.alpha, damped.beta, mass.size)
+        return Block(device.delta, np.broadcast_to(d, mass.shape), alpha, beta, mass, period)
+
+    def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
+        """A parameter of the devices of a block, flat; 0 where it is not given."""
+        values = self._values.get(name, np.zeros(1))
+        dim = self._dim_of(name)
+        if dim is not None:
+            axis = self.device_dims.index(dim)
+            values = values[slices[dim]].reshape([-1 if index == axis else 1 for index in range(len(shape))])
+        return np.broadcast_to(values, shape or (1,)).ravel()
+
+    def _wall(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
+        """A parameter of the walls of a block: one row for all devices, or one column with an entry a device."""
+        if name in self.wall_dims:
+            return self._values[name][slices[name]][None, :]
+        return self._device(name, slices, shape)[:, None]
+
+    def _dim_of(self, name: str) -> str | None:
+        """The dimension along which a parameter changes."""
+        table = self.axes.devices
+        if table is not None and name in table.columns:
+            return "device"
+        return name if name in self.sizes else None
+
+    @staticmethod
+    def _paired(alpha: np.ndarray, beta: np.ndarray, devices: int) -> tuple[np.ndarray, np.ndarray]:
+        return np.broadcast_to(alpha, (devices, alpha.shape[1])), np.broadcast_to(beta, (devices, beta.shape[1]))
+
+    def size_of(self, family: Family) -> int:
+        """How many points a family has."""
+        return math.prod(self.shape_of(family))

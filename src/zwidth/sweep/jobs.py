@@ -1,0 +1,58 @@
+"""What the engines hand out and get back."""
+
+from __future__ import annotations
+
+import errno
+from collections.abc import Callable, Generator, Iterable
+from typing import NamedTuple, TypeAlias
+
+from zwidth.sweep.plan import Task
+
+Perform: TypeAlias = Callable[[str, str, int], None]
+"""What computes one chunk: `zwidth.sweep.chunks.perform`, or in a test something that fails."""
+
+MAX_ATTEMPTS = 3
+"""How often a chunk is tried whose worker is killed."""
+
+# What no other chunk would escape.
+_HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
+
+
+class Job(NamedTuple):
+    """One chunk of one store."""
+
+    path: str
+    task: Task
+
+
+class Finished(NamedTuple):
+    """How one chunk went: no error, or what went wrong; ``hopeless`` where the other chunks would fare the same."""
+
+    job: Job
+    error: str = ""
+    hopeless: bool = False
+
+
+def attempt(perform: Perform, job: Job) -> Finished:
+    """Do one job; whatever goes wrong is told, for the other jobs do not depend on it."""
+    try:
+        perform(job.path, job.task.family, job.task.index)
+    except Exception as error:
+        number = _errno_of(error)
+        return Finished(job, f"{type(error).__name__}: {error}", number in _HOPELESS)
+    return Finished(job)
+
+
+def _errno_of(error: BaseException | None) -> int | None:
+    """The number of the system's error that lies behind an exception."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return error.errno
+        error = error.__cause__ or error.__context__
+    return None
+
+
+def in_this_process(jobs: Iterable[Job], perform: Perform) -> Generator[Finished]:
+    """Do one job after the other."""
+    for job in jobs:
+        yield attempt(perform, job)

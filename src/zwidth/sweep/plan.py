@@ -1,0 +1,311 @@
+"""The plan of a sweep: its chunks, its methods, what it will take, and whether that fits."""
+
+from __future__ import annotations
+
+import math
+import os
+import shutil
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
+from zwidth.errors import ResourceError
+from zwidth.sweep.grid import Grid
+from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
+from zwidth.sweep.sweeps import SweepStudy
+
+MEMORY = 2**28
+"""Bytes that one chunk may take while it is computed, beside what an idle worker takes."""
+
+IDLE_MEMORY = 500 * 2**20
+"""Bytes that a worker takes before its first chunk: Python, JAX and its compiled kernels."""
+
+# What a killed worker loses is the chunk it was at.
+_CHUNK_SECONDS = 10.0
+_LARGEST_CHUNK = 2**25
+# Enough chunks to share among workers and to show progress, none so small that its files cost more than its points.
+_FEWEST_CHUNKS = 16
+_SMALLEST_CHUNK = 2**15
+_LAID_OUT_BYTES = 96 * 2**20
+_RADIUS_OUTPUTS = {"spectral_radius", "margin", "settling_time"}
+
+Methods: TypeAlias = dict[str, str]
+Rate: TypeAlias = Callable[[str, str, float], float]
+
+
+class Task(NamedTuple):
+    """One chunk of one family of outputs: what is computed, written and repaired as a whole."""
+
+    family: Family
+    index: int
+
+    def __str__(self) -> str:
+        return f"{self.family}/{self.index}"
+
+
+@dataclass(frozen=True)
+class FamilyPlan:
+    """How the outputs of one family are cut into chunks."""
+
+    family: Family
+    outputs: tuple[str, ...]
+    dims: tuple[str, ...]
+    shape: tuple[int, ...]
+    chunks: tuple[int, ...]
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """How many chunks there are along each dimension."""
+        return tuple(-(-size // chunk) for size, chunk in zip(self.shape, self.chunks, strict=True))
+
+    @property
+    def count(self) -> int:
+        """How many chunks there are."""
+        return math.prod(self.counts)
+
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """The outputs and the status: every one of them has a file for each chunk."""
+        return (*self.outputs, STATUS_OF[self.family])
+
+    def position(self, index: int) -> tuple[int, ...]:
+        """The position of a chunk along each dimension."""
+        return tuple(int(part) for part in np.unravel_index(index, self.counts)) if self.counts else ()
+
+    def place(self, index: int) -> tuple[slice, ...]:
+        """The points of a chunk."""
+        starts = zip(self.position(index), self.chunks, self.shape, strict=True)
+        return tuple(slice(at * chunk, min((at + 1) * chunk, size)) for at, chunk, size in starts)
+
+    def points(self, index: int) -> int:
+        """How many points a chunk has."""
+        return math.prod(part.stop - part.start for part in self.place(index))
+
+    def describe(self, index: int) -> str:
+        """A chunk by its name and its place, for messages."""
+        parts = zip(self.dims, self.place(index), strict=True)
+        place = ", ".join(f"{dim} {part.start}:{part.stop}" for dim, part in parts)
+        return f"{Task(self.family, index)}{f' ({place})' if place else ''}"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a sweep will do.
+
+    Attributes:
+        study: name of the study.
+        families: how its outputs are cut into chunks.
+        methods: the method of every output that has a choice.
+        memory: bytes that a chunk takes while it is computed, at most.
+        disk: bytes that the store takes, estimated from above.
+        seconds: time on one core, a rough guess.
+    """
+
+    study: str
+    families: tuple[FamilyPlan, ...]
+    methods: Methods
+    memory: int
+    disk: int
+    seconds: float
+
+    def family(self, name: str) -> FamilyPlan:
+        """The plan of one family."""
+        return next(family for family in self.families if family.family == name)
+
+    def tasks(self) -> Iterator[Task]:
+        """Every chunk, in the order of the work."""
+        for family in self.families:
+            yield from (Task(family.family, index) for index in range(family.count))
+
+    def points(self, task: Task) -> int:
+        """How many points a chunk has."""
+        return self.family(task.family).points(task.index)
+
+    def describe(self, task: Task) -> str:
+        """A chunk for messages."""
+        return self.family(task.family).describe(task.index)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What a store keeps of the plan: later work on it must follow the same."""
+        return {
+            "chunks": {family.family: list(family.chunks) for family in self.families},
+            "methods": dict(sorted(self.methods.items())),
+        }
+
+    def lines(self) -> Iterator[str]:
+        """The plan in words."""
+        yield f"study {self.study}"
+        for family in self.families:
+            size = " x ".join(f"{dim} {size}" for dim, size in zip(family.dims, family.shape, strict=True))
+            chunk = " x ".join(map(str, family.chunks))
+            points = math.prod(family.shape)
+            yield f"  {', '.join(family.outputs)}"
+            yield f"    points   {points:,} ({size or 'one point'})"
+            yield f"    chunks   {family.count:,} of {chunk or '1'}"
+        chosen = ", ".join(f"{name} by {method}" for name, method in sorted(self.methods.items()))
+        yield f"  methods    {chosen or 'no choice'}"
+        yield f"  memory     {_size(self.memory)} a chunk, and {_size(IDLE_MEMORY)} a worker"
+        yield f"  disk       {_size(self.disk)} at most"
+        yield f"  time       about {_time(self.seconds)} on one core"
+
+
+def make_plan(study: SweepStudy, *, memory: int = MEMORY, rate: Rate | None = None) -> Plan:
+    """Cut a study into chunks and choose its methods.
+
+    Args:
+        study: the study.
+        memory: bytes that a chunk may take while it is computed.
+        rate: points a second of an output by a method at a number of poles; a rough table where left out.
+    """
+    grid = Grid(study)
+    methods = choose_methods(study, grid)
+    poles = _most_periods(study, grid) + 4.0
+    families, seconds = [], 0.0
+    for family, outputs in study.families.items():
+        slowness = sum(1.0 / (rate or _rate)(name, methods.get(name, ""), poles) for name in _computed(outputs))
+        per_point = _bytes_per_point(outputs)
+        size = grid.size_of(family)
+        target = min((memory - _LAID_OUT_BYTES) // per_point, _LARGEST_CHUNK, int(_CHUNK_SECONDS / slowness))
+        target = max(1, min(target, max(size // _FEWEST_CHUNKS, _SMALLEST_CHUNK)))
+        shape = grid.shape_of(family)
+        families.append(FamilyPlan(family, outputs, grid.dims_of(family), shape, chunk_shape(shape, target)))
+        seconds += size * slowness
+    largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
+    disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
+    return Plan(study.name, tuple(families), methods, largest + _LAID_OUT_BYTES, disk, seconds)
+
+
+def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
+    """The plan that a store was made with, from what it keeps of it."""
+    fresh = make_plan(study)
+    families = tuple(
+        FamilyPlan(plan.family, plan.outputs, plan.dims, plan.shape, tuple(kept["chunks"][plan.family]))
+        for plan in fresh.families
+    )
+    return Plan(study.name, families, dict(kept["methods"]), fresh.memory, fresh.disk, fresh.seconds)
+
+
+def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
+    """Cut a grid into chunks of about equal size and at most ``target`` points; fast dimensions stay whole first."""
+    chunks, room = [], target
+    for size in reversed(shape):
+        chunk = max(1, min(size, room))
+        # Equal parts: no chunk is a sliver.
+        chunk = -(-size // -(-size // chunk)) if size else 1
+        chunks.append(chunk)
+        room = room // chunk if chunk == size else 1
+    return tuple(reversed(chunks))
+
+
+def choose_methods(study: SweepStudy, grid: Grid) -> Methods:
+    """The method of every output that has a choice; it depends on the study alone, never on the machine."""
+    methods = {}
+    if "stable" in study.outputs:
+        methods["stable"] = "companion"
+    if _RADIUS_OUTPUTS & set(study.outputs):
+        methods["spectral_radius"] = "companion"
+    return methods
+
+
+def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
+    """Refuse, before any work, what cannot fit on the disk or in memory.
+
+    Args:
+        plans: what is to be computed.
+        folder: where.
+        workers: how many processes compute at one time.
+        begun: studies that have a store, and part of their disk space, already.
+
+    Raises:
+        ResourceError: it does not fit; the message has the numbers and the remedy.
+    """
+    free = shutil.disk_usage(_existing(folder)).free
+    disk = sum(plan.disk for plan in plans if plan.study not in begun)
+    if disk > free:
+        raise ResourceError(
+            f"out: {folder} has {_size(free)} free, but the results may take {_size(disk)}; "
+            "choose another folder with --out DIR, fewer outputs or fewer values on an axis"
+        )
+    total = _machine_memory()
+    memory = max(workers * (plan.memory + IDLE_MEMORY) for plan in plans)
+    if memory > total:
+        raise ResourceError(
+            f"workers: {workers} of them may take {_size(memory)} of memory, but there are {_size(total)}; "
+            "choose fewer with --workers N"
+        )
+
+
+def _existing(folder: Path) -> Path:
+    """The folder itself or the nearest one above it that exists."""
+    folder = folder.absolute()
+    return next(path for path in (folder, *folder.parents) if path.exists())
+
+
+def _machine_memory() -> int:
+    """The memory that this process may use: the machine's, or less in a container."""
+    total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    try:
+        return min(total, int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii")))
+    except (OSError, ValueError):
+        # No container, or one without a limit.
+        return total
+
+
+def _computed(outputs: tuple[str, ...]) -> set[str]:
+    """The outputs that cost something; the others follow from them."""
+    costly = {"spectral_radius" if name in _RADIUS_OUTPUTS else name for name in outputs}
+    costly = {"passive" if name == "passivity_margin" else name for name in costly}
+    return {"alpha_max" if OUTPUTS[name].family == "device" else name for name in costly}
+
+
+def _bytes_per_point(outputs: tuple[str, ...]) -> int:
+    """Memory for a point of a chunk: results, what they are made of, and copies while they are written."""
+    floats = sum(OUTPUTS[name].dtype == "float64" for name in outputs)
+    hidden = 24 if _RADIUS_OUTPUTS & set(outputs) else 0
+    hidden += 8 if {"passive", "passivity_margin"} & set(outputs) else 0
+    return 8 * floats + hidden + (16 if floats else 0) + len(outputs) + 4
+
+
+def _disk_bits(outputs: tuple[str, ...]) -> int:
+    """Bits for a point on the disk: numbers hardly shrink, truth values are packed, a status is nearly always 0."""
+    return 1 + sum({"float64": 64, "bool": 1, "uint8": 1}[OUTPUTS[name].dtype] for name in outputs)
+
+
+def _most_periods(study: SweepStudy, grid: Grid) -> float:
+    """The longest delay in periods."""
+    given = study.axes.given
+    if "d" in given:
+        return study.axes.end("d", largest=True)
+    if "delay" not in given:
+        return 0.0
+    longest = study.axes.end("delay", largest=True)
+    if grid.delay_in_periods:
+        return longest
+    return longest * (study.axes.end("rate", True) if "rate" in given else 1.0 / study.axes.end("period", False))
+
+
+def _rate(output: str, method: str, poles: float) -> float:
+    """Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it."""
+    if output == "alpha_max":
+        return 1e6
+    if output == "passive":
+        return 1.5e6 / poles
+    return 1e6 / (poles / 4.0) ** 2.5
+
+
+def _size(count: float) -> str:
+    for unit in ("B", "KiB", "MiB", "GiB"):
+        if count < 1024:
+            return f"{count:.3g} {unit}"
+        count /= 1024
+    return f"{count:.3g} TiB"
+
+
+def _time(seconds: float) -> str:
+    for limit, unit, length in ((120, "s", 1.0), (7200, "min", 60.0), (172800, "h", 3600.0)):
+        if seconds < limit:
+            return f"{seconds / length:.2g} {unit}"
+    return f"{seconds / 86400:.2g} days"

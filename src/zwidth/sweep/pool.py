@@ -1,0 +1,126 @@
+"""Workers on this machine: processes that compute chunks, and are replaced when something kills them."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections import Counter, deque
+from collections.abc import Generator, Iterable
+from multiprocessing.connection import Connection, wait
+from typing import Any
+
+from zwidth.sweep.jobs import MAX_ATTEMPTS, Finished, Job, Perform, attempt
+
+# Never fork a process in which JAX may have started: its threads do not survive, its locks do.
+_CONTEXT = multiprocessing.get_context("spawn")
+
+
+def in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[Finished]:
+    """Do jobs in ``count`` processes; a job whose worker dies is tried again, at the end and a few times at most."""
+    waiting = deque(jobs)
+    deaths: Counter[Job] = Counter()
+    workers = [_Worker(number, count, perform) for number in range(min(count, len(waiting)))]
+    try:
+        while waiting or any(worker.job for worker in workers):
+            for worker in workers:
+                if worker.job is None and waiting:
+                    worker.start(waiting.popleft())
+            busy = [worker for worker in workers if worker.job]
+            ready = wait([part for worker in busy for part in (worker.pipe, worker.process.sentinel)])
+            for worker in (worker for worker in busy if worker.pipe in ready or worker.process.sentinel in ready):
+                job, finished = worker.job, worker.result()
+                if finished is not None:
+                    yield finished
+                    continue
+                assert job is not None, "a busy worker has a job"
+                deaths[job] += 1
+                why = worker.cause_of_death()
+                workers[workers.index(worker)] = _Worker(worker.number, count, perform)
+                if deaths[job] < MAX_ATTEMPTS:
+                    waiting.append(job)
+                else:
+                    yield Finished(job, f"its worker died each of {MAX_ATTEMPTS} times ({why})")
+    finally:
+        for worker in workers:
+            worker.stop()
+
+
+class _Worker:
+    """One process and what it is doing.
+
+    Args:
+        number: of the worker.
+        count: how many there are.
+        perform: what does a job.
+    """
+
+    def __init__(self, number: int, count: int, perform: Perform) -> None:
+        self.number = number
+        self.job: Job | None = None
+        self.pipe, theirs = _CONTEXT.Pipe()
+        self.process = _CONTEXT.Process(target=_work, args=(theirs, number, count, perform), daemon=True)
+        self.process.start()
+        theirs.close()
+
+    def start(self, job: Job) -> None:
+        """Hand over a job."""
+        self.job = job
+        try:
+            self.pipe.send(job)
+        except OSError:
+            # The worker is dead: its sentinel says so.
+            pass
+
+    def result(self) -> Finished | None:
+        """How the job went; None where the worker died over it."""
+        try:
+            finished = self.pipe.recv() if self.pipe.poll() else None
+        except (EOFError, OSError):
+            finished = None
+        self.job = None
+        return finished
+
+    def cause_of_death(self) -> str:
+        """How the process ended, for messages."""
+        self.process.join()
+        code = self.process.exitcode or 0
+        return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+    def stop(self) -> None:
+        """End the process; what it was writing is not there yet under its name."""
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
+    """The life of a worker."""
+    # Ctrl-C reaches the whole group of processes; the parent decides what becomes of it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _share_processors(number, count)
+    while True:
+        try:
+            job: Any = pipe.recv()
+        except (EOFError, OSError):
+            return
+        pipe.send(attempt(perform, job))
+
+
+def _share_processors(number: int, count: int) -> None:
+    """Keep to this worker's share of the processors: JAX would start a thread on each of them in every worker."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    available = sorted(os.sched_getaffinity(0))
+    if 1 < count <= len(available):
+        os.sched_setaffinity(0, available[number::count])
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed cannot end its workers."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "a worker has a parent"
+    parent.join()
+    os._exit(1)

@@ -1,0 +1,412 @@
+"""The store of one sweep: a Zarr group that xarray opens, which knows what is in it and whether that is whole.
+
+A chunk of the plan is a chunk of every variable of its family, so that no two tasks ever write one file. When all files
+of a chunk are there, their checksums are written, in one small file that says by being there that the chunk is done.
+Every file appears under its name at once and whole. That holds when a program is killed at any moment; it does not
+when the machine loses power, since nothing waits for the disk: `Store.faults` finds what a power failure damaged.
+
+This is the only module that imports zarr, xarray or a library for HDF5.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import shutil
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zwidth.errors import StoreError, StoreExistsError
+from zwidth.status import Status
+from zwidth.sweep.files import checksum, write_whole
+from zwidth.sweep.grid import Grid
+from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF
+from zwidth.sweep.plan import FamilyPlan, Plan, Task, kept_plan
+from zwidth.sweep.record import digest
+from zwidth.sweep.sweeps import SweepStudy
+
+if TYPE_CHECKING:
+    import xarray
+    import zarr
+
+SUFFIX = ".zarr"
+FORMAT = 1
+MAX_CSV_POINTS = 1_000_000
+_SEAL = "attributes_sha256"
+_FILES = "file_checksums"
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep back what zarr says about every codec and type that is not in its core specification."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*Zarr", category=UserWarning)
+        warnings.filterwarnings("ignore", message=".*Zarr", category=FutureWarning)
+        yield
+
+
+def _checksums(family: str) -> str:
+    return f"{family}_checksum"
+
+
+class Store:
+    """A store on the disk.
+
+    Args:
+        path: its folder, ``<study>.zarr``.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @cached_property
+    def attributes(self) -> dict[str, Any]:
+        """What the store says of itself; raises `StoreError` where that cannot be trusted."""
+        try:
+            attributes = json.loads((self.path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
+            sealed = attributes[_SEAL]
+        except FileNotFoundError as error:
+            raise StoreError(f"{self.path}: no store of a sweep (it has no zarr.json); check the path") from error
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise StoreError(f"{self.path}/zarr.json: cannot be read ({error}); start again in a new folder") from error
+        if digest({key: value for key, value in attributes.items() if key != _SEAL}) != sealed:
+            raise StoreError(f"{self.path}/zarr.json: damaged, its checksum is wrong; start again in a new folder")
+        if attributes.get("zwidth_format") != FORMAT:
+            what = attributes.get("zwidth_format")
+            raise StoreError(f"{self.path}: format {what}, this release reads format {FORMAT}; use another release")
+        return attributes
+
+    @cached_property
+    def study(self) -> SweepStudy:
+        """The study that the store is for."""
+        return SweepStudy.model_validate(self.attributes["study"])
+
+    @cached_property
+    def plan(self) -> Plan:
+        """The plan that the store was made with."""
+        return kept_plan(self.study, self.attributes["plan"])
+
+    @cached_property
+    def grid(self) -> Grid:
+        """The study's grid."""
+        return Grid(self.study)
+
+    @cached_property
+    def _group(self) -> zarr.Group:
+        import zarr
+
+        with _quiet():
+            return zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
+
+    @cached_property
+    def _arrays(self) -> dict[str, Any]:
+        names = [name for family in self.plan.families for name in family.variables]
+        with _quiet():
+            return {name: self._group[name] for name in names}
+
+    def _files(self, family: FamilyPlan, index: int) -> list[Path]:
+        """The files that hold a chunk, in the order of its variables."""
+        key = "/".join(("c", *map(str, family.position(index))))
+        return [self.path / name / key for name in family.variables]
+
+    def _flag(self, task: Task) -> Path:
+        return self.path / _checksums(task.family) / "c" / str(task.index) / "0"
+
+    def is_done(self, task: Task) -> bool:
+        """Whether a chunk is marked as done."""
+        return self._flag(task).exists()
+
+    def missing(self) -> list[Task]:
+        """The chunks that are not marked as done, in the order of the work."""
+        return [task for task in self.plan.tasks() if not self.is_done(task)]
+
+    def write(self, task: Task, values: Mapping[str, np.ndarray]) -> None:
+        """Write all variables of a chunk, then mark it as done."""
+        family = self.plan.family(task.family)
+        place = family.place(task.index)
+        files = self._files(family, task.index)
+        shape = tuple(part.stop - part.start for part in place)
+        with _quiet():
+            for name, file in zip(family.variables, files, strict=True):
+                # Zarr would read what is left of a damaged chunk at the edge of the grid before it replaces it.
+                file.unlink(missing_ok=True)
+                self._arrays[name][place if place else ...] = np.ascontiguousarray(values[name]).reshape(shape)
+        sums = np.array([checksum(file) for file in files], dtype="<u4")
+        write_whole(self._flag(task), sums.tobytes())
+
+    def forget(self, task: Task) -> None:
+        """Take back that a chunk is done."""
+        self._flag(task).unlink(missing_ok=True)
+
+    def fault_of(self, task: Task) -> str:
+        """What is wrong with a chunk that is marked as done; nothing where its files are what was written."""
+        family = self.plan.family(task.family)
+        kept = self._flag(task).read_bytes()
+        if len(kept) != 4 * len(family.variables):
+            return "its record of checksums is damaged"
+        files = zip(family.variables, self._files(family, task.index), np.frombuffer(kept, "<u4"), strict=True)
+        wrong = [(name, file) for name, file, expected in files if checksum(file) != expected]
+        return ", ".join(f"{name} is {'damaged' if file.exists() else 'missing'}" for name, file in wrong)
+
+    def damaged_files(self) -> list[str]:
+        """Files beside the chunks that are not what was written: coordinates and the descriptions of variables."""
+        kept = self.attributes[_FILES]
+        return [name for name, expected in kept.items() if checksum(self.path / name) != expected]
+
+    def restore(self, names: list[str]) -> None:
+        """Write such files again; they follow from the store's attributes."""
+        attributes = self.attributes
+        with _built(self.path, attributes) as fresh:
+            for name in names:
+                (self.path / name).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(fresh / name, self.path / name)
+
+
+def create(path: Path, attributes: dict[str, Any], *, may_exist: bool = False) -> Store:
+    """Make an empty store, at once and whole.
+
+    Args:
+        path: its folder.
+        attributes: what it says of itself, with ``study`` and ``plan``.
+        may_exist: take the store that another process has made in the meantime.
+    """
+    with _built(path, attributes) as fresh:
+        try:
+            os.rename(fresh, path)
+        except OSError as error:
+            if not path.exists():
+                raise
+            if not may_exist:
+                raise StoreExistsError(
+                    f"out: {path} exists already; go on with it with --resume, or choose another folder with --out DIR"
+                ) from error
+    return Store(path)
+
+
+@contextmanager
+def _built(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
+    """A complete store without chunks, beside ``path``; what is left of it goes when the block ends."""
+    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    fresh.parent.mkdir(parents=True, exist_ok=True)
+    study = SweepStudy.model_validate(attributes["study"])
+    plan, grid = kept_plan(study, attributes["plan"]), Grid(study)
+    try:
+        with _quiet():
+            _build(fresh, plan, grid)
+        files = sorted(file for file in fresh.rglob("*") if file.is_file() and file != fresh / "zarr.json")
+        sums = {file.relative_to(fresh).as_posix(): checksum(file) for file in files}
+        described = {"Conventions": "CF-1.11", "zwidth_format": FORMAT, "coordinates": _auxiliary(grid), **attributes}
+        described = {key: value for key, value in described.items() if key not in (_FILES, _SEAL)} | {_FILES: sums}
+        document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8"))
+        document["attributes"] = {**described, _SEAL: digest(described)}
+        write_whole(fresh / "zarr.json", json.dumps(document, indent=2).encode())
+        yield fresh
+    finally:
+        shutil.rmtree(fresh, ignore_errors=True)
+
+
+def _auxiliary(grid: Grid) -> str:
+    """The coordinates that are no dimension, as CF lists them."""
+    return " ".join(name for name in grid.coordinates() if name not in grid.dims)
+
+
+def _build(path: Path, plan: Plan, grid: Grid) -> None:
+    """Write the coordinates and describe the variables."""
+    import zarr
+    from zarr.codecs import BloscCodec, ZstdCodec
+    from zarr.codecs.numcodecs import PackBits
+
+    group = zarr.create_group(path, zarr_format=3)
+    for name, (dims, values, attributes) in grid.coordinates().items():
+        if values.dtype.kind == "U":
+            values = values.astype(np.dtypes.StringDType())
+        array = group.create_array(
+            name,
+            shape=values.shape,
+            dtype=values.dtype,
+            # NaN, which no value is: a chunk of zeros would otherwise not be written, and not be found missing.
+            fill_value="" if values.dtype.kind == "T" else np.nan,
+            dimension_names=dims,
+            attributes=attributes,
+        )
+        array[...] = values
+    packed: dict[str, Any] = {"filters": [PackBits()], "compressors": [ZstdCodec(level=3)], "fill_value": False}
+    number: dict[str, Any] = {
+        "compressors": [BloscCodec(cname="zstd", clevel=3, shuffle="shuffle")],
+        "fill_value": np.nan,
+    }
+    code: dict[str, Any] = {"compressors": [ZstdCodec(level=3)], "fill_value": NOT_COMPUTED}
+    keeping = {"bool": packed, "float64": number, "uint8": code}
+    for family in plan.families:
+        common: dict[str, Any] = {"shape": family.shape, "chunks": family.chunks, "dimension_names": family.dims}
+        for name in family.outputs:
+            output = OUTPUTS[name]
+            attributes = {"long_name": output.long_name, **output.attributes}
+            if output.dtype == "float64":
+                attributes["units"] = output.units_in(grid.physical)
+            attributes["ancillary_variables"] = STATUS_OF[family.family]
+            group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
+        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=_status_flags(), **common, **code)
+        group.create_array(
+            _checksums(family.family),
+            shape=(family.count, len(family.variables)),
+            chunks=(1, len(family.variables)),
+            dtype="<u4",
+            compressors=None,
+            fill_value=0,
+            dimension_names=(f"{family.family}_chunk", f"{family.family}_variable"),
+            attributes={"long_name": "CRC-32 of the files of a chunk, in the order of 'variables'; written last"}
+            | {"variables": list(family.variables)},
+        )
+
+
+def _status_flags() -> dict[str, Any]:
+    """The CF description of a status."""
+    meanings = [*(status.name.lower() for status in Status), "not_computed"]
+    return {
+        "long_name": "why a point has its values",
+        "flag_values": [*(int(status) for status in Status), NOT_COMPUTED],
+        "flag_meanings": " ".join(meanings),
+    }
+
+
+def find_stores(path: Path) -> list[Path]:
+    """The stores at a path: the path itself, or those in the folder."""
+    if (path / "zarr.json").is_file() or path.name.endswith(SUFFIX):
+        return [path]
+    return sorted(found for found in path.glob(f"*{SUFFIX}") if not found.name.startswith("."))
+
+
+def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
+    """Open the results of a sweep, without reading them yet.
+
+    Args:
+        path: a store ``<study>.zarr``, or the folder of a run that holds only one.
+
+    Returns:
+        An `xarray.Dataset` backed by dask, one dask chunk a chunk of the store. ``attrs["complete"]`` is 1 where every
+        chunk is there; the points of the others have the status 255, "not computed".
+
+    Raises:
+        StoreError: there is no store, there are several, or its attributes are damaged.
+
+    Example:
+        >>> import tempfile, zwidth
+        >>> from zwidth.sweep.config import Config
+        >>> from zwidth.sweep.engine import run_sweeps
+        >>> axes = {"alpha": [0.1, 0.9], "beta": 0.1, "delta": 0.1, "d": 1}
+        >>> study = {"kind": "sweep", "name": "small", "axes": axes}
+        >>> config = Config.model_validate({"version": 1, "name": "example", "studies": [study]})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     _ = run_sweeps(config, folder)
+        ...     zwidth.open_dataset(folder).stable.values
+        array([ True, False])
+    """
+    import xarray
+
+    store = one_store(path)
+    attributes = store.attributes
+    with _quiet():
+        dataset = xarray.open_zarr(store.path, consolidated=False, chunks={})
+    dataset = dataset.drop_vars([_checksums(family.family) for family in store.plan.families])
+    if "device" in dataset.coords:
+        # Neither netCDF nor pandas knows NumPy's strings of variable length.
+        labels = np.array([str(label) for label in dataset["device"].values])
+        dataset = dataset.assign_coords(device=("device", labels, dataset["device"].attrs))
+    dataset.attrs = {key: value for key, value in attributes.items() if key not in (_SEAL, _FILES, "coordinates")}
+    return dataset.assign_attrs(complete=int(not store.missing()))
+
+
+def one_store(path: str | os.PathLike[str]) -> Store:
+    """The only store at a path."""
+    folder = Path(os.fsdecode(path))
+    found = find_stores(folder)
+    if len(found) != 1:
+        names = ", ".join(store.name for store in found)
+        raise StoreError(
+            f"{folder}: holds several stores; name one of {names}" if found else f"{folder}: holds no store of a sweep"
+        )
+    return Store(found[0])
+
+
+def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
+    """Write the results of a sweep into one netCDF-4 file, chunk by chunk.
+
+    Args:
+        path: as for `open_dataset`.
+        file: the file to make; truth values become bytes, and what is nested in the attributes JSON.
+
+    Raises:
+        StoreError: as `open_dataset`.
+        StoreExistsError: the file exists.
+    """
+    target = _free(file)
+    dataset = open_dataset(path)
+    packed = {name: {"zlib": True, "complevel": 1} for name, variable in dataset.data_vars.items() if variable.ndim}
+    for variable in (dataset, *dataset.variables.values()):
+        variable.attrs = {key: _flat(value) for key, value in variable.attrs.items()}
+    with _replacing(target) as partial:
+        # One thread: the HDF5 library is not made for several, and lets only one of them in at a time.
+        import dask
+
+        with dask.config.set(scheduler="synchronous"):  # pyright: ignore[reportPrivateImportUsage]
+            dataset.to_netcdf(partial, engine="h5netcdf", encoding=packed)
+
+
+def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
+    """Write the results of a small sweep as a table, one row a point, all parameters and outputs in columns.
+
+    Args:
+        path: as for `open_dataset`.
+        file: the file to make.
+
+    Raises:
+        StoreError: as `open_dataset`, or more than a million points.
+        StoreExistsError: the file exists.
+    """
+    target = _free(file)
+    dataset = open_dataset(path)
+    points = int(np.prod([size for size in dataset.sizes.values()], dtype=float))
+    if points > MAX_CSV_POINTS:
+        raise StoreError(
+            f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; export to netCDF, or select a part "
+            "with zwidth.open_dataset"
+        )
+    with _replacing(target) as partial:
+        if dataset.sizes:
+            dataset.to_dataframe().to_csv(partial)
+        else:
+            dataset.expand_dims("point").to_dataframe().to_csv(partial, index=False)
+
+
+def _flat(value: Any) -> Any:
+    """An attribute as netCDF knows them."""
+    if isinstance(value, list) and all(isinstance(item, int) for item in value):
+        return np.array(value, dtype=np.int64 if max(value, default=0) > NOT_COMPUTED else np.uint8)
+    return json.dumps(value) if value is None or isinstance(value, dict | list) else value
+
+
+def _free(file: str | os.PathLike[str]) -> Path:
+    target = Path(os.fsdecode(file))
+    if target.exists():
+        raise StoreExistsError(f"{target} exists already; choose another name or remove it")
+    return target
+
+
+@contextmanager
+def _replacing(target: Path) -> Iterator[Path]:
+    """A file that takes its name when it is whole."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
+    try:
+        yield partial
+        os.replace(partial, target)
+    finally:
+        partial.unlink(missing_ok=True)

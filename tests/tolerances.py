@@ -1,0 +1,101 @@
+"""How far a computed value may be from the true one: a tolerance per quantity and precision, each with its reason.
+
+A tolerance is loosened only with a written cause. "Condition" means: what a change of every input by one rounding
+error can do to the exact result, so that no algorithm whatever could do better than about 1 of it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+EPS64 = 2.0**-52
+EPS32 = 2.0**-23
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """The largest error allowed in each precision, and why it is not smaller."""
+
+    float64: float
+    reason: str
+    # NaN: the quantity is not offered in float32 (it is computed directly only, hence in float64).
+    float32: float = math.nan
+
+
+def rounding_errors(count: float, reason: str) -> Tolerance:
+    """The same count of rounding errors in both precisions."""
+    return Tolerance(count * EPS64, reason, count * EPS32)
+
+
+PHI = rounding_errors(4, "Relative. One exponential, one Horner sum of positive terms, one product.")
+PHI_SLOPE = rounding_errors(
+    16, "Relative to the larger of the value and its bound at 0. Autodiff adds two rounded products of like size."
+)
+PHI_CURVATURE = rounding_errors(24, "As PHI_SLOPE, with four rounded products.")
+
+PLANT = rounding_errors(4, "Relative, where e^-delta does not underflow. Sums of positive terms: nothing cancels.")
+PLANT_DECAYED = rounding_errors(
+    1, "Relative, times 1 + delta: the exponent's own rounding is multiplied by delta in e^-delta."
+)
+TRANSFER = rounding_errors(8, "Relative. As PHI, and the products with T^2/m.")
+COEFFICIENT = rounding_errors(4, "Relative to the sum of the magnitudes of its terms, which may cancel for some walls.")
+
+BOUNDARY = rounding_errors(8, "In units of the condition: measured below 4 over 10,000 points up to d = 500.")
+BOUNDARY_LIMIT = rounding_errors(4, "Relative, at omega -> 0 and at pi, where the value is a short formula of delta.")
+BOUNDARY_SLOPE = Tolerance(
+    1e-12, "Relative to the gradient's norm: autodiff of the closed form divides by its norm twice.", 1e-4
+)
+BOUNDARY_POINT = Tolerance(
+    1e-12,
+    "Relative to |alpha| + |beta|, or the wall's condition where that is larger: Newton's method ends within 16 "
+    "rounding errors of the residual. Near the ridge a column touches the curve, which squares the condition.",
+)
+BOUNDARY_POINT_SLOPE = Tolerance(1e-10, "Relative. The implicit derivative divides by the residual's Jacobian.")
+
+POLE = Tolerance(1e-12, "Relative, for simple poles: Newton's last step in the factored form, times its condition.")
+DOUBLE_POLE = Tolerance(
+    1e-7, "Relative. An error of eps in P moves a double pole by its square root, 1.5e-8, times a constant."
+)
+REBUILT = Tolerance(
+    1e-11, "Relative to the largest coefficient of prod (1 + |z_i| z): multiplying 13 poles out adds their errors."
+)
+LABEL_BAND = Tolerance(
+    1e-13,
+    "|rho - 1| below which a label from poles is not judged: 500 rounding errors, more than the condition of a "
+    "simple pole on the unit circle costs at degree 10.",
+)
+
+PASSIVITY = Tolerance(
+    1e-12, "Relative to |alpha| (d + 1) + |beta| + delta, the size of the terms: golden section finds a maximum squared."
+)
+PASSIVITY_SCAN = Tolerance(
+    1e-7, "Relative to the same size: a scan of 1e5 frequencies misses a maximum by (step/2)^2/2 of its curvature."
+)
+PASSIVE_SLOPE = Tolerance(1e-7, "Golden bracket of 12 rounds narrows beta to 2 * 8^-12; the optimum is a corner.")
+PASSIVE_SLOPE_LP = Tolerance(
+    1e-6, "The linear program sees 20,000 frequencies: between two of them the bound overshoots by the step squared."
+)
+
+RESPONSE = Tolerance(
+    1e-11, "Relative to the largest sample: rounding errors of 200 periods add up, and a peer's state grows alike."
+)
+RESPONSE_DENSE = Tolerance(1e-8, "Relative to the largest value: solve_ivp's own tolerance of 1e-11 over 40 pieces.")
+SETTLING = Tolerance(1e-12, "In periods: the settling time is one of the time axis' own entries.")
+
+AREA = Tolerance(
+    2e-4, "Relative: chords of a 400-point outline cut corners by (length of a piece)^2/12 of its curvature."
+)
+AREA_GRID = Tolerance(0.01, "Relative: a grid of 200 x 200 cells counts each cell on the edge as in or out.")
+
+PEER = Tolerance(
+    1e-10,
+    "Relative to the largest coefficient: scipy's expm of [[A, B], [0, 0]] and control's transfer-function algebra "
+    "multiply matrices whose entries differ by up to 1e6.",
+)
+PEER_POLE = Tolerance(
+    1e-6,
+    "Absolute: peers take eigenvalues of an unbalanced matrix and do not polish them; a pair of poles 1e-3 apart "
+    "costs three digits more.",
+)
+NORMALIZED = rounding_errors(4, "Relative: two or three rounded products and quotients.")

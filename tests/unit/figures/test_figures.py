@@ -1,0 +1,339 @@
+"""Figures are tested by the data they draw and the words on them, not by pixels."""
+
+import warnings
+from functools import cache
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+from zwidth import figures
+from zwidth.figures import data as records
+from zwidth.figures import style
+
+
+def outline(delta, d=0.0, delay_model="held", line=False):
+    """Half an ellipse from (0, -delta) to (0, 2 + delta); with ``line``, its end runs straight at omega = pi."""
+    omega = np.linspace(0.0, np.pi if line else 2.0, 21)
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 21)
+    alpha, beta = (1.0 + delta) * np.cos(turn), 1.0 + (1.0 + delta) * np.sin(turn)
+    piece = np.full(omega.size, "complex_pair")
+    if line:
+        alpha, beta, omega = np.append(alpha, 0.0), np.append(beta, 3.0), np.append(omega, np.pi)
+        alpha[-2] = 0.5
+        piece = np.append(piece, "minus_one")
+    return records.Outline(delta, d, delay_model, alpha, beta, omega, piece)
+
+
+def path(d=0.0, delay_model="held"):
+    delta = np.linspace(0.0, 10.0, 41)
+    kind = np.full(delta.size, "smooth")
+    return records.RidgePath(d, delay_model, delta, (1.0 + delta) / (1.0 + d), 0.5 - 0.1 * delta, delta / 10, kind)
+
+
+def interval(d=0.0, delay_model="held"):
+    delta = np.linspace(0.0, 2.0, 11)
+    return records.DampingInterval(d, delay_model, delta, -delta, 2.0 / (1.0 + d) + delta)
+
+
+def passive_outline(delta, d=0.0):
+    return records.PassiveOutline(delta, d, np.array([0.0, 2.0 * delta, 0.0]), np.array([-delta, 0.0, delta]))
+
+
+def cost(d):
+    delta = np.linspace(0.0, 4.0, 17)
+    return records.PassivityCost(d, delta, 1.0 + 3.0 * delta, -0.1 * delta, 2.0 * delta / (1.0 + d), 0.1 * delta)
+
+
+def response(label="a device", settling_time=0.03):
+    time = np.arange(100) * 1e-3
+    position = 1e-4 * (1.0 - np.exp(-time / 0.01))
+    return records.Response(
+        label, 0.1, 0.4, 0.1, 1.0, time, position, np.gradient(position), -position / 1e-4, 1e-4, settling_time
+    )
+
+
+def grid_map(deltas=(0.1,), si=None):
+    alpha, beta = np.linspace(0.0, 1.0, 6), np.linspace(-1.0, 1.0, 5)
+    shape = (alpha.size, beta.size, len(deltas), 1)
+    radius = 0.5 + np.broadcast_to(alpha[:, None, None, None] + beta[None, :, None, None] ** 2, shape)
+    outputs = {"stable": radius < 1, "spectral_radius": radius, "passive": radius < 0.8}
+    return records.MapData(alpha, beta, np.array(deltas), np.array([1.0]), outputs, si)
+
+
+def recommendation():
+    region = records.BoundaryData((outline(0.1, 1.0),), passive=(passive_outline(0.1, 1.0),), si=SI)
+    return records.RecommendationData(8e4, 100.0, 0.75, 1.1e5, 100.0, 20.0, 180.0, region, response())
+
+
+SI = records.SIScale(stiffness=1e5, virtual_damping=100.0)
+
+EVERY_FIGURE = {
+    "boundary": lambda ax=None: figures.draw_boundary(
+        records.BoundaryData((outline(0.5), outline(1.0), outline(0.5, 2.0), outline(1.0, 2.0)), (path(), path(2.0))),
+        ax,
+    ),
+    "boundary with a line": lambda ax=None: figures.draw_boundary(
+        records.BoundaryData((outline(1.0), outline(3.0, line=True))), ax
+    ),
+    "boundary with passivity in SI": lambda ax=None: figures.draw_boundary(
+        records.BoundaryData((outline(0.5),), passive=(passive_outline(0.5),), si=SI), ax
+    ),
+    "boundary of many deltas": lambda ax=None: figures.draw_boundary(
+        records.BoundaryData(tuple(outline(delta) for delta in np.linspace(0.1, 2.0, 20))), ax
+    ),
+    "boundary of both models": lambda ax=None: figures.draw_boundary(
+        records.BoundaryData((outline(0.5, 0.5), outline(0.6, 0.5, "fractional_power"))), ax
+    ),
+    "zero stiffness": lambda ax=None: figures.draw_zero_stiffness(
+        records.ZeroStiffnessData((interval(), interval(0.5), interval(0.5, "fractional_power")), (interval(3.0),)), ax
+    ),
+    "ridge": lambda ax=None: figures.draw_ridge(
+        records.RidgeData((path(), path(0.5), path(0.5, "fractional_power"))), ax
+    ),
+    "passivity cost": lambda ax=None: figures.draw_passivity_cost(records.PassivityData((cost(0.0), cost(1.0))), ax),
+    "step": lambda ax=None: figures.draw_step(
+        records.StepData((response("first"), response("second", np.nan)), True), ax
+    ),
+    "normalized step": lambda ax=None: figures.draw_step(records.StepData((response("first"),), False), ax),
+    "map of radius": lambda ax=None: figures.draw_map(grid_map(), "spectral_radius", ax),
+    "map of stable": lambda ax=None: figures.draw_map(grid_map(si=SI), "stable", ax),
+    "map of many": lambda ax=None: figures.draw_map(grid_map(np.linspace(0, 1, 7)), "passive", ax),
+    "recommendation": lambda ax=None: figures.draw_recommendation(recommendation(), ax),
+}
+
+
+def curves(ax):
+    """The labelled curves of an Axes, as (x, y)."""
+    return {str(line.get_label()): line.get_xydata().T for line in ax.lines if not line.get_label().startswith("_")}
+
+
+def assert_drawn(ax, label, x, y):
+    line = curves(ax)[label]
+    np.testing.assert_allclose(line[0], x, rtol=1e-15)
+    np.testing.assert_allclose(line[1], y, rtol=1e-15)
+
+
+def words(figure):
+    """All text of a figure."""
+    return " ".join(text.get_text() for text in figure.findobj(matplotlib.text.Text))
+
+
+@cache
+def drawn(name):
+    """One of the figures, laid out once for all tests, with every warning an error."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        figure = EVERY_FIGURE[name]()
+        figure.draw_without_rendering()
+    return figure
+
+
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_a_figure_leaves_no_trace_in_matplotlib(name):
+    import matplotlib.pyplot as plt
+
+    before = matplotlib.rcParams.copy()
+    assert isinstance(drawn(name), Figure)
+    assert matplotlib.rcParams == before
+    assert plt.get_fignums() == []
+
+
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_a_figure_is_drawn_into_a_given_axes(name):
+    figure = Figure()
+    ax = figure.subplots()
+    assert EVERY_FIGURE[name](ax) is figure
+    assert ax.has_data()
+    assert ax.get_xlabel()
+    assert ax.get_ylabel()
+
+
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_every_text_stays_on_the_page(name):
+    figure = drawn(name)
+    page = figure.bbox
+    for text in figure.findobj(matplotlib.text.Text):
+        if not text.get_visible() or not text.get_text().strip():
+            continue
+        # Tick labels: those beyond the range exist but are not drawn.
+        if text.get_text().startswith(r"$\mathdefault"):
+            continue
+        box = text.get_window_extent()
+        assert box.x0 >= page.x0 - 1, text.get_text()
+        assert box.x1 <= page.x1 + 1, text.get_text()
+        assert box.y0 >= page.y0 - 1, text.get_text()
+        assert box.y1 <= page.y1 + 1, text.get_text()
+
+
+@pytest.mark.parametrize("name", ["boundary with a line", "map of stable"])
+def test_the_same_figure_is_written_in_the_same_bytes(name, tmp_path):
+    written = []
+    before = matplotlib.rcParams.copy()
+    for attempt in ("first", "second"):
+        files = figures.save(EVERY_FIGURE[name](), tmp_path / attempt)
+        assert [file.suffix for file in files] == [".png", ".svg"]
+        written.append([file.read_bytes() for file in files])
+    assert matplotlib.rcParams == before
+    assert written[0] == written[1]
+    assert b"<dc:date>" not in written[0][1]
+    assert b"<text" not in written[0][1], "text is drawn as outlines"
+
+
+def test_boundaries_show_the_given_curves_in_one_panel_for_each_delay():
+    figure = drawn("boundary")
+    assert [ax.get_title(loc="left") for ax in figure.axes] == ["$d = 0$", "$d = 2$"]
+    for ax, d in zip(figure.axes, (0.0, 2.0), strict=True):
+        for delta in (0.5, 1.0):
+            given = outline(delta, d)
+            assert_drawn(ax, f"boundary, delta = {delta:g}, d = {d:g}", given.alpha, given.beta)
+        assert_drawn(ax, f"path of alpha_max, d = {d:g}", path(d).alpha_max, path(d).beta)
+        shaded = [patch.get_xy() for patch in ax.patches]
+        assert any(np.array_equal(xy[:21], np.c_[outline(1.0, d).alpha, outline(1.0, d).beta]) for xy in shaded)
+
+
+def test_axes_carry_the_symbols_with_their_definitions():
+    text = words(drawn("boundary"))
+    assert r"\alpha = K\,T^2\!/m" in text
+    assert r"\beta = B\,T/m" in text
+    assert r"$\delta = 0.5$" in text
+    assert r"\delta = b\,T/m" in words(drawn("ridge"))
+
+
+def test_a_real_pole_at_minus_one_has_a_line_of_its_own():
+    ax = drawn("boundary with a line").axes[0]
+    given = outline(3.0, line=True)
+    assert_drawn(ax, "boundary, delta = 3, d = 0", given.alpha[:21], given.beta[:21])
+    assert_drawn(ax, "z = -1, delta = 3, d = 0", given.alpha[20:], given.beta[20:])
+    styles = {line.get_label(): line.get_linestyle() for line in ax.lines}
+    assert styles["boundary, delta = 3, d = 0"] != styles["z = -1, delta = 3, d = 0"]
+
+
+def test_passivity_is_dash_dotted_and_si_axes_are_added():
+    ax = drawn("boundary with passivity in SI").axes[0]
+    assert_drawn(ax, "passive, delta = 0.5, d = 0", [0.0, 1.0, 0.0], [-0.5, 0.0, 0.5])
+    top, right = ax.child_axes
+    assert "kN/m" in top.get_xlabel()
+    assert "N s/m" in right.get_ylabel()
+    np.testing.assert_allclose(top.get_xlim(), np.array(ax.get_xlim()) * 100.0, rtol=1e-12)
+    np.testing.assert_allclose(right.get_ylim(), np.array(ax.get_ylim()) * 100.0, rtol=1e-12)
+
+
+def test_the_larger_delta_is_darker():
+    ax = drawn("boundary").axes[0]
+    gray = {
+        line.get_label(): np.dot(matplotlib.colors.to_rgb(line.get_color()), [0.299, 0.587, 0.114]) for line in ax.lines
+    }
+    assert gray["boundary, delta = 1, d = 0"] < gray["boundary, delta = 0.5, d = 0"] - 0.1
+
+
+def test_zero_stiffness_shows_both_models_and_the_lower_bound():
+    figure = drawn("zero stiffness")
+    ax = figure.axes[0]
+    for given in (interval(), interval(0.5), interval(0.5, "fractional_power")):
+        assert_drawn(ax, f"beta_upper, d = {given.d:g}, {given.delay_model}", given.delta, given.beta_upper)
+    assert_drawn(ax, "beta_lower", interval().delta, -interval().delta)
+    assert_drawn(ax, "passive beta_upper, d = 3", interval(3.0).delta, interval(3.0).beta_upper)
+    styles = {line.get_label(): line.get_linestyle() for line in ax.lines}
+    assert styles["beta_upper, d = 0.5, held"] == "-"
+    assert styles["beta_upper, d = 0.5, fractional_power"] == "--"
+    assert "fractional power" in words(figure)
+
+
+def test_the_ridge_comes_in_two_scalings():
+    given = records.RidgeData((path(), path(0.5), path(0.5, "fractional_power")))
+    near, far = figures.draw_ridge(given, two_scalings=True).axes
+    assert near.get_xlim() == (0.0, 1.0)
+    assert far.get_xlim() == (0.0, 10.0)
+    for each in given.paths:
+        label = f"alpha_max, d = {each.d:g}, {each.delay_model}"
+        assert_drawn(far, label, each.delta, each.alpha_max)
+        inside = each.delta <= 1.0
+        assert_drawn(near, label, each.delta[inside], each.alpha_max[inside])
+
+
+def test_passivity_cost_shows_both_maxima_and_their_ratio():
+    maxima, ratio = drawn("passivity cost").axes
+    for d in (0.0, 1.0):
+        given = cost(d)
+        assert_drawn(maxima, f"alpha_max, d = {d:g}", given.delta, given.alpha_max)
+        assert_drawn(maxima, f"alpha_max_passive, d = {d:g}", given.delta, given.alpha_max_passive)
+        share = 100.0 * given.alpha_max_passive / given.alpha_max
+        assert_drawn(ratio, f"passive share, d = {d:g}", given.delta, share)
+
+
+def test_step_responses_are_drawn_in_readable_units():
+    figure = drawn("step")
+    positions, forces = figure.axes
+    given = response()
+    text = r"first  ($\alpha = 0.1$, $\beta = 0.4$)"
+    line = curves(positions)[text]
+    np.testing.assert_allclose(line[0], given.time * 1e3, rtol=1e-14)
+    np.testing.assert_allclose(line[1], given.position * 1e6, rtol=1e-14)
+    np.testing.assert_array_equal(curves(forces)["wall_force, first"][1], given.wall_force)
+    assert "µm" in positions.get_ylabel()
+    assert "ms" in forces.get_xlabel()
+    assert "not settled" in words(figure)
+
+
+def test_a_map_shows_the_grid_and_the_edge_of_stability():
+    figure = drawn("map of radius")
+    mesh = figure.axes[0].collections[0]
+    np.testing.assert_array_equal(mesh.get_array().T, grid_map().outputs["spectral_radius"][:, :, 0, 0])
+    contour = figure.axes[0].collections[1]
+    assert list(contour.levels) == [1.0]
+    stable = drawn("map of stable").axes[0].collections[0]
+    np.testing.assert_array_equal(stable.get_array().T, grid_map().outputs["stable"][:, :, 0, 0])
+
+
+def test_a_map_of_many_deltas_shows_the_ends_and_the_middle():
+    titles = [ax.get_title(loc="left") for ax in drawn("map of many").axes]
+    assert titles == [rf"$\delta = {delta:g}$,  $d = 1$" for delta in (0, 0.5, 1)]
+
+
+def test_a_recommendation_is_marked_inside_its_interval():
+    region, _ = drawn("recommendation").axes
+    marks = curves(region)
+    np.testing.assert_allclose(marks["recommended"][:, 0], (80.0, 100.0))
+    np.testing.assert_allclose(marks["virtual_damping_interval"][1], (20.0, 180.0))
+    np.testing.assert_allclose(marks["stiffness_max"][:, 0], (110.0, 100.0))
+    assert "kN/m" in region.get_xlabel()
+
+
+@pytest.mark.parametrize(
+    "positions, gap, expected",
+    [
+        ([0.0, 1.0], 0.5, [0.0, 1.0]),
+        ([0.0, 0.0], 1.0, [-0.5, 0.5]),
+        ([3.0, 0.0, 0.1], 0.5, [3.0, -0.2, 0.3]),
+        ([5.0], 1.0, [5.0]),
+    ],
+)
+def test_labels_are_spread_no_further_than_needed(positions, gap, expected):
+    np.testing.assert_allclose(style.spread(positions, gap), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "largest, unit, factor, text",
+    [
+        (0.1, "s", 1e3, "ms"),
+        (9e-5, "m", 1e6, "µm"),
+        (2e4, "N/m", 1e-3, "kN/m"),
+        (0.0, "m", 1.0, "m"),
+        (5.0, "m", 1, "m"),
+    ],
+)
+def test_units_have_a_readable_prefix(largest, unit, factor, text):
+    found, name = style.si_unit(largest, unit)
+    assert found == pytest.approx(factor)
+    assert name == text
+
+
+def test_no_figure_module_imports_jax_or_pyplot():
+    folder = Path(figures.__file__).parent
+    for file in folder.glob("*.py"):
+        source = file.read_text(encoding="utf-8")
+        assert "import jax" not in source, file.name
+        assert "pyplot as" not in source, file.name

@@ -1,0 +1,194 @@
+"""What the studies compute, against the library's own functions and pole counts."""
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.figures.data import SIScale
+from zwidth.stability.poles import unstable_poles
+from zwidth.studies.boundaries import outline, run_boundary, stable_intervals
+from zwidth.studies.maps import run_map
+from zwidth.studies.outcome import csv_text, stack
+from zwidth.studies.passivity import passive_edge, run_passivity, stiffest_passive, unit_outline
+from zwidth.studies.ridges import needed_models, ridge_paths, run_ridge
+from zwidth.studies.steps import run_step
+from zwidth.sweep.responses import StepStudy
+from zwidth.sweep.studies import BoundaryStudy, MapStudy, PassivityStudy, RidgeStudy
+
+DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])
+DELAYS = np.array([0.0, 0.25, 0.9, 1.0, 4.0])
+
+
+def read_csv(text):
+    """A table as text columns."""
+    header, *rows = [line.split(",") for line in text.splitlines()]
+    return dict(zip(header, np.array(rows).T, strict=True))
+
+
+def test_the_interval_at_zero_stiffness_is_where_poles_cross():
+    # Close enough to alpha = 0 that beta moves by less than the step, far enough that the pole near 1 is counted.
+    alpha, step = 1e-7, 1e-3
+    for found in stable_intervals(DELTAS, DELAYS, "held"):
+        inside = unstable_poles(alpha, np.stack([found.beta_lower + step, found.beta_upper - step]), DELTAS, found.d)
+        beyond = unstable_poles(alpha, np.stack([found.beta_lower - step, found.beta_upper + step]), DELTAS, found.d)
+        assert np.all(inside == 0), found.d
+        assert np.all(beyond > 0), found.d
+
+
+def test_both_models_give_one_interval_for_whole_periods():
+    held, powers = (
+        stable_intervals(DELTAS, np.array([0.0, 1.0, 3.0]), model) for model in ("held", "fractional_power")
+    )
+    for one, other in zip(held, powers, strict=True):
+        np.testing.assert_allclose(one.beta_upper, other.beta_upper, rtol=1e-12)
+
+
+def test_the_fractional_power_ends_at_its_lobe():
+    (found,) = stable_intervals(np.array([0.5]), np.array([0.5]), "fractional_power")
+    omega = np.linspace(1e-3, np.pi, 200_001)
+    curve = zwidth.boundary(omega, 0.5, 0.5, delay="fractional_power")
+    end = np.flatnonzero(curve.alpha[1:] < 0)[0]
+    assert found.beta_upper[0] == pytest.approx(curve.beta[end], abs=1e-4)
+
+
+@pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 2.0])
+def test_the_passive_edge_separates_passive_from_not(d):
+    angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
+    alpha, beta = passive_edge(angles, d)
+    for delta in (0.1, 3.0):
+        inside = zwidth.is_passive(delta * alpha * (1 - 1e-9), delta * beta * (1 - 1e-9), delta, d)
+        beyond = zwidth.is_passive(delta * alpha * (1 + 1e-9), delta * beta * (1 + 1e-9), delta, d)
+        assert np.all(inside)
+        assert not np.any(beyond)
+
+
+def test_without_delay_the_passive_set_is_colgates_triangle():
+    alpha, beta = unit_outline(0.0)
+    np.testing.assert_allclose(alpha / 2 + np.abs(beta), 1.0, rtol=1e-13)
+
+
+@pytest.mark.parametrize("d, slope", [(0.0, 2.0), (1.0, 2 * np.sqrt(2) - 2)])
+def test_the_stiffest_passive_wall(d, slope):
+    # d = 0: eq. (21) at beta = 0. d = 1: the largest alpha with alpha (1 + 2 cos w)/2 - beta cos 2w <= 1 for every w.
+    found = stiffest_passive(d)
+    assert found.alpha == pytest.approx(slope, rel=1e-12)
+    assert zwidth.passivity_margin(found.alpha, found.beta, 1.0, d) == pytest.approx(0.0, abs=1e-12)
+
+
+def test_a_passive_wall_is_never_stiffer_than_a_stable_one():
+    study = PassivityStudy.model_validate(
+        {"kind": "passivity", "name": "p", "delta": [0.1, 1.0, 10.0], "d": [0, 0.5, 2]}
+    )
+    table = run_passivity(study).table
+    assert np.all(table["alpha_max_passive"] < table["alpha_max"])
+    np.testing.assert_allclose(table["alpha_max"], zwidth.alpha_max(table["delta"], table["d"]).alpha, rtol=1e-13)
+
+
+def test_ridges_are_those_of_the_library():
+    delta, d = np.linspace(0.0, 10.0, 7), np.array([0.0, 0.125, 3.0])
+    paths, notes = ridge_paths(delta, d, "held")
+    assert notes == []
+    for path in paths:
+        expected = zwidth.alpha_max(delta, path.d)
+        np.testing.assert_allclose(path.alpha_max, expected.alpha, rtol=1e-13)
+        assert [zwidth.RidgeKind[name.upper()] for name in path.kind] == list(expected.kind)
+    assert paths[0].kind[-1] == "corner"
+
+
+def test_whole_delays_are_computed_in_one_model_alone():
+    d = np.array([0.0, 0.5, 1.0])
+    both = needed_models(("held", "fractional_power"), d)
+    assert [(name, list(delays)) for name, delays in both] == [("held", [0.0, 0.5, 1.0]), ("fractional_power", [0.5])]
+    assert needed_models(("held", "fractional_power"), np.array([1.0]))[-1][0] == "held"
+    assert list(needed_models(("fractional_power",), d)[0][1]) == [0.0, 0.5, 1.0]
+
+
+def test_a_ridge_study_tables_every_curve():
+    study = RidgeStudy.model_validate(
+        {"kind": "ridge", "name": "r", "delta": [0, 1], "d": [0.5, 1], "delay_models": ["held", "fractional_power"]}
+    )
+    outcome = run_ridge(study)
+    assert list(outcome.table["delay_model"]) == ["held"] * 4 + ["fractional_power"] * 2
+    assert list(outcome.figures) == [""]
+
+
+def test_an_outline_has_names_for_its_pieces():
+    edge, verified = outline(3.0, 0.0, "held")
+    assert verified
+    assert set(edge.piece) == {"complex_pair", "minus_one"}
+
+
+def test_a_boundary_study_tables_boundaries_ridge_and_passivity():
+    study = BoundaryStudy.model_validate(
+        {"kind": "boundary", "name": "b", "delta": [0, 0.5], "d": [0, 1], "ridge_path": True, "passivity": True}
+    )
+    table = run_boundary(study, SIScale(1e5, 1e2)).table
+    np.testing.assert_array_equal(table["stiffness_N_per_m"], 1e5 * table["alpha"])
+    curve = (table["curve"] == "boundary") & (table["piece"] == "complex_pair")
+    # The first and last vertex of a lobe lie at alpha = 0 by definition.
+    curve &= table["alpha"] > 1e-9
+    expected = zwidth.boundary(table["omega"][curve], table["delta"][curve], table["d"][curve])
+    np.testing.assert_allclose(table["alpha"][curve], expected.alpha, rtol=1e-12)
+    np.testing.assert_allclose(table["beta"][curve], expected.beta, rtol=1e-12, atol=1e-14)
+    ridge = table["curve"] == "ridge_path"
+    np.testing.assert_allclose(
+        table["alpha"][ridge], zwidth.alpha_max(table["delta"][ridge], table["d"][ridge]).alpha, rtol=1e-12
+    )
+    assert set(table["delta"][table["curve"] == "passive"]) == {0.5}
+
+
+def test_step_responses_of_devices_and_walls():
+    device = {"mass": 0.1, "damping": "10 N s/m", "period": "1 ms", "delay": "1 periods"}
+    study = StepStudy.model_validate(
+        {"kind": "step", "name": "s", "devices": [device], "stiffness_fraction": 0.75, "duration": "50 periods"}
+    )
+    table = run_step(study).table
+    ridge = zwidth.alpha_max(0.1, 1)
+    expected = zwidth.step_response(0.75 * float(ridge.alpha), float(ridge.beta), 0.1, 1, periods=50)
+    np.testing.assert_allclose(table["position_m"], expected.position * 1e-3**2 / 0.1, rtol=1e-12)
+    np.testing.assert_allclose(table["time_s"], expected.time * 1e-3, rtol=1e-12)
+    assert table["label"][0] == "K = 14.90 kN/m, B = 41.60 N s/m"
+
+
+def test_a_response_that_does_not_settle_is_noted():
+    study = StepStudy.model_validate(
+        {
+            "kind": "step",
+            "name": "s",
+            "devices": [{"delta": 0.1, "d": 1, "label": "stiff"}],
+            "walls": [{"alpha": 1.0, "beta": 0.4}],
+            "duration": "20 periods",
+        }
+    )
+    outcome = run_step(study)
+    assert "stiff" in outcome.notes[0]
+    assert "position" in outcome.table
+
+
+def test_a_map_holds_every_output_on_the_grid():
+    study = MapStudy.model_validate(
+        {
+            "kind": "map",
+            "name": "m",
+            "alpha": [0.1, 0.2, 0.9],
+            "beta": [0.1, 0.4],
+            "delta": [0, 0.1],
+            "d": [0, 0.5, 1],
+            "outputs": ["stable", "spectral_radius", "passive"],
+        }
+    )
+    arrays = run_map(study).arrays
+    grid = np.meshgrid(arrays["alpha"], arrays["beta"], arrays["delta"], arrays["d"], indexing="ij")
+    radius = np.array([np.nanmax(np.abs(row)) for row in zwidth.poles(*(axis.ravel() for axis in grid))])
+    np.testing.assert_allclose(arrays["spectral_radius"].ravel(), radius, rtol=1e-9)
+    np.testing.assert_array_equal(arrays["stable"], arrays["spectral_radius"] < 1)
+    np.testing.assert_array_equal(arrays["passive"], zwidth.is_passive(*grid))
+
+
+def test_tables_keep_every_digit():
+    value = np.array([0.1 + 0.2, 1e-300, np.nan])
+    table = stack([{"curve": "a", "x": value}, {"curve": "b", "x": value[:1], "y": 2.0}])
+    read = read_csv(csv_text(table))
+    assert list(read["curve"]) == ["a", "a", "a", "b"]
+    np.testing.assert_array_equal(read["x"].astype(float), [*value, value[0]])
+    np.testing.assert_array_equal(read["y"].astype(float), [np.nan, np.nan, np.nan, 2.0])
