@@ -29,10 +29,8 @@ def rounding_errors(count: float, reason: str) -> Tolerance:
 
 
 PHI = rounding_errors(4, "Relative. One exponential, one Horner sum of positive terms, one product.")
-PHI_SLOPE = rounding_errors(
-    16, "Relative to the larger of the value and its bound at 0. Autodiff adds two rounded products of like size."
-)
-PHI_CURVATURE = rounding_errors(24, "As PHI_SLOPE, with four rounded products.")
+PHI_SLOPE = rounding_errors(16, "Relative. Autodiff adds two or three rounded products, which cancel by up to half.")
+PHI_CURVATURE = rounding_errors(24, "Relative. As PHI_SLOPE, with four or five rounded products.")
 
 PLANT = rounding_errors(4, "Relative, where e^-delta does not underflow. Sums of positive terms: nothing cancels.")
 PLANT_DECAYED = rounding_errors(

@@ -7,20 +7,22 @@ of it; inside somebody's own transformation (`jit`, `grad`, ...) the ambient pre
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth._types import ArrayLike
+from zwidth._types import Array, ArrayLike
 from zwidth.errors import InputError, TracedDelayError
 
 # Large batches run in pieces of one size: one compilation, bounded memory, and a point's value does not depend
-# on how many others came with it.
+# on how many others came with it. (A single number is compiled apart and may differ in the last place.)
 CHUNK = 1 << 15
 
 
@@ -67,14 +69,22 @@ _UNFUSED = {"xla_disable_hlo_passes": "fusion"}
 
 
 @cache
-def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
-    options = None if fused else _UNFUSED
-    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)), compiler_options=options)
+def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)))
 
 
-def _padded_size(count: int, chunk: int) -> int:
+def _padded_size(count: int, chunk: int, least: int) -> int:
     """Round up to a power of two, so that batches of many sizes share a few compilations."""
-    return min(chunk, 1 << max(count - 1, 0).bit_length())
+    return min(chunk, 1 << max(count - 1, least - 1, 0).bit_length())
+
+
+def _piece(column: np.ndarray, start: int, size: int) -> np.ndarray:
+    part = column[start : start + size]
+    missing = size - part.size
+    if not missing:
+        return part
+    # The last point is repeated: a neutral filler would need to be known to be good for every kernel.
+    return np.concatenate([part, np.full(missing, part[-1] if part.size else 0.0)])
 
 
 def map_flat(
@@ -82,22 +92,84 @@ def map_flat(
     columns: list[np.ndarray],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    fused: bool = True,
+    least: int = 1,
 ) -> Any:
-    """Apply a one-point kernel to every row of equally long columns, in float64; NumPy leaves come back."""
+    """Apply a one-point kernel to every row of equally long columns, in float64; NumPy leaves come back.
+
+    Pieces hold ``chunk`` points and run on as many threads as there are processors. A piece is never shorter than
+    ``least``: the compiler treats very short ones differently, to the last place.
+    """
     count = columns[0].size
-    function = _compiled(kernel, static, fused)
-    size = _padded_size(count, chunk)
-    pieces = []
+    function = _compiled(kernel, static)
+    size = _padded_size(count, chunk, least)
+
+    def run(start: int) -> Any:
+        # The setting belongs to the thread.
+        with jax.enable_x64(True):
+            result = function(*(_piece(column, start, size) for column in columns))
+            return jax.tree.map(np.asarray, result)
+
+    first = run(0)
+    # A copy, because JAX's own memory is read-only.
+    whole = jax.tree.map(lambda leaf: np.empty((count, *leaf.shape[1:]), leaf.dtype), first)
+
+    def store(start: int, result: Any) -> None:
+        stop = min(start + size, count)
+        jax.tree.map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
+
+    store(0, first)
+    if count > size:
+        # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
+        with ThreadPoolExecutor(_processors()) as threads:
+            list(threads.map(lambda start: store(start, run(start)), range(size, count, size)))
+    return whole
+
+
+def _processors() -> int:
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS
+        return os.cpu_count() or 1
+
+
+class _Packed(NamedTuple):
+    """A compiled kernel of one point that returns one vector, and how to take its result out of it."""
+
+    function: Callable[..., Any]
+    unpack: Callable[[np.ndarray], Any]
+
+
+@cache
+def _packed(kernel: Callable[..., Any], static: tuple[Any, ...], arity: int) -> _Packed | None:
+    """For a kernel that returns real scalars. One array in and one out: each costs as much as the computation."""
+
+    def at(point: jax.Array) -> Any:
+        return kernel(*(point[index] for index in range(arity)), *static)
+
+    shapes = jax.eval_shape(at, jax.ShapeDtypeStruct((arity,), np.float64))
+    leaves, structure = jax.tree.flatten(shapes)
+    if any(leaf.shape or leaf.dtype.kind not in "fiub" for leaf in leaves):
+        return None
+    types = [leaf.dtype.type for leaf in leaves]
+    function = jax.jit(lambda point: jnp.stack([leaf.astype(point.dtype) for leaf in jax.tree.leaves(at(point))]))
+
+    def unpack(vector: np.ndarray) -> Any:
+        return structure.unflatten([kind(value) for kind, value in zip(types, vector.tolist(), strict=True)])
+
+    return _Packed(function, unpack)
+
+
+def _single(kernel: Callable[..., Any], point: list[float], static: tuple[Any, ...]) -> Any:
+    """The result at one point, as NumPy scalars (arrays where the kernel returns any)."""
     with jax.enable_x64(True):
-        for start in range(0, max(count, 1), size):
-            parts = [column[start : start + size] for column in columns]
-            missing = size - parts[0].size
-            # The last point is repeated: a neutral filler would need to be known to be good for every kernel.
-            filled = [np.pad(part, (0, missing), mode="edge") if part.size else np.zeros(size) for part in parts]
-            result = function(*filled)
-            pieces.append(jax.tree.map(lambda leaf, stop=size - missing: np.asarray(leaf)[:stop], result))
-    return pieces[0] if len(pieces) == 1 else jax.tree.map(lambda *leaves: np.concatenate(leaves), *pieces)
+        packed = _packed(kernel, static, len(point))
+        if packed is not None:
+            return packed.unpack(np.asarray(packed.function(np.array(point))))
+    return jax.tree.map(lambda leaf: leaf[0], map_flat(kernel, [np.array([value]) for value in point], static))
+
+
+# The types whose conversion needs no check; bool and 0-d arrays take the long way.
+_NUMBERS = frozenset({float, int, np.float64})
 
 
 def pointwise(
@@ -106,14 +178,21 @@ def pointwise(
     values: tuple[ArrayLike, ...],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    fused: bool = True,
+    least: int = 1,
 ) -> Any:
     """Broadcast ``values``, apply the one-point ``kernel`` to each point, and restore the common shape."""
+    if _NUMBERS.issuperset(map(type, values)):
+        try:
+            return _single(kernel, [float(value) for value in values], static)
+        except OverflowError:
+            pass  # An integer beyond float64: the long way names it.
     if is_traced(*values):
         return _traced(kernel, values, static)
     arrays = broadcast(names, values)
     shape = arrays[0].shape
-    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, fused)
+    if not shape:
+        return to_caller(_single(kernel, [float(array) for array in arrays], static), values)
+    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, least)
     return to_caller(jax.tree.map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 
@@ -125,6 +204,17 @@ def _traced(kernel: Callable[..., Any], values: tuple[ArrayLike, ...], static: t
         return kernel(*arrays, *static)
     flat = jax.vmap(lambda *point: kernel(*point, *static))(*(array.reshape(-1) for array in arrays))
     return jax.tree.map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat)
+
+
+def stored(values: Any, witness: Array) -> Any:
+    """``values``, computed once: for a kernel in which many later steps use them.
+
+    XLA:CPU repeats a chain of cheap operations in every loop it makes out of the operations behind it, but never a
+    division. The divisor here is 1, or NaN where ``witness`` (anything known at run time) is, so that the compiler
+    cannot see it. Halves the time to compile and to run of a Newton iteration on a discretized plant.
+    """
+    one = jax.lax.stop_gradient(jnp.where(jnp.isnan(witness), jnp.nan, 1.0))
+    return jax.tree.map(lambda value: value / one, values)
 
 
 def concrete_delay(d: ArrayLike) -> np.ndarray:

@@ -10,7 +10,6 @@ factored. Pole methods use the coefficients `coefficients`, frequency methods `f
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -42,11 +41,16 @@ def affine(delta: Array, d: Array, degree: Degree) -> Affine:
     plant = plant_of(delta, d, degree)
     zero = jnp.zeros_like(plant.a2)
     head = [jnp.ones_like(plant.a2), -(1.0 + plant.c), plant.c]
-    # The numerator without the common factor z that a whole delay leaves in it.
-    n = [plant.a2, plant.a1, plant.a0] if degree.fractional else [plant.a2, plant.a1]
+    # N(z) and (z - 1) N(z), without the common factor z that a whole delay leaves in them; a2 - a1 is then the gap.
+    if degree.fractional:
+        n = [plant.a2, plant.a1, plant.a0]
+        differences = [plant.a1 - plant.a2, plant.a0 - plant.a1]
+    else:
+        n = [plant.a2, plant.a1]
+        differences = [-plant.gap]
     pad = [zero] * (degree.poles - len(n))
     n1 = [*pad, *n, zero]
-    n2 = [*pad, n[0], *(right - left for left, right in pairwise(n)), -n[-1]]
+    n2 = [*pad, n[0], *differences, -n[-1]]
     d0 = head + [zero] * (degree.poles - 2)
     return Affine(jnp.stack(d0), jnp.stack(n1), jnp.stack(n2))
 
@@ -227,7 +231,7 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
         TracedDelayError: d is traced.
 
     Numerics:
-        Every coefficient of P's parts D, N1, N2 is accurate to a few units in the last place for every delta.
+        Every coefficient is accurate to a few rounding errors of the terms it is the sum of, for every delta.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eqs. (15), (17).

@@ -48,20 +48,22 @@ def decay(x: Array) -> Array:
 def phi1(x: Array) -> Array:
     """``(1 - e^-x)/x``, 1 at x = 0."""
     small, low, high = _branches(x)
-    return jnp.where(small, jnp.exp(-low) * _series(low, _PHI1), -jnp.expm1(-high) / high)
+    # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact.
+    return jnp.where(small, jnp.exp(-low) * _series(low, _PHI1), (1.0 - jnp.exp(-high)) / high)
 
 
 def phi2(x: Array) -> Array:
     """``(1 - phi1)/x = (e^-x - 1 + x)/x^2``, 1/2 at x = 0."""
     small, low, high = _branches(x)
     # Divided twice: x^2 overflows, and its derivative does so sooner.
-    return jnp.where(small, jnp.exp(-low) * _series(low, _PHI2), (1.0 + jnp.expm1(-high) / high) / high)
+    return jnp.where(small, jnp.exp(-low) * _series(low, _PHI2), (1.0 - (1.0 - jnp.exp(-high)) / high) / high)
 
 
 def psi(x: Array) -> Array:
     """``phi1 - phi2 = (1 - e^-x - x e^-x)/x^2``, 1/2 at x = 0."""
     small, low, high = _branches(x)
-    return jnp.where(small, jnp.exp(-low) * _series(low, _PSI), (-jnp.expm1(-high) / high - jnp.exp(-high)) / high)
+    c = jnp.exp(-high)
+    return jnp.where(small, jnp.exp(-low) * _series(low, _PSI), ((1.0 - c) / high - c) / high)
 
 
 def gap(x: Array) -> Array:
@@ -70,4 +72,4 @@ def gap(x: Array) -> Array:
     half = 0.5 * low
     series = jnp.exp(-half) * low * _series(half * half, _GAP)
     c = jnp.exp(-high)
-    return jnp.where(small, series, ((1.0 + c) + 2.0 * jnp.expm1(-high) / high) / high)
+    return jnp.where(small, series, ((1.0 + c) - 2.0 * (1.0 - c) / high) / high)

@@ -17,6 +17,7 @@ import numpy as np
 
 from zwidth import phi
 from zwidth._types import Array
+from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.grouping import degree_of
 from zwidth.scene import Scene
@@ -99,7 +100,7 @@ def step_response(
         InputError: an argument is no single finite number, or out of range.
 
     Numerics:
-        Exact between force changes up to rounding; float64. An unstable response grows to inf.
+        Exact between force changes up to rounding; float64. An unstable response that outgrows float64 ends as inf or NaN.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VIII, Fig. 11, eqs. (2), (6).
@@ -110,21 +111,21 @@ def step_response(
         >>> print(f"{response.position[-1] * 0.108:.2f}")
         1.00
     """
-    numbers = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, "force": force}
-    for name, value in numbers.items():
-        if np.ndim(value) != 0 or not np.isfinite(value):
-            raise InputError(f"{name}: got {value!r}; a single finite number is needed")
-    for name in ("delta", "d"):
-        if numbers[name] < 0:
-            raise InputError(f"{name}: got {numbers[name]!r}; it must be at least 0")
+    arguments = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, "force": force}
+    numbers = {name: as_float64(name, value) for name, value in arguments.items()}
+    for name, number in numbers.items():
+        if number.ndim or not np.isfinite(number):
+            raise InputError(f"{name}: got {arguments[name]!r}; a single finite number is needed")
+        if name in ("delta", "d") and number < 0:
+            raise InputError(f"{name}: got {arguments[name]!r}; it must be at least 0")
     for name, count in {"periods": periods, "substeps": substeps}.items():
         if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
             raise InputError(f"{name}: got {count!r}; a whole number of at least 1 is needed")
+    alpha, beta, delta, d, force = (float(number) for number in numbers.values())
     lag = degree_of(d).whole
     fractions = np.arange(substeps) / substeps
     with jax.enable_x64(True):
-        wall = jnp.asarray([alpha, beta, delta, force], dtype=jnp.float64)
-        history = _simulate_jit(wall, fractions, float(d) - lag, lag, int(periods))
+        history = _simulate_jit(np.array([alpha, beta, delta, force]), fractions, d - lag, lag, int(periods))
     position, velocity, wall_force = (np.asarray(part).ravel() for part in history)
     time = (np.arange(periods)[:, None] + fractions).ravel()
     final = force / alpha if alpha != 0 else np.nan

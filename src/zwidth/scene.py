@@ -112,7 +112,9 @@ def _converted(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -
 def _formula_at(*arguments: Any) -> tuple[Array, ...]:
     """``formula`` with NaN for what is out of range; the last three arguments are the formula, the names, and NumPy."""
     *values, formula, names, xp = arguments
-    good = (xp.where(_in_range(name, value, xp), value, np.nan) for name, value in zip(names, values, strict=True))
+    # Multiplied, not chosen: the derivatives of what is out of range are then NaN as well.
+    pairs = zip(names, values, strict=True)
+    good = (value * xp.where(_in_range(name, value, xp), 1.0, np.nan) for name, value in pairs)
     return formula(*good, xp)
 
 

@@ -17,6 +17,7 @@ class Status(IntEnum):
     NO_BOUNDARY = 3
     UNDECIDED = 4
     ON_BOUNDARY = 5
+    UNREACHABLE = 6
 
     @property
     def message(self) -> str:
@@ -36,4 +37,5 @@ _MESSAGES = {
         "with the extra 'certified' installed."
     ),
     Status.ON_BOUNDARY: "A pole lies exactly on the unit circle, or too close to it for the largest precision allowed.",
+    Status.UNREACHABLE: "No value of the quantity asked for reaches the wanted stiffness; change another one.",
 }

@@ -52,7 +52,6 @@ _RC: Any = {
     "axes.spines.right": False,
     "axes.axisbelow": True,
     "axes.grid": False,
-    "axes.formatter.use_mathtext": True,
     "xtick.labelsize": 8.0,
     "ytick.labelsize": 8.0,
     "xtick.direction": "out",
@@ -125,9 +124,13 @@ def figure_of(ax: Axes) -> Figure:
 def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
     """Write ``stem.png`` and ``stem.svg``; the same figure gives the same bytes."""
     png, svg = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+    engine = figure.get_layout_engine()
     with house_style():
         figure.savefig(png, dpi=PNG_DPI, metadata={"Software": None})
+        # What is laid out once need not be again: it is half of the work.
+        figure.set_layout_engine("none")
         figure.savefig(svg, metadata={"Date": None})
+    figure.set_layout_engine(engine)
     return png, svg
 
 

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
     import flint
 
 FIRST_BITS = 128
+# Enough for the exact product of a float64 and 1 - f: an argument known to fewer bits would cost the phi-functions more.
+_EXACT_BITS = 1200
 
 
 class Verdict(NamedTuple):
@@ -82,10 +84,12 @@ def _device(delta: float, d: float, bits: int) -> _BallDevice:
         c, phi2, psi = _phi(flint.arb(delta), frexp(delta)[1], bits)
         return _BallDevice(c, (psi, phi2))
     ball, f_ball = flint.arb(delta), flint.arb(f)
-    t = 1 - f_ball
-    # f and 1 - f are at least 2^-1074: both exponents bound the argument's from below, which is all they are for.
-    e_t, phi2_t, psi_t = _phi(ball * t, frexp(delta)[1] + frexp(1 - f)[1] - 1, bits)
-    _, phi2_f, psi_f = _phi(ball * f_ball, frexp(delta)[1] + frexp(f)[1] - 1, bits)
+    with flint.ctx.workprec(_EXACT_BITS):
+        t = 1 - f_ball
+        x_t, x_f = ball * t, ball * f_ball
+    # Of a product's exponent, the sum of the factors' is off by one at most.
+    e_t, phi2_t, psi_t = _phi(x_t, frexp(delta)[1] + frexp(1 - f)[1] - 1, bits)
+    _, phi2_f, psi_f = _phi(x_f, frexp(delta)[1] + frexp(f)[1] - 1, bits)
     phi1_t, phi1_f = phi2_t + psi_t, phi2_f + psi_f
     a2 = t * t * phi2_t
     a1 = t * t * psi_t + t * f_ball * (e_t + phi1_t) * phi1_f + f_ball * f_ball * phi2_f

@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth._types import Array
-from zwidth.stability.layout import Points, device_ok, padded, pieces
+from zwidth.stability.layout import DeviceWork, Points, device_ok, per_device, split
 from zwidth.stability.row_limit import (
     LONG_FIELDS,
     SHORT_FIELDS,
@@ -62,65 +61,20 @@ def in_verified_range(points: Points) -> np.ndarray:
 
 
 @cache
+def _rows(short: bool) -> DeviceWork:
+    if short:
+        return DeviceWork(jax.jit(short_device), jax.jit(short_row), len(SHORT_FIELDS), np.float64)
+    return DeviceWork(jax.jit(long_device), jax.jit(long_row), len(LONG_FIELDS), np.float64)
+
+
+@cache
 def _compiled(name: str) -> Any:
-    kernels = {
-        "short": (short_device, short_row),
-        "long": (long_device, long_row),
-        "less": jnp.less,
-        "between": lambda alpha, limit: (alpha > 0) & (alpha < limit),
-    }[name]
-    return tuple(map(jax.jit, kernels)) if isinstance(kernels, tuple) else jax.jit(kernels)
+    return jax.jit({"less": jnp.less, "between": lambda alpha, limit: (alpha > 0) & (alpha < limit)}[name])
 
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
     """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range."""
-    shape = np.broadcast_shapes(beta.shape, delta.shape, d.shape)
-    device_shape = np.broadcast_shapes(delta.shape, d.shape)
-    deltas, delays = (np.broadcast_to(array, device_shape).reshape(-1) for array in (delta, d))
-    rows = np.broadcast_to(beta, shape).reshape(-1)
-    short = ~(delays >= 1)
-    if deltas.size == 1:
-        return _rows_of_one(rows, deltas, delays, bool(short[0])).reshape(shape)
-    # Which device each row belongs to.
-    owner = np.broadcast_to(np.arange(deltas.size).reshape(device_shape), shape).reshape(-1)
-    out = np.empty(rows.size)
-    for is_short in (True, False):
-        mine = np.flatnonzero(short == is_short)
-        if not mine.size:
-            continue
-        index = np.flatnonzero(short[owner] == is_short) if mine.size < short.size else slice(None)
-        place = np.zeros(short.size, np.intp)
-        place[mine] = np.arange(mine.size)
-        out[index] = _rows_of_many(rows[index], deltas[mine], delays[mine], place[owner[index]], is_short)
-    return out.reshape(shape)
-
-
-def _rows_of_one(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, short: bool) -> np.ndarray:
-    device, row = _compiled("short" if short else "long")
-    out = np.empty(beta.size)
-    with jax.enable_x64(True):
-        fields = device(delta, d)
-        for part, size in pieces(beta.size):
-            out[part] = np.asarray(row(padded(beta[part], size), fields))[: part.stop - part.start]
-    return out
-
-
-def _rows_of_many(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, owner: np.ndarray, short: bool) -> np.ndarray:
-    """Each device once, unless there are about as many devices as rows: then both in small pieces, in the cache."""
-    device, row = _compiled("short" if short else "long")
-    shared = 4 * delta.size <= beta.size
-    out = np.empty(beta.size)
-    with jax.enable_x64(True):
-        if shared:
-            fields = np.empty((len(SHORT_FIELDS if short else LONG_FIELDS), delta.size))
-            for part, size in pieces(delta.size):
-                values = np.asarray(device(padded(delta[part], size), padded(d[part], size)))
-                fields[:, part] = values[:, : part.stop - part.start]
-        for part, size in pieces(beta.size):
-            mine = padded(owner[part], size)
-            here = fields[:, mine] if shared else device(delta[mine], d[mine])
-            out[part] = np.asarray(row(padded(beta[part], size), here))[: part.stop - part.start]
-    return out
+    return split((beta, delta, d), d >= 1, np.float64, lambda long, part: per_device(_rows(not long), [part[0]], *part[1:]))
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
@@ -150,10 +104,3 @@ def _compare_places(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
     ends = np.where(np.isnan(limit), 0.0, limit).reshape(-1)
     count = np.searchsorted(ordered, ends).astype(np.int16)
     return np.asarray(_compiled("less")(place.reshape(alpha.shape), count.reshape(limit.shape)))
-
-
-def limit_of(beta: Array, delta: Array, d: Array) -> Array:
-    """`row_limits` on arrays that already have one shape, traced or not."""
-    short = short_row(beta, short_device(delta, d))
-    long = long_row(beta, long_device(delta, d))
-    return jnp.where(d < 1, short, long)

@@ -10,20 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
-from zwidth import batching
 from zwidth._types import Array, ArrayLike
-from zwidth.grouping import NAMES, Degree, degree_of, groups
+from zwidth.grouping import Degree
 from zwidth.stability import balls
 from zwidth.stability.certified_crossover import crossover
 from zwidth.stability.certified_filter import OPEN, STABLE, HeldDevice, coefficients, device, recursion
+from zwidth.stability.layout import Points, by_degree, lay_out, point_ok, run_pieces
 from zwidth.status import Status
 
 # Beyond, the recursion leaves too much open: 0.02 % of a map at d = 14, 2 % at d = 20. Its proof counts on it too.
 _RECURSION_UP_TO = 12
-# Large enough to hide the cost of a call, small enough for the caches.
-_TILE = 1 << 17
-# A grid pays for a compilation of its own shape from this size on.
-_GRID_FROM = 1 << 19
+# Smaller batches are filled up to this size, so that they share one compilation.
+_SMALLEST_BATCH = 1 << 10
+# A map pays for a compilation of its own shape from this size on.
+_MAP_FROM = 1 << 19
 # Balls need memory and time in proportion to the delay.
 _LONGEST_FOR_BALLS = 100_000
 # Where balls would take about a second, compiling the second pass is cheaper.
@@ -83,79 +83,40 @@ def certified_stable(
         >>> certified_stable([0.3, 0.6, -0.1], 0.5, 0.0, 0).stable.tolist()
         [True, False, False]
     """
-    arrays = [batching.as_float64(name, value) for name, value in zip(NAMES, (alpha, beta, delta, d), strict=True)]
-    caller_shape = batching.broadcast(NAMES, tuple(arrays))[0].shape
-    shape = caller_shape or (1,)
-    code = _filtered(arrays, shape)
-    stable, status, bits = code == STABLE, np.zeros(shape, np.int32), np.zeros(shape, np.int32)
-    rest = np.unravel_index(np.flatnonzero(code == OPEN), shape)
-    if rest[0].size:
-        columns = [np.broadcast_to(array, shape)[rest] for array in arrays]
-        stable[rest], status[rest], bits[rest] = _settled(columns, max_bits)
-    return CertifiedResult(*(result.reshape(caller_shape) for result in (stable, status, bits)))
+    laid = lay_out((alpha, beta, delta, d))
+    points, shape = laid.points, laid.points.shape
+    code = by_degree(points, shape, np.uint8, partial(_codes, pair=False, edge=False))
+    stable, status, bits = np.asarray(code == STABLE), np.zeros(shape, np.int32), np.zeros(shape, np.int32)
+    rest = np.flatnonzero(code == OPEN)
+    if rest.size:
+        # A single index, because a point without axes has no other.
+        flat = [np.broadcast_to(array, shape).reshape(-1)[rest] for array in points]
+        for result, values in zip((stable, status, bits), _settled(Points(*flat), max_bits), strict=True):
+            result.reshape(-1)[rest] = values
+    return CertifiedResult(*map(laid.spread, (stable, status, bits)))
 
 
-def _filtered(arrays: list[np.ndarray], shape: tuple[int, ...]) -> np.ndarray:
-    """The filter's code of every point."""
-    alpha, beta, delta, d = arrays
-    if _is_constant(delta) and _is_constant(d):
-        delta, d = delta.ravel()[:1], d.ravel()[:1]
-        degree = degree_of(float(d[0]))
-        whole = _static_whole(degree)
+def _codes(degree: Degree, points: Points, *, pair: bool, edge: bool) -> np.ndarray:
+    """The filter's code of points of one degree, of their broadcast shape."""
+    whole = degree.whole if degree.whole <= _RECURSION_UP_TO and not pair else None
+    shape, static = points.shape, (whole, degree.fractional, pair, edge)
+    if not points.size:
+        return np.zeros(shape, np.uint8)
+    one_device = points.delta.size == points.d.size == 1
+    if one_device and points.size >= _MAP_FROM and points.size > 8 * max(points.alpha.size, points.beta.size):
         with jax.enable_x64(True):
-            plant = _device_kernel(delta, d, degree.fractional)
-            if np.prod(shape) >= _GRID_FROM > max(alpha.size, beta.size):
-                return np.asarray(_kernel(alpha, beta, delta, d, plant, whole, degree.fractional, False, False))
-        columns = [_flat(alpha, shape), _flat(beta, shape), delta, d]
-        return _tiled(columns, plant, degree, pair=False, edge=False).reshape(shape)
-    columns = [_flat(array, shape) for array in arrays]
-    return _by_degree(columns, pair=False, edge=False).reshape(shape)
-
-
-def _is_constant(array: np.ndarray) -> bool:
-    return array.size == 1 or (array.size > 0 and bool((array == array.flat[0]).all()))
-
-
-def _flat(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    return np.broadcast_to(array, shape).ravel()
-
-
-def _static_whole(degree: Degree) -> int | None:
-    """The whole delay where it decides the kernel; None for the one kernel of all long delays."""
-    return degree.whole if degree.whole <= _RECURSION_UP_TO else None
-
-
-def _by_degree(columns: list[np.ndarray], *, pair: bool, edge: bool) -> np.ndarray:
-    """The filter's code of columns that may mix devices and degrees."""
-    code = np.full(columns[0].size, OPEN, np.uint8)
-    if pair:
-        fractional = columns[3] != np.floor(columns[3])
-        parts = [(Degree(_RECURSION_UP_TO + 1, bool(kind)), np.flatnonzero(fractional == kind)) for kind in (0, 1)]
-    else:
-        parts = list(groups(columns[3]))
-    for degree, index in parts:
-        if index.size:
-            code[index] = _tiled([column[index] for column in columns], None, degree, pair=pair, edge=edge)
-    return code
-
-
-def _tiled(
-    columns: list[np.ndarray], plant: HeldDevice | None, degree: Degree, *, pair: bool, edge: bool
-) -> np.ndarray:
-    """Run the kernel in pieces of few sizes, so that batches of any size share their compilations."""
-    count = columns[0].size
-    size = min(_TILE, 1 << max(count - 1, 0).bit_length())
-    code = np.empty(count, np.uint8)
-    whole = _static_whole(degree)
-    with jax.enable_x64(True):
-        for start in range(0, count, size):
-            stop = min(start + size, count)
-            pieces = [column if column.size != count else column[start:stop] for column in columns]
-            if stop - start < size:
-                pieces = [np.resize(piece, size) if piece.size == stop - start else piece for piece in pieces]
-            result = _kernel(*pieces, plant, whole, degree.fractional, pair, edge)
-            code[start:stop] = np.asarray(result)[: stop - start]
-    return code
+            plant = _device_kernel(points.delta, points.d, degree.fractional)
+            return np.asarray(_kernel(*points, plant, *static))
+    columns = [np.broadcast_to(array, shape).reshape(-1) for array in (points[:2] if one_device else points)]
+    if points.size < _SMALLEST_BATCH:
+        columns = [np.resize(column, _SMALLEST_BATCH) for column in columns]
+    plant = None
+    if one_device:
+        columns += [points.delta.reshape(1), points.d.reshape(1)]
+        with jax.enable_x64(True):
+            plant = _device_kernel(*columns[2:], degree.fractional)
+    code = run_pieces(lambda *pieces: _kernel(*pieces, plant, *static), columns, np.uint8)
+    return code[: points.size].reshape(shape)
 
 
 @partial(jax.jit, static_argnums=2)
@@ -190,42 +151,33 @@ def _is_valid(value: Array) -> Array:
     return ((bits >= 0) | (bits == jnp.iinfo(jnp.int64).min)) & (value < jnp.inf)
 
 
-def _settled(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Decide what the first pass left open: by signs, by the second pass, by balls."""
-    alpha, beta, delta, d = columns
+def _settled(points: Points, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Decide what the first pass left open, one axis of points: by signs, by the second pass, by balls."""
+    alpha, beta, delta, d = points
     stable, bits = np.zeros(alpha.size, bool), np.zeros(alpha.size, np.int32)
     status = np.full(alpha.size, Status.UNDECIDED, np.int32)
-    valid = np.isfinite(alpha) & np.isfinite(beta) & np.isfinite(delta) & np.isfinite(d) & (delta >= 0) & (d >= 0)
+    valid = point_ok(points)
     status[~valid] = Status.INVALID_INPUT
     # P(1) = phi1 alpha < 0, or for alpha = 0 P'(1) = phi1 (delta + beta) < 0: a real pole beyond z = 1.
-    outside = valid & ((alpha < 0) | ((alpha == 0) & (beta < -delta)))
-    status[outside] = Status.OK
+    status[valid & ((alpha < 0) | ((alpha == 0) & (beta < -delta)))] = Status.OK
     # For alpha = 0 and |beta| <= delta, |beta N| <= |beta| phi1 <= 1 - c <= |z - c| on the circle: with the pole at
     # z = 1 aside, none is outside.
     status[valid & (alpha == 0) & (np.abs(beta) <= delta)] = Status.ON_BOUNDARY
     rest = np.flatnonzero(status == Status.UNDECIDED)
-    rest = rest[_second_pass(columns, rest, stable, status)]
+    # Without balls the second pass always runs, lest a point's status depend on how many others came with it.
+    if not balls.available() or np.sum(d[rest] + 1.0) >= _SECOND_PASS_FROM:
+        for edge in (False, True):
+            index = rest[(alpha[rest] == 0) == edge]
+            stable[index], status[index] = _second_pass(Points(*(column[index] for column in points)), edge)
+        rest = rest[status[rest] == Status.UNDECIDED]
     if balls.available():
         near = rest[d[rest] <= _LONGEST_FOR_BALLS]
-        stable[near], status[near], bits[near] = balls.decide_all([column[near] for column in columns], max_bits)
+        stable[near], status[near], bits[near] = balls.decide_all([column[near] for column in points], max_bits)
     return stable, status, bits
 
 
-def _second_pass(columns: list[np.ndarray], rest: np.ndarray, stable: np.ndarray, status: np.ndarray) -> np.ndarray:
-    """Let the crossover try what is left, pairs and the edge included; a mask of what it leaves."""
-    left = np.ones(rest.size, bool)
-    # Without balls always, lest a point's status depend on how many others came with it.
-    if balls.available() and np.sum(columns[3][rest] + 1.0) < _SECOND_PASS_FROM:
-        return left
-    edge = columns[0][rest] == 0
-    for kind in (False, True):
-        places = np.flatnonzero(edge == kind)
-        if places.size:
-            index = rest[places]
-            code = _by_degree([column[index] for column in columns], pair=True, edge=kind)
-            decided = code != OPEN
-            left[places] = ~decided
-            is_inside = code[decided] == STABLE
-            stable[index[decided]] = is_inside & (not kind)
-            status[index[decided]] = np.where(is_inside & kind, Status.ON_BOUNDARY, Status.OK)
-    return left
+def _second_pass(points: Points, edge: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Let the crossover try again, pairs included: stable and status."""
+    code = by_degree(points, points.shape, np.uint8, partial(_codes, pair=True, edge=edge))
+    decided = np.where((code == STABLE) & edge, Status.ON_BOUNDARY, Status.OK)
+    return (code == STABLE) & (not edge), np.where(code == OPEN, Status.UNDECIDED, decided)

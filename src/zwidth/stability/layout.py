@@ -15,12 +15,16 @@ import numpy as np
 
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
-from zwidth.grouping import NAMES, Degree, groups
+from zwidth.grouping import NAMES, Degree
 
 # Below this many values an argument is too small for looking for repetition to pay.
 _WORTH_FOLDING = 2048
 # Compiled sizes are powers of two up to this many points; larger batches run in pieces of it.
 PIECE = 1 << 17
+
+
+# Smaller maps are listed point by point, in padded pieces that share their compilations.
+_WORTH_OWN_SHAPE = 1 << 16
 
 
 class Points(NamedTuple):
@@ -41,9 +45,12 @@ class Points(NamedTuple):
         """How many points there are."""
         return int(np.prod(self.shape))
 
-    def flat(self) -> Points:
-        """Every argument at every point, in one axis."""
-        return Points(*(np.ascontiguousarray(array).reshape(-1) for array in np.broadcast_arrays(*self)))
+    @property
+    def is_dense(self) -> bool:
+        """Whether the points form a map large enough to be compiled in its own shape, row by row."""
+        shape = self.shape
+        return self.size >= _WORTH_OWN_SHAPE and shape[-1] >= 32 and 4 * sum(a.size for a in self) <= self.size
+
 
 
 class Laid(NamedTuple):
@@ -89,36 +96,42 @@ def _repeats(array: np.ndarray, axis: int) -> bool:
     return bool(np.array_equal(first, array.take([-1], axis=axis)) and (array == first).all())
 
 
-def by_degree(points: Points, shape: tuple[int, ...], dtype: Any, work: Callable[[Degree, Points], np.ndarray]) -> Any:
-    """Fill an array of ``shape`` with ``work(degree, part)`` for the parts of ``points`` of one degree each.
+def split(
+    arrays: tuple[np.ndarray, ...], key: np.ndarray, dtype: Any, work: Callable[[Any, tuple[np.ndarray, ...]], np.ndarray]
+) -> np.ndarray:
+    """Fill an array of the common shape with ``work(value, parts)`` for the parts where ``key`` has that value.
 
-    Where the delay varies along one axis its parts keep their layout; where it varies along several, the points are
+    Where the key varies along one axis the parts keep their layout; where it varies along several, the points are
     listed one by one.
     """
-    parts = list(_parts(points))
-    if len(parts) == 1 and parts[0][1] is None:
-        return work(parts[0][0], points)
-    varying = [axis for axis, length in enumerate(points.d.shape) if length > 1]
-    if len(varying) != 1:
-        flat = points.flat()
-        out = np.empty(flat.alpha.size, dtype)
-        for degree, index in groups(flat.d):
-            out[index] = work(degree, Points(*(column[index] for column in flat)))
-        return out.reshape(shape)
-    axis = varying[0]
+    shape = np.broadcast_shapes(*(array.shape for array in arrays))
+    key = fold(key)
+    values = np.unique(key)
+    if values.size <= 1:
+        return work(values[0] if values.size else 0, arrays)
     out = np.empty(shape, dtype)
-    for degree, index in parts:
-        part = Points(*(column if column.shape[axis] == 1 else column.take(index, axis) for column in points))
-        out[(slice(None),) * axis + (index,)] = work(degree, part)
+    varying = [axis for axis, length in enumerate(key.shape) if length > 1]
+    if len(varying) == 1:
+        axis, along = varying[0], key.reshape(-1)
+        for value in values:
+            index = np.flatnonzero(along == value)
+            parts = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
+            out[(slice(None),) * axis + (index,)] = work(value, parts)
+        return out
+    everywhere = np.broadcast_arrays(key, *arrays)
+    for value in values:
+        mine = everywhere[0] == value
+        out[mine] = work(value, tuple(array[mine] for array in everywhere[1:]))
     return out
 
 
-def _parts(points: Points) -> Iterator[tuple[Degree, np.ndarray | None]]:
-    found = list(groups(points.d.reshape(-1)))
-    if len(found) <= 1:
-        yield (found[0][0] if found else Degree(0, False)), None
-        return
-    yield from found
+def by_degree(points: Points, dtype: Any, work: Callable[[Degree, Points], np.ndarray]) -> np.ndarray:
+    """Fill an array of the broadcast shape with ``work(degree, part)`` for the parts of one degree each."""
+    defined = np.where(np.isfinite(points.d) & (points.d >= 0), points.d, 0.0)
+    whole = np.floor(defined)
+    # Twice the whole part, plus one where a fraction remains, names a degree.
+    code = 2 * whole + (defined != whole)
+    return split(points, code, dtype, lambda value, part: work(Degree(int(value // 2), bool(value % 2)), Points(*part)))
 
 
 def device_ok(points: Points) -> np.ndarray:
@@ -132,24 +145,73 @@ def point_ok(points: Points) -> np.ndarray:
     return np.isfinite(points.alpha) & np.isfinite(points.beta) & device_ok(points)
 
 
-def pieces(count: int) -> Iterator[tuple[slice, int]]:
+def pieces(count: int, piece: int = PIECE) -> Iterator[tuple[slice, int]]:
     """Slices that cover ``count`` values, each with the compiled size to which it is padded."""
-    for start in range(0, count, PIECE):
-        stop = min(start + PIECE, count)
-        yield slice(start, stop), min(PIECE, 1 << max(stop - start - 1, 0).bit_length())
+    for start in range(0, count, piece):
+        stop = min(start + piece, count)
+        yield slice(start, stop), min(piece, 1 << max(stop - start - 1, 0).bit_length())
 
 
 def padded(column: np.ndarray, size: int) -> np.ndarray:
     """Repeat the last value up to ``size``: it is as harmless as the point it came from."""
-    return column if column.size == size else np.pad(column, (0, size - column.size), mode="edge")
+    if column.size == size:
+        return column
+    filled = np.empty(size, column.dtype)
+    filled[: column.size] = column
+    filled[column.size :] = column[-1]
+    return filled
 
 
-def run_pieces(function: Callable[..., Any], columns: list[np.ndarray], dtype: Any) -> np.ndarray:
-    """Apply a compiled elementwise function to flat columns in float64; columns of length 1 are shared by all."""
-    count = max(column.size for column in columns)
-    out = np.empty(count, dtype)
+class DeviceWork(NamedTuple):
+    """A compiled function of (delta, d) and one of points with its result: what is shared, and what is not."""
+
+    device: Callable[[Any, Any], Any]  # (delta, d) -> fields along a new first axis
+    kernel: Callable[..., Any]  # (*columns, fields) -> one value a point
+    fields: int
+    dtype: Any
+    piece: int = PIECE
+
+
+def per_device(work: DeviceWork, columns: list[np.ndarray], delta: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """Apply ``work`` to columns that broadcast with delta and d; the result has their broadcast shape.
+
+    Each device is computed once, unless there are about as many devices as points: then both go through the cache in
+    small pieces.
+    """
+    shape = np.broadcast_shapes(delta.shape, d.shape, *(column.shape for column in columns))
+    device_shape = np.broadcast_shapes(delta.shape, d.shape)
+    deltas, delays = (np.broadcast_to(array, device_shape).reshape(-1) for array in (delta, d))
+    flat = [np.broadcast_to(column, shape).reshape(-1) for column in columns]
+    owner = None
+    if deltas.size > 1:
+        owner = np.broadcast_to(np.arange(deltas.size).reshape(device_shape), shape).reshape(-1)
+    return _in_pieces(work, flat, deltas, delays, owner).reshape(shape)
+
+
+def _in_pieces(
+    work: DeviceWork, flat: list[np.ndarray], delta: np.ndarray, d: np.ndarray, owner: np.ndarray | None
+) -> np.ndarray:
+    count = flat[0].size
+    shared = 4 * delta.size <= count or delta.size == 1
+    out = np.empty(count, work.dtype)
     with jax.enable_x64(True):
-        for part, size in pieces(count):
-            columns_here = [column if column.size == 1 else padded(column[part], size) for column in columns]
-            out[part] = np.asarray(function(*columns_here))[: part.stop - part.start]
+        fields = fields_of(work, delta, d) if shared else None
+        for part, size in pieces(count, work.piece):
+            if fields is None or owner is None:
+                here = fields if fields is not None else work.device(*(padded(a[owner[part]], size) for a in (delta, d)))
+            else:
+                here = np.asarray(fields)[:, padded(owner[part], size)]
+            values = work.kernel(*(padded(column[part], size) for column in flat), here)
+            out[part] = np.asarray(values)[: part.stop - part.start]
     return out
+
+
+def fields_of(work: DeviceWork, delta: np.ndarray, d: np.ndarray) -> Any:
+    """The fields of every device of two flat arrays; call it with float64 enabled."""
+    if delta.size == 1:
+        return work.device(delta, d)
+    fields = np.empty((work.fields, delta.size))
+    for part, size in pieces(delta.size, work.piece):
+        values = work.device(padded(delta[part], size), padded(d[part], size))
+        fields[:, part] = np.asarray(values)[:, : part.stop - part.start]
+    return fields

@@ -18,6 +18,7 @@ RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
 # Small enough for the second-level cache, large enough to pay for its dispatch.
 _CHUNK = 1 << 13
+_LEAST = 1 << 4
 
 
 class RidgeKind(IntEnum):
@@ -74,7 +75,7 @@ def alpha_max(
     check_choice("method", method, _METHODS)
     # "auto" and "newton" share one compilation.
     route = "kkt" if method == "kkt" else "newton"
-    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, route), _CHUNK)
+    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, route), _CHUNK, _LEAST)
 
 
 def ridge_kernel(delta: Array, d: Array, delay: str, method: str = "newton") -> RidgePoint:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import optimistix
 
 from zwidth._types import Array
+from zwidth.batching import stored
 from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
 from zwidth.stability.bracketing import bisect
 from zwidth.stability.curve import corner, lobe_end
@@ -69,7 +70,7 @@ def kkt_ridge(delta: Array, d: Array, delay: str) -> tuple[Array, Array, Array, 
     # A solver that sees NaN in one lane may spoil or stop the others; NaN is put back behind it.
     poison = 0.0 * (delta + d)
     delta, d = jnp.where(jnp.isnan(delta), 1.0, delta), jnp.where(jnp.isnan(d), 1.0, d)
-    loop = frequency_loop(delta, d, delay)
+    loop = stored(frequency_loop(delta, d, delay), delta)
     at_corner = corner(loop)
     is_corner = at_corner.is_ridge
     omega, found = _smooth_omega(loop, d, delay)
@@ -89,11 +90,12 @@ def _smooth_omega(loop: FrequencyLoop, d: Array, delay: str) -> tuple[Array, Arr
     def slope(omega: Array, loop: FrequencyLoop) -> Array:
         return jax.grad(lambda w: frequency_boundary(w, loop, delay).alpha)(omega)
 
-    end = lobe_end(loop, d, delay)
+    end = stored(lobe_end(loop, d, delay), d)
     # Below, the slope is positive; at pi itself it vanishes by symmetry whatever the optimum.
     upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
     start, bracketed = bisect(slope, 1e-6 * end, upper, loop)
-    wall = jax.lax.stop_gradient(frequency_boundary(start, loop, delay))
+    start = stored(start, d)
+    wall = jax.lax.stop_gradient(stored(frequency_boundary(start, loop, delay), d))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(wall.alpha.dtype).tiny)
     scale_beta = jnp.maximum(jnp.abs(wall.beta), scale_alpha)
     tolerance = 16 * jnp.finfo(start.dtype).eps
@@ -105,7 +107,7 @@ def _smooth_omega(loop: FrequencyLoop, d: Array, delay: str) -> tuple[Array, Arr
         max_steps=_MAX_STEPS,
         throw=False,
     )
-    omega = solution.value[2]
+    omega = stored(solution.value[2], d)
     # Rounding can keep Newton from its last tolerance; what counts is that it stayed where the bracket put it.
     close = jnp.abs(omega - start) <= 1e-5 * end
     return omega, bracketed & close

@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.batching import stored
 from zwidth.plant import Plant
 
 
@@ -241,15 +242,6 @@ def _solve_fractional(curve: Curve, D: Array, start: Start) -> tuple[Array, Arra
     return s, last
 
 
-def _stored(values, one: Array):
-    """``values / one`` with ``one`` equal to 1: values are computed once.
-
-    XLA:CPU repeats a chain of cheap operations in every kernel that uses its result, here the whole plant in each
-    Newton step; it never repeats a division. Halves the time to compile and to run. (It must not see the 1.)
-    """
-    return jax.tree.map(lambda value: value / one, values)
-
-
 @partial(jax.custom_jvp, nondiff_argnums=(3,))
 def ridge_point(curve: Curve, D: Array, start: Start, delay: str) -> tuple[Array, Array]:
     """The s of the ridge, exactly 1 at a corner, and the last step taken; differentiable in ``curve`` and D."""
@@ -304,10 +296,9 @@ class NewtonRidge(NamedTuple):
 
 def newton_ridge(plant: Plant, lag: Array, start: Start, delay: str) -> NewtonRidge:
     """The ridge of one plant behind ``lag`` periods (whole in the held model), with exact derivatives."""
-    one = jnp.where(jnp.isnan(start.scale), jnp.nan, 1.0)
-    curve = curve_of(_stored(plant, one))
+    curve = curve_of(stored(plant, start.scale))
     D = lag + 1.0
-    s, last = _stored(ridge_point(curve, D, start, delay), one)
+    s, last = stored(ridge_point(curve, D, start, delay), start.scale)
     # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
     converged = jnp.abs(last) <= jnp.sqrt(jnp.finfo(s.dtype).eps) * s
     is_corner = s >= 1.0

@@ -21,6 +21,8 @@ rearranged below so that nothing cancels, for every damping.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 
 from zwidth import phi
@@ -34,15 +36,16 @@ VERIFIED_DAMPING = 1e6
 
 # From the starting points below each sequence doubles its digits a step; the last step only confirms.
 _END_STEPS = 6
-_ROW_STEPS = 5
+_ROW_STEPS = 3
 
 _SIN = [1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800, -1 / 1307674368000]
+_ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
 _COS = [1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600, -1 / 87178291200, 1 / 20922789888000]
 
 SHORT_FIELDS = ("ok", "delta", "f", "p1", "p2", "psi", "em", "a1", "a2", "a0", "u0", "u1", "v1", "tilt", "start")
 LONG_FIELDS = (
     *("ok", "delta", "k", "g0", "g1", "g2", "h0", "h1", "v0", "v1", "v2", "b1", "b2"),
-    *("end", "top", "bend"),
+    *("end", "top", "bow", "sin_bow", "bend"),
 )
 
 
@@ -121,12 +124,17 @@ def long_device(delta: Array, d: Array) -> Array:
     b2 = -8.0 * a0 * (1.0 - 2.0 * delta * a2)
     fields = [jnp.asarray(ok, delta.dtype), delta, k, *g, *h, *v, b1, b2]
     end = _lobe_end(fields, em / (p1 + f * em), d)
-    total, _, scale, _ = _offset(end, fields)
+    total, d_total, scale, d_scale = _offset(_Angles(end, fields), fields)
     top = total / scale
-    # sqrt(b) starts in proportion to w, with this factor.
-    start = jnp.sqrt((0.25 * b1 + 0.5 * g[0] * (k * k - 0.25) + k * h[0]) / v[0])
-    bend = jnp.sqrt(top) / (end * start) - 2.0 / jnp.pi
-    return jnp.stack([*fields, end, top, bend])
+    # Rows start from sqrt(b/top) = sin(bow w/end)/sin(bow), with the slope of the curve at the lobe's end, where
+    # strong damping makes it nearly flat; `bend` adds the slope at w = 0. Right to 0.4 %. The relative slope at the
+    # end, bow/tan(bow), is inverted by a rational function.
+    flat = jnp.clip(1.0 - 0.5 * end * (d_total / total - d_scale / scale), 0.0, 1.0)
+    bow = jnp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
+    sin_bow = jnp.sin(bow)
+    slope = (0.25 * b1 + 0.5 * g[0] * (k * k - 0.25) + k * h[0]) / v[0]
+    bend = jnp.sqrt(top / slope) / end - sin_bow / bow
+    return jnp.stack([*fields, end, top, bow, sin_bow, bend])
 
 
 class _Angles:
@@ -151,9 +159,8 @@ class _Angles:
         self.base, self.dbase = y * (b1 + y * b2), dy * (b1 + 2.0 * y * b2)
 
 
-def _offset(omega: Array, fields: list[Array] | Array) -> tuple[Array, Array, Array, Array]:
+def _offset(at: _Angles, fields: list[Array] | Array) -> tuple[Array, Array, Array, Array]:
     """``b = beta + delta`` on the curve as T/Q, accurate relative to b itself, with the derivatives of T and Q."""
-    at = _Angles(omega, fields)
     k, s, c = fields[2], at.s, at.c
     total = c * at.base + at.E * at.drop + s * c * 2.0 * at.sin_k * at.H
     d_total = c * at.dbase - 0.5 * s * at.base + at.dE * at.drop + at.E * (k * at.sin_k - 0.5 * s)
@@ -161,12 +168,24 @@ def _offset(omega: Array, fields: list[Array] | Array) -> tuple[Array, Array, Ar
     return total, d_total, c * at.V, c * at.dV - 0.5 * s * at.V
 
 
-def _alpha(omega: Array, fields: list[Array] | Array) -> Array:
-    at = _Angles(omega, fields)
+class _Turned(NamedTuple):
+    """``X = sin((n+1) w) E + cos((n+1) w) sin w H``, proportional to alpha, its companion a quarter turn on, and dX."""
+
+    across: Array
+    along: Array
+    d_across: Array
+    F: Array
+    dF: Array
+
+
+def _turned(at: _Angles, turns: Array) -> _Turned:
     # (n + 1) w = k w + w/2
     sine = at.sin_k * at.c + at.cos_k * at.s
     cosine = at.cos_k * at.c - at.sin_k * at.s
-    return 2.0 * at.s * (sine / at.c * at.E + 2.0 * at.s * cosine * at.H) / at.V
+    sin_w, cos_w = 2.0 * at.s * at.c, 1.0 - 2.0 * at.s * at.s
+    F, dF = sin_w * at.H, cos_w * at.H + sin_w * at.dH
+    along = cosine * at.E - sine * F
+    return _Turned(sine * at.E + cosine * F, along, turns * along + sine * at.dE + cosine * dF, F, dF)
 
 
 def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
@@ -180,15 +199,11 @@ def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
     omega = 0.5 * jnp.pi / turns * (1.0 + 0.7 * ratio / (ratio + 1.0 / turns))
     for _ in range(_END_STEPS):
         at = _Angles(omega, fields)
-        sine = at.sin_k * at.c + at.cos_k * at.s
-        cosine = at.cos_k * at.c - at.sin_k * at.s
-        sin_w, cos_w = 2.0 * at.s * at.c, 1.0 - 2.0 * at.s * at.s
-        F, dF = sin_w * at.H, cos_w * at.H + sin_w * at.dH
-        imaginary, real = sine * at.E + cosine * F, cosine * at.E - sine * F
-        size = at.E * at.E + F * F
+        x = _turned(at, turns)
+        size = at.E * at.E + x.F * x.F
         # Less than a quarter turn away sin cos is a safe stand-in for the phase left; farther off, creep up.
-        left = jnp.where(real < 0, imaginary * real, -0.2 * size)
-        step = left / (turns * size + (at.E * dF - F * at.dE))
+        left = jnp.where(x.along < 0, x.across * x.along, -0.2 * size)
+        step = left / (turns * size + (at.E * x.dF - x.F * at.dE))
         omega = jnp.minimum(omega - step, limit)
     return omega
 
@@ -199,25 +214,39 @@ def long_row(beta: Array, fields: Array) -> Array:
     b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
     lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
     """
-    ok, delta, end, top, bend = fields[0], fields[1], fields[-3], fields[-2], fields[-1]
+    ok, delta, end, top, bow, sin_bow, bend = fields[0], fields[1], *fields[-5:]
     b = beta + delta
     inside = (b > 0) & (b < top)
     goal = jnp.where(inside, b, 0.5 * top)
-    r = jnp.sqrt(goal / top)
-    rest = jnp.sqrt((1.0 - r) * (1.0 + r))
-    # w/end = 2/pi arcsin r for strong damping; `bend` corrects the slope at 0 for the rest. The arcsine needs three
-    # digits only: half of the angle by its tangent, in a short series.
-    x = r / (1.0 + rest)
-    arcsine = 2.0 * x * (1.0 - x * x * (0.3323 - x * x * (0.1848 - 0.0691 * x * x)))
-    omega = end * jnp.minimum(2.0 / jnp.pi * arcsine + bend * r * rest, 1.0)
+    share = goal / top
+    r = jnp.sqrt(share)
+    omega = jnp.minimum(end * (_arcsine(r * sin_bow) / bow + bend * r * (1.0 - share)), end)
     for _ in range(_ROW_STEPS):
-        total, d_total, scale, d_scale = _offset(omega, fields)
-        # 2 (b - sqrt(goal b))/b' with the root of goal/b as (1 + 3 x)/(3 + x): a single division.
-        part = goal * scale
-        step = 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))
-        omega = jnp.clip(omega - step, 0.0, end)
-    limit = jnp.where(inside, _alpha(omega, fields), 0.0)
-    return _finish(limit, b, beta, ok)
+        omega = jnp.clip(omega - _newton_step(goal, _Angles(omega, fields), fields), 0.0, end)
+    at = _Angles(omega, fields)
+    x = _turned(at, fields[2] + 0.5)
+    numerator, denominator = 2.0 * at.s * x.across, at.c * at.V
+    # The last step is taken in alpha itself.
+    step = _newton_step(goal, at, fields)
+    numerator -= step * (at.c * x.across + 2.0 * at.s * x.d_across)
+    denominator -= step * (at.c * at.dV - 0.5 * at.s * at.V)
+    return _finish(jnp.where(inside, numerator / denominator, 0.0), b, beta, ok)
+
+
+def _arcsine(x: Array) -> Array:
+    """Three to four digits of arcsin x for 0 <= x <= 1, half of it by its tangent; good enough for a start."""
+    t = x / (1.0 + jnp.sqrt(jnp.maximum((1.0 - x) * (1.0 + x), 0.0)))
+    return 2.0 * t * _horner(_ARCTAN, t * t)
+
+
+def _newton_step(goal: Array, at: _Angles, fields: list[Array] | Array) -> Array:
+    """``2 (b - sqrt(goal b))/b'`` with sqrt(goal/b) as (1 + 3 goal/b)/(3 + goal/b): one division in all.
+
+    XLA fuses a chain of such steps into one loop over the rows only while no quotient is used twice.
+    """
+    total, d_total, scale, d_scale = _offset(at, fields)
+    part = goal * scale
+    return 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))
 
 
 def limit_kernel(beta: Array, delta: Array, d: Array) -> Array:

@@ -12,6 +12,7 @@ from zwidth.plant import Plant, split_delay
 from zwidth.stability.ridge_newton import Start, newton_ridge
 
 _CHUNK = 1 << 13
+_LEAST = 1 << 4
 
 
 def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
@@ -52,7 +53,7 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
         0.631130
     """
     check_delay_model(delay)
-    return pointwise(slope_kernel, ("d",), (d,), (delay,), _CHUNK)
+    return pointwise(slope_kernel, ("d",), (d,), (delay,), _CHUNK, _LEAST)
 
 
 def slope_kernel(d: Array, delay: str) -> Array:

@@ -27,6 +27,8 @@ from zwidth.studies.ridges import needed_models, ridge_paths
 from zwidth.sweep.studies import BoundaryStudy
 
 _RIDGE_POINTS = 101
+# Batches of one size: a run with several studies over delta compiles once for each delay model.
+_BATCH = 256
 
 
 def run_boundary(study: BoundaryStudy, si: SIScale | None) -> Outcome:
@@ -102,7 +104,7 @@ def _zero_stiffness(study: BoundaryStudy) -> Outcome:
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[DampingInterval]:
     """The virtual damping that is stable for alpha -> 0, over delta, for every delay."""
     columns = [np.tile(deltas, delays.size), np.repeat(delays, deltas.size)]
-    upper = np.asarray(map_flat(_upper_kernel, columns, (delay,))).reshape(delays.size, deltas.size)
+    upper = np.asarray(map_flat(_upper_kernel, columns, (delay,), _BATCH)).reshape(delays.size, deltas.size)
     return [DampingInterval(float(d), delay, deltas, -deltas, row) for d, row in zip(delays, upper, strict=True)]
 
 

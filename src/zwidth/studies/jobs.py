@@ -19,6 +19,7 @@ from zwidth.sweep.devices import PhysicalScene
 from zwidth.sweep.document import Config
 from zwidth.sweep.responses import RecommendStudy, StepStudy
 from zwidth.sweep.studies import BoundaryStudy, MapStudy, PassivityStudy, RidgeStudy, Study
+from zwidth.sweep.sweeps import SweepStudy
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,9 @@ class Job:
 
 
 def jobs_of(config: Config) -> list[Job]:
-    """The studies in their order; then, where figures of the paper are repeated, its numbers as well."""
-    jobs = [Job(study.name, study.kind, _performer(study, config)) for study in config.studies]
+    """The studies in their order, but for sweeps, which have stores of their own; then, where figures of the paper are repeated, its numbers as well."""
+    studies = [study for study in config.studies if not isinstance(study, SweepStudy)]
+    jobs = [Job(study.name, study.kind, _performer(study, config)) for study in studies]
     if any((getattr(study, "figure", None) or "").startswith("fig") for study in config.studies):
         jobs.append(Job("published", "report", run_report))
     return jobs

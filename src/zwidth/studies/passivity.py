@@ -55,8 +55,8 @@ def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> tuple[DampingIn
     """The virtual damping that is passive for alpha -> 0, over delta."""
     found = []
     for d in delays:
-        _, (lower, upper) = passive_edge(np.array([-0.5 * np.pi, 0.5 * np.pi]), float(d))
-        found.append(DampingInterval(float(d), "held", deltas, deltas * lower, deltas * upper))
+        _, beta = unit_outline(float(d))
+        found.append(DampingInterval(float(d), "held", deltas, deltas * beta[0], deltas * beta[-1]))
     return tuple(found)
 
 

@@ -14,10 +14,12 @@ from typing import TypeAlias
 
 import numpy as np
 
+from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.passivity import _sample_count as sample_count
 from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.poles import companion_chunk, radius_by_companion
 from zwidth.stability.ridge import alpha_max
+from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
 from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
@@ -28,6 +30,8 @@ Columns: TypeAlias = tuple[np.ndarray, ...]
 _PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
+# From here on it is cheaper to treat the betas of each device together than to list every pair.
+_MANY_ROWS = 256
 _DECAY = math.log(50.0)
 
 
@@ -75,8 +79,7 @@ def _walls(outputs: tuple[str, ...], block: Block, methods: dict[str, str]) -> d
         if "settling_time" in outputs:
             found["settling_time"] = _settling_time(radius, block)
     if "stable" in outputs:
-        radius = found.get("spectral_radius")
-        found["stable"] = (_radius(block, shape) if radius is None else radius) < 1.0
+        found["stable"] = _stable(block, shape)
     if {"passive", "passivity_margin"} & set(outputs):
         margin = _by_device(_passivity, block, shape, _passivity_groups)
         found |= {"passivity_margin": margin, "passive": margin > 0}
@@ -102,6 +105,43 @@ def _settling_time(radius: np.ndarray, block: Block) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         periods = np.where(radius < 1.0, _DECAY / -np.log(radius), np.where(np.isnan(radius), np.nan, np.inf))
     return periods * block.period[:, None, None] if block.period.size else periods
+
+
+def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
+    """Which walls are stable: by the boundary where its shape is known, elsewhere by their poles."""
+    stable = np.empty(shape, dtype=bool)
+    limit = _limits(block)
+    for plane, alpha, ends in zip(stable, block.alpha, limit, strict=True):
+        np.less(alpha[:, None], ends, out=plane)
+        plane[~(alpha > 0)] = False
+    known = (block.delta <= VERIFIED_DAMPING) & (block.d <= VERIFIED_DELAY)
+    if not known.all():
+        rest = Block(*(part[~known] if part.size else part for part in block[:6]), block.rows)
+        stable[~known] = _radius(rest, (int((~known).sum()), *shape[1:])) < 1.0
+    return stable
+
+
+def _limits(block: Block) -> np.ndarray:
+    """The stiffest stable alpha of every device and beta, shape (D, B)."""
+    if block.rows >= _MANY_ROWS:
+        size = min(_PIECE, 1 << (block.rows - 1).bit_length())
+        devices = zip(block.beta, block.delta, block.d, strict=True)
+        return np.stack([_limits_of_one(beta, delta, d, size) for beta, delta, d in devices])
+    columns = tuple(
+        np.broadcast_to(part, block.beta.shape).ravel() for part in (block.beta, block.delta[:, None], block.d[:, None])
+    )
+    limit = np.empty(block.beta.size)
+    # Delays below one period have a kernel of their own: with both in a piece, its size would vary.
+    for short in (False, True):
+        index = np.flatnonzero((columns[2] < 1) == short)
+        if index.size:
+            picked = tuple(column[index] for column in columns)
+            limit[index] = in_pieces(lambda *piece: (row_limits(*piece),), picked, _PIECE)[0]
+    return limit.reshape(block.beta.shape)
+
+
+def _limits_of_one(beta: np.ndarray, delta: float, d: float, size: int) -> np.ndarray:
+    return in_pieces(lambda piece: (row_limits(piece, np.array([delta]), np.array([d])),), (beta,), size)[0]
 
 
 def _by_device(

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,8 +15,7 @@ from zwidth.sweep.sweeps import SweepStudy
 from zwidth.sweep.table import LABEL
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """A block of the grid, normalized: D devices, each with the same number of walls.
 
     Attributes:
@@ -26,6 +24,7 @@ class Block:
         alpha: of their walls, shape (D, A).
         beta: of their walls, shape (D, B); every alpha of a device meets every beta.
         mass, period: of the devices in SI units, shape (D,); empty in a normalized sweep.
+        rows: how many betas the whole grid has, of which the block may hold a part only.
     """
 
     delta: np.ndarray
@@ -34,6 +33,7 @@ class Block:
     beta: np.ndarray
     mass: np.ndarray
     period: np.ndarray
+    rows: int
 
 
 class Grid:
@@ -103,8 +103,12 @@ class Grid:
         if not self.physical:
             delta, d = (self._device(name, slices, shape) for name in ("delta", "d"))
             alpha, beta = (self._wall(name, slices, shape) for name in ("alpha", "beta"))
-            return Block(delta, d, *self._paired(alpha, beta, delta.size), np.empty(0), np.empty(0))
+            return Block(delta, d, *self._paired(alpha, beta, delta.size), np.empty(0), np.empty(0), self._rows)
         return self._physical_block(slices, shape)
+
+    @property
+    def _rows(self) -> int:
+        return self.sizes.get("virtual_damping" if self.physical else "beta", 1)
 
     def _physical_block(self, slices: dict[str, slice], shape: tuple[int, ...]) -> Block:
         mass, damping, delay = (self._device(name, slices, shape) for name in ("mass", "damping", "delay"))
@@ -124,7 +128,7 @@ class Grid:
             damped = normalize(mass=mass[:, None], period=period[:, None], virtual_damping=virtual_damping)
         d = delay if in_periods else device.d
         alpha, beta = self._paired(walls.alpha, damped.beta, mass.size)
-        return Block(device.delta, np.broadcast_to(d, mass.shape), alpha, beta, mass, period)
+        return Block(device.delta, np.broadcast_to(d, mass.shape), alpha, beta, mass, period, self._rows)
 
     def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
         """A parameter of the devices of a block, flat; 0 where it is not given."""

@@ -204,7 +204,7 @@ def choose_methods(study: SweepStudy, grid: Grid) -> Methods:
     """The method of every output that has a choice; it depends on the study alone, never on the machine."""
     methods = {}
     if "stable" in study.outputs:
-        methods["stable"] = "companion"
+        methods["stable"] = "boundary"
     if _RADIUS_OUTPUTS & set(study.outputs):
         methods["spectral_radius"] = "companion"
     return methods
@@ -291,6 +291,8 @@ def _rate(output: str, method: str, poles: float) -> float:
     """Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it."""
     if output == "alpha_max":
         return 1e6
+    if output == "stable":
+        return 3e8
     if output == "passive":
         return 1.5e6 / poles
     return 1e6 / (poles / 4.0) ** 2.5

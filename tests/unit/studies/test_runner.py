@@ -70,7 +70,7 @@ def test_a_run_is_never_overwritten_unasked(config, tmp_path):
     out = tmp_path / "out"
     run(config, out=out)
     before = (out / "run.json").read_bytes()
-    with pytest.raises(StoreExistsError, match="already holds a run.*--out") as caught:
+    with pytest.raises(StoreExistsError, match=r"already holds a run.*--out") as caught:
         run(config, out=out)
     assert str(out) in str(caught.value)
     assert (out / "run.json").read_bytes() == before
@@ -144,9 +144,11 @@ def test_an_interrupted_run_leaves_nothing_behind(config, tmp_path):
 
 def test_a_folder_that_appears_meanwhile_is_left_alone(tmp_path):
     out = tmp_path / "out"
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "run.json").write_text("{}", encoding="utf-8")
     with pytest.raises(StoreExistsError), staged(out, overwrite=False):
-        out.mkdir()
-        (out / "run.json").write_text("{}", encoding="utf-8")
+        other.rename(out)
     assert (out / "run.json").read_text(encoding="utf-8") == "{}"
 
 

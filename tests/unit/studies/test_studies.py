@@ -177,7 +177,7 @@ def test_a_map_holds_every_output_on_the_grid():
             "outputs": ["stable", "spectral_radius", "passive"],
         }
     )
-    arrays = run_map(study).arrays
+    arrays = run_map(study, None).arrays
     grid = np.meshgrid(arrays["alpha"], arrays["beta"], arrays["delta"], arrays["d"], indexing="ij")
     radius = np.array([np.nanmax(np.abs(row)) for row in zwidth.poles(*(axis.ravel() for axis in grid))])
     np.testing.assert_allclose(arrays["spectral_radius"].ravel(), radius, rtol=1e-9)

@@ -1,0 +1,167 @@
+"""From a shipped configuration to a folder of results."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.errors import StoreExistsError
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+FIGURES = ("fig5", "fig6", "fig7", "fig8", "fig9", "fig10", "fig11", "passivity_cost")
+
+# What the paper prints: eqs. (24), (25), section VIII, remark 3.
+PRINTED = {
+    "alpha_max(delta = 0, d = 0)": "0.6863",
+    "alpha_max(delta = 0, d = 1)": "0.1445",
+    "delta, b = 0 N s/m": "0",
+    "delta, b = 10 N s/m": "0.1",
+    "delta, b = 100 N s/m": "1",
+    "0.75 alpha_max, b = 0 N s/m": "0.108",
+    "0.75 alpha_max, b = 10 N s/m": "0.149",
+    "0.75 alpha_max, b = 100 N s/m": "0.656",
+    "beta at alpha_max, b = 0 N s/m": "0.425",
+    "beta at alpha_max, b = 10 N s/m": "0.416",
+    "beta at alpha_max, b = 100 N s/m": "0.388",
+    "delta above which the line appears for d = 0": "2.3",
+}
+
+
+@pytest.fixture(scope="module")
+def paper(tmp_path_factory):
+    return zwidth.run(CONFIGS / "paper.yaml", out=tmp_path_factory.mktemp("runs") / "paper")
+
+
+@pytest.fixture(scope="module")
+def phantom(tmp_path_factory):
+    return zwidth.run(CONFIGS / "phantom.yaml", out=tmp_path_factory.mktemp("runs") / "phantom")
+
+
+def table_of(run, name):
+    """A CSV file as columns, numbers as float64."""
+    with open(run.folder / f"{name}.csv", encoding="utf-8", newline="") as file:
+        header, *rows = csv.reader(file)
+    columns = {}
+    for key, values in zip(header, zip(*rows, strict=True), strict=True):
+        try:
+            columns[key] = np.array(values, dtype=np.float64)
+        except ValueError:
+            columns[key] = np.array(values)
+    return columns
+
+
+def json_of(run, name):
+    return json.loads((run.folder / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def test_the_paper_run_makes_every_file(paper):
+    assert paper.failed == ()
+    assert [note for study in paper.studies for note in study.notes] == []
+    expected = {f"{name}.{suffix}" for name in FIGURES for suffix in ("csv", "png", "svg")}
+    expected |= {"published.md", "published.json", "run.json", "config.yaml"}
+    assert {file.name for file in paper.folder.iterdir()} == expected
+    for file in paper.folder.iterdir():
+        assert file.stat().st_size > 500, file.name
+
+
+def test_every_printed_number_is_reproduced(paper):
+    content = json_of(paper, "published")
+    assert content["all_agree"] is True
+    printed = {row["quantity"]: row["printed"] for row in content["published"]}
+    assert printed.items() >= PRINTED.items()
+    assert all(row["agrees"] for row in content["published"])
+    sharpened = {row["where"]: row["computed"] for row in content["sharpened"]}
+    assert sharpened["remark 3: 'delta > 2.3'"] == pytest.approx(2.310571356753694, abs=1e-14)
+    values = [row["computed"] for row in content["sharpened"]]
+    assert values[1] == pytest.approx(3.659361627421784, abs=1e-14)
+    text = (paper.folder / "published.md").read_text(encoding="utf-8")
+    assert "NO" not in text
+    assert "0.6862915010" in text
+
+
+def test_fig5_holds_twenty_boundaries_and_the_path_through_their_maxima(paper):
+    table = table_of(paper, "fig5")
+    boundary = table["curve"] == "boundary"
+    curves = set(zip(table["d"][boundary], table["delta"][boundary], strict=True))
+    assert curves == {(d, delta) for d in (0, 1, 2, 4) for delta in (0, 0.25, 0.5, 0.75, 1)}
+    for d, delta in curves:
+        here = boundary & (table["d"] == d) & (table["delta"] == delta)
+        top = zwidth.alpha_max(delta, d)
+        assert np.max(table["alpha"][here]) == pytest.approx(float(top.alpha), rel=1e-12)
+        assert table["beta"][here][0] == pytest.approx(-delta, abs=1e-12)
+        on_path = (table["curve"] == "ridge_path") & (table["d"] == d) & np.isclose(table["delta"], delta, atol=1e-12)
+        assert table["alpha"][on_path] == pytest.approx(float(top.alpha), rel=1e-9)
+
+
+def test_fig10_holds_both_delay_models_where_they_differ(paper):
+    table = table_of(paper, "fig10")
+    fractional = table["delay_model"] == "fractional_power"
+    assert set(table["d"][fractional]) == {0.125, 0.25, 0.5}
+    assert set(table["d"][~fractional]) == {0, 0.125, 0.25, 0.5, 1, 2, 4}
+    # Section VII: the maximum stiffness rises with the physical damping.
+    for d in (0, 0.125, 0.25, 0.5, 1, 2, 4):
+        here = ~fractional & (table["d"] == d)
+        assert np.all(np.diff(table["alpha_max"][here]) > 0)
+
+
+def test_fig8_passivity_lies_inside_stability(paper):
+    table = table_of(paper, "fig8")
+    passive = table["curve"] == "passive"
+    bound = table["alpha"][passive] / 2 + np.abs(table["beta"][passive])
+    np.testing.assert_allclose(bound, table["delta"][passive], rtol=1e-12)
+
+
+def test_fig11_settles_faster_with_more_damping(paper):
+    table = table_of(paper, "fig11")
+    assert list(dict.fromkeys(table["label"])) == ["b = 0 N s/m", "b = 10 N s/m", "b = 100 N s/m"]
+    settled = []
+    for label in dict.fromkeys(table["label"]):
+        here = table["label"] == label
+        final = 1e-3**2 / 0.1 / table["alpha"][here][0]
+        outside = np.abs(table["position_m"][here] - final) > 0.02 * final
+        settled.append(table["time_s"][here][outside][-1])
+    assert settled == sorted(settled, reverse=True)
+
+
+def test_a_second_run_into_the_same_folder_is_refused(paper):
+    before = {file.name: file.stat().st_mtime_ns for file in paper.folder.iterdir()}
+    with pytest.raises(StoreExistsError, match="already holds a run"):
+        zwidth.run(CONFIGS / "paper.yaml", out=paper.folder)
+    assert {file.name: file.stat().st_mtime_ns for file in paper.folder.iterdir()} == before
+
+
+def test_the_recommendation_is_the_library_s_in_si_units(phantom):
+    assert phantom.failed == ()
+    found = json_of(phantom, "recommendation")
+    ridge = zwidth.alpha_max(0.1, 1)
+    assert found["maximum"]["stiffness"] == pytest.approx(float(ridge.alpha) * 1e5, rel=1e-12)
+    assert found["maximum"]["virtual_damping"] == pytest.approx(float(ridge.beta) * 1e2, rel=1e-7)
+    best = found["recommended"]
+    assert best["stiffness"] == pytest.approx(0.75 * found["maximum"]["stiffness"], rel=1e-12)
+    assert best["stable"] is True
+    assert best["passive"] is False
+    assert best["virtual_damping_lower"] < best["virtual_damping"] < best["virtual_damping_upper"]
+    for name, outside in (("virtual_damping_lower", -1e-6), ("virtual_damping_upper", 1e-6)):
+        edge = best[name] / 1e2
+        radii = [np.abs(zwidth.poles(best["alpha"], edge + sign * outside, 0.1, 1)).max() for sign in (-1.0, 1.0)]
+        assert radii[0] < 1 < radii[1]
+    assert 0.0 < best["settling_time"] < 0.1
+    text = (phantom.folder / "recommendation.md").read_text(encoding="utf-8")
+    assert "19.86 kN/m" in text
+    assert "14.90 kN/m" in text
+
+
+def test_the_phantom_run_makes_every_file(phantom):
+    names = {file.name for file in phantom.folder.iterdir()}
+    figures = ("recommend", "boundary", "step", "map_stable", "map_spectral_radius", "map_passive")
+    assert names >= {f"{name}.{suffix}" for name in figures for suffix in ("png", "svg")}
+    assert names >= {"recommend.csv", "boundary.csv", "step.csv", "map.npz", "recommendation.md", "run.json"}
+    boundary = table_of(phantom, "boundary")
+    np.testing.assert_allclose(boundary["stiffness_N_per_m"], 1e5 * boundary["alpha"], rtol=1e-12)
+    with np.load(phantom.folder / "map.npz") as arrays:
+        assert arrays["stable"].shape == (101, 121, 1, 1)
+        np.testing.assert_array_equal(arrays["stable"], arrays["spectral_radius"] < 1)

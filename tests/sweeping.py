@@ -1,0 +1,143 @@
+"""What the tests of sweeps share: small configurations, the command line, and chunks that go wrong."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+from zwidth.sweep.chunks import perform
+from zwidth.sweep.document import Config
+from zwidth.sweep.store import find_stores, open_dataset
+
+AXES = {
+    "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 40}},
+    "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 300}},
+    "delta": [0.0, 0.1, 1.0, 3.0],
+    "d": [0, 0.5, 1, 2],
+}
+
+
+def study(name="map", axes=None, outputs=("stable",), **fields):
+    return {"kind": "sweep", "name": name, "axes": AXES if axes is None else axes, "outputs": list(outputs), **fields}
+
+
+def config_of(*studies, name="test"):
+    return Config.model_validate({"version": 1, "name": name, "studies": list(studies) or [study()]})
+
+
+def values_of(path):
+    """Every variable of a store, in memory."""
+    with open_dataset(path) as dataset:
+        return {name: variable.values for name, variable in dataset.data_vars.items()}
+
+
+def assert_same(first, second):
+    """Two stores hold the same values, bit by bit."""
+    one, other = values_of(first), values_of(second)
+    assert one.keys() == other.keys()
+    for name in one:
+        assert one[name].dtype == other[name].dtype
+        assert one[name].tobytes() == other[name].tobytes(), name
+
+
+def flags(path):
+    """The marks of finished chunks, each with what would change if it were written again."""
+    marks = [mark for store in find_stores(Path(path)) for mark in store.glob("*_checksum/c/*/0")]
+    return {mark: (mark.stat().st_ino, mark.stat().st_mtime_ns) for mark in marks}
+
+
+def chunk_file(path, variable="stable", number=0):
+    """One file of a variable."""
+    return sorted(file for file in (Path(path) / variable / "c").rglob("*") if file.is_file())[number]
+
+
+_MAIN = """
+import sys
+from zwidth.cli import main
+from zwidth.cli.commands import cli
+from zwidth.cli.sweeps import COMMANDS
+
+for command in COMMANDS:
+    cli.add_command(command)
+main()
+"""
+
+
+def command(*arguments):
+    """The words that start the command line."""
+    return [sys.executable, "-c", _MAIN, *map(str, arguments)]
+
+
+def zwidth(*arguments, **options):
+    """Run the command line to its end."""
+    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=300, **options)
+
+
+def start(*arguments, **options):
+    """Start the command line in a process group of its own."""
+    return subprocess.Popen(
+        command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, **options
+    )
+
+
+def slowly(path, family, index):
+    """A chunk that takes a moment, so that something can happen meanwhile."""
+    time.sleep(0.02)
+    perform(path, family, index)
+
+
+def failing_on_2(path, family, index):
+    """Chunk 2 always fails."""
+    if index == 2:
+        raise ArithmeticError("no number is good enough")
+    perform(path, family, index)
+
+
+def killed_on_2(path, family, index):
+    """Chunk 2 always kills the process that computes it."""
+    if index == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    perform(path, family, index)
+
+
+def killed_once_on_2(path, family, index):
+    """Chunk 2 kills its first process only."""
+    mark = Path(path).with_suffix(".killed")
+    if index == 2 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    perform(path, family, index)
+
+
+def interrupted_on_2(path, family, index):
+    """Somebody presses Ctrl-C while chunk 2 is computed."""
+    if index == 2:
+        raise KeyboardInterrupt
+    perform(path, family, index)
+
+
+def disk_full_on_2(path, family, index):
+    """The disk is full when chunk 2 is written."""
+    if index == 2:
+        raise OSError(28, "No space left on device")
+    perform(path, family, index)
+
+
+def flip(file, position=-1):
+    """Flip the bits of one byte of a file."""
+    data = bytearray(file.read_bytes())
+    data[position] ^= 0xFF
+    file.write_bytes(data)
+
+
+def poles_say_stable(alpha, beta, delta, d):
+    """Stability by poles, the slow way."""
+    from zwidth.stability.poles import radius_by_companion
+
+    return np.asarray(radius_by_companion(alpha, beta, delta, d)) < 1.0
+
+

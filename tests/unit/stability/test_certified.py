@@ -1,0 +1,193 @@
+"""The certified method: right or silent on every reference point, with the status that says which."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.errors import InputError
+from zwidth.stability import balls
+from zwidth.stability.certified import certified_stable
+from zwidth.status import Status
+
+REFERENCE = Path(__file__).resolve().parents[2] / "reference"
+NAMES = ("alpha", "beta", "delta", "d")
+STABLE, ON_BOUNDARY = 1, 2
+
+
+def reference(name):
+    with np.load(REFERENCE / name) as stored:
+        return {key: stored[key] for key in stored}
+
+
+def random_map(delta, d, count, seed):
+    """Walls around the stable set, about half of them outside."""
+    rng = np.random.default_rng(seed)
+    ridge = zwidth.alpha_max(delta, d)
+    reach = abs(float(ridge.beta)) + delta
+    return rng.uniform(0, 1.5 * float(ridge.alpha), count), rng.uniform(-1.2 * reach, 2.5 * reach, count)
+
+
+def test_every_reference_label_is_found():
+    points = reference("labels.npz")
+    result = certified_stable(*(points[name] for name in NAMES))
+    assert (result.status == Status.OK).all()
+    np.testing.assert_array_equal(result.stable, points["stable"])
+    assert (result.bits == 0).mean() > 0.8
+
+
+def test_every_adversarial_label_is_found():
+    points = reference("adversarial.npz")
+    result = certified_stable(*(points[name] for name in NAMES))
+    np.testing.assert_array_equal(
+        result.status, np.where(points["label"] == ON_BOUNDARY, Status.ON_BOUNDARY, Status.OK)
+    )
+    np.testing.assert_array_equal(result.stable, points["label"] == STABLE)
+    # Hard points they are: the filter cannot have decided most of them.
+    assert 0.2 < (result.bits > 0).mean() < 0.9
+
+
+@pytest.mark.parametrize("d", [0, 1, 2, 4, 8, 0.5, 1.3, 12.9, 20, 100, 500.5])
+@pytest.mark.parametrize("delta", [0.0, 1e-4, 1.0, 50.0, 1e4])
+def test_filter_alone_decides_nearly_all_of_a_map(monkeypatch, delta, d):
+    monkeypatch.setattr(balls, "available", lambda: False)
+    alpha, beta = random_map(delta, d, 4000, seed=7)
+    result = certified_stable(alpha, beta, delta, d)
+    assert (result.status == Status.OK).mean() >= 0.999
+    assert 0.02 < result.stable.mean() < 0.9
+
+
+@pytest.mark.parametrize(
+    ("point", "status", "stable"),
+    [
+        # alpha = 0 is a pole at z = 1; the others decide whether one is outside.
+        ((0.0, 0.3, 0.1, 1.0), Status.ON_BOUNDARY, False),
+        ((0.0, 0.0, 0.0, 3.0), Status.ON_BOUNDARY, False),
+        ((-0.0, 0.05, 0.1, 500.0), Status.ON_BOUNDARY, False),
+        ((0.0, -0.1, 0.1, 1.5), Status.ON_BOUNDARY, False),
+        ((0.0, np.nextafter(-0.1, -1), 0.1, 1.5), Status.OK, False),
+        ((0.0, np.nextafter(-0.1, 0), 0.1, 1.5), Status.ON_BOUNDARY, False),
+        ((0.0, 3.0, 0.0, 0.0), Status.OK, False),
+        ((0.0, 5.0, 0.1, 500.0), Status.OK, False),
+        # R = z^2 + 1: three poles on the circle, none of which any precision could tell from outside.
+        ((0.0, 2.0, 0.0, 0.0), Status.ON_BOUNDARY, False),
+        ((0.0, np.nextafter(2.0, 3.0), 0.0, 0.0), Status.OK, False),
+        ((0.0, np.nextafter(2.0, 1.0), 0.0, 0.0), Status.ON_BOUNDARY, False),
+        # A pole exactly at z = -1, others outside.
+        ((2.0, 3.0, 0.0, 1.5), Status.OK, False),
+        # Next to z = 1.
+        ((1e-300, 0.1, 0.1, 1.0), Status.OK, True),
+        ((5e-324, 0.1, 0.1, 0.0), Status.OK, True),
+        ((5e-324, 5e-324, 5e-324, 5e-324), Status.OK, True),
+        ((-5e-324, 0.1, 0.1, 1.0), Status.OK, False),
+        ((1e-300, 0.0, 0.1, 500.0), Status.OK, True),
+        # Extremes.
+        ((1e300, 1e300, 1.0, 2.0), Status.OK, False),
+        ((1.0, 1.0, 1e300, 2.0), Status.OK, True),
+        ((1.0, 0.0, 1e6, 1.0 - 2.0**-53), Status.OK, True),
+    ],
+)
+def test_structure_is_recognized(point, status, stable):
+    result = certified_stable(*point)
+    assert (result.status, result.stable) == (status, stable)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("which", range(4))
+def test_invalid_input_has_its_status(value, which):
+    point = [0.1, 0.2, 0.1, 1.0]
+    point[which] = value
+    result = certified_stable(*([other, bad] for other, bad in zip((0.1, 0.2, 0.1, 1.0), point, strict=True)))
+    assert result.status.tolist() == [Status.OK, Status.INVALID_INPUT]
+    assert result.stable.tolist() == [True, False]
+
+
+@pytest.mark.parametrize("value", [-1.0, -5e-324])
+@pytest.mark.parametrize("which", [2, 3])
+def test_negative_damping_and_delay_are_invalid(value, which):
+    point = [0.1, 0.2, 0.1, 1.0]
+    point[which] = value
+    assert certified_stable(*point).status == Status.INVALID_INPUT
+
+
+def test_negative_zero_is_zero():
+    result = certified_stable(0.1, 0.2, [-0.0, 0.0], [[-0.0], [0.0]])
+    assert (result.status == Status.OK).all()
+    assert result.stable.all()
+
+
+def test_every_layout_gives_the_same_labels():
+    alpha, beta = np.linspace(0.0, 0.6, 1024), np.linspace(-0.3, 1.2, 640)
+    as_map = certified_stable(alpha[:, None], beta, 0.2, 1.0)
+    assert as_map.stable.shape == (1024, 640)
+    a, b = np.meshgrid(alpha, beta, indexing="ij")
+    # A second device, far away in the batch, keeps the flat layout from being recognized as a map.
+    flat = certified_stable(
+        np.append(a.ravel(), 0.1), np.append(b.ravel(), 0.1), np.append(np.full(a.size, 0.2), 3.0), 1.0
+    )
+    np.testing.assert_array_equal(flat.stable[:-1].reshape(a.shape), as_map.stable)
+    np.testing.assert_array_equal(flat.status[:-1].reshape(a.shape), as_map.status)
+    few = slice(None, None, 997)
+    scattered = certified_stable(a.ravel()[few], b.ravel()[few], 0.2, 1.0)
+    np.testing.assert_array_equal(scattered.stable, as_map.stable.ravel()[few])
+    assert as_map.stable.any()
+    assert not as_map.stable[0].any()
+
+
+def test_mixed_delays_keep_their_places():
+    points = reference("labels.npz")
+    d = np.array([0.0, 0.5, 1.0, 4.0, 60.0, 60.5])
+    mixed = certified_stable(0.01, 0.1, 0.3, d)
+    assert mixed.stable.tolist() == [bool(certified_stable(0.01, 0.1, 0.3, each).stable) for each in d]
+    order = np.random.default_rng(3).permutation(points["d"].size)
+    shuffled = certified_stable(*(points[name][order] for name in NAMES))
+    np.testing.assert_array_equal(shuffled.stable, points["stable"][order])
+
+
+def test_shapes_broadcast_and_may_be_empty():
+    assert certified_stable(0.1, 0.2, 0.1, 1).stable.shape == ()
+    assert certified_stable([], 0.2, 0.1, 1).stable.shape == (0,)
+    assert certified_stable(np.zeros((2, 1)), np.ones((1, 3)), 0.1, [[[1]]]).status.shape == (1, 2, 3)
+    with pytest.raises(InputError, match="broadcast"):
+        certified_stable([0.1, 0.2], [0.1, 0.2, 0.3], 0.1, 1)
+    with pytest.raises(InputError, match="alpha"):
+        certified_stable("soft", 0.1, 0.1, 1)
+
+
+def test_without_balls_open_points_are_undecided(monkeypatch):
+    points = reference("adversarial.npz")
+    chosen = slice(0, 600)
+    columns = [points[name][chosen] for name in NAMES]
+    monkeypatch.setattr(balls, "available", lambda: False)
+    result = certified_stable(*columns)
+    open_ones = result.status == Status.UNDECIDED
+    assert 0.1 < open_ones.mean() < 0.9
+    assert not result.stable[open_ones].any()
+    np.testing.assert_array_equal(result.stable[~open_ones], points["label"][chosen][~open_ones] == STABLE)
+
+
+def test_too_little_precision_is_undecided():
+    result = certified_stable(1e-300, 0.1, 0.1, 1.0, max_bits=128)
+    assert (result.status, result.stable, result.bits) == (Status.UNDECIDED, False, 128)
+
+
+def test_the_extra_is_loaded_only_when_needed():
+    code = """
+import sys
+import zwidth.stability.certified as certified
+result = certified.certified_stable(0.3, 0.5, 0.0, 0)
+assert bool(result.stable), result
+assert "flint" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+
+
+def test_no_setting_is_left_changed():
+    import flint
+
+    before = flint.ctx.prec
+    certified_stable(1e-300, 0.1, 0.1, 1.0)
+    assert flint.ctx.prec == before

@@ -1,0 +1,143 @@
+"""Poles and spectral radius against labels from 60-digit arithmetic, mpmath's roots, and double poles made on purpose."""
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import oracles
+import pytest
+import tolerances as tol
+from mpmath import mp
+
+import zwidth
+from zwidth.stability.poles import companion, radius_by_companion, unstable_poles
+
+LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
+
+
+@pytest.fixture(scope="module")
+def labels():
+    with np.load(LABELS) as file:
+        return {name: file[name] for name in file.files}
+
+
+@pytest.fixture(scope="module")
+def radius(labels):
+    return radius_by_companion(*(labels[name] for name in ("alpha", "beta", "delta", "d")))
+
+
+def test_no_label_is_wrong_outside_the_band(labels, radius):
+    judged = np.abs(labels["margin"]) > tol.LABEL_BAND.float64
+    assert judged.mean() > 0.9
+    np.testing.assert_array_equal((radius < 1)[judged], labels["stable"][judged])
+
+
+def test_unstable_poles_are_counted(labels):
+    count = unstable_poles(*(labels[name] for name in ("alpha", "beta", "delta", "d")))
+    judged = np.abs(labels["margin"]) > tol.LABEL_BAND.float64
+    np.testing.assert_array_equal((count == 0)[judged], labels["stable"][judged])
+    assert count.max() > 1
+    assert unstable_poles(0.1, 0.1, -1.0, 0) == -1
+
+
+def test_the_radius_has_all_its_digits(labels, radius):
+    # Every point of this set: none has its largest poles so close together that the radius would lose digits.
+    np.testing.assert_allclose(radius, labels["rho"], rtol=tol.POLE.float64)
+
+
+def pair_up(got, exact):
+    """Relative distances from each exact pole to its own computed one."""
+    left = list(np.asarray(got))
+    for pole in sorted(exact, key=abs, reverse=True):
+        nearest = min(range(len(left)), key=lambda k: abs(left[k] - complex(pole)))
+        yield abs(left.pop(nearest) - complex(pole)) / abs(complex(pole))
+
+
+WALLS = [
+    (0.108, 0.425, 0.0, 1.0),
+    (0.5, 0.5, 1e-12, 0.0),
+    (3.0, -0.2, 2.0, 0.125),
+    (40.0, -3.0, 30.0, 0.9),
+    (0.05, 0.2, 0.1, 4.0),
+    (0.02, 0.1, 0.5, 8.5),
+    (-0.1, 0.2, 0.3, 2.0),
+    (5e3, 700.0, 1e4, 1.3),
+]
+
+
+@pytest.mark.parametrize("wall", WALLS)
+def test_every_pole_is_a_root_of_the_exact_polynomial(wall):
+    with mp.workdps(oracles.DIGITS):
+        exact = mp.polyroots(oracles.polynomial(*wall), maxsteps=500, extraprec=400)
+    assert max(pair_up(zwidth.poles(*wall), exact)) <= tol.POLE.float64
+
+
+def test_hundreds_of_poles():
+    wall = (1e-6, 1e-3, 0.01, 500)
+    got = zwidth.poles(*wall)
+    assert got.shape == (503,)
+    np.testing.assert_allclose(np.sum(got), -zwidth.char_poly(*wall)[1], rtol=0, atol=503 * tol.POLE.float64)
+    with mp.workdps(oracles.DIGITS):
+        coefficients = oracles.polynomial(*wall)
+        derivative = [(503 - k) * coefficient for k, coefficient in enumerate(coefficients[:-1])]
+        for pole in got[::25]:
+            # The distance to the nearest root is about |P/P'|.
+            step = oracles.evaluate(coefficients, complex(pole)) / oracles.evaluate(derivative, complex(pole))
+            assert abs(step) <= tol.POLE.float64
+
+
+def corner(delta):
+    """The wall at d = 0 with P(-1) = P'(-1) = 0, from model formulas in mpmath."""
+    value = oracles.phi(delta)
+    gap, s = value.phi2 - value.psi, value.psi / value.phi2
+    alpha = 4 * (1 + value.c) * (1 + 1 / (1 + value.c) - 1 / (1 - s)) / gap
+    return alpha, (1 + value.c) / gap - alpha / 2
+
+
+@pytest.mark.parametrize("delta", [4.0, 10.0, 300.0])
+def test_a_double_pole_keeps_half_of_its_digits(delta):
+    with mp.workdps(oracles.DIGITS):
+        alpha, beta = (float(value) for value in corner(delta))
+    got = zwidth.poles(alpha, beta, delta, 0)
+    nearest = np.sort(np.abs(got + 1))[:2]
+    assert (nearest <= tol.DOUBLE_POLE.float64).all()
+    assert radius_by_companion(alpha, beta, delta, 0) == pytest.approx(1.0, rel=tol.DOUBLE_POLE.float64)
+
+
+def test_without_a_spring_a_pole_is_at_one():
+    got = zwidth.poles(0.0, 0.4, np.array([0.0, 0.3, 2.0]), 1)
+    assert np.abs(got - 1).min(axis=-1).max() <= 2 * np.finfo(float).eps
+
+
+def test_without_a_damper_a_pole_is_at_zero():
+    np.testing.assert_array_equal(np.abs(zwidth.poles(0.1, 0.0, 0.3, np.array([0, 1, 2.5]))).min(-1), [0, 0, 0])
+
+
+def test_mixed_degrees_end_in_nan():
+    got = zwidth.poles(0.1, 0.2, 0.3, np.array([0, 4.5, 2]))
+    np.testing.assert_array_equal(np.isfinite(got).sum(-1), [3, 8, 5])
+    assert np.isnan(got[0, 3:]).all()
+
+
+def test_a_nearly_whole_delay_adds_a_pole_at_zero():
+    for d, near in ((np.nextafter(2.0, 3.0), 2), (5e-324, 0), (np.nextafter(1.0, 0.0), 1)):
+        got, whole = zwidth.poles(0.2, 0.3, 0.4, d), zwidth.poles(0.2, 0.3, 0.4, near)
+        reference = [*whole, 0.0] if d != np.nextafter(1.0, 0.0) else whole
+        for pole in reference:
+            assert np.abs(got - pole).min() <= 1e-7
+
+
+def test_the_companion_matrix_has_the_polynomial_as_its_own():
+    monic = np.array([1.0, -2.0, 0.5, 0.25, -0.125])
+    np.testing.assert_allclose(np.poly(np.asarray(companion(jnp.asarray(monic)))), monic, atol=1e-6)
+
+
+def test_derivatives_of_a_pole(x64):
+    def slowest(alpha):
+        return jnp.max(jnp.abs(zwidth.poles(alpha, 0.4, 0.3, 1)))
+
+    h = 1e-5
+    difference = (radius_by_companion(0.2 + h, 0.4, 0.3, 1) - radius_by_companion(0.2 - h, 0.4, 0.3, 1)) / (2 * h)
+    assert float(jax.grad(slowest)(0.2)) == pytest.approx(difference, rel=1e-8)
+    assert np.isnan(jax.grad(slowest)(np.nan))

@@ -1,0 +1,69 @@
+"""Plans: chunks that cover every point once, and refusals before any work."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from sweeping import config_of, study
+
+from zwidth.errors import ResourceError
+from zwidth.sweep.engine import plan_sweeps
+from zwidth.sweep.plan import MEMORY, FamilyPlan, check_resources, chunk_shape, kept_plan, make_plan
+
+HUGE = {
+    "alpha": {"linear": {"start": 0, "stop": 1, "num": 100_000}},
+    "beta": {"linear": {"start": 0, "stop": 1, "num": 100_000}},
+    "delta": {"linear": {"start": 0, "stop": 1, "num": 10}},
+    "d": 1,
+}
+
+
+@given(st.lists(st.integers(1, 9), max_size=4), st.integers(1, 300))
+def test_chunks_cover_every_point_once(shape, target):
+    shape = tuple(shape)
+    chunks = chunk_shape(shape, target)
+    assert math.prod(chunks) <= target
+    plan = FamilyPlan("wall", ("stable",), tuple("abcd"[: len(shape)]), shape, chunks)
+    count = np.zeros(shape, int)
+    for index in range(plan.count):
+        count[plan.place(index)] += 1
+        assert plan.points(index) == count[plan.place(index)].size
+    assert (count == 1).all()
+    assert plan.count == math.prod(plan.counts)
+
+
+@pytest.mark.parametrize("outputs", [("stable",), ("spectral_radius", "passive"), ("alpha_max", "stable")])
+@pytest.mark.parametrize("memory", [2**27, MEMORY, 2**30])
+def test_a_chunk_stays_within_its_memory(outputs, memory):
+    plan = make_plan(config_of(study(axes=HUGE, outputs=outputs)).studies[0], memory=memory)
+    assert plan.memory <= memory
+
+
+def test_the_plan_that_a_store_keeps_is_the_plan():
+    small = config_of(study(outputs=("stable", "alpha_max"))).studies[0]
+    plan = make_plan(small, memory=2**27)
+    assert kept_plan(small, plan.as_dict()).families == plan.families
+    assert kept_plan(small, plan.as_dict()).methods == plan.methods
+
+
+def test_a_map_of_a_thousand_million_points_takes_megabytes():
+    axes = {**HUGE, "alpha": {"linear": {"start": 0, "stop": 1, "num": 10_000}}, "delta": 1}
+    (plan,) = plan_sweeps(config_of(study(axes=axes)))
+    assert plan.family("wall").shape == (10_000, 100_000)
+    assert plan.disk < 256 * 2**20
+
+
+def test_what_does_not_fit_is_refused(tmp_path):
+    plans = plan_sweeps(config_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin"))))
+    with pytest.raises(ResourceError, match=r"free, but the results may take 2\.\d+ TiB; choose another folder"):
+        check_resources(plans, tmp_path / "not" / "there", workers=1)
+    with pytest.raises(ResourceError, match=r"workers: 100000 of them may take .*; choose fewer with --workers"):
+        check_resources(plan_sweeps(config_of()), tmp_path, workers=100_000)
+
+
+def test_a_plan_tells_what_it_will_do():
+    text = "\n".join(plan_sweeps(config_of(study(outputs=("stable", "alpha_max"))))[0].lines())
+    for word in ("study map", "192,000", "d 4 x delta 4 x alpha 40 x beta 300", "chunks", "boundary", "disk", "memory"):
+        assert word in text

@@ -1,0 +1,289 @@
+"""Sweeps from a configuration to values: right, the same whoever computes them, and resumable."""
+
+import numpy as np
+import pytest
+from sweeping import (
+    AXES,
+    assert_same,
+    chunk_file,
+    config_of,
+    disk_full_on_2,
+    failing_on_2,
+    flags,
+    flip,
+    interrupted_on_2,
+    killed_on_2,
+    killed_once_on_2,
+    study,
+    values_of,
+)
+
+import zwidth
+from zwidth.errors import InputError, StoreError, StoreExistsError
+from zwidth.status import Status
+from zwidth.sweep.engine import run_sweeps
+from zwidth.sweep.plan import Task
+from zwidth.sweep.store import Store, open_dataset
+from zwidth.sweep.verify import verify
+
+ALL = ("stable", "spectral_radius", "margin", "settling_time", "passive", "passivity_margin")
+FEW = {"alpha": [0.0, 0.1, 0.5], "beta": [-0.05, 0.1, 0.4, 0.9], "delta": [0.0, 0.3], "d": [0, 0.5, 2]}
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """A run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("finished")
+    config = config_of(study(outputs=("stable", "alpha_max", "kind")))
+    result = run_sweeps(config, folder)
+    assert result.ok
+    assert result.computed == result.total > 5
+    return config, folder
+
+
+def copy_of(finished, folder):
+    """A copy of the finished run, to be damaged."""
+    import shutil
+
+    config, source = finished
+    shutil.copytree(source, folder, dirs_exist_ok=True)
+    return config, folder / "map.zarr"
+
+
+def test_the_values_are_those_of_the_library(tmp_path):
+    outputs = (*ALL, "alpha_max", "beta_at_max", "kind")
+    run_sweeps(config_of(study(axes=FEW, outputs=outputs)), tmp_path)
+    data = open_dataset(tmp_path).load()
+    assert data.stable.dims == ("d", "delta", "alpha", "beta")
+    assert data.stable.dtype == bool
+    alpha, beta, delta, d = (np.array(FEW[name], float) for name in ("alpha", "beta", "delta", "d"))
+    at = np.broadcast_arrays(alpha[:, None], beta, delta[:, None, None], d[:, None, None, None])
+    radius = np.abs(zwidth.poles(*at))
+    radius = np.nanmax(radius, axis=-1)
+    np.testing.assert_allclose(data.spectral_radius, radius, rtol=1e-12)
+    # A row of alpha = 0 has a pole at 1, which eigenvalues place on either side.
+    decided = np.abs(radius - 1) > 1e-9
+    np.testing.assert_array_equal(data.stable.values[decided], (radius < 1)[decided])
+    assert not data.stable.sel(alpha=0.0).any()
+    np.testing.assert_allclose(data.margin, 1 - radius, atol=1e-12)
+    np.testing.assert_allclose(data.passivity_margin, zwidth.passivity_margin(*at), atol=1e-14)
+    np.testing.assert_array_equal(data.passive, np.asarray(zwidth.is_passive(*at)))
+    settled = data.settling_time.values[radius < 1 - 1e-9]
+    np.testing.assert_allclose(settled, np.log(50) / -np.log(radius[radius < 1 - 1e-9]), rtol=1e-6)
+    assert np.isinf(data.settling_time.values[radius > 1 + 1e-9]).all()
+    ridge = zwidth.alpha_max(delta, d[:, None])
+    np.testing.assert_allclose(data.alpha_max, ridge.alpha, rtol=1e-14)
+    np.testing.assert_allclose(data.beta_at_max, ridge.beta, rtol=1e-12)
+    np.testing.assert_array_equal(data.kind, ridge.kind)
+    assert (data.status == Status.OK).all()
+    assert (data.ridge_status == Status.OK).all()
+
+
+def test_physical_results_are_in_si_units(tmp_path):
+    axes = {"mass": "100 g", "damping": [0, 10], "rate": "1 kHz", "delay": "1 ms", "stiffness": [1000, 20_000]}
+    run_sweeps(config_of(study(axes=axes, outputs=("stable", "settling_time", "stiffness_max"))), tmp_path)
+    data = open_dataset(tmp_path).load()
+    scene = [zwidth.Scene(zwidth.Device(0.1, damping), zwidth.Timing(1e-3, 1e-3)) for damping in (0.0, 10.0)]
+    best = [float(zwidth.alpha_max(one.delta, one.d).alpha) for one in scene]
+    np.testing.assert_allclose(data.stiffness_max, [one.to_si(alpha=a).stiffness for one, a in zip(scene, best)])
+    assert data.stiffness_max.attrs["units"] == "N/m"
+    assert data.settling_time.attrs["units"] == "s"
+    assert data.damping.attrs["units"] == "N s/m"
+    assert data.mass == 0.1
+    radius = np.max(np.abs(zwidth.poles(0.01, 0.0, scene[1].delta, 1)))
+    np.testing.assert_allclose(data.settling_time.sel(damping=10, stiffness=1000), -np.log(50) / np.log(radius) * 1e-3)
+
+
+@pytest.mark.parametrize("axes", [FEW, {**FEW, "beta": {"linear": {"start": -0.1, "stop": 0.5, "num": 260}}}])
+@pytest.mark.parametrize("target", [1, 7, 100])
+def test_values_do_not_depend_on_chunks(tmp_path, monkeypatch, axes, target):
+    from zwidth.sweep import plan
+
+    if target < 100 and axes is not FEW:
+        axes = {**axes, "alpha": [0.1], "d": [0.5, 2]}
+    config = config_of(study(axes=axes, outputs=("stable", "spectral_radius", "passivity_margin", "alpha_max")))
+    run_sweeps(config, tmp_path / "whole")
+    whole = plan.chunk_shape
+    monkeypatch.setattr(plan, "chunk_shape", lambda shape, size: whole(shape, target if len(shape) > 3 else 2))
+    monkeypatch.setattr(plan, "_SMALLEST_CHUNK", 1)
+    result = run_sweeps(config, tmp_path / "parts")
+    assert result.computed > 2
+    assert_same(tmp_path / "whole", tmp_path / "parts")
+
+
+def test_values_do_not_depend_on_workers(finished, tmp_path):
+    config, folder = finished
+    result = run_sweeps(config, tmp_path, workers=2)
+    assert result.ok
+    assert_same(folder, tmp_path)
+
+
+def test_shards_complete_each_other(finished, tmp_path):
+    config, folder = finished
+    results = [run_sweeps(config, tmp_path, shard=(number, 3)) for number in (1, 2, 3)]
+    assert all(result.ok and result.computed > 0 for result in results)
+    assert sum(result.computed for result in results) == len(flags(tmp_path))
+    assert all(one.ok for one in verify(tmp_path))
+    assert_same(folder, tmp_path)
+
+
+def test_a_chunk_that_fails_is_named_and_the_rest_completes(finished, tmp_path):
+    config, folder = finished
+    result = run_sweeps(config, tmp_path, perform=failing_on_2)
+    assert not result.ok
+    ((chunk, error),) = result.failed.items()
+    assert chunk.startswith("map/wall/2 (d ")
+    assert error == "ArithmeticError: no number is good enough"
+    assert open_dataset(tmp_path).attrs["complete"] == 0
+    assert (open_dataset(tmp_path).status.values == 255).any()
+    before = flags(tmp_path)
+    assert run_sweeps(config, tmp_path, resume=True).computed == 1
+    assert before.items() <= flags(tmp_path).items()
+    assert_same(folder, tmp_path)
+
+
+def test_a_worker_that_is_killed_is_replaced(finished, tmp_path):
+    config, folder = finished
+    result = run_sweeps(config, tmp_path, workers=2, perform=killed_once_on_2)
+    assert result.ok
+    assert_same(folder, tmp_path)
+
+
+def test_a_chunk_that_always_kills_its_worker_is_named(finished, tmp_path):
+    config, _ = finished
+    result = run_sweeps(config, tmp_path, workers=1, perform=killed_on_2)
+    ((chunk, error),) = result.failed.items()
+    assert chunk.startswith("map/wall/2 ")
+    assert error == "its worker died each of 3 times (signal SIGKILL)"
+    assert result.computed == result.total - 1
+
+
+def test_ctrl_c_keeps_what_is_done(finished, tmp_path):
+    config, folder = finished
+    result = run_sweeps(config, tmp_path, perform=interrupted_on_2)
+    assert result.interrupted
+    assert result.computed == 2
+    resumed = run_sweeps(config, tmp_path, resume=True)
+    assert (resumed.skipped, resumed.ok) == (2, True)
+    assert_same(folder, tmp_path)
+
+
+def test_a_full_disk_ends_the_run(finished, tmp_path):
+    config, _ = finished
+    result = run_sweeps(config, tmp_path, perform=disk_full_on_2)
+    assert "No space left on device" in result.hopeless
+    assert result.computed == 2
+
+
+def test_events_tell_how_far_it_is(tmp_path):
+    events = []
+    run_sweeps(config_of(), tmp_path, progress=events.append)
+    assert [event.chunks for event in events] == list(range(1, len(events) + 1))
+    assert events[-1].points == events[-1].total_points == 4 * 4 * 40 * 300
+    assert events[-1].seconds_left == 0
+    assert all(event.rate > 0 and event.study == "map" for event in events)
+
+
+def test_a_store_is_never_overwritten(finished):
+    config, folder = finished
+    with pytest.raises(StoreExistsError, match=r"map\.zarr exists already; go on with it with --resume"):
+        run_sweeps(config, folder)
+
+
+@pytest.mark.parametrize(
+    "change, key, words",
+    [
+        ({"axes": {**AXES, "d": [0, 0.5, 1, 3]}}, "axes.d[3]", "2.0, the configuration has 3.0"),
+        ({"axes": {**AXES, "d": [0, 1]}}, "axes.d", "a list of 4 items, the configuration has a list of 2 items"),
+        ({"outputs": ("stable", "alpha_max")}, "outputs", "list of 3 items"),
+        ({"accuracy": 1e-3}, "accuracy", "nothing, the configuration has 0.001"),
+    ],
+)
+def test_another_configuration_is_refused(finished, change, key, words):
+    _, folder = finished
+    before = flags(folder)
+    changed = config_of(study(**{"outputs": ("stable", "alpha_max", "kind"), **change}))
+    with pytest.raises(StoreError) as caught:
+        run_sweeps(changed, folder, resume=True)
+    assert f"studies[map].{key}: the store was made with" in str(caught.value)
+    assert words in str(caught.value)
+    assert flags(folder) == before
+
+
+def test_another_release_is_refused(finished, monkeypatch):
+    config, folder = finished
+    monkeypatch.setattr("zwidth.sweep.record.__version__", "99.0")
+    with pytest.raises(StoreError, match=r"made with zwidth .*, now there is 99\.0; install the same release"):
+        run_sweeps(config, folder, resume=True)
+
+
+def test_a_damaged_chunk_is_named_and_repaired_alone(finished, tmp_path):
+    config, path = copy_of(finished, tmp_path)
+    damages = {
+        "stable/1": lambda: flip(chunk_file(path, "stable", 1)),
+        "status/3": lambda: chunk_file(path, "status", 3).write_bytes(chunk_file(path, "status", 3).read_bytes()[:-3]),
+        "alpha_max/0": lambda: chunk_file(path, "alpha_max", 0).unlink(),
+    }
+    for damage in damages.values():
+        damage()
+    before = flags(path)
+    (found,) = verify(path)
+    assert not found.ok
+    assert len(found.damaged) == 3
+    text = "\n".join(found.damaged)
+    for words in ("stable is damaged", "status is damaged", "alpha_max is missing"):
+        assert words in text
+    result = run_sweeps(config, tmp_path, resume=True)
+    assert sorted(f"map/{one}" for one in found.damaged) == sorted(result.repaired)
+    assert result.computed == 3
+    assert len(before.items() & flags(path).items()) == len(before) - 3
+    assert verify(path)[0].ok
+    assert_same(finished[1], tmp_path)
+
+
+def test_a_damaged_mark_and_damaged_coordinates_are_repaired(finished, tmp_path):
+    config, path = copy_of(finished, tmp_path)
+    mark = path / "wall_checksum" / "c" / "1" / "0"
+    mark.write_bytes(mark.read_bytes()[:-1])
+    flip(path / "alpha" / "c" / "0")
+    (path / "stable" / "zarr.json").write_text("{}")
+    damaged = verify(path)[0].damaged
+    assert len(damaged) == 3
+    assert {"alpha/c/0 is damaged or missing", "stable/zarr.json is damaged or missing"} < set(damaged)
+    result = run_sweeps(config, tmp_path, resume=True)
+    assert (len(result.repaired), result.computed) == (3, 1)
+    assert verify(path)[0].ok
+    assert_same(finished[1], tmp_path)
+
+
+def test_damaged_attributes_are_refused(finished, tmp_path):
+    config, path = copy_of(finished, tmp_path)
+    text = (path / "zarr.json").read_text()
+    (path / "zarr.json").write_text(text.replace('"precision": "float64"', '"precision": "float32"'))
+    assert "damaged, its checksum is wrong" in verify(tmp_path)[0].error
+    with pytest.raises(StoreError, match="damaged, its checksum is wrong"):
+        run_sweeps(config, tmp_path, resume=True)
+
+
+def test_what_a_killed_run_leaves_behind_is_removed(finished, tmp_path):
+    config, path = copy_of(finished, tmp_path)
+    left = [path / "stable" / "c" / "0" / "0" / "0" / "0.123.partial", tmp_path / ".map.zarr.1234.partial"]
+    left[0].write_bytes(b"half")
+    left[1].mkdir()
+    run_sweeps(config, tmp_path, resume=True)
+    assert not any(one.exists() for one in left)
+
+
+def test_options_that_exclude_each_other(tmp_path):
+    for options in ({"workers": 1, "scheduler": "tcp://x"}, {"workers": 0}, {"shard": (3, 2)}, {"shard": (0, 2)}):
+        with pytest.raises(InputError):
+            run_sweeps(config_of(), tmp_path, **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_single_point(tmp_path):
+    run_sweeps(config_of(study(axes={"alpha": 0.1, "beta": 0.1, "delta": 0.1, "d": 1}, outputs=("stable", "kind"))), tmp_path)
+    values = values_of(tmp_path)
+    assert values["stable"] == np.array(True)
+    assert values["kind"].shape == ()
+    assert Store(tmp_path / "map.zarr").is_done(Task("wall", 0))

@@ -1,0 +1,109 @@
+"""Batching: shapes, types, pieces, and a caller's own transformations, with kernels whose answers are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from zwidth.batching import as_float64, broadcast, concrete_delay, is_traced, map_flat, pointwise
+from zwidth.errors import InputError, TracedDelayError
+
+
+def weighted(x, y, factor=1.0):
+    return {"sum": x + factor * y, "pair": jnp.stack([x, y])}
+
+
+def fragile(x):
+    return jnp.where(x < 0, jnp.nan, jnp.sqrt(jnp.abs(x)))
+
+
+NAMES = ("x", "y")
+
+
+def test_arguments_broadcast_and_vectors_come_last():
+    x, y = np.arange(3.0)[:, None], np.arange(4.0)
+    got = pointwise(weighted, NAMES, (x, y), (10.0,))
+    np.testing.assert_array_equal(got["sum"], x + 10 * y)
+    assert got["pair"].shape == (3, 4, 2)
+    np.testing.assert_array_equal(got["pair"][..., 1], np.broadcast_to(y, (3, 4)))
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 25])
+@pytest.mark.parametrize("chunk", [1, 8])
+def test_pieces_join_to_the_whole(count, chunk):
+    x = np.arange(float(count))
+    np.testing.assert_array_equal(map_flat(fragile, [x], chunk=chunk), np.sqrt(x))
+
+
+def test_nothing_in_nothing_out():
+    got = pointwise(weighted, NAMES, (np.ones((0, 3)), 1.0))
+    assert got["sum"].shape == (0, 3)
+    assert got["pair"].shape == (0, 3, 2)
+    assert got["sum"].dtype == np.float64
+
+
+def test_a_bad_point_leaves_its_neighbors_alone():
+    x = np.linspace(0.1, 5.0, 9)
+    spoiled = x.copy()
+    spoiled[4] = -1.0
+    clean, got = pointwise(fragile, ("x",), (x,)), pointwise(fragile, ("x",), (spoiled,))
+    assert np.isnan(got[4])
+    np.testing.assert_array_equal(np.delete(got, 4), np.delete(clean, 4))
+
+
+def test_types_follow_the_caller():
+    assert isinstance(pointwise(fragile, ("x",), (2.0,)), np.float64)
+    assert isinstance(pointwise(fragile, ("x",), (np.ones(2),)), np.ndarray)
+    assert isinstance(pointwise(fragile, ("x",), ([1, 2],)), np.ndarray)
+    from_jax = pointwise(fragile, ("x",), (jnp.ones(2),))
+    assert isinstance(from_jax, jax.Array)
+    assert from_jax.dtype == np.float64
+
+
+def test_float64_without_touching_the_configuration():
+    before = jax.config.jax_enable_x64
+    assert pointwise(fragile, ("x",), (1 + 2.0**-40,)) == np.sqrt(1 + 2.0**-40)
+    assert jnp.ones(1).dtype == jnp.float32
+    assert jax.config.jax_enable_x64 == before
+
+
+def test_inside_a_transformation_the_ambient_precision_holds():
+    def function(x):
+        assert is_traced(x)
+        return pointwise(fragile, ("x",), (x,))
+
+    assert jax.jit(function)(jnp.ones(3)).dtype == jnp.float32
+    assert jax.vmap(function)(jnp.ones(3)).shape == (3,)
+    with jax.enable_x64(True):
+        assert jax.jit(function)(jnp.ones(3)).dtype == jnp.float64
+        assert float(jax.grad(function)(4.0)) == 0.25
+
+
+def test_traced_arguments_broadcast_too():
+    got = jax.jit(lambda x: pointwise(weighted, NAMES, (x, np.arange(4.0))))(jnp.ones((3, 1)))
+    assert got["sum"].shape == (3, 4)
+    assert got["pair"].shape == (3, 4, 2)
+
+
+@pytest.mark.parametrize("value", ["1", None, 1j, ["1"], [1, [2]], {}, np.array(["a"]), object()])
+def test_what_is_no_real_number(value):
+    with pytest.raises(InputError, match="x: got .*, a real number or a rectangular array of real numbers is needed"):
+        as_float64("x", value)
+
+
+@pytest.mark.parametrize("value", [True, 3, np.int8(3), np.float16(0.5), [1, 2.5], np.uint64(7)])
+def test_what_is_a_real_number(value):
+    got = as_float64("x", value)
+    assert got.dtype == np.float64
+    np.testing.assert_array_equal(got, value)
+
+
+def test_shapes_that_do_not_fit_are_all_named():
+    message = r"shapes do not broadcast: x \(2,\), y \(3,\); make each axis equal or 1"
+    with pytest.raises(InputError, match=message):
+        broadcast(NAMES, (np.ones(2), np.ones(3)))
+
+
+def test_a_traced_delay_is_refused_with_the_remedy():
+    with pytest.raises(TracedDelayError, match="pass d as a plain number, for example through jit's static_argnums"):
+        jax.jit(lambda d: concrete_delay(d).sum())(1.0)
