@@ -126,6 +126,18 @@ def evaluate(coefficients, z) -> mpc:
     return total
 
 
+def roots(coefficients) -> list[mpc]:
+    """All roots of a polynomial with simple roots, highest power first: NumPy's, finished by Newton's method."""
+    degree = len(coefficients) - 1
+    derivative = [(degree - k) * coefficient for k, coefficient in enumerate(coefficients[:-1])]
+    found = [mpc(root) for root in np.roots(np.array([float(coefficient) for coefficient in coefficients]))]
+    for _ in range(8):
+        found = [root - evaluate(coefficients, root) / evaluate(derivative, root) for root in found]
+    distances = [abs(a - b) for k, a in enumerate(found) for b in found[:k]]
+    assert min(distances) > mpf(10) ** -20, "two starting points met at one root"
+    return found
+
+
 def relative_error(got, exact, floor=0) -> float:
     """|got - exact| over |exact| (or over ``floor``, where that is larger)."""
     scale = max(abs(exact), mpf(floor))

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from zwidth.status import Status as Status
     from zwidth.studies import run as run
     from zwidth.sweep.config import load_config as load_config
+    from zwidth.sweep.store import open_dataset as open_dataset
 
 # public name -> the module that defines it
 _HOME = {
@@ -73,6 +74,7 @@ _HOME = {
     "alpha_max": "zwidth.stability.ridge",
     "Status": "zwidth.status",
     "load_config": "zwidth.sweep.config",
+    "open_dataset": "zwidth.sweep.store",
     "run": "zwidth.studies",
 }
 
@@ -103,6 +105,7 @@ __all__ = [
     "is_passive",
     "load_config",
     "normalize",
+    "open_dataset",
     "passivity_margin",
     "poles",
     "run",

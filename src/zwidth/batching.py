@@ -69,8 +69,9 @@ _UNFUSED = {"xla_disable_hlo_passes": "fusion"}
 
 
 @cache
-def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
-    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)))
+def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
+    options = None if fused else _UNFUSED
+    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)), compiler_options=options)
 
 
 def _padded_size(count: int, chunk: int, least: int) -> int:
@@ -92,6 +93,7 @@ def map_flat(
     columns: list[np.ndarray],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
+    fused: bool = True,
     least: int = 1,
 ) -> Any:
     """Apply a one-point kernel to every row of equally long columns, in float64; NumPy leaves come back.
@@ -100,7 +102,7 @@ def map_flat(
     ``least``: the compiler treats very short ones differently, to the last place.
     """
     count = columns[0].size
-    function = _compiled(kernel, static)
+    function = _compiled(kernel, static, fused)
     size = _padded_size(count, chunk, least)
 
     def run(start: int) -> Any:
@@ -140,7 +142,7 @@ class _Packed(NamedTuple):
 
 
 @cache
-def _packed(kernel: Callable[..., Any], static: tuple[Any, ...], arity: int) -> _Packed | None:
+def _packed(kernel: Callable[..., Any], static: tuple[Any, ...], arity: int, fused: bool) -> _Packed | None:
     """For a kernel that returns real scalars. One array in and one out: each costs as much as the computation."""
 
     def at(point: jax.Array) -> Any:
@@ -151,7 +153,10 @@ def _packed(kernel: Callable[..., Any], static: tuple[Any, ...], arity: int) -> 
     if any(leaf.shape or leaf.dtype.kind not in "fiub" for leaf in leaves):
         return None
     types = [leaf.dtype.type for leaf in leaves]
-    function = jax.jit(lambda point: jnp.stack([leaf.astype(point.dtype) for leaf in jax.tree.leaves(at(point))]))
+    function = jax.jit(
+        lambda point: jnp.stack([leaf.astype(point.dtype) for leaf in jax.tree.leaves(at(point))]),
+        compiler_options=None if fused else _UNFUSED,
+    )
 
     def unpack(vector: np.ndarray) -> Any:
         return structure.unflatten([kind(value) for kind, value in zip(types, vector.tolist(), strict=True)])
@@ -159,13 +164,14 @@ def _packed(kernel: Callable[..., Any], static: tuple[Any, ...], arity: int) -> 
     return _Packed(function, unpack)
 
 
-def _single(kernel: Callable[..., Any], point: list[float], static: tuple[Any, ...]) -> Any:
+def _single(kernel: Callable[..., Any], point: list[float], static: tuple[Any, ...], fused: bool) -> Any:
     """The result at one point, as NumPy scalars (arrays where the kernel returns any)."""
     with jax.enable_x64(True):
-        packed = _packed(kernel, static, len(point))
+        packed = _packed(kernel, static, len(point), fused)
         if packed is not None:
             return packed.unpack(np.asarray(packed.function(np.array(point))))
-    return jax.tree.map(lambda leaf: leaf[0], map_flat(kernel, [np.array([value]) for value in point], static))
+    columns = [np.array([value]) for value in point]
+    return jax.tree.map(lambda leaf: leaf[0], map_flat(kernel, columns, static, fused=fused))
 
 
 # The types whose conversion needs no check; bool and 0-d arrays take the long way.
@@ -178,12 +184,13 @@ def pointwise(
     values: tuple[ArrayLike, ...],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
+    fused: bool = True,
     least: int = 1,
 ) -> Any:
     """Broadcast ``values``, apply the one-point ``kernel`` to each point, and restore the common shape."""
     if _NUMBERS.issuperset(map(type, values)):
         try:
-            return _single(kernel, [float(value) for value in values], static)
+            return _single(kernel, [float(value) for value in values], static, fused)
         except OverflowError:
             pass  # An integer beyond float64: the long way names it.
     if is_traced(*values):
@@ -191,8 +198,8 @@ def pointwise(
     arrays = broadcast(names, values)
     shape = arrays[0].shape
     if not shape:
-        return to_caller(_single(kernel, [float(array) for array in arrays], static), values)
-    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, least)
+        return to_caller(_single(kernel, [float(array) for array in arrays], static, fused), values)
+    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, fused, least)
     return to_caller(jax.tree.map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 

@@ -6,7 +6,6 @@ Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence o
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from decimal import Decimal
@@ -123,18 +122,25 @@ def corner_takes_over() -> float:
     beta))``. Its maximum passes the corner, where the curve ends, when ``d alpha/d beta = 0`` there.
     """
 
-    def slope(delta: float) -> float:
-        # Far from delta = 0, where these quotients would cancel.
-        c = math.exp(-delta)
-        p1 = -math.expm1(-delta) / delta
-        p2 = (1.0 - p1) / delta
-        psi = p1 - p2
-        beta = float(boundary(np.pi, delta, 0).beta)
-        numerator = (1.0 - c) + beta * (p2 + c * psi) - beta**2 * psi * p1
-        denominator = psi * (1.0 + p2 * beta)
-        return ((p2 + c * psi) - 2.0 * beta * psi * p1) * denominator - numerator * psi * p2
+    # Extended precision where the machine has it: in float64 rounding blurs the last two digits of this root.
+    low, high = np.longdouble(2.5), np.longdouble(6.0)
+    while low < (middle := (low + high) / 2) < high:
+        low, high = (middle, high) if _slope_at_corner(middle) < 0 else (low, middle)
+    return float(high)
 
-    return _root(slope, 2.5, 6.0)
+
+def _slope_at_corner(delta: np.longdouble) -> np.longdouble:
+    """The numerator of d alpha/d beta at the corner for d = 0; beta there as P(-1) = P'(-1) = 0 gives it."""
+    c = np.exp(-delta)
+    # Far from delta = 0, where these quotients would cancel.
+    p1 = -np.expm1(-delta) / delta
+    p2 = (1 - p1) / delta
+    psi = p1 - p2
+    gap = p2 - psi
+    beta = (1 + c) / gap * (1 - 2 * (1 + 1 / (1 + c) - p2 / gap))
+    numerator = (1 - c) + beta * (p2 + c * psi) - beta**2 * psi * p1
+    denominator = psi * (1 + p2 * beta)
+    return ((p2 + c * psi) - 2 * beta * psi * p1) * denominator - numerator * psi * p2
 
 
 def _root(function: Callable[[float], float], low: float, high: float) -> float:

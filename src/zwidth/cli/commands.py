@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import click
 
 from zwidth import __version__
+from zwidth.cli import sweeps
 from zwidth.cli.options import json_option, physical_options
 from zwidth.cli.words import row, verdict_lines
 from zwidth.quantities import plain, with_unit
@@ -118,22 +118,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-@cli.command()
-@click.argument("config", type=click.Path(path_type=Path))
-@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.  [default: runs/NAME]")
-@click.option("--overwrite", is_flag=True, help="Replace a run that the folder already holds.")
-def run(config: Path, out: Path | None, overwrite: bool) -> None:
-    """Run the studies of a CONFIG file.
-
-    Data, figures and a record of the run go into one folder.
-    """
-    from zwidth.cli.progress import reporter
-    from zwidth.studies import run as run_studies
-
-    with reporter() as progress:
-        result = run_studies(config, out=out, overwrite=overwrite, progress=progress)
-    click.echo(f"{len(result.studies) - len(result.failed)} of {len(result.studies)} done, results in {result.folder}")
-    for study in result.failed:
-        click.echo(f"zwidth: study {study.name!r} failed: {study.error}", err=True)
-    if not result.ok:
-        raise SystemExit(1)
+for command in (sweeps.run, sweeps.verify, sweeps.export):
+    cli.add_command(command)

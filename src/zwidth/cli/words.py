@@ -40,7 +40,8 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         row(
             "stiffest stable wall",
             f"K_max = {with_unit(verdict.stiffness_max, 'N/m')} "
-            f"at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')} (alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)})",
+            f"at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')} "
+            f"(alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)})",
         ),
         row("slowest pole", _pole_words(verdict)),
     ]

@@ -52,7 +52,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{stable_area(0.0, 0):.4f}")
         0.9096
     """
-    return pointwise(_stable_area_kernel, ("delta", "d"), (delta, d), chunk=_CHUNK)
+    return pointwise(_stable_area_kernel, ("delta", "d"), (delta, d), chunk=_CHUNK, fused=False)
 
 
 def _stable_area_kernel(delta: Array, d: Array) -> Array:

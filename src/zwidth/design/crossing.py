@@ -1,4 +1,4 @@
-"""The outermost zero of a function of one unknown, for kernels of one point: bracket, solve, differentiate.
+"""The outermost zero of a function of one unknown, for kernels of one point.
 
 Outermost means: beyond it the function stays negative, whatever it does before. The number of steps is fixed, so
 that no point of a batch waits for another.
@@ -7,87 +7,65 @@ that no point of a batch waits for another.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from zwidth._types import Array
 
-_GOLDEN = 0.6180339887498949
-_GOLDEN_STEPS = 45
-# Newton steps inside a bracket that halves whenever they do not: far more than the smooth functions here need.
-_SOLVER_STEPS = 48
+# Each round cuts the bracket into this many cells; the first one has equal ratios, the others equal widths.
+_CELLS = 160
+_ROUNDS = 9
 # A logarithm of a ratio of stiffnesses this close to 0 is 0 but for rounding.
 _ZERO = 1e-14
 
 Function = Callable[[Array], Array]
 
 
-class Bracket(NamedTuple):
-    """The function is >= 0 at ``inner`` and < 0 at ``outer``, where ``exists``."""
+def outermost_zero(function: Function, inner: Array, outer: Array, offset: Array) -> tuple[Array, Array]:
+    """The last zero between ``inner`` and ``outer``, and whether there is one; implicitly differentiable.
 
-    inner: Array
-    outer: Array
-    exists: Array
-
-
-def outermost_bracket(function: Function, grid: Array) -> Bracket:
-    """Bracket the last sign change along ``grid``, which runs outwards.
-
-    Where no sample is positive, the highest one is climbed: a peak between two samples may still be.
+    ``inner + offset`` and ``outer + offset`` are positive, and ``function(outer)`` is negative. Cutting into many
+    cells at once, without derivatives, has the function compiled in one place only: Newton's method would add two.
     """
-    values = jax.vmap(function)(grid)
-    last = grid.shape[0] - 1
-    index = jnp.max(jnp.where(values >= -_ZERO, jnp.arange(last + 1), -1))
-    top = jnp.argmax(values)
-    peak, height = _climb(function, grid[jnp.maximum(top - 1, 0)], grid[jnp.minimum(top + 1, last)])
-    found = index >= 0
-    inner = jnp.where(found, grid[jnp.maximum(index, 0)], peak)
-    outer = jnp.where(found, grid[jnp.clip(index + 1, 0, last)], grid[jnp.minimum(top + 1, last)])
-    return Bracket(inner, outer, (found | (height >= -_ZERO)) & (values[last] < 0))
+    inner, outer, offset = jax.lax.stop_gradient((inner, outer, offset))
+
+    def search(residual: Function, _: tuple[Array, Array]) -> tuple[Array, Array]:
+        return _cut(residual, inner, outer, offset)
+
+    # The flag rides along as a second unknown, whose equation is trivial.
+    def equations(unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
+        return function(unknowns[0]), unknowns[1]
+
+    def solve(residual: Callable[..., tuple[Array, Array]], start: tuple[Array, Array]) -> tuple[Array, Array]:
+        return search(lambda x: residual((x, start[1]))[0], start)
+
+    def tangent(linear: Callable[..., tuple[Array, Array]], right: tuple[Array, Array]) -> tuple[Array, Array]:
+        slope, _ = linear((jnp.ones_like(right[0]), jnp.zeros_like(right[1])))
+        return right[0] / slope, right[1]
+
+    zero, found = jax.lax.custom_root(equations, (inner, jnp.zeros_like(inner)), solve, tangent)
+    return zero, jax.lax.stop_gradient(found) > 0
 
 
-def _climb(function: Function, low: Array, high: Array) -> tuple[Array, Array]:
-    """The place and the height of the peak between two points, by golden section."""
+def _cut(function: Function, inner: Array, outer: Array, offset: Array) -> tuple[Array, Array]:
+    """Shrink the bracket to the last cell whose inner end is not negative, or else round the highest sample."""
+    part = jnp.arange(_CELLS + 1, dtype=inner.dtype) / _CELLS
 
-    def shrink(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        low, high, _ = state
-        width = _GOLDEN * (high - low)
-        inside = jnp.stack([high - width, low + width])
-        # One call for both points: the function is compiled once.
-        left, right = jax.vmap(function)(inside)
-        keep_left = left > right
-        low, high = jnp.where(keep_left, low, inside[0]), jnp.where(keep_left, inside[1], high)
-        return low, high, jnp.maximum(left, right)
+    def one_round(index: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        inner, outer, found = state
+        width = outer - inner
+        ratio = jnp.log((outer + offset) / (inner + offset))
+        share = jnp.expm1(part * ratio) * (inner + offset) / width
+        share = jnp.where((index == 0) & (width != 0), jnp.where(part < 1.0, share, 1.0), part)
+        points = inner + share * width
+        values = jax.vmap(function)(points)
+        last = jnp.max(jnp.where(values >= -_ZERO, jnp.arange(_CELLS + 1), -1))
+        top = jnp.argmax(values)
+        crossed = last >= 0
+        low = jnp.where(crossed, last, jnp.maximum(top - 1, 0))
+        high = jnp.minimum(jnp.where(crossed, last, top) + 1, _CELLS)
+        return points[low], points[high], jnp.where(crossed, 1.0, found)
 
-    low, high, height = jax.lax.fori_loop(0, _GOLDEN_STEPS, shrink, (low, high, jnp.full_like(low, -jnp.inf)))
-    return 0.5 * (low + high), height
-
-
-def solve(function: Function, bracket: Bracket) -> Array:
-    """The zero inside a bracket, differentiable in all that ``function`` closes over (implicit function theorem)."""
-    inner, outer = jax.lax.stop_gradient((bracket.inner, bracket.outer))
-    return jax.lax.custom_root(
-        function,
-        0.5 * (inner + outer),
-        lambda residual, start: _safeguarded_newton(residual, start, inner, outer),
-        lambda linear, right: right / linear(jnp.ones_like(right)),
-    )
-
-
-def _safeguarded_newton(function: Function, start: Array, inner: Array, outer: Array) -> Array:
-    """Newton's method in a bracket, with bisection where a step would leave it."""
-
-    def step(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        x, inner, outer = state
-        value, slope = jax.jvp(function, (x,), (jnp.ones_like(x),))
-        inside = value >= 0
-        inner, outer = jnp.where(inside, x, inner), jnp.where(inside, outer, x)
-        newton = x - value / jnp.where(slope == 0, 1.0, slope)
-        low, high = jnp.minimum(inner, outer), jnp.maximum(inner, outer)
-        usable = (slope != 0) & (newton >= low) & (newton <= high)
-        return jnp.where(usable, newton, 0.5 * (low + high)), inner, outer
-
-    x, _, _ = jax.lax.fori_loop(0, _SOLVER_STEPS, step, (start, inner, outer))
-    return x
+    inner, outer, found = jax.lax.fori_loop(0, _ROUNDS, one_round, (inner, outer, jnp.zeros_like(inner)))
+    return inner, found

@@ -1,9 +1,9 @@
 """What a device needs for a wanted stiffness: damping, sampling period, shortness of delay, or mass.
 
-Every answer is a zero of ``log(K_max/K)`` in one quantity with the others fixed. Brackets come from bounds found
-over delta from 0 to 1e5 and d from 0 to 1e6, where g is the slope of eq. (22):
+Every answer is a zero of ``log(K_max/K)`` in one quantity with the others fixed. The search is bracketed by bounds that
+were found over delta from 0 to 1e5 and d from 0 to 1e6, with room to spare:
 
-    0.36 < alpha_max(delta, d)/(alpha_max(0, d) + g(d) delta) < 1.1
+    0.2 (1/D^2 + delta/D) < alpha_max(delta, d) < 6 (1/D^2 + delta/D)     D = d + 1
 """
 
 from __future__ import annotations
@@ -11,12 +11,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
-from zwidth.design.crossing import Bracket, Function, outermost_bracket, solve
+from zwidth.design.crossing import Function, outermost_zero
 from zwidth.design.stiffness import check_stiffness
 from zwidth.errors import InputError
 from zwidth.loop import poison
@@ -24,13 +23,10 @@ from zwidth.scene import denormalize, normalize
 from zwidth.stability.ridge import ridge_kernel
 from zwidth.status import Status
 
-# The bounds above with some room, and a bound that holds for every d at once.
-_LEAST, _MOST = 0.3, 1.2
-_MOST_AT_REST, _MOST_PER_DAMPING = 0.85, 5.5
-# A few percent between neighbors, whatever the range.
-_SAMPLES = 256
-# A delay of this many periods is as good as continuous time, to 1e-6 of the stiffness.
-_LONGEST = 1e6
+_LEAST, _MOST = 0.2, 6.0
+# A delay of this many periods is as good as continuous time, to 1e-6 of the stiffness; a device with this delta is
+# as good as massless.
+_LIMIT = 1e6
 _CHUNK = 1 << 11
 
 
@@ -45,19 +41,19 @@ def _alpha(delta: Array, d: Array) -> Array:
     return ridge_kernel(delta, d, "held").alpha
 
 
-def _finish(function: Function, bracket: Bracket, ok: Array, inputs: tuple[Array, ...], free: Array | None = None):
-    """Solve and attach the status; ``free`` marks points where nothing at all is required."""
-    exists = ok & bracket.exists
-    free = jnp.zeros_like(ok) if free is None else ok & free
-    value = solve(function, Bracket(*(jnp.where(exists, x, 1.0) for x in bracket[:2]), exists))
-    answered = exists | free
-    value = jnp.where(free, 0.0, jnp.where(exists, value, 0.0))
+def _requirement(
+    function: Function, bracket: tuple[Array, Array, Array], ok: Array, inputs: tuple[Array, ...], free: bool = False
+) -> Requirement:
+    """Solve and attach the status. ``free``: where the function never reaches 0, nothing at all is required."""
+    value, found = outermost_zero(function, *bracket)
+    answered = ok & (found | free)
+    value = jnp.where(ok & found, value, 0.0)
     status = jnp.where(ok, jnp.where(answered, Status.OK, Status.UNREACHABLE), Status.INVALID_INPUT)
     return Requirement(value + poison(answered, *inputs), status.astype(jnp.int32))
 
 
 def _pointwise(kernel: Callable[..., Any], names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Requirement:
-    return pointwise(kernel, names, values, chunk=_CHUNK)
+    return pointwise(kernel, names, values, chunk=_CHUNK, fused=False)
 
 
 def _positive(*values: Array) -> Array:
@@ -76,18 +72,6 @@ def _not_negative(*values: Array) -> Array:
 
 def _safe(ok: Array, *values: Array) -> tuple[Array, ...]:
     return tuple(jnp.where(ok, value, 1.0) for value in values)
-
-
-def _rest_and_slope(d: Array) -> tuple[Array, Array]:
-    """alpha_max(0, d) and nearly g(d), for brackets, from one call: the ridge is compiled once."""
-    strong = 1e6
-    at_rest, strongly_damped = jax.vmap(lambda delta: _alpha(delta, d))(jnp.array([0.0, strong], d.dtype))
-    return _constant(at_rest), _constant(strongly_damped / strong)
-
-
-def _constant(value: Array) -> Array:
-    """For what only places a bracket."""
-    return jax.lax.stop_gradient(value)
 
 
 def required_damping(
@@ -111,7 +95,7 @@ def required_damping(
         InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
-        K_max at the answer equals K to about 1e-14. Traceable, with derivatives by the implicit function theorem
+        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem
         (0 where no damping is needed).
 
     References:
@@ -133,11 +117,14 @@ def _damping_kernel(stiffness: Array, mass: Array, period: Array, d: Array) -> R
     stiffness, mass, period, d = _safe(ok, *inputs)
     rate = mass / period
     wanted = stiffness * period / rate
-    at_rest, slope = _rest_and_slope(d)
-    lowest, highest = ((wanted / bound - at_rest) / slope for bound in (_MOST, _LEAST))
-    # Outwards, where "not enough" is negative, is towards less damping.
-    bracket = Bracket(*map(_constant, (highest * rate, jnp.maximum(lowest, 0.0) * rate)), at_rest < wanted)
-    return _finish(lambda b: jnp.log(_alpha(b / rate, d) / wanted), bracket, ok, inputs, at_rest >= wanted)
+    enough = wanted * (d + 1.0) / _LEAST
+
+    def shortfall(damping: Array) -> Array:
+        return -jnp.log(_alpha(damping / rate, d) / wanted)
+
+    # Outwards is towards more damping; the offset lets the samples start at 0.
+    bracket = (jnp.zeros_like(d), enough * rate, jnp.minimum(1e-3, 1e-3 * enough) * rate)
+    return _requirement(shortfall, bracket, ok, inputs, free=True)
 
 
 def required_period(
@@ -152,7 +139,8 @@ def required_period(
 
     The T of ``K_max(m, b, T, t_d) = K``, with the delay fixed either in seconds or in periods. In periods there is
     exactly one. In seconds K_max tends to a finite limit for T -> 0: at or above it no rate is enough. Below it, at
-    strong damping (delta > 8), K_max is not quite monotone in T (it varies by up to 1.2 %); the longest T is returned.
+    strong damping (delta > 8), K_max is not quite monotone in T (it dips by up to 1.2 %) and nearly flat where d is
+    between 1/4 and 1; the longest T is returned that samples a few percent apart show.
 
     Args:
         stiffness: the wanted K_max in N/m, > 0.
@@ -169,7 +157,7 @@ def required_period(
             shapes do not broadcast.
 
     Numerics:
-        K_max at the answer equals K to about 1e-14. Traceable, with derivatives by the implicit function theorem.
+        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -193,26 +181,22 @@ def required_period(
     return _pointwise(kernel, ("stiffness", "mass", "damping", given[0]), (stiffness, mass, damping, fixed))
 
 
-def _longest_period(stiffness: Array, mass: Array, damping: Array, at_rest: Array, per_damping: Array) -> Array:
-    """The T at which ``(at_rest + per_damping b T/m) m/T^2 = K``: an explicit bound on the answer."""
-    linear = per_damping * damping
-    return (linear + jnp.sqrt(linear * linear + 4.0 * stiffness * at_rest * mass)) / (2.0 * stiffness)
+def _period_at(bound: float, stiffness: Array, mass: Array, damping: Array, D: Array) -> Array:
+    """The T at which ``bound (1/D^2 + delta/D) m/T^2 = K``."""
+    linear, constant = bound * damping / D, bound * mass / (D * D)
+    return (linear + jnp.sqrt(linear * linear + 4.0 * stiffness * constant)) / (2.0 * stiffness)
 
 
 def _period_in_periods_kernel(stiffness: Array, mass: Array, damping: Array, d: Array) -> Requirement:
     inputs = (stiffness, mass, damping, d)
     ok = _positive(stiffness, mass) & _not_negative(damping, d)
     stiffness, mass, damping, d = _safe(ok, *inputs)
-    at_rest, slope = _rest_and_slope(d)
-    ends = (
-        _constant(_longest_period(stiffness, mass, damping, bound * at_rest, bound * slope))
-        for bound in (_LEAST, _MOST)
-    )
 
     def surplus(period: Array) -> Array:
         return jnp.log(_alpha(damping * period / mass, d) * (mass / stiffness) / period / period)
 
-    return _finish(surplus, Bracket(*ends, jnp.ones_like(ok)), ok, inputs)
+    ends = (_period_at(bound, stiffness, mass, damping, d + 1.0) for bound in (_LEAST, _MOST))
+    return _requirement(surplus, (*ends, jnp.zeros_like(d)), ok, inputs)
 
 
 def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array) -> Requirement:
@@ -223,21 +207,14 @@ def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array) 
     def surplus(period: Array) -> Array:
         return jnp.log(_alpha(damping * period / mass, delay / period) * (mass / stiffness) / period / period)
 
-    longest = _longest_period(stiffness, mass, damping, jnp.asarray(_MOST_AT_REST), jnp.asarray(_MOST_PER_DAMPING))
-    # Without any delay, the answer lies less than a factor of 10 below the bound.
-    shortest = jnp.where(delay > 0, jnp.minimum(delay / _LONGEST, 0.01 * longest), 0.01 * longest)
-    grid = jnp.geomspace(_constant(shortest), _constant(longest), _SAMPLES)
-    return _finish(surplus, _held_fixed(outermost_bracket, surplus, grid), ok, inputs)
+    one = jnp.ones_like(delay)
+    longest = _period_at(_MOST, stiffness, mass, damping, one)
+    without_delay = _period_at(_LEAST, stiffness, mass, damping, one)
+    shortest = jnp.where(delay > 0, jnp.minimum(delay / _LIMIT, 0.1 * without_delay), without_delay)
+    return _requirement(surplus, (shortest, longest, jnp.zeros_like(delay)), ok, inputs)
 
 
-def _held_fixed(search: Callable[..., Bracket], function: Function, grid: Array) -> Bracket:
-    """A bracket as a constant, so that no derivative passes through the search."""
-    return Bracket(*map(_constant, search(function, grid)))
-
-
-def allowed_delay(
-    stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike
-) -> Requirement:
+def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike) -> Requirement:
     """Return the longest delay with which a wall of the wanted stiffness can be stable.
 
     The largest t_d of ``K_max(m, b, T, t_d) = K``. K_max falls with the delay to 0, except that for delta > 6 it first
@@ -256,7 +233,7 @@ def allowed_delay(
         InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
-        K_max at the answer equals K to about 1e-14. Traceable, with derivatives by the implicit function theorem.
+        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -280,13 +257,11 @@ def _delay_kernel(stiffness: Array, mass: Array, damping: Array, period: Array) 
     def surplus(delay: Array) -> Array:
         return jnp.log(_alpha(delta, delay / period) / wanted)
 
-    # alpha_max < 0.85/(d + 1)^2 + 5.5 delta/(d + 1)
-    linear = _MOST_PER_DAMPING * delta
-    longest = (linear + jnp.sqrt(linear * linear + 4.0 * wanted * _MOST_AT_REST)) / (2.0 * wanted)
-    grid = period * (jnp.geomspace(1.0, _constant(jnp.maximum(longest, 1.5)), _SAMPLES) - 1.0)
-    # The first point is no delay at all, exactly.
-    grid = _constant(grid.at[0].set(0.0))
-    return _finish(surplus, _held_fixed(outermost_bracket, surplus, grid), ok, inputs)
+    # alpha_max < 6 (1/D^2 + delta/D) at D = d + 1
+    linear = _MOST * delta
+    longest = (linear + jnp.sqrt(linear * linear + 4.0 * wanted * _MOST)) / (2.0 * wanted)
+    longest = jnp.maximum(longest, 1.5) - 1.0
+    return _requirement(surplus, (jnp.zeros_like(delta), longest * period, period), ok, inputs)
 
 
 def required_mass(
@@ -311,7 +286,7 @@ def required_mass(
         InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
-        K_max at the answer equals K to about 1e-14. Traceable, with derivatives by the implicit function theorem
+        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem
         (0 where any mass will do).
 
     References:
@@ -331,14 +306,13 @@ def _mass_kernel(stiffness: Array, damping: Array, period: Array, d: Array) -> R
     inputs = (stiffness, damping, period, d)
     ok = _positive(stiffness, period) & _not_negative(damping, d)
     stiffness, damping, period, d = _safe(ok, *inputs)
-    at_rest, _ = _rest_and_slope(d)
 
     def shortfall(mass: Array) -> Array:
         return -jnp.log(_alpha(damping * period / mass, d) * (mass / stiffness) / period / period)
 
-    heaviest = stiffness * period * period / (_LEAST * at_rest)
-    # delta = 1e6: the limit of a massless device.
-    lightest = jnp.maximum(damping * period / _LONGEST, 0.1 * heaviest * (damping == 0))
-    grid = _constant(jnp.geomspace(jnp.minimum(lightest, 0.1 * heaviest), heaviest, _SAMPLES))
-    bracket = _held_fixed(outermost_bracket, shortfall, grid)
-    return _finish(shortfall, bracket, ok, inputs, ~bracket.exists)
+    D = d + 1.0
+    heaviest = stiffness * (period * D) ** 2 / _LEAST
+    # The undamped device answers above the second bound.
+    lightest = jnp.where(damping > 0, damping * period / _LIMIT, heaviest * _LEAST / _MOST)
+    bracket = (jnp.minimum(lightest, 0.01 * heaviest), heaviest, jnp.zeros_like(d))
+    return _requirement(shortfall, bracket, ok, inputs, free=True)

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     import flint
 
 FIRST_BITS = 128
-# Enough for the exact product of a float64 and 1 - f: an argument known to fewer bits would cost the phi-functions more.
+# Enough for the exact product of a float64 and 1 - f; what its rounding lost, the phi-functions would multiply.
 _EXACT_BITS = 1200
 
 
@@ -90,11 +90,12 @@ def _device(delta: float, d: float, bits: int) -> _BallDevice:
     # Of a product's exponent, the sum of the factors' is off by one at most.
     e_t, phi2_t, psi_t = _phi(x_t, frexp(delta)[1] + frexp(1 - f)[1] - 1, bits)
     _, phi2_f, psi_f = _phi(x_f, frexp(delta)[1] + frexp(f)[1] - 1, bits)
-    phi1_t, phi1_f = phi2_t + psi_t, phi2_f + psi_f
-    a2 = t * t * phi2_t
-    a1 = t * t * psi_t + t * f_ball * (e_t + phi1_t) * phi1_f + f_ball * f_ball * phi2_f
-    a0 = e_t * f_ball * f_ball * psi_f
-    return _BallDevice((-ball).exp(), (a0, a1, a2))
+    with flint.ctx.workprec(bits):
+        phi1_t, phi1_f = phi2_t + psi_t, phi2_f + psi_f
+        a2 = t * t * phi2_t
+        a1 = t * t * psi_t + t * f_ball * (e_t + phi1_t) * phi1_f + f_ball * f_ball * phi2_f
+        a0 = e_t * f_ball * f_ball * psi_f
+        return _BallDevice((-ball).exp(), (a0, a1, a2))
 
 
 def _phi(x: flint.arb, exponent: int, bits: int) -> tuple[flint.arb, flint.arb, flint.arb]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import jax
@@ -15,15 +15,13 @@ from zwidth.grouping import Degree
 from zwidth.stability import balls
 from zwidth.stability.certified_crossover import crossover
 from zwidth.stability.certified_filter import OPEN, STABLE, HeldDevice, coefficients, device, recursion
-from zwidth.stability.layout import Points, by_degree, lay_out, point_ok, run_pieces
+from zwidth.stability.layout import DeviceWork, Points, by_degree, fields_of, lay_out, per_device, point_ok
 from zwidth.status import Status
 
 # Beyond, the recursion leaves too much open: 0.02 % of a map at d = 14, 2 % at d = 20. Its proof counts on it too.
 _RECURSION_UP_TO = 12
 # Smaller batches are filled up to this size, so that they share one compilation.
 _SMALLEST_BATCH = 1 << 10
-# A map pays for a compilation of its own shape from this size on.
-_MAP_FROM = 1 << 19
 # Balls need memory and time in proportion to the delay.
 _LONGEST_FOR_BALLS = 100_000
 # Where balls would take about a second, compiling the second pass is cheaper.
@@ -85,7 +83,7 @@ def certified_stable(
     """
     laid = lay_out((alpha, beta, delta, d))
     points, shape = laid.points, laid.points.shape
-    code = by_degree(points, shape, np.uint8, partial(_codes, pair=False, edge=False))
+    code = by_degree(points, np.uint8, partial(_codes, pair=False, edge=False))
     stable, status, bits = np.asarray(code == STABLE), np.zeros(shape, np.int32), np.zeros(shape, np.int32)
     rest = np.flatnonzero(code == OPEN)
     if rest.size:
@@ -98,51 +96,41 @@ def certified_stable(
 
 def _codes(degree: Degree, points: Points, *, pair: bool, edge: bool) -> np.ndarray:
     """The filter's code of points of one degree, of their broadcast shape."""
-    whole = degree.whole if degree.whole <= _RECURSION_UP_TO and not pair else None
-    shape, static = points.shape, (whole, degree.fractional, pair, edge)
-    if not points.size:
-        return np.zeros(shape, np.uint8)
-    one_device = points.delta.size == points.d.size == 1
-    if one_device and points.size >= _MAP_FROM and points.size > 8 * max(points.alpha.size, points.beta.size):
+    shape = points.shape
+    short = degree.whole <= _RECURSION_UP_TO and not pair
+    work = _work(degree.whole if short else None, degree.fractional, pair, edge)
+    if points.is_dense:
+        device_shape = np.broadcast_shapes(points.delta.shape, points.d.shape)
+        devices = [np.broadcast_to(array, device_shape).reshape(-1) for array in (points.delta, points.d)]
         with jax.enable_x64(True):
-            plant = _device_kernel(points.delta, points.d, degree.fractional)
-            return np.asarray(_kernel(*points, plant, *static))
-    columns = [np.broadcast_to(array, shape).reshape(-1) for array in (points[:2] if one_device else points)]
-    if points.size < _SMALLEST_BATCH:
-        columns = [np.resize(column, _SMALLEST_BATCH) for column in columns]
-    plant = None
-    if one_device:
-        columns += [points.delta.reshape(1), points.d.reshape(1)]
-        with jax.enable_x64(True):
-            plant = _device_kernel(*columns[2:], degree.fractional)
-    code = run_pieces(lambda *pieces: _kernel(*pieces, plant, *static), columns, np.uint8)
-    return code[: points.size].reshape(shape)
+            fields = np.asarray(fields_of(work, *devices)).reshape(-1, *device_shape)
+            return np.asarray(work.kernel(points.alpha, points.beta, fields))
+    count = points.size
+    if 0 < count < _SMALLEST_BATCH:
+        points = Points(*(np.resize(np.broadcast_to(array, shape), _SMALLEST_BATCH) for array in points))
+    code = per_device(work, [points.alpha, points.beta], points.delta, points.d)
+    return code.reshape(-1)[:count].reshape(shape)
 
 
-@partial(jax.jit, static_argnums=2)
-def _device_kernel(delta: Array, d: Array, fractional: bool) -> HeldDevice:
-    return device(delta, d - jnp.floor(d), fractional)
+@cache
+def _work(whole: int | None, fractional: bool, pair: bool, edge: bool) -> DeviceWork:
+    """The compiled filter: by the recursion for the given whole delay, by the crossover for any (None)."""
 
+    def devices(delta: Array, d: Array) -> Array:
+        periods = jnp.floor(d)
+        plant = device(delta, d - periods, fractional)
+        fields = jnp.stack([delta, periods, *(field for field in plant if field is not None)])
+        # With NaN the filter leaves every point of the device open.
+        return jnp.where(_is_valid(delta) & _is_valid(d), fields, jnp.nan)
 
-@partial(jax.jit, static_argnums=(5, 6, 7, 8))
-def _kernel(
-    alpha: Array,
-    beta: Array,
-    delta: Array,
-    d: Array,
-    plant: HeldDevice | None,
-    whole: int | None,
-    fractional: bool,
-    pair: bool,
-    edge: bool,
-) -> Array:
-    """The filter, elementwise; by the recursion for the given whole delay, by the crossover for any (None)."""
-    plant = device(delta, d - jnp.floor(d), fractional) if plant is None else plant
-    if whole is None:
-        code = crossover(alpha, beta, delta, jnp.floor(d), plant, pair, edge)
-    else:
-        code = recursion(*coefficients(alpha, beta, plant, whole))
-    return jnp.where(_is_valid(delta) & _is_valid(d), code, jnp.uint8(OPEN))
+    def kernel(alpha: Array, beta: Array, fields: Array) -> Array:
+        delta, periods, c, a2, a1, *rest = fields
+        plant = HeldDevice(c, a2, a1, rest[0] if fractional else None)
+        if whole is None:
+            return crossover(alpha, beta, delta, periods, plant, pair, edge)
+        return recursion(*coefficients(alpha, beta, plant, whole))
+
+    return DeviceWork(jax.jit(devices), jax.jit(kernel), 6 if fractional else 5, np.uint8)
 
 
 def _is_valid(value: Array) -> Array:
@@ -178,6 +166,6 @@ def _settled(points: Points, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.
 
 def _second_pass(points: Points, edge: bool) -> tuple[np.ndarray, np.ndarray]:
     """Let the crossover try again, pairs included: stable and status."""
-    code = by_degree(points, points.shape, np.uint8, partial(_codes, pair=True, edge=edge))
+    code = by_degree(points, np.uint8, partial(_codes, pair=True, edge=edge))
     decided = np.where((code == STABLE) & edge, Status.ON_BOUNDARY, Status.OK)
     return (code == STABLE) & (not edge), np.where(code == OPEN, Status.UNDECIDED, decided)

@@ -75,7 +75,9 @@ def alpha_max(
     check_choice("method", method, _METHODS)
     # "auto" and "newton" share one compilation.
     route = "kkt" if method == "kkt" else "newton"
-    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, route), _CHUNK, _LEAST)
+    # The general route iterates over long formulas.
+    fused = route == "newton"
+    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, route), _CHUNK, fused, _LEAST)
 
 
 def ridge_kernel(delta: Array, d: Array, delay: str, method: str = "newton") -> RidgePoint:

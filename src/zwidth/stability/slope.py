@@ -53,7 +53,7 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
         0.631130
     """
     check_delay_model(delay)
-    return pointwise(slope_kernel, ("d",), (d,), (delay,), _CHUNK, _LEAST)
+    return pointwise(slope_kernel, ("d",), (d,), (delay,), _CHUNK, least=_LEAST)
 
 
 def slope_kernel(d: Array, delay: str) -> Array:

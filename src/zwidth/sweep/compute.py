@@ -27,7 +27,9 @@ from zwidth.grouping import degree_of, groups
 
 Columns: TypeAlias = tuple[np.ndarray, ...]
 
-_PIECE = 1 << 12
+# Small where a point is expensive, for a sweep of a few points pays for a whole piece; the last one is for rows.
+_PIECE = 1 << 9
+_ROW_PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
@@ -124,7 +126,7 @@ def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
 def _limits(block: Block) -> np.ndarray:
     """The stiffest stable alpha of every device and beta, shape (D, B)."""
     if block.rows >= _MANY_ROWS:
-        size = min(_PIECE, 1 << (block.rows - 1).bit_length())
+        size = min(_ROW_PIECE, 1 << (block.rows - 1).bit_length())
         devices = zip(block.beta, block.delta, block.d, strict=True)
         return np.stack([_limits_of_one(beta, delta, d, size) for beta, delta, d in devices])
     columns = tuple(
@@ -136,7 +138,7 @@ def _limits(block: Block) -> np.ndarray:
         index = np.flatnonzero((columns[2] < 1) == short)
         if index.size:
             picked = tuple(column[index] for column in columns)
-            limit[index] = in_pieces(lambda *piece: (row_limits(*piece),), picked, _PIECE)[0]
+            limit[index] = in_pieces(lambda *piece: (row_limits(*piece),), picked, _ROW_PIECE)[0]
     return limit.reshape(block.beta.shape)
 
 

@@ -17,7 +17,8 @@ def test_verdict_is_that_of_the_poles(d, delta):
     rng = np.random.default_rng(31)
     for alpha, beta in zip(rng.uniform(0, 1 + delta, 6), rng.uniform(-1 - delta, 2 + delta, 6), strict=True):
         with mp.workdps(oracles.digits_for(delta)):
-            radius = max(abs(z) for z in mp.polyroots(oracles.polynomial(alpha, beta, delta, d), maxsteps=400))
+            p = oracles.polynomial(alpha, beta, delta, d)[::-1]
+            radius = max(abs(z) for z in mp.polyroots(p, maxsteps=400, asc=True))
             verdict = balls.decide(float(alpha), float(beta), delta, d, 4096)
             assert verdict.status == Status.OK
             assert verdict.stable == (radius < 1)
@@ -49,9 +50,7 @@ def test_zeros_on_the_circle_are_never_labelled_by_precision(bits):
 
     with flint.ctx.workprec(bits):
         assert balls.schur_cohn([flint.arb(1), flint.arb(0), flint.arb(1)]) is None
-        assert (
-            balls.schur_cohn([flint.arb(1) - flint.arb(2) ** -100, flint.arb(0), flint.arb(1)]) is (bits > 128) or None
-        )
+        assert balls.schur_cohn([flint.arb(3) / 3, flint.arb(1), flint.arb(1)]) is None
 
 
 def test_rational_points_on_the_circle():
@@ -62,5 +61,5 @@ def test_rational_points_on_the_circle():
 
 
 def test_precision_doubles_until_decided():
-    assert [balls.decide(alpha, 0.1, 0.1, 1.0, 1 << 14).bits for alpha in (1e-3, 1e-100, 1e-300)] == [128, 512, 2048]
+    assert [balls.decide(alpha, 0.1, 0.1, 1.0, 1 << 14).bits for alpha in (1e-3, 1e-100, 1e-300)] == [128, 512, 1024]
     assert balls.decide(1e-300, 0.1, 0.1, 1.0, 512) == (False, Status.UNDECIDED, 512)

@@ -56,7 +56,7 @@ def test_whole_delay_device_errors_are_as_stated():
     for index, delta in enumerate(DELTAS):
         with mp.workdps(oracles.digits_for(delta)):
             exact = oracles.phi(delta)
-            assert oracles.relative_error(plant.c[index], exact.c, floor=1e-290) <= 8 * UNIT
+            assert oracles.relative_error(plant.c[index], exact.c, floor=1e-280) <= 8 * UNIT
             assert oracles.relative_error(plant.a2[index], exact.phi2) <= 20 * UNIT
             assert oracles.relative_error(plant.a1[index], exact.psi) <= 20 * UNIT
 
@@ -67,7 +67,7 @@ def test_phi_errors_are_as_stated_between():
     with mp.workdps(80):
         exact = [oracles.phi(x) for x in delta]
         for got, want, count in ((plant.c, 0, 8), (plant.a2, 2, 20), (plant.a1, 3, 20)):
-            assert oracles.worst(got, [value[want] for value in exact], floor=1e-290) <= count * UNIT
+            assert oracles.worst(got, [value[want] for value in exact], floor=1e-280) <= count * UNIT
 
 
 @pytest.mark.parametrize("fraction", [5e-324, 1e-9, 0.2, 0.5, 0.83, 1.0 - 2.0**-53])
@@ -114,14 +114,16 @@ def test_crossover_never_contradicts_balls_at_long_delays(d, delta):
     for a, b, found in zip(alpha, beta, code, strict=True):
         if found != OPEN:
             assert balls.decide(float(a), float(b), delta, float(d), 8192).stable == (found == STABLE)
-    assert (code != OPEN).sum() >= 12
+    assert (code[:8] != OPEN).all()
+    assert (code == OPEN).any()
 
 
 @pytest.mark.parametrize("d", [0, 1, 6, 0.5, 40, 40.5])
 def test_edge_agrees_with_balls(d):
     rng = np.random.default_rng(23)
+    seen = set()
     for delta in (0.0, 0.2, 5.0):
-        beta = delta + rng.uniform(0, 2.0 + delta, 40) / (1.0 + d)
+        beta = delta + rng.uniform(0, 4.0 + 2.0 * delta, 40) / (1.0 + d)
         plant = device(jnp.full(1, delta), jnp.full(1, d - int(d)), d != int(d))
         whole = jnp.full(1, float(int(d)))
         code = np.asarray(
@@ -131,7 +133,8 @@ def test_edge_agrees_with_balls(d):
             verdict = balls.decide(0.0, float(b), delta, float(d), 4096)
             assert found == OPEN or (found == STABLE) == (verdict.status == zwidth.Status.ON_BOUNDARY)
         assert (code != OPEN).mean() > 0.9
-        assert {STABLE, UNSTABLE} <= set(code.tolist())
+        seen.update(code.tolist())
+    assert {STABLE, UNSTABLE} <= seen
 
 
 def test_crossover_leaves_open_what_its_proof_does_not_cover():
@@ -162,10 +165,7 @@ def test_own_elementary_functions():
     np.testing.assert_allclose(inverse(jnp.asarray(-x)), -1 / x, rtol=2.0**-47)
     assert float(root(jnp.asarray(0.0))) == 0.0
     v, u = np.cos(rng.uniform(-np.pi, np.pi, 20000)), np.sin(rng.uniform(-np.pi, np.pi, 20000))
-    np.testing.assert_allclose(
-        certified_crossover._angle(jnp.asarray(u), jnp.asarray(v)), np.arctan2(u, v), atol=2.0**-34
-    )
+    angle = certified_crossover._angle
+    np.testing.assert_allclose(angle(jnp.asarray(u), jnp.asarray(v)), np.arctan2(u, v), rtol=0, atol=2.0**-36)
     tiny = 10 ** rng.uniform(-100, -1, 2000)
-    np.testing.assert_allclose(
-        certified_crossover._angle(jnp.asarray(tiny), jnp.asarray(1.0)), np.arctan(tiny), rtol=2.0**-35
-    )
+    np.testing.assert_allclose(angle(jnp.asarray(tiny), jnp.asarray(1.0)), np.arctan(tiny), rtol=2.0**-35)

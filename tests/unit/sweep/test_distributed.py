@@ -1,0 +1,57 @@
+"""Sweeps on a dask.distributed cluster: one on this machine, with workers in processes of their own."""
+
+import warnings
+
+import pytest
+from sweeping import assert_same, config_of, killed_on_2, killed_once_on_2
+
+from zwidth.errors import InputError
+from zwidth.sweep.engine import run_sweeps
+
+# Closing a cluster leaves sockets to the garbage collector, which pytest then reports in whatever test runs next.
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    """The address of a scheduler with two workers, each of which is replaced when it dies."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from distributed import LocalCluster
+
+        with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
+            yield cluster.scheduler_address
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished")
+    assert run_sweeps(config_of(), folder).ok
+    return folder
+
+
+def test_a_cluster_computes_the_same(cluster, finished, tmp_path):
+    result = run_sweeps(config_of(), tmp_path, scheduler=cluster)
+    assert result.ok
+    assert result.computed == result.total
+    assert_same(finished, tmp_path)
+
+
+def test_work_of_a_killed_worker_is_done_by_another(cluster, finished, tmp_path):
+    result = run_sweeps(config_of(), tmp_path, scheduler=cluster, perform=killed_once_on_2)
+    assert result.ok
+    assert_same(finished, tmp_path)
+
+
+def test_a_chunk_that_always_kills_its_worker_is_named(cluster, tmp_path):
+    result = run_sweeps(config_of(), tmp_path, scheduler=cluster, perform=killed_on_2)
+    ((chunk, error),) = result.failed.items()
+    assert chunk.startswith("map/wall/2 ")
+    assert error.startswith("KilledWorker: its worker died every time")
+    assert result.computed == result.total - 1
+
+
+def test_no_scheduler_at_the_address(tmp_path, monkeypatch):
+    monkeypatch.setattr("zwidth.sweep.distributed._CONNECT_SECONDS", 1)
+    with pytest.raises(InputError, match="scheduler: no answer from 'tcp://127.0.0.1:9'"):
+        run_sweeps(config_of(), tmp_path, scheduler="tcp://127.0.0.1:9")
