@@ -80,7 +80,12 @@ def zwidth(*arguments, **options):
 def start(*arguments, **options):
     """Start the command line in a process group of its own."""
     return subprocess.Popen(
-        command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True, **options
+        command(*arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        **options,
     )
 
 
@@ -139,5 +144,3 @@ def poles_say_stable(alpha, beta, delta, d):
     from zwidth.stability.poles import radius_by_companion
 
     return np.asarray(radius_by_companion(alpha, beta, delta, d)) < 1.0
-
-

@@ -65,7 +65,8 @@ LABEL_BAND = Tolerance(
 )
 
 PASSIVITY = Tolerance(
-    1e-12, "Relative to |alpha| (d + 1) + |beta| + delta, the size of the terms: golden section finds a maximum squared."
+    1e-12,
+    "Relative to |alpha| (d + 1) + |beta| + delta, the size of the terms: golden section finds a maximum squared.",
 )
 PASSIVITY_SCAN = Tolerance(
     1e-7, "Relative to the same size: a scan of 1e5 frequencies misses a maximum by (step/2)^2/2 of its curvature."
@@ -97,3 +98,20 @@ PEER_POLE = Tolerance(
     "costs three digits more.",
 )
 NORMALIZED = rounding_errors(4, "Relative: two or three rounded products and quotients.")
+
+RIDGE = Tolerance(2e-15, "Relative, ten rounding errors: at a maximum an error of omega enters squared.", 4e-6)
+RIDGE_BETA = Tolerance(4e-15, "Relative to |alpha| + |beta|: beta is a difference of terms of that size.", 1e-5)
+RIDGE_OMEGA = Tolerance(
+    4e-15,
+    "Relative, times 1 + 1/(pi - omega): near the corner cos^2(omega/2) is what delta determines to a rounding error.",
+    1e-5,
+)
+RIDGE_SLOPE = Tolerance(1e-12, "Relative; a slope that cancels to far below its terms has RIDGE_SLOPE_FLOOR.", 1e-4)
+RIDGE_SLOPE_FLOOR = Tolerance(
+    1e-15, "Relative to |alpha| + |beta| over the unit of the variable: terms of that size are rounded and subtracted."
+)
+RIDGE_CURVATURE = Tolerance(
+    1e-11, "Relative, beside 16 rounding errors of alpha's terms: implicit derivatives divide by alpha'' once."
+)
+RIDGE_ORACLE = Tolerance(1e-11, "Relative: bisection of a slope leaves omega with sqrt(eps) of the curve's curvature.")
+LIMIT_SLOPE = rounding_errors(8, "Relative: the same method as RIDGE, on a plant of three numbers.")

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.methods import is_stable as is_stable
+    from zwidth.stability.methods import spectral_radius as spectral_radius
+    from zwidth.stability.methods import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
@@ -38,6 +41,7 @@ if TYPE_CHECKING:
     from zwidth.stability.ridge import RidgeKind as RidgeKind
     from zwidth.stability.ridge import RidgePoint as RidgePoint
     from zwidth.stability.ridge import alpha_max as alpha_max
+    from zwidth.stability.slope import stiffness_slope as stiffness_slope
     from zwidth.status import Status as Status
     from zwidth.studies import run as run
     from zwidth.sweep.config import load_config as load_config
@@ -64,6 +68,9 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
+    "is_stable": "zwidth.stability.methods",
+    "spectral_radius": "zwidth.stability.methods",
+    "stability_of": "zwidth.stability.methods",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
@@ -72,6 +79,7 @@ _HOME = {
     "RidgeKind": "zwidth.stability.ridge",
     "RidgePoint": "zwidth.stability.ridge",
     "alpha_max": "zwidth.stability.ridge",
+    "stiffness_slope": "zwidth.stability.slope",
     "Status": "zwidth.status",
     "load_config": "zwidth.sweep.config",
     "open_dataset": "zwidth.sweep.store",
@@ -79,7 +87,6 @@ _HOME = {
 }
 
 __all__ = [
-    "__version__",
     "Assessment",
     "BoundaryPoint",
     "ConfigError",
@@ -96,6 +103,7 @@ __all__ = [
     "TracedDelayError",
     "VirtualWall",
     "ZwidthError",
+    "__version__",
     "alpha_max",
     "assess",
     "boundary",
@@ -103,14 +111,18 @@ __all__ = [
     "char_poly",
     "denormalize",
     "is_passive",
+    "is_stable",
     "load_config",
     "normalize",
     "open_dataset",
     "passivity_margin",
     "poles",
     "run",
+    "spectral_radius",
+    "stability_of",
     "stable_region",
     "step_response",
+    "stiffness_slope",
 ]
 
 

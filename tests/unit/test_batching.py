@@ -87,7 +87,7 @@ def test_traced_arguments_broadcast_too():
 
 @pytest.mark.parametrize("value", ["1", None, 1j, ["1"], [1, [2]], {}, np.array(["a"]), object()])
 def test_what_is_no_real_number(value):
-    with pytest.raises(InputError, match="x: got .*, a real number or a rectangular array of real numbers is needed"):
+    with pytest.raises(InputError, match=r"x: got .*, a real number or a rectangular array of real numbers is needed"):
         as_float64("x", value)
 
 

@@ -4,11 +4,11 @@ import itertools
 
 import jax
 import numpy as np
-import oracles
 import pytest
-import tolerances as tol
 from mpmath import mp, mpf
 
+import oracles
+import tolerances as tol
 import zwidth
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.grouping import degree_of
@@ -161,7 +161,7 @@ def test_closed_loop_broadcasts_and_keeps_bad_points_to_themselves():
 
 @pytest.mark.parametrize("d", [0.5, -1, np.nan, np.inf, [1, 2]])
 def test_closed_loop_needs_one_whole_delay(d):
-    with pytest.raises(InputError, match="d: got .*one whole number of at least 0"):
+    with pytest.raises(InputError, match=r"d: got .*one whole number of at least 0"):
         closed_loop_transfer(0.1, 10.0, 1e-3, 1e3, 5.0, d)
 
 

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import tolerances as tol
 from mpmath import hyp1f1, mp, mpf
 
+import tolerances as tol
 from zwidth import phi
 
 SMALL = [0.0, 5e-324, 1e-300, *(10.0**k for k in range(-16, 0))]

@@ -3,11 +3,11 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracles
 import pytest
-import tolerances as tol
 from mpmath import mp, mpf
 
+import oracles
+import tolerances as tol
 from zwidth.errors import InputError
 from zwidth.plant import held_plant, position_transfer, split_delay, undelayed_plant, velocity_transfer
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 import scipy.signal
-import tolerances as tol
-from peers import models
 from scipy.integrate import solve_ivp
 
+import tolerances as tol
 import zwidth
+from peers import models
 from zwidth.errors import InputError
 from zwidth.response import scene_step_response, settling_time, step_response
 

@@ -5,11 +5,11 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracles
 import pytest
-import tolerances as tol
 from mpmath import mpf
 
+import oracles
+import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
 

@@ -186,7 +186,8 @@ def _tell(result: SweepResult, path: Path, folder: Path, out: Path | None, shard
         click.echo(f"repaired {found}", err=True)
     done = result.computed + result.skipped
     click.echo(f"{done} of {result.total} chunks done ({result.computed} now), results in {folder}")
-    again = f"zwidth run {path}{f' --out {out}' if out else ''} --resume{f' --shard {shard[0]}/{shard[1]}' if shard else ''}"
+    where, part = f" --out {out}" if out else "", f" --shard {shard[0]}/{shard[1]}" if shard else ""
+    again = f"zwidth run {path}{where} --resume{part}"
     if result.hopeless:
         click.echo(f"zwidth: out: {folder}: {result.hopeless}; the disk is full or read-only, or a limit on files is "
                    f"reached; make room and go on with: {again}", err=True)  # fmt: skip
@@ -210,7 +211,13 @@ def _reporter() -> Iterator[Callable[[SweepEvent], None]]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TaskProgressColumn(), TextColumn("{task.fields[state]}"))
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[state]}"),
+    )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         shown = bar.add_task("starting", total=None, state="")
 
@@ -257,7 +264,9 @@ def verify(folder: Path, as_json: bool) -> None:
     found = verify_stores(folder)
     if as_json:
         keys = ("chunks", "done", "damaged", "error", "ok")
-        click.echo(json.dumps({store.path.name: {key: getattr(store, key) for key in keys} for store in found}, indent=2))
+        click.echo(
+            json.dumps({store.path.name: {key: getattr(store, key) for key in keys} for store in found}, indent=2)
+        )
     for store in () if as_json else found:
         state = store.error or f"{store.done} of {store.chunks} chunks done, {len(store.damaged) or 'none'} damaged"
         click.echo(f"{store.path.name}: {state}")

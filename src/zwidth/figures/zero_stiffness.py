@@ -41,6 +41,7 @@ def draw_zero_stiffness(data: ZeroStiffnessData, ax: Axes | None = None) -> Figu
         ax.set_ylim(*style.span(float(values.min()), float(values.max())))
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
         _label_curves(ax, data.stable, colors)
+        ax.set_title(r"$\alpha \to 0$")
         ax.set_xlabel(style.DELTA_LABEL)
         ax.set_ylabel(style.BETA_LABEL)
         handles = _legend_handles(data)

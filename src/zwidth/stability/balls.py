@@ -191,7 +191,8 @@ def _decide_rational(alpha: float, beta: float, d: float, max_bits: int) -> Verd
         inside = schur_cohn([flint.arb(value) for value in rest])
         if inside is False:
             return Verdict(False, Status.OK, bits)
-        zeros = [zero for zero, _ in paired.numer().complex_roots()]
+        roots: Any = paired.numer().complex_roots()
+        zeros = [zero for zero, _multiplicity in roots]
         if any(abs(zero) > 1 for zero in zeros):
             return Verdict(False, Status.OK, bits)
         # 1/conj(z) is a zero too; where its ball meets no other zero's, it is z itself: z is on the circle.
@@ -221,6 +222,8 @@ def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np
     """`decide` point by point: stable, status, bits."""
     count = columns[0].size
     stable, status, bits = np.zeros(count, bool), np.zeros(count, np.int32), np.zeros(count, np.int32)
-    for index, point in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        stable[index], status[index], bits[index] = decide(*point, max_bits)
+    alpha, beta, delta, d = (column.tolist() for column in columns)
+    for index in range(count):
+        verdict = decide(alpha[index], beta[index], delta[index], d[index], max_bits)
+        stable[index], status[index], bits[index] = verdict
     return stable, status, bits

@@ -294,19 +294,16 @@ def _counted(point: BoundaryPoint, everything: tuple[ArrayLike, ...], search: fl
     found = status.ravel() == Status.OK
     confirmed, possible, refuted = (np.zeros(found.shape, dtype=bool) for _ in range(3))
     for share in _SIDE_STEPS:
-        open_ = np.flatnonzero(found & ~confirmed & ~refuted)
-        if not open_.size:
+        if not (found & ~confirmed & ~refuted).any():
             break
-        rows = (alpha, beta, delta, d, dalpha, dbeta)
-        here_alpha, here_beta, here_delta, here_d, right, up = (row[open_] for row in rows)
-        step = outward * share * np.hypot(here_alpha, here_beta) / np.hypot(right, up)
+        step = outward * share * np.hypot(alpha, beta) / np.hypot(dalpha, dbeta)
         inner, outer = (
-            np.asarray(radius_by_companion(here_alpha + away * right, here_beta + away * up, here_delta, here_d)) - 1.0
+            np.asarray(radius_by_companion(alpha + away * dalpha, beta + away * dbeta, delta, d)) - 1.0
             for away in (-step, step)
         )
-        confirmed[open_] = (inner < -_ROUNDING) & (outer > _ROUNDING)
-        refuted[open_] = outer < -_ROUNDING
-        possible[open_] |= inner <= _ROUNDING
+        confirmed |= (inner < -_ROUNDING) & (outer > _ROUNDING)
+        refuted |= (outer < -_ROUNDING) & ~confirmed
+        possible |= inner <= _ROUNDING
     kept = (found & ~refuted & (confirmed | possible)).reshape(status.shape)
     status = np.where((status == Status.OK) & ~kept, Status.NO_BOUNDARY, status)
     walls = (np.where(kept, np.asarray(value), np.nan) for value in (point.alpha, point.beta, point.omega))

@@ -15,26 +15,30 @@ sum, which only removes an error), and whatever is below 2^-1022 may become zero
    z^N - (1 + c) z^(N-1) + c z^(N-2) errs by less than 18u, the wall's part by less than (60 + 4)u of itself, and
    where the two overlap a sum adds 2u size: ``P = p + e`` with ``|p| <= size`` and ``|e| <= 72u size``.
 3. One stage, degree m: p of degree m, e any continuous function with ``|e| <= eps`` on the circle, and
-   ``p*(z) = z^m conj(p(z))``. From a = p_m 2^-k and b = p_0 2^-k (exact) comes
+   ``p*(z) = z^m conj(p(z))``. From a = 2^-k p_m and b = 2^-k p_0 (exact) comes
 
        q_i = a p_(i+1) - b p_(m-1-i),   that is   (a P - b P*)/z = q + e'
 
    the constant term vanishes exactly. ``|e'| <= (|a| + |b|)(eps + 2.01u |p|)``, the latter for the rounding of q. The
    bounds of e and of |p| grow by the same factor, so that after all stages
    ``eps <= (72 + 2.01 N) u size G`` with the running product ``G = prod (|a| + |b|)``.
-4. Decision. The last p is p_1 z + p_0. If ``||p_1| - |p_0|| > eps``, no stage vanishes on the circle, for
+4. Decision. The last p is p_2 z^2 + p_1 z + p_0. Two stages more, taken exactly, show that on the circle
+
+       (|p_2| + |p_0|) |p| >= |p_2 - p_0| | |p_2 + p_0| - |p_1| |
+
+   If the right side exceeds ``(|p_2| + |p_0|) eps``, no stage vanishes on the circle, for
    ``|q + e'| <= (|a| + |b|) |p + e|`` there. Let o = m minus the winding number of p + e. Rouche's theorem gives
    o(p) = o(q) where |b| < |a|, o(p) = m - o(q) where |b| > |a|, and o(p) = m/2 where they are equal (a P and b P* are
    then of one size and nowhere equal, so their quotient winds as often as 1 does). Since 0 <= o(q) <= m - 1, o(P) = 0
-   exactly if |b| < |a| at every stage: stable. Otherwise a pole is strictly outside: unstable.
-   The comparison |p_0| < p_m is between floating-point numbers, hence exact.
+   exactly if |b| < |a| at every stage, |p_0| < |p_2| and |p_1| < |p_2 + p_0|: stable. Otherwise a pole is strictly
+   outside: unstable. Comparisons are between floating-point numbers, hence exact; p_2 + p_0 is within u of itself,
+   which the last stage's rounding covers.
 
 The test asks for ``1.01 (72 + 3 N) u``: the rounding of G, of size and of the test itself, and second-order terms,
-are below N u of it. What is below 2^-1022 and becomes zero changes a stage by less than 2^-1019 m times the later
-``|a| + |b|``. Relative to eps that is nothing as long as G stays above 2^-900: each factor is above 1 or, where a
-stage has nothing but such numbers to scale, above 2^-51, and there are fewer than 16. Two last stages are not scaled;
-if one of them shrinks everything by more than 2^900, the addend 2^-500 covers it. Overflow ends as inf or NaN, which
-decide nothing.
+are below N u of it. What is below 2^-1022 and becomes zero changes a stage by less than 2^-1019 m. Relative to eps that
+is nothing, because |a| >= 1 wherever a stage is scaled (an a without exponent is scaled to inf or NaN, which decides
+nothing). The first stage, where a = 1, and the last two are not scaled; if one of those shrinks everything by more than
+2^900, the addend 2^-500 covers it. Overflow makes ``2 size G``, which bounds all coefficients, inf or NaN.
 """
 
 from __future__ import annotations
@@ -61,9 +65,7 @@ _EXP_LIMIT = 700.0
 _COEFFICIENT_ERROR = 72
 _UNIT = 2.0**-53
 _ABSOLUTE = 2.0**-500
-_FINITE = 2.0**1000
 _EXPONENT_BITS = 0x7FF << 52
-_INVERSE_BITS = 2046 << 52
 
 
 class HeldDevice(NamedTuple):
@@ -134,33 +136,33 @@ def coefficients(alpha: Array, beta: Array, plant: HeldDevice, whole: int) -> tu
 
 
 def recursion(p: list, size: Array) -> Array:
-    """UNSTABLE, STABLE or OPEN for a monic polynomial, elementwise; ``p`` lowest power first."""
+    """UNSTABLE, STABLE or OPEN for a monic polynomial, elementwise; ``p`` lowest power first, degree 3 or more."""
     degree = len(p) - 1
-    growth, inside = size, None
-    for m in range(degree, 1, -1):
+    growth, inside = 2.0 * size, None
+    for m in range(degree, 2, -1):
         lead, last = p[m], p[0]
         # Scaled by lead's own power of two: no square, so neither overflow nor underflow over many stages. The two
-        # last stages are short enough without it.
-        scale = _inverse_power(lead) if 3 < m < degree else 1.0
+        # last stages are few enough without it.
+        scale = _inverse_power(lead) if 4 < m < degree else 1.0
         a, b = (None, last) if m == degree else (lead * scale, last * scale)
         size_a, size_b = 1.0 if a is None else jnp.abs(a), jnp.abs(b)
         smaller = size_b < size_a
         inside = smaller if inside is None else inside & smaller
         growth = growth * (size_a + size_b)
         p = [_combined(a, p[i + 1], b, p[m - 1 - i]) for i in range(m)]
-    size_a, size_b = jnp.abs(p[1]), jnp.abs(p[0])
-    smaller = size_b < size_a
-    inside = smaller if inside is None else inside & smaller
-    gap = jnp.abs(size_a - size_b)
-    bound = 1.01 * (_COEFFICIENT_ERROR + 3 * degree) * _UNIT
-    decided = (gap > bound * growth + _ABSOLUTE) & (gap < _FINITE)
+    p0, p1, p2 = p
+    size_0, size_1, size_2, total = jnp.abs(p0), jnp.abs(p1), jnp.abs(p2), jnp.abs(p2 + p0)
+    inside = inside & (size_0 < size_2) & (size_1 < total)
+    least = jnp.abs(p2 - p0) * jnp.abs(total - size_1)
+    bound = 0.5 * 1.01 * (_COEFFICIENT_ERROR + 3 * degree) * _UNIT
+    decided = least > (bound * growth + _ABSOLUTE) * (size_2 + size_0)
     return jnp.where(decided, inside.astype(jnp.uint8), jnp.uint8(OPEN))
 
 
 def _inverse_power(value: Array) -> Array:
-    """2^-k, where 2^k <= |value| < 2^(k+1)."""
+    """2^-k, where 2^k <= 2 |value| < 2^(k+1); inf where value has no exponent."""
     bits = lax.bitcast_convert_type(value, jnp.int64) & _EXPONENT_BITS
-    return lax.bitcast_convert_type(_INVERSE_BITS - bits, jnp.float64)
+    return lax.bitcast_convert_type(_EXPONENT_BITS - bits, jnp.float64)
 
 
 def _combined(a: Array | None, x: Array | None, b: Array, y: Array | None) -> Array | None:

@@ -23,7 +23,7 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64, is_traced, pointwise
-from zwidth.errors import TracedDelayError
+from zwidth.errors import InputError, TracedDelayError
 from zwidth.loop import poison, valid_wall
 from zwidth.plant import split_delay
 
@@ -176,6 +176,10 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     The condition is homogeneous in (alpha, beta, delta), so ``alpha_passive = slope * delta`` for every delta. The
     passive set is convex: for each beta bisect the largest alpha, then golden section over beta.
     """
+
+    delay = as_float64("d", d)
+    if delay.ndim or not (np.isfinite(delay) and delay >= 0):
+        raise InputError(f"d: got {d!r}; a single finite number of at least 0 is needed")
 
     def largest_alpha(betas: np.ndarray) -> np.ndarray:
         low, high = np.zeros_like(betas), np.full_like(betas, 2.0)

@@ -14,6 +14,7 @@ from typing import TypeAlias
 
 import numpy as np
 
+from zwidth.grouping import degree_of, groups
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.passivity import _sample_count as sample_count
 from zwidth.stability.passivity import passivity_margin
@@ -23,7 +24,6 @@ from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
 from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
-from zwidth.grouping import degree_of, groups
 
 Columns: TypeAlias = tuple[np.ndarray, ...]
 
@@ -57,7 +57,9 @@ def in_pieces(function: Callable[..., tuple[np.ndarray, ...]], columns: Columns,
 
 def _devices(block: Block) -> dict[str, np.ndarray]:
     """What belongs to devices."""
-    alpha, beta, _, kind, status = in_pieces(lambda *columns: tuple(alpha_max(*columns)), (block.delta, block.d), _PIECE)
+    alpha, beta, _, kind, status = in_pieces(
+        lambda *columns: tuple(alpha_max(*columns)), (block.delta, block.d), _PIECE
+    )
     good = status == Status.OK
     found = {
         "alpha_max": alpha,

@@ -52,9 +52,10 @@ def _many(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finish
     from distributed import as_completed
 
     waiting = iter(jobs)
-    of_future: dict[str, Job] = {}
+    of_future: dict[Any, Job] = {}
     # A cluster that is still starting has no workers yet, and may have more later.
-    ahead = _AHEAD * max(4, sum(client.nthreads().values()))
+    threads: Any = client.nthreads()
+    ahead = _AHEAD * max(4, sum(threads.values()))
     completed = as_completed(with_results=False)
 
     def hand_out() -> None:
@@ -90,7 +91,8 @@ def _check_folder(client: Client, address: str, jobs: list[Job]) -> None:
     if not jobs or not client.nthreads():
         return
     path = jobs[0].path
-    blind = [worker for worker, sees in client.run(os.path.exists, path).items() if not sees]
+    seen: Any = client.run(os.path.exists, path)
+    blind = [worker for worker, sees in seen.items() if not sees]
     if blind:
         raise InputError(
             f"scheduler: the worker {blind[0]} of {address} does not see {path}; choose a folder that all machines "

@@ -17,6 +17,7 @@ from zwidth.sweep.resume import check_same, new_store, repair, store_path, sweep
 from zwidth.sweep.store import Store
 from zwidth.sweep.sweeps import SweepStudy
 
+
 @dataclass(frozen=True)
 class SweepEvent:
     """How far the sweeps are, sent after every chunk.

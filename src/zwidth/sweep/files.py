@@ -22,7 +22,7 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def checksum(path: Path) -> int:
-    """The CRC-32 of a file; 0 for none, which stands for a chunk that holds nothing but its fill value."""
+    """The CRC-32 of a file; 0 where there is none."""
     total = 0
     try:
         with open(path, "rb") as stream:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
+from zwidth.status import Status
+
 Family: TypeAlias = Literal["wall", "device"]
 """Whether an output belongs to each wall, or to each device and delay whatever its wall."""
 
@@ -65,12 +67,16 @@ _ALL = (
     Output("alpha_max", "device", "float64", "largest normalized stiffness that some virtual damping makes stable"),
     Output("beta_at_max", "device", "float64", "normalized virtual damping of that wall"),
     Output(
-        "kind", "device", "uint8", "kind of that optimum: smooth, or a corner with a double pole at z = -1", "", None,
-        False, _KINDS,
+        "kind",
+        "device",
+        "uint8",
+        "kind of that optimum: smooth, or a corner with a double pole at z = -1",
+        "",
+        None,
+        False,
+        _KINDS,
     ),
-    Output(
-        "stiffness_max", "device", "float64", "largest stable stiffness K", "N/m", physical_only=True
-    ),
+    Output("stiffness_max", "device", "float64", "largest stable stiffness K", "N/m", physical_only=True),
     Output(
         "virtual_damping_at_max", "device", "float64", "virtual damping B of that wall", "N s/m", physical_only=True
     ),
@@ -79,3 +85,13 @@ OUTPUTS = {output.name: output for output in _ALL}
 
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 """The variable that says for each point of a family why it has the values it has."""
+
+
+def status_flags() -> dict[str, Any]:
+    """The CF description of a status."""
+    meanings = [*(status.name.lower() for status in Status), "not_computed"]
+    return {
+        "long_name": "why a point has its values",
+        "flag_values": [*(int(status) for status in Status), NOT_COMPUTED],
+        "flag_meanings": " ".join(meanings),
+    }

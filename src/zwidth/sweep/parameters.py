@@ -121,7 +121,9 @@ def delay_entries() -> tuple[Entry, Entry, Callable[[], str]]:
             units.setdefault(unit)
             if len(units) > 1:
                 remedy = f"write all of them in {next(iter(units))}"
-                raise problem(f"got {describe(raw)}", "the delays of an axis are all in seconds or all in periods", remedy)
+                raise problem(
+                    f"got {describe(raw)}", "the delays of an axis are all in seconds or all in periods", remedy
+                )
             return value
 
         return entry
@@ -137,15 +139,13 @@ def _delays(raw: Any) -> DelayValues:
     return DelayValues(axis, unit())
 
 
-def _unit_axis(name: str) -> Any:
-    """The annotation of an axis in units."""
+def _reader(name: str) -> Callable[[Any], Axis]:
+    """A validator for an axis of a parameter in SI units."""
     parameter = PARAMETERS[name]
-    dimension = parameter.dimension
+    dimension, allowed = parameter.dimension, parameter.allowed
     assert dimension is not None, "a normalized parameter has an annotation already"
-    low = max(parameter.allowed.low, 0.0)
-    positive = Range(low, parameter.allowed.high, low_open=low == 0.0)
-    read = axis_of(parameter.entry(), quantity(dimension, positive))
-    return Annotated[Axis, PlainValidator(read), SPELLED, _schema(dimension)]
+    low = max(allowed.low, 0.0)
+    return axis_of(parameter.entry(), quantity(dimension, Range(low, allowed.high, low_open=low == 0.0)))
 
 
 def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
@@ -156,12 +156,10 @@ def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
 
 SPELLED = PlainSerializer(lambda value: value.spelling(), return_type=Any)
 
-PeriodAxis = _unit_axis("period")
-RateAxis = _unit_axis("rate")
-MassAxis = _unit_axis("mass")
-DampingAxis = _unit_axis("damping")
-StiffnessAxis = _unit_axis("stiffness")
-VirtualDampingAxis = _unit_axis("virtual_damping")
-TimeAxis = Annotated[
-    DelayValues, PlainValidator(_delays), SPELLED, _schema(TIME, "periods", "period")
-]
+PeriodAxis = Annotated[Axis, PlainValidator(_reader("period")), SPELLED, _schema(TIME)]
+RateAxis = Annotated[Axis, PlainValidator(_reader("rate")), SPELLED, _schema(RATE)]
+MassAxis = Annotated[Axis, PlainValidator(_reader("mass")), SPELLED, _schema(MASS)]
+DampingAxis = Annotated[Axis, PlainValidator(_reader("damping")), SPELLED, _schema(DAMPING)]
+StiffnessAxis = Annotated[Axis, PlainValidator(_reader("stiffness")), SPELLED, _schema(STIFFNESS)]
+VirtualDampingAxis = Annotated[Axis, PlainValidator(_reader("virtual_damping")), SPELLED, _schema(DAMPING)]
+TimeAxis = Annotated[DelayValues, PlainValidator(_delays), SPELLED, _schema(TIME, "periods", "period")]

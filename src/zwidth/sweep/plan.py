@@ -8,7 +8,7 @@ import shutil
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -36,7 +36,8 @@ Methods: TypeAlias = dict[str, str]
 Rate: TypeAlias = Callable[[str, str, float], float]
 
 
-class Task(NamedTuple):
+@dataclass(frozen=True)
+class Task:
     """One chunk of one family of outputs: what is computed, written and repaired as a whole."""
 
     family: Family

@@ -8,6 +8,7 @@ import signal
 import threading
 from collections import Counter, deque
 from collections.abc import Generator, Iterable
+from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
@@ -67,11 +68,9 @@ class _Worker:
     def start(self, job: Job) -> None:
         """Hand over a job."""
         self.job = job
-        try:
+        # Where the worker is dead already, its sentinel says so.
+        with suppress(OSError):
             self.pipe.send(job)
-        except OSError:
-            # The worker is dead: its sentinel says so.
-            pass
 
     def result(self) -> Finished | None:
         """How the job went; None where the worker died over it."""

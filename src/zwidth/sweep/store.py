@@ -24,10 +24,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.errors import StoreError, StoreExistsError
-from zwidth.status import Status
 from zwidth.sweep.files import checksum, write_whole
 from zwidth.sweep.grid import Grid
-from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF
+from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.sweep.plan import FamilyPlan, Plan, Task, kept_plan
 from zwidth.sweep.record import digest
 from zwidth.sweep.sweeps import SweepStudy
@@ -109,7 +108,9 @@ class Store:
     def _arrays(self) -> dict[str, Any]:
         names = [name for family in self.plan.families for name in family.variables]
         with _quiet():
-            return {name: self._group[name] for name in names}
+            arrays: dict[str, Any] = {name: self._group[name] for name in names}
+        # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
+        return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
     def _files(self, family: FamilyPlan, index: int) -> list[Path]:
         """The files that hold a chunk, in the order of its variables."""
@@ -253,7 +254,7 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
                 attributes["units"] = output.units_in(grid.physical)
             attributes["ancillary_variables"] = STATUS_OF[family.family]
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
-        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=_status_flags(), **common, **code)
+        group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **common, **code)
         group.create_array(
             _checksums(family.family),
             shape=(family.count, len(family.variables)),
@@ -262,19 +263,8 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
             compressors=None,
             fill_value=0,
             dimension_names=(f"{family.family}_chunk", f"{family.family}_variable"),
-            attributes={"long_name": "CRC-32 of the files of a chunk, in the order of 'variables'; written last"}
-            | {"variables": list(family.variables)},
+            attributes={"long_name": f"CRC-32 of the files of a chunk: {', '.join(family.variables)}; written last"},
         )
-
-
-def _status_flags() -> dict[str, Any]:
-    """The CF description of a status."""
-    meanings = [*(status.name.lower() for status in Status), "not_computed"]
-    return {
-        "long_name": "why a point has its values",
-        "flag_values": [*(int(status) for status in Status), NOT_COMPUTED],
-        "flag_meanings": " ".join(meanings),
-    }
 
 
 def find_stores(path: Path) -> list[Path]:
@@ -373,11 +363,11 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
     """
     target = _free(file)
     dataset = open_dataset(path)
-    points = int(np.prod([size for size in dataset.sizes.values()], dtype=float))
+    points = int(np.prod(list(dataset.sizes.values()), dtype=float))
     if points > MAX_CSV_POINTS:
         raise StoreError(
-            f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; export to netCDF, or select a part "
-            "with zwidth.open_dataset"
+            f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; export to netCDF, or select "
+            "a part with zwidth.open_dataset"
         )
     with _replacing(target) as partial:
         if dataset.sizes:

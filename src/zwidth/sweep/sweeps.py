@@ -13,7 +13,7 @@ from zwidth.sweep.axes import MAX_DELAY_PERIODS, AnyAxis, Axis, DelayAxis, Delta
 from zwidth.sweep.devices import AnyScene, PhysicalScene
 from zwidth.sweep.faults import LocatedProblem, listing, problem
 from zwidth.sweep.fields import Range, Strict, members, number, one_of
-from zwidth.sweep.outputs import OUTPUTS, STATUS_OF
+from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
 from zwidth.sweep.parameters import (
     NORMALIZED,
     PARAMETERS,
@@ -92,7 +92,9 @@ class Axes(Strict):
         own = [name for name in PARAMETERS if getattr(self, name) is not None]
         for name in own:
             if name in columns:
-                what = problem("given twice, as an axis and as a column of devices", "each parameter once", "remove one")
+                what = problem(
+                    "given twice, as an axis and as a column of devices", "each parameter once", "remove one"
+                )
                 yield (name,), what
         if columns and not any(name in columns for name in own):
             yield from ((("devices",), what) for _, what in _mixed([*own, *columns], "axes and devices together"))
@@ -141,7 +143,10 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
         if (key in PHYSICAL) != physical:
             kinds = "physical key, after normalized ones" if not physical else "normalized key, after physical ones"
             allowed = f"{where} are in SI units or normalized, never both"
-            yield (key,), problem(kinds, allowed, f"choose from {listing(PHYSICAL if physical else NORMALIZED)}", on_key=True)
+            yield (
+                (key,),
+                problem(kinds, allowed, f"choose from {listing(PHYSICAL if physical else NORMALIZED)}", on_key=True),
+            )
     if "period" in keys and "rate" in keys:
         second = [key for key in keys if key in ("period", "rate")][1]
         allowed = "the sampling period and its rate say the same"
@@ -229,10 +234,13 @@ class SweepStudy(Study):
         if not longest <= MAX_DELAY_PERIODS:
             place = ("axes", "devices") if axis is None else ("axes", "delay")
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
-            yield place, problem(f"the longest delay is {longest:.6g} of the shortest periods", allowed, "check the units")
+            yield (
+                place,
+                problem(f"the longest delay is {longest:.6g} of the shortest periods", allowed, "check the units"),
+            )
 
     @property
-    def families(self) -> dict[str, tuple[str, ...]]:
+    def families(self) -> dict[Family, tuple[str, ...]]:
         """The outputs of walls and those of devices."""
         groups = {family: tuple(n for n in self.outputs if OUTPUTS[n].family == family) for family in STATUS_OF}
         return {family: names for family, names in groups.items() if names}

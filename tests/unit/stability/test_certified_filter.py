@@ -1,5 +1,7 @@
 """The floating-point filter: its stated errors hold, and its two routes never contradict each other or the balls."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -36,19 +38,24 @@ def near_the_curve(delta, d, count, seed):
     return jnp.asarray(np.asarray(wall.alpha) * (1 + distance)), jnp.asarray(np.asarray(wall.beta))
 
 
-@jax.jit
-def short_route(alpha, beta, delta, fraction):
-    return recursion(*coefficients(alpha, beta, device(delta, fraction, True), 1))
+@partial(jax.jit, static_argnums=(4, 5))
+def by_recursion(alpha, beta, delta, fraction, whole, fractional):
+    return recursion(*coefficients(alpha, beta, device(delta, fraction, fractional), whole))
 
 
-def routes(alpha, beta, delta, d):
-    """Codes of the recursion and of the crossover."""
-    whole, fraction = int(d), d - int(d)
-    delta = jnp.full(1, delta)
-    plant = device(delta, jnp.full(1, fraction), fraction > 0)
-    first = recursion(*coefficients(alpha, beta, plant, whole))
-    second = crossover(alpha, beta, delta, jnp.full(1, float(whole)), plant, pair=True, edge=False)
-    return np.asarray(first), np.asarray(second)
+@partial(jax.jit, static_argnums=(5, 6))
+def by_crossover(alpha, beta, delta, fraction, whole, fractional, edge):
+    return crossover(alpha, beta, delta, whole, device(delta, fraction, fractional), True, edge)
+
+
+def recursion_codes(alpha, beta, delta, d):
+    fraction = d - int(d)
+    return np.asarray(by_recursion(alpha, beta, jnp.full(1, delta), jnp.full(1, fraction), int(d), fraction > 0))
+
+
+def crossover_codes(alpha, beta, delta, d, edge=False):
+    fraction, whole = d - int(d), jnp.full(1, float(int(d)))
+    return np.asarray(by_crossover(alpha, beta, jnp.full(1, delta), jnp.full(1, fraction), whole, fraction > 0, edge))
 
 
 def test_whole_delay_device_errors_are_as_stated():
@@ -84,7 +91,7 @@ def test_held_fraction_device_errors_are_as_stated(fraction):
 def test_routes_never_contradict_each_other(d):
     for delta in (0.0, 1e-4, 0.3, 3.7, 40.0, 800.0, 1e4):
         alpha, beta = columns(3000, 11, delta, d)
-        first, second = routes(alpha, beta, delta, d)
+        first, second = recursion_codes(alpha, beta, delta, d), crossover_codes(alpha, beta, delta, d)
         both = (first != OPEN) & (second != OPEN)
         np.testing.assert_array_equal(first[both], second[both])
         assert both.mean() > 0.99
@@ -94,7 +101,7 @@ def test_routes_never_contradict_each_other(d):
 @pytest.mark.parametrize("delta", [1e-3, 1.0, 30.0])
 def test_routes_never_contradict_balls_next_to_the_boundary(d, delta):
     alpha, beta = near_the_curve(delta, d, 60, seed=13)
-    first, second = routes(alpha, beta, delta, d)
+    first, second = recursion_codes(alpha, beta, delta, d), crossover_codes(alpha, beta, delta, d)
     truth = [balls.decide(float(a), float(b), delta, float(d), 4096).stable for a, b in zip(alpha, beta, strict=True)]
     expected = np.where(truth, STABLE, UNSTABLE)
     for code in (first, second):
@@ -109,8 +116,7 @@ def test_routes_never_contradict_balls_next_to_the_boundary(d, delta):
 def test_crossover_never_contradicts_balls_at_long_delays(d, delta):
     far, near = columns(8, 17, delta, d), near_the_curve(delta, d, 12, seed=19)
     alpha, beta = (jnp.concatenate(pair) for pair in zip(far, near, strict=True))
-    plant = device(jnp.full(1, delta), jnp.full(1, d - int(d)), d != int(d))
-    code = np.asarray(crossover(alpha, beta, jnp.full(1, delta), jnp.full(1, float(int(d))), plant, True, False))
+    code = crossover_codes(alpha, beta, delta, d)
     for a, b, found in zip(alpha, beta, code, strict=True):
         if found != OPEN:
             assert balls.decide(float(a), float(b), delta, float(d), 8192).stable == (found == STABLE)
@@ -124,11 +130,7 @@ def test_edge_agrees_with_balls(d):
     seen = set()
     for delta in (0.0, 0.2, 5.0):
         beta = delta + rng.uniform(0, 4.0 + 2.0 * delta, 40) / (1.0 + d)
-        plant = device(jnp.full(1, delta), jnp.full(1, d - int(d)), d != int(d))
-        whole = jnp.full(1, float(int(d)))
-        code = np.asarray(
-            crossover(jnp.zeros(beta.size), jnp.asarray(beta), jnp.full(1, delta), whole, plant, True, True)
-        )
+        code = crossover_codes(jnp.zeros(beta.size), jnp.asarray(beta), delta, d, edge=True)
         for b, found in zip(beta, code, strict=True):
             verdict = balls.decide(0.0, float(b), delta, float(d), 4096)
             assert found == OPEN or (found == STABLE) == (verdict.status == zwidth.Status.ON_BOUNDARY)
@@ -138,10 +140,8 @@ def test_edge_agrees_with_balls(d):
 
 
 def test_crossover_leaves_open_what_its_proof_does_not_cover():
-    plant = device(jnp.full(1, 0.1), jnp.zeros(1), False)
-
     def code(alpha, beta, whole=20.0):
-        return int(crossover(*map(jnp.asarray, ([alpha], [beta], [0.1], [whole])), plant, pair=True, edge=False)[0])
+        return int(crossover_codes(jnp.full(1, alpha), jnp.full(1, beta), 0.1, whole)[0])
 
     assert code(1e-4, 0.05) == STABLE
     assert [code(a, b) for a, b in ((0.0, 0.05), (-1e-4, 0.05), (np.nan, 0.05), (1e-4, np.inf), (2.0**201, 1.0))] == (
@@ -152,9 +152,9 @@ def test_crossover_leaves_open_what_its_proof_does_not_cover():
 
 def test_extremes_of_the_recursion_stay_open():
     nothing = jnp.asarray([np.nan, np.inf, -np.inf, 1e308, 1e200])
-    code = short_route(nothing, nothing, jnp.full(5, 0.5), jnp.full(5, 0.5))
-    assert set(np.asarray(code).tolist()) <= {OPEN, UNSTABLE}
-    assert (np.asarray(code)[:3] == OPEN).all()
+    code = recursion_codes(nothing, nothing, 0.5, 1.5)
+    assert set(code.tolist()) <= {OPEN, UNSTABLE}
+    assert (code[:3] == OPEN).all()
 
 
 def test_own_elementary_functions():

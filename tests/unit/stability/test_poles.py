@@ -1,15 +1,15 @@
-"""Poles and spectral radius against labels from 60-digit arithmetic, mpmath's roots, and double poles made on purpose."""
+"""Poles and spectral radius against labels from 60-digit arithmetic, exact roots, and double poles made on purpose."""
 
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import oracles
 import pytest
-import tolerances as tol
 from mpmath import mp
 
+import oracles
+import tolerances as tol
 import zwidth
 from zwidth.stability.poles import companion, radius_by_companion, unstable_poles
 

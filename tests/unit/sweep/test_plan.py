@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from sweeping import config_of, study
 
+from sweeping import config_of, study
 from zwidth.errors import ResourceError
 from zwidth.sweep.engine import plan_sweeps
 from zwidth.sweep.plan import MEMORY, FamilyPlan, check_resources, chunk_shape, kept_plan, make_plan

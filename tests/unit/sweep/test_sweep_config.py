@@ -1,13 +1,17 @@
 """Sweep studies in a configuration: axes with units, devices in tables and CSV files, and what is refused."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from zwidth.errors import ConfigError
 from zwidth.scene import normalize
-from zwidth.sweep.config import Config, load_config
+from zwidth.sweep.config import Config, config_json_schema, load_config
 from zwidth.sweep.grid import Grid
 
+ROOT = Path(__file__).parents[3]
 SCENE = "scene: {mass: 100 g, damping: 10 N s/m, rate: 1 kHz, delay: 1 ms}\n"
 CSV = """label, mass [g], damping (N s/m), source
 # remarks are skipped
@@ -156,3 +160,18 @@ def test_faults_have_their_place(load, tmp_path, axes, rest, place, words):
     for fault in caught.value.faults:
         assert fault.line is not None
         assert fault.remedy, str(fault)
+
+
+def test_the_shipped_schema_is_what_zwidth_schema_prints():
+    shipped = (ROOT / "src" / "zwidth" / "sweep" / "schema.json").read_text(encoding="utf-8")
+    assert shipped == json.dumps(config_json_schema(), indent=2) + "\n", (
+        "run: zwidth schema > src/zwidth/sweep/schema.json"
+    )
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_shipped_configuration_names_its_schema(path):
+    first = path.read_text(encoding="utf-8").splitlines()[0]
+    marker = "# yaml-language-server: $schema="
+    assert first.startswith(marker)
+    assert (path.parent / first.removeprefix(marker)).resolve() == ROOT / "src" / "zwidth" / "sweep" / "schema.json"

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+
+import zwidth
 from sweeping import (
     AXES,
     assert_same,
@@ -17,8 +19,6 @@ from sweeping import (
     study,
     values_of,
 )
-
-import zwidth
 from zwidth.errors import InputError, StoreError, StoreExistsError
 from zwidth.status import Status
 from zwidth.sweep.engine import run_sweeps
@@ -85,7 +85,9 @@ def test_physical_results_are_in_si_units(tmp_path):
     data = open_dataset(tmp_path).load()
     scene = [zwidth.Scene(zwidth.Device(0.1, damping), zwidth.Timing(1e-3, 1e-3)) for damping in (0.0, 10.0)]
     best = [float(zwidth.alpha_max(one.delta, one.d).alpha) for one in scene]
-    np.testing.assert_allclose(data.stiffness_max, [one.to_si(alpha=a).stiffness for one, a in zip(scene, best)])
+    np.testing.assert_allclose(
+        data.stiffness_max, [one.to_si(alpha=a).stiffness for one, a in zip(scene, best, strict=True)]
+    )
     assert data.stiffness_max.attrs["units"] == "N/m"
     assert data.settling_time.attrs["units"] == "s"
     assert data.damping.attrs["units"] == "N s/m"

@@ -1,0 +1,323 @@
+"""The ridge against 160-digit values, its general solver, an independent implicit derivative and pole counts."""
+
+import json
+import warnings
+from functools import cache
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import tolerances as tol
+import zwidth
+from zwidth.errors import InputError
+from zwidth.loop import frequency_boundary, frequency_loop
+from zwidth.stability.curve import corner
+from zwidth.stability.poles import unstable_poles
+from zwidth.stability.ridge import RidgeKind, ridge_kernel
+from zwidth.status import Status
+
+REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "ridge_extended.json"
+MODELS = ["held", "fractional_power"]
+# The corner takes over at d = 0; closer than a few rounding errors of delta nobody can say which kind it is.
+TAKE_OVER = 3.659361627421783507
+# One size for all derivatives of a model: one compilation, and a quick one.
+SIZE = 320
+QUICK = {"xla_disable_hlo_passes": "fusion"}
+
+
+@cache
+def reference(model):
+    rows = [row for row in json.loads(REFERENCE.read_text()) if row["model"] == model]
+    columns = {name: np.array([float(row[name]) for row in rows]) for name in rows[0] if name not in ("model", "kind")}
+    columns["corner"] = np.array([row["kind"] == "corner" for row in rows])
+    columns["judged"] = (columns["d"] > 0) | (np.abs(columns["delta"] / TAKE_OVER - 1) > 2e-15)
+    assert len(rows) > 70
+    return columns
+
+
+@cache
+def compiled_derivatives(model):
+    def three(point):
+        return jnp.stack(ridge_kernel(*point, model)[:3])
+
+    def alpha(point):
+        return ridge_kernel(*point, model).alpha
+
+    def everything(point):
+        return jax.jacfwd(three)(point), jax.grad(alpha)(point), jax.hessian(alpha)(point)
+
+    return jax.jit(jax.vmap(everything), compiler_options=QUICK)
+
+
+def derivatives(model, delta, d):
+    """Jacobian of (alpha, beta, omega), gradient and Hessian of alpha in (delta, d), at every point."""
+    with jax.enable_x64(True):
+        points = np.resize(np.stack(np.broadcast_arrays(delta, d), axis=1), (SIZE, 2))
+        return [np.asarray(leaf)[: np.size(delta)] for leaf in compiled_derivatives(model)(points)]
+
+
+def excess(got, exact, relative, floor):
+    """The largest error, in units of what is allowed."""
+    error = np.where(got == exact, 0.0, np.abs(got - exact))
+    return np.max(error / (relative * np.abs(exact) + floor))
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_values_and_kind(model):
+    exact = reference(model)
+    got = zwidth.alpha_max(exact["delta"], exact["d"], delay=model)
+    size = exact["alpha"] + np.abs(exact["beta"])
+    assert excess(got.alpha, exact["alpha"], tol.RIDGE.float64, 0) <= 1
+    assert excess(got.beta, exact["beta"], 0, tol.RIDGE_BETA.float64 * size) <= 1
+    with np.errstate(divide="ignore"):
+        condition = 1 + 1 / np.abs(np.pi - exact["omega"])
+    assert excess(got.omega, exact["omega"], 0, tol.RIDGE_OMEGA.float64 * condition) <= 1
+    judged = exact["judged"]
+    np.testing.assert_array_equal((got.kind == RidgeKind.CORNER)[judged], exact["corner"][judged])
+    assert judged.sum() >= len(judged) - 2
+    assert (got.status == Status.OK).all()
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_derivatives(model):
+    exact = reference(model)
+    jacobian, gradient, hessian = derivatives(model, exact["delta"], exact["d"])
+    judged = exact["judged"]
+    delta, alpha = exact["delta"], exact["alpha"]
+    size = alpha + np.abs(exact["beta"])
+    # What is rounded and subtracted in a derivative: the value over the distance at which it changes.
+    per = {"delta": size / (1 + delta), "d": size}
+    for k, name in enumerate(("delta", "d")):
+        floor = tol.RIDGE_SLOPE_FLOOR.float64 * per[name]
+        for got in (jacobian[:, 0, k], gradient[:, k]):
+            assert excess(got, exact[f"alpha_{name}"], tol.RIDGE_SLOPE.float64, floor) <= 1
+        # beta and omega move with omega, whose curvature is divided by.
+        floor = 16 * floor
+        assert excess(jacobian[:, 1, k], exact[f"beta_{name}"], tol.RIDGE_SLOPE.float64, floor) <= 1
+        nearness = 1 / np.maximum(np.pi - exact["omega"], 1e-8) ** 2
+        relative = tol.RIDGE_SLOPE.float64 * (1 + 1e-3 * nearness)
+        error = excess(
+            jacobian[judged, 2, k], exact[f"omega_{name}"][judged], relative[judged], 1e-15 / (1 + delta[judged])
+        )
+        assert error <= 1
+    across = {
+        "delta_delta": (0, 0, size / (1 + delta) ** 2),
+        "delta_d": (0, 1, size),
+        "d_d": (1, 1, size * (1 + delta)),
+    }
+    for name, (i, j, scale) in across.items():
+        floor = 1e-14 * scale
+        error = excess(
+            hessian[judged, i, j], exact[f"alpha_{name}"][judged], tol.RIDGE_CURVATURE.float64, floor[judged]
+        )
+        assert error <= 1, name
+    np.testing.assert_allclose(hessian[:, 0, 1], hessian[:, 1, 0], rtol=1e-7, atol=1e-14 * size.max())
+
+
+def test_published_values():
+    undamped = zwidth.alpha_max(0.0, 0)
+    assert undamped.alpha == pytest.approx(12 - 8 * np.sqrt(2), rel=1e-15)
+    assert undamped.beta == pytest.approx(2 * np.sqrt(2) - 2, rel=1e-15)
+    corner_point = zwidth.alpha_max(4.0, 0)
+    assert corner_point.kind == RidgeKind.CORNER
+    assert corner_point.omega == np.pi
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_agrees_with_the_general_solver(model):
+    rng = np.random.default_rng(4)
+    delta = np.concatenate([[0.0, 1e-9, 3.6, 3.7, 40.0, 1e4], 10 ** rng.uniform(-3, 3, 58)])
+    d = np.concatenate([[0.0, 1.0, 0.0, 0.0, 0.125, 3.0], rng.uniform(0, 6, 58)])
+    fast = zwidth.alpha_max(delta, d, delay=model, method="newton")
+    general = zwidth.alpha_max(delta, d, delay=model, method="kkt")
+    np.testing.assert_array_equal(general.status, Status.OK)
+    np.testing.assert_array_equal(general.kind, fast.kind)
+    np.testing.assert_allclose(general.alpha, fast.alpha, rtol=tol.RIDGE.float64)
+    np.testing.assert_allclose(general.omega, fast.omega, rtol=1e-9)
+    with jax.enable_x64(True):
+        decided = jax.vmap(lambda a, b: corner(frequency_loop(a, b, model)).is_ridge)(delta, d)
+    np.testing.assert_array_equal(decided, fast.kind == RidgeKind.CORNER)
+
+
+def independent_curve(omega, point, model):
+    """(alpha, beta) straight from the definitions, in complex arithmetic; for delta well above 0."""
+    delta, d = point
+    c, z = jnp.exp(-delta), jnp.exp(1j * omega)
+
+    def velocity(t):
+        return (1 - jnp.exp(-delta * t)) / delta
+
+    def position(t):
+        return (t - velocity(t)) / delta
+
+    n = jnp.floor(d) if model == "held" else d
+    f = d - n
+    t = 1 - f
+    x0, v0 = position(t), velocity(t)
+    x1, v1 = position(f) + velocity(f) * velocity(t), velocity(f) * jnp.exp(-delta * t)
+    gain = x0 * z + velocity(1.0) * v0 - c * x0 + (x1 * z + velocity(1.0) * v1 - c * x1) / z
+    q = -jnp.exp(1j * omega * n) * (z - 1) * (z - c) / gain
+    return q.real - jnp.tan(omega / 2) * q.imag, q.imag / jnp.sin(omega)
+
+
+def independent_ridge(model):
+    """Bisection of the curve's slope in omega; its implicit derivative from jaxopt."""
+    with warnings.catch_warnings():
+        # jaxopt announces at import that it is no longer maintained.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        from jaxopt import implicit_diff
+
+    def slope(omega, point):
+        return jax.grad(lambda w: independent_curve(w, point, model)[0])(omega)
+
+    def solve(_, point):
+        limit = jnp.minimum(jnp.pi, jnp.pi / (point[1] + 0.5))
+
+        def halve(_, bracket):
+            low, high = bracket
+            middle = 0.5 * (low + high)
+            rising = slope(middle, point) > 0
+            return jnp.where(rising, middle, low), jnp.where(rising, high, middle)
+
+        return jax.lax.fori_loop(0, 60, halve, (1e-3 * limit, limit * (1 - 1e-9)))[0]
+
+    def three(point):
+        omega = implicit_diff.custom_root(slope)(solve)(None, point)
+        return jnp.stack([*independent_curve(omega, point, model), omega])
+
+    return three
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_gradient_agrees_with_an_independent_implicit_derivative(model):
+    rng = np.random.default_rng(5)
+    delta, d = 10 ** rng.uniform(-0.5, 1, 24), rng.uniform(0.3, 5, 24)
+    with jax.enable_x64(True):
+        three = jax.vmap(jax.jacrev(independent_ridge(model)))
+        oracle = jax.jit(three, compiler_options=QUICK)(np.stack([delta, d], axis=1))
+    got = derivatives(model, delta, d)[0]
+    # alpha's slope sees the oracle's omega only to second order.
+    np.testing.assert_allclose(got[:, 0], oracle[:, 0], rtol=tol.RIDGE_ORACLE.float64)
+    np.testing.assert_allclose(got, oracle, rtol=1e-7, atol=1e-9)
+
+
+def test_slopes_are_continuous_where_the_corner_takes_over():
+    step = 1e-7
+    jacobian, gradient, hessian = derivatives("held", np.array([TAKE_OVER - step, TAKE_OVER + step]), np.zeros(2))
+    np.testing.assert_allclose(gradient[1], gradient[0], atol=5e3 * step)
+    assert np.isfinite(jacobian).all()
+    # Curvatures jump, omega leaves pi with a vertical tangent.
+    assert abs(hessian[1, 1, 1] - hessian[0, 1, 1]) > 1e3
+    assert jacobian[0, 2, 0] > 1e2
+    assert jacobian[1, 2, 0] == 0
+
+
+def test_slopes_are_continuous_at_whole_delays():
+    step = 1e-8
+    whole = np.array([1.0, 2.0, 5.0])
+    for delta in (0.0, 0.3, 8.0):
+        _, right, at = derivatives("held", np.full(3, delta), whole)
+        _, left, before = derivatives("held", np.full(3, delta), whole - step)
+        np.testing.assert_allclose(left, right, rtol=1e-5)
+        # The second derivative is the one from the right: it differs from the one from the left.
+        assert (np.abs(before[:, 1, 1] / at[:, 1, 1] - 1) > 1e-2).all()
+
+
+BAD = [(np.nan, 1.0), (-1.0, 1.0), (np.inf, 0.5), (1.0, np.nan), (1.0, -0.5), (0.2, np.inf), (-np.inf, -np.inf)]
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_bad_points_spoil_nothing(model):
+    rng = np.random.default_rng(6)
+    good = np.stack([10 ** rng.uniform(-3, 3, 41), rng.uniform(0, 9, 41)])
+    place = np.sort(rng.choice(41, len(BAD)))
+    mixed = np.insert(good, place, np.transpose(BAD), axis=1)
+    is_bad = np.insert(np.zeros(41, bool), place, True)
+    alone = zwidth.alpha_max(*good, delay=model)
+    among = zwidth.alpha_max(*mixed, delay=model)
+    for clean, spoiled in zip(alone, among, strict=True):
+        np.testing.assert_array_equal(spoiled[~is_bad], clean)
+    np.testing.assert_array_equal(among.status[is_bad], Status.INVALID_INPUT)
+    for leaf in among[:3]:
+        assert np.isnan(leaf[is_bad]).all()
+    for clean, spoiled in zip(derivatives(model, *good), derivatives(model, *mixed), strict=True):
+        np.testing.assert_array_equal(spoiled[~is_bad], clean)
+        assert np.isnan(spoiled[is_bad]).all()
+
+
+def test_every_device_is_answered():
+    """No point of a wide domain fails, and none lies below a plain scan of the curve."""
+    rng = np.random.default_rng(7)
+    delta = np.where(rng.random(4000) < 0.05, 0.0, 10 ** rng.uniform(-12, 8, 4000))
+    d = np.concatenate([rng.uniform(0, 4, 1000), 10 ** rng.uniform(-12, 3, 1000), rng.integers(0, 501, 1000)])
+    d = np.concatenate([d, rng.integers(1, 9, 1000) - 10 ** rng.uniform(-15, -2, 1000)])
+    for model in MODELS:
+        got = zwidth.alpha_max(delta, d, delay=model)
+        np.testing.assert_array_equal(got.status, Status.OK)
+        limit = np.minimum(np.pi, np.pi / (d + 0.5))
+        lobe = np.full(4000, True)
+        # Up to the first return to alpha = 0 the scan sees nothing stiffer.
+        for fraction in np.linspace(0, 1, 120)[1:-1]:
+            scanned = zwidth.boundary(fraction * limit, delta, d, delay=model).alpha
+            lobe &= scanned > 0
+            assert (scanned[lobe] <= got.alpha[lobe] * (1 + 1e-13)).all()
+
+
+# Few whole parts of d: each is another polynomial, hence another compilation.
+SAMPLE = [
+    (0.0, 0.0),
+    (3.0, 0.0),
+    (3.67, 0.0),
+    (10.0, 0.01),
+    (34.0, 0.125),
+    (0.5, 0.9),
+    (1e3, 0.5),
+    (0.1, 2.0),
+    (5.0, 2.0),
+]
+
+
+def test_stable_just_inside_and_never_just_outside():
+    delta, d = np.transpose(SAMPLE)
+    ridge = zwidth.alpha_max(delta, d)
+    assert (unstable_poles(ridge.alpha * (1 - 1e-9), ridge.beta, delta, d) == 0).all()
+    spread = np.maximum(np.abs(ridge.beta), ridge.alpha)
+    beta = ridge.beta + np.linspace(-0.2, 0.2, 401)[:, None] * spread
+    assert (unstable_poles(1.0005 * ridge.alpha, beta, delta, d) > 0).all()
+
+
+def test_shapes_types_and_precision():
+    point = zwidth.alpha_max(1, 1)
+    assert isinstance(point.alpha, np.float64)
+    assert isinstance(point.kind, np.int32)
+    grid = zwidth.alpha_max(np.array([[0.1], [2.0]]), [0, 1, 2.5])
+    assert grid.alpha.shape == grid.status.shape == (2, 3)
+    assert grid.alpha.dtype == np.float64
+    assert zwidth.alpha_max([], 1).alpha.shape == (0,)
+    assert grid.alpha[1, 1] == pytest.approx(zwidth.alpha_max(2.0, 1).alpha, rel=tol.RIDGE.float64)
+    assert isinstance(zwidth.alpha_max(jnp.ones(2), 1).alpha, jax.Array)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_ambient_precision_inside_jit(model):
+    exact = reference(model)
+    usual = (exact["delta"] <= 1e4) & ((exact["d"] % 1 < 0.99) & exact["judged"])
+    delta, d = np.float32(exact["delta"][usual]), np.float32(exact["d"][usual])
+    got = jax.jit(lambda *point: zwidth.alpha_max(*point, delay=model))(delta, d)
+    assert got.alpha.dtype == jnp.float32
+    # float32 inputs are other numbers.
+    truth = zwidth.alpha_max(np.float64(delta), np.float64(d), delay=model)
+    np.testing.assert_allclose(got.alpha, truth.alpha, rtol=tol.RIDGE.float32)
+    np.testing.assert_array_equal(got.status, Status.OK)
+
+
+def test_arguments_are_checked():
+    with pytest.raises(InputError, match=r"method: got 'newtno', .* did you mean 'newton'"):
+        zwidth.alpha_max(1.0, 1, method="newtno")
+    with pytest.raises(InputError, match="delay"):
+        zwidth.alpha_max(1.0, 1, delay="padé")
+    with pytest.raises(InputError, match="delta"):
+        zwidth.alpha_max("much", 1)
