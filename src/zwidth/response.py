@@ -100,7 +100,7 @@ def step_response(
         InputError: an argument is no single finite number, or out of range.
 
     Numerics:
-        Exact between force changes up to rounding; float64. An unstable response that outgrows float64 ends as inf or NaN.
+        Exact between force changes up to rounding; float64. An unstable response that outgrows it ends as inf or NaN.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VIII, Fig. 11, eqs. (2), (6).

@@ -11,7 +11,8 @@ import yaml
 
 from sweeping import assert_same, flags, start, study, zwidth
 
-MOMENTS = 6
+# More of them: ZWIDTH_KILLS=50 python -m pytest tests/e2e/test_kill_resume.py
+MOMENTS = int(os.environ.get("ZWIDTH_KILLS", "6"))
 # Chunks of a quarter of a million points: some seconds of work in many steps.
 AXES = {
     "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 1000}},
@@ -32,19 +33,20 @@ def config(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def undisturbed(config, tmp_path_factory):
-    """Its results, and how long they took after the first chunk."""
+    """Its results, and how long it took to begin and then to end."""
     folder = tmp_path_factory.mktemp("undisturbed") / "out"
+    started = time.monotonic()
     process = start("run", config, "--out", folder)
-    begun = wait_for_chunks(folder, 1)
+    begun = wait_for_chunks(process, folder, 1)
     errors = process.communicate(timeout=300)[1]
     assert process.returncode == 0, errors
-    return folder, time.monotonic() - begun
+    return folder, begun - started, time.monotonic() - begun
 
 
-def wait_for_chunks(folder, count):
-    """The time at which a run has done some chunks."""
+def wait_for_chunks(process, folder, count):
+    """The time at which a run has done some chunks, or is at its end."""
     deadline = time.monotonic() + 240
-    while len(flags(folder)) < count and time.monotonic() < deadline:
+    while len(flags(folder)) < count and process.poll() is None and time.monotonic() < deadline:
         time.sleep(0.005)
     return time.monotonic()
 
@@ -55,14 +57,20 @@ def kill_group(process):
 
 
 def test_killed_at_any_moment_a_run_resumes(config, undisturbed, tmp_path):
-    reference, seconds = undisturbed
+    reference, beginning, working = undisturbed
     moments = random.Random(20061)
+    before = {}
     for number in range(MOMENTS):
         process = start("run", config, "--out", tmp_path, "--resume")
-        wait_for_chunks(tmp_path, 1)
-        time.sleep(moments.uniform(0, 0.5 * seconds / MOMENTS) if number else moments.uniform(0, 0.5))
+        if number % 3 == 0:
+            # While it starts, makes its store or checks what is there.
+            time.sleep(moments.uniform(0.1, 1.2) * beginning)
+        else:
+            wait_for_chunks(process, tmp_path, len(before) + 1)
+            time.sleep(moments.uniform(0, 0.5 / MOMENTS) * working)
         kill_group(process)
-    before = flags(tmp_path)
+        assert before.items() <= flags(tmp_path).items()
+        before = flags(tmp_path)
     result = zwidth("run", config, "--out", tmp_path, "--resume")
     assert result.returncode == 0, result.stderr
     # Nothing that was marked as done was computed again.
@@ -74,7 +82,7 @@ def test_killed_at_any_moment_a_run_resumes(config, undisturbed, tmp_path):
 
 def test_a_parent_that_is_killed_takes_its_workers_along(config, undisturbed, tmp_path):
     process = start("run", config, "--out", tmp_path, "--workers", "2")
-    wait_for_chunks(tmp_path, 2)
+    wait_for_chunks(process, tmp_path, 2)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     deadline = time.monotonic() + 60
@@ -97,7 +105,7 @@ def group_lives(group):
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number):
     process = start("run", config, "--out", tmp_path / "out", "--workers", "1")
-    wait_for_chunks(tmp_path / "out", 1)
+    wait_for_chunks(process, tmp_path / "out", 1)
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
@@ -122,7 +130,7 @@ def test_no_room_for_a_file_ends_the_run_with_a_message(config, tmp_path):
 
 
 def test_what_cannot_fit_is_refused_before_any_work(config, tmp_path):
-    text = config.read_text(encoding="utf-8").replace("num: 1000", "num: 1000000").replace("- stable", "- margin")
+    text = config.read_text(encoding="utf-8").replace("num: 1000", "num: 100000").replace("- stable", "- margin")
     (tmp_path / "huge.yaml").write_text(text, encoding="utf-8")
     result = zwidth("run", tmp_path / "huge.yaml", "--out", tmp_path / "out")
     assert result.returncode == 2

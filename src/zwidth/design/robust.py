@@ -98,7 +98,8 @@ def robust_max_stiffness(
         if reached < best:
             best, device = reached, candidate
     is_vertex = bool(np.all((device == box[:, 0]) | (device == box[:, 1])))
-    return RobustStiffness(best, *(float(value) for value in device), is_vertex)
+    worst = (float(value) for value in device)
+    return RobustStiffness(best, *worst, is_vertex=is_vertex)
 
 
 def _descend(box: np.ndarray, start: np.ndarray) -> tuple[float, np.ndarray]:

@@ -306,5 +306,5 @@ def _counted(point: BoundaryPoint, everything: tuple[ArrayLike, ...], search: fl
         possible |= inner <= _ROUNDING
     kept = (found & ~refuted & (confirmed | possible)).reshape(status.shape)
     status = np.where((status == Status.OK) & ~kept, Status.NO_BOUNDARY, status)
-    walls = (np.where(kept, np.asarray(value), np.nan) for value in (point.alpha, point.beta, point.omega))
-    return to_caller(BoundaryPoint(*walls, status.astype(np.int32)), everything)
+    alpha, beta, omega = (np.where(kept, np.asarray(value), np.nan) for value in (point.alpha, point.beta, point.omega))
+    return to_caller(BoundaryPoint(alpha, beta, omega, status.astype(np.int32)), everything)

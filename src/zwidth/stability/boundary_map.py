@@ -13,17 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import DeviceWork, Points, device_ok, per_device, split
-from zwidth.stability.row_limit import (
-    LONG_FIELDS,
-    SHORT_FIELDS,
-    VERIFIED_DAMPING,
-    VERIFIED_DELAY,
-    long_device,
-    long_row,
-    short_device,
-    short_row,
-)
+from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY, long_device, long_row, short_row
 
 # Smaller maps are compared by NumPy, with nothing to compile.
 _WORTH_COMPILING = 1 << 16
@@ -63,8 +55,9 @@ def in_verified_range(points: Points) -> np.ndarray:
 @cache
 def _rows(short: bool) -> DeviceWork:
     if short:
-        return DeviceWork(jax.jit(short_device), jax.jit(short_row), len(SHORT_FIELDS), np.float64)
-    return DeviceWork(jax.jit(long_device), jax.jit(long_row), len(LONG_FIELDS), np.float64)
+        return DeviceWork(compiled_device(), jax.jit(lambda beta, fields: short_row(beta, Device(*fields))), np.float64)
+    solved = jax.jit(lambda fields: long_device(Device(*fields)))
+    return DeviceWork(lambda delta, d: solved(compiled_device()(delta, d)), jax.jit(long_row), np.float64)
 
 
 @cache
@@ -74,7 +67,9 @@ def _compiled(name: str) -> Any:
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
     """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range."""
-    return split((beta, delta, d), d >= 1, np.float64, lambda long, part: per_device(_rows(not long), [part[0]], *part[1:]))
+    return split(
+        (beta, delta, d), d >= 1, np.float64, lambda long, part: per_device(_rows(not long), [part[0]], *part[1:])
+    )
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +43,7 @@ def certified_stable(
 
     ``stable`` means ``max |z| < 1`` over the zeros of `zwidth.char_poly`, held delay. First comes a floating-point
     filter: the Schur-Cohn recursion whose last polynomial must exceed ``1.01 (72 + 3 N) 2^-53 size prod (|a| + |b|)``,
-    N the degree, a and b the two factors of each stage (d < 13); or the phase where the loop gain is one, which must
+    N the degree, a and b the two factors of each stage (d < 17); or the phase where the loop gain is one, which must
     keep a stated distance from pi (any d). `zwidth.stability.certified_filter` and
     `zwidth.stability.certified_crossover` derive both bounds term by term, from the rounding of exp on. What they
     leave open is decided in ball arithmetic (python-flint), doubling the precision.
@@ -69,7 +69,7 @@ def certified_stable(
     Numerics:
         A label is a theorem about the float64 inputs, provided that XLA's ``+ - * /`` round correctly, as they do
         unless its fast-math flags are set. The filter decides more than 99.9 % of a map at a few times the cost of a
-        plain Schur-Cohn recursion, and for d > 12 at a cost that does not grow with d; balls take about 50
+        plain Schur-Cohn recursion, and for d > 16 at a cost that does not grow with d; balls take about 50
         microseconds a point for small d and 20 milliseconds at d = 500.
 
     References:
@@ -116,13 +116,6 @@ def _codes(degree: Degree, points: Points, *, pair: bool, edge: bool) -> np.ndar
 def _work(whole: int | None, fractional: bool, pair: bool, edge: bool) -> DeviceWork:
     """The compiled filter: by the recursion for the given whole delay, by the crossover for any (None)."""
 
-    def devices(delta: Array, d: Array) -> Array:
-        periods = jnp.floor(d)
-        plant = device(delta, d - periods, fractional)
-        fields = jnp.stack([delta, periods, *(field for field in plant if field is not None)])
-        # With NaN the filter leaves every point of the device open.
-        return jnp.where(_is_valid(delta) & _is_valid(d), fields, jnp.nan)
-
     def kernel(alpha: Array, beta: Array, fields: Array) -> Array:
         delta, periods, c, a2, a1, *rest = fields
         plant = HeldDevice(c, a2, a1, rest[0] if fractional else None)
@@ -130,7 +123,21 @@ def _work(whole: int | None, fractional: bool, pair: bool, edge: bool) -> Device
             return crossover(alpha, beta, delta, periods, plant, pair, edge)
         return recursion(*coefficients(alpha, beta, plant, whole))
 
-    return DeviceWork(jax.jit(devices), jax.jit(kernel), 6 if fractional else 5, np.uint8)
+    return DeviceWork(device=_devices(fractional), kernel=jax.jit(kernel), dtype=np.uint8)
+
+
+@cache
+def _devices(fractional: bool) -> Any:
+    """delta, the whole periods of d, and the plant, along a new first axis; compiled once for all degrees."""
+
+    def devices(delta: Array, d: Array) -> Array:
+        periods = jnp.floor(d)
+        plant = device(delta, d - periods, fractional)
+        fields = jnp.stack([delta, periods, *(field for field in plant if field is not None)])
+        # With NaN the filter leaves every point of the device open.
+        return jnp.where(_is_valid(delta) & _is_valid(d), fields, jnp.nan)
+
+    return jax.jit(devices)
 
 
 def _is_valid(value: Array) -> Array:

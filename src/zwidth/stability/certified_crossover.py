@@ -5,32 +5,43 @@ The recursion's bound grows with the degree. Here nothing does: with ``W = s z -
 
     Q(z) = T + B,     T = z^(1+n) (z - 1)(z - c),     B = M W,     P = Q (whole d) or z Q
 
-and on z = e^(jw), x = sin^2(w/2), where the two parts are equally large is a cubic whatever n is:
+and where its two parts are equally large on z = e^(jw), x = sin^2(w/2), is a cubic whatever n is:
 
-    H(x) = |B|^2 - |T|^2 = (g - 4 m1 x + m2 x^2)(alpha^2 + 4 beta s x) - 4 x (em^2 + 4 c x)
-    g = (a2 + a1 + a0)^2,  m1 = a1 (a2 + a0) + 4 a2 a0,  m2 = 16 a2 a0,  em = 1 - c = delta (a2 + a1 + a0)
+    H(x) = |B|^2 - |T|^2 = (g - 4 m1 x + m2 x^2)(alpha^2 + b x) - 4 x (em^2 + 4 c x)
+         = h0 + h1 x + h2 x^2 + h3 x^3
+    h0 = g alpha^2                                                    h2 = m2 alpha^2 - 4 m1 b - 16 c
+    h1 = 4 g ((beta - delta)(beta + delta) + alpha beta) - 4 m1 alpha^2     h3 = m2 b
+    g = (a2 + a1 + a0)^2,  m1 = a1 (a2 + a0) + 4 a2 a0,  m2 = 16 a2 a0
+    b = 4 beta s,  em = 1 - c = delta (a2 + a1 + a0)
 
 Counting. Cut (0, pi] into arcs on which H has one sign and short gaps between them. In a gap
-``Theta = arg T - arg B = (n + 3/2) w + pi/2 + arg(z - c) - arg M - arg W`` stays within (2 m - 1) pi and (2 m + 1) pi
+``Theta = arg T - arg B = (n + 3/2) w + pi/2 + arg(z - c) - arg M - arg W`` stays between (2 m - 1) pi and (2 m + 1) pi
 for a whole number m: Q does not vanish there. On an arc arg Q follows the larger part to within pi/2. Summed up,
 Q winds by half turns: 3 + n - 2 m on [0, pi] after one gap (T is larger at pi), and ``arg B(pi)/pi - 2 m + 2 m'``
 after two. B is larger at w = 0, for alpha > 0. Stable means 3 + n half turns. Where B is larger everywhere, Q winds as
 B does, by two half turns at most: unstable. arg M and arg W are principal values: their imaginary parts
 (a2 - a0) sin w and s sin w keep one sign, and neither vanishes where B is the larger part.
 
-Errors (u = 2^-53, device as in `certified_filter`). g, m1, m2 and em^2 are within 125u, hence each coefficient of H
-within 132u of the sum of its absolute terms. The blossom of H at (l, l, l), (l, l, r), (l, r, r), (r, r, r) bounds H
-on [l, r]; with its own rounding it is within 2^-44 of the same blossom of the absolute terms. A gap is
-``x (1 +- 2^-34)`` around any x where Theta is evaluated; nothing need be known of how x was found. With y = 1 - x:
+Edge. At alpha = 0, P = (z - 1) R. With R in place of P, T has no factor z - 1, B = beta M and W = beta > 0 no argument,
+2 + n half turns are stable, and ``H = g (beta^2 - delta^2) - 4 (m1 beta^2 + c) x + m2 beta^2 x^2``.
 
-    dw <= 1.01 2^-34 sqrt(x/y)       the change of w in the gap, hence of (n + 3/2) w
-    dw/|z - c| <= 2 dw/sqrt x        since |z - c|^2 = em^2 + 4 c x >= x/2
+Errors (u = 2^-53, device as in `certified_filter`: a2 and a1 within 60u of themselves, a0 within 33u of itself and u of
+a1). The coefficients of H are within 140u of the sum of their absolute terms, and of g |b|/16 x^2 (on the edge
+g beta^2/16 x) for the part of a0 that is within u of a1. The blossom of H at (l, l, l), (l, l, r), (l, r, r), (r, r, r)
+bounds H on [l, r]; with its own rounding it is within 2^-44 of the same blossom of the absolute terms. A gap is
+``x (1 +- 2^-34)`` around any x at which Theta is evaluated; nothing need be known of how x was found. With y = 1 - x:
+
+    dw <= 1.01 2^-34 sqrt(x/y)       the change of w in the gap, n + 1.5 times
+    1.6 dw                           w itself, computed within 2^-35 of itself, n + 1.5 times
+    dw/|z - c| <= 1.5 2^-34/y        as |z - c|^2 = em^2 + 4 c x >= x/2
     dw (a2 + a0)/|M| <= 182 dw       where |M| >= 2^-7.5 (a2 + a1 + a0) is asked for
-    dw |s|/|W| <= 2^-34/y            since |W| >= |s| sin w
-    2^-25                            rounding of all terms: below 2^9 u/|.| of a vector, 2^-45 of an angle of it
+    dw |s|/|W| <= 2^-34/y            as |W| >= |s| sin w
+    2^-33                            three angles within 2^-36, of vectors within 2^-37 of their sizes
 
-The gaps must end below x = 1 - 2^-16. The arctangent is a series with 16 terms on |v| <= sqrt 2 - 1, cut off at 2^-45.
-Intermediate results stay within 2^+-1000 where |alpha|, |beta|, delta are within 2^+-200 (or zero) and n < 2^30.
+The tolerance is ``4 ((n + 200) dw + 2^-32/y + 2^-25)``. Gaps must end below x = 1 - 2^-16. The arctangent is a series
+of 12 terms on |v| <= sqrt 2 - 1, inverse and root are Newton's method. No result exceeds 2^1000, and what is below
+2^-1022 is nothing beside the absolute terms, which are above 2^-810: alpha (on the edge beta) is asked to be within
+2^+-200, |beta| and delta below 2^200, n below 2^30.
 """
 
 from __future__ import annotations
@@ -128,17 +139,17 @@ def _gain_cubic(loop: _Loop) -> _Cubic:
     m1, m2 = _squared_numerator(loop)
     size_b, c = jnp.abs(b), 16.0 * plant.c
     h = (g * a, g * q - 4.0 * m1 * a, m2 * a - 4.0 * m1 * b - c, m2 * b)
-    sizes = (h[0], g * size_q + 4.0 * m1 * a, m2 * a + 4.0 * m1 * size_b + c, m2 * size_b)
+    sizes = (h[0], g * size_q + 4.0 * m1 * a, m2 * a + (4.0 * m1 + 0.0625 * g) * size_b + c, m2 * size_b)
     return _Cubic(h, sizes)
 
 
 def _edge_cubic(loop: _Loop) -> _Cubic:
     """H without the pole at z = 1: a quadratic."""
     g, b = loop.gain * loop.gain, loop.beta * loop.beta
-    h0 = g * ((loop.beta - loop.delta) * (loop.beta + loop.delta))
     m1, m2 = _squared_numerator(loop)
-    sizes = (jnp.abs(h0), 4.0 * (m1 * b + loop.plant.c), m2 * b, jnp.zeros_like(b))
-    return _Cubic((h0, -sizes[1], sizes[2], sizes[3]), sizes)
+    h0, h1 = g * ((loop.beta - loop.delta) * (loop.beta + loop.delta)), 4.0 * (m1 * b + loop.plant.c)
+    zero = jnp.zeros_like(b)
+    return _Cubic((h0, -h1, m2 * b, zero), (jnp.abs(h0), h1 + 0.0625 * g * b, m2 * b, zero))
 
 
 def _squared_numerator(loop: _Loop) -> tuple[Array, Array]:

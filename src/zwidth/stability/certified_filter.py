@@ -36,7 +36,7 @@ sum, which only removes an error), and whatever is below 2^-1022 may become zero
 
 The test asks for ``1.01 (72 + 3 N) u``: the rounding of G, of size and of the test itself, and second-order terms,
 are below N u of it. What is below 2^-1022 and becomes zero changes a stage by less than 2^-1019 m. Relative to eps that
-is nothing, because |a| >= 1 wherever a stage is scaled (an a without exponent is scaled to inf or NaN, which decides
+is nothing, because |a| >= 2 wherever a stage is scaled (without an exponent p_m is scaled to inf or NaN, which decide
 nothing). The first stage, where a = 1, and the last two are not scaled; if one of those shrinks everything by more than
 2^900, the addend 2^-500 covers it. Overflow makes ``2 size G``, which bounds all coefficients, inf or NaN.
 """
@@ -138,7 +138,7 @@ def coefficients(alpha: Array, beta: Array, plant: HeldDevice, whole: int) -> tu
 def recursion(p: list, size: Array) -> Array:
     """UNSTABLE, STABLE or OPEN for a monic polynomial, elementwise; ``p`` lowest power first, degree 3 or more."""
     degree = len(p) - 1
-    growth, inside = 2.0 * size, None
+    growth, inside = 2.0 * size, jnp.ones_like(size, dtype=bool)
     for m in range(degree, 2, -1):
         lead, last = p[m], p[0]
         # Scaled by lead's own power of two: no square, so neither overflow nor underflow over many stages. The two
@@ -147,7 +147,7 @@ def recursion(p: list, size: Array) -> Array:
         a, b = (None, last) if m == degree else (lead * scale, last * scale)
         size_a, size_b = 1.0 if a is None else jnp.abs(a), jnp.abs(b)
         smaller = size_b < size_a
-        inside = smaller if inside is None else inside & smaller
+        inside = inside & smaller
         growth = growth * (size_a + size_b)
         p = [_combined(a, p[i + 1], b, p[m - 1 - i]) for i in range(m)]
     p0, p1, p2 = p
@@ -160,7 +160,7 @@ def recursion(p: list, size: Array) -> Array:
 
 
 def _inverse_power(value: Array) -> Array:
-    """2^-k, where 2^k <= 2 |value| < 2^(k+1); inf where value has no exponent."""
+    """2^-k, where 2^(k+1) <= |value| < 2^(k+2); inf where value has no exponent."""
     bits = lax.bitcast_convert_type(value, jnp.int64) & _EXPONENT_BITS
     return lax.bitcast_convert_type(_EXPONENT_BITS - bits, jnp.float64)
 

@@ -52,7 +52,6 @@ class Points(NamedTuple):
         return self.size >= _WORTH_OWN_SHAPE and shape[-1] >= 32 and 4 * sum(a.size for a in self) <= self.size
 
 
-
 class Laid(NamedTuple):
     """Folded arguments and the shape the caller's arguments broadcast to."""
 
@@ -97,7 +96,10 @@ def _repeats(array: np.ndarray, axis: int) -> bool:
 
 
 def split(
-    arrays: tuple[np.ndarray, ...], key: np.ndarray, dtype: Any, work: Callable[[Any, tuple[np.ndarray, ...]], np.ndarray]
+    arrays: tuple[np.ndarray, ...],
+    key: np.ndarray,
+    dtype: Any,
+    work: Callable[[Any, tuple[np.ndarray, ...]], np.ndarray],
 ) -> np.ndarray:
     """Fill an array of the common shape with ``work(value, parts)`` for the parts where ``key`` has that value.
 
@@ -167,7 +169,6 @@ class DeviceWork(NamedTuple):
 
     device: Callable[[Any, Any], Any]  # (delta, d) -> fields along a new first axis
     kernel: Callable[..., Any]  # (*columns, fields) -> one value a point
-    fields: int
     dtype: Any
     piece: int = PIECE
 
@@ -197,8 +198,12 @@ def _in_pieces(
     with jax.enable_x64(True):
         fields = fields_of(work, delta, d) if shared else None
         for part, size in pieces(count, work.piece):
-            if fields is None or owner is None:
-                here = fields if fields is not None else work.device(*(padded(a[owner[part]], size) for a in (delta, d)))
+            if fields is None:
+                # Not shared, so there are several devices, each point with its own.
+                rows = np.asarray(owner)[part]
+                here = work.device(*(padded(device[rows], size) for device in (delta, d)))
+            elif owner is None:
+                here = fields
             else:
                 here = np.asarray(fields)[:, padded(owner[part], size)]
             values = work.kernel(*(padded(column[part], size) for column in flat), here)
@@ -210,8 +215,8 @@ def fields_of(work: DeviceWork, delta: np.ndarray, d: np.ndarray) -> Any:
     """The fields of every device of two flat arrays; call it with float64 enabled."""
     if delta.size == 1:
         return work.device(delta, d)
-    fields = np.empty((work.fields, delta.size))
+    parts = []
     for part, size in pieces(delta.size, work.piece):
         values = work.device(padded(delta[part], size), padded(d[part], size))
-        fields[:, part] = np.asarray(values)[:, : part.stop - part.start]
-    return fields
+        parts.append(np.asarray(values)[:, : part.stop - part.start])
+    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)

@@ -165,7 +165,10 @@ class Verdict:
             self.gathered = here
             return
         last = len(here) - 1
-        summed = [old + new if self.margin and k == last else old | new for k, (old, new) in enumerate(zip(self.gathered, here, strict=True))]
+        summed = [
+            old + new if self.margin and k == last else old | new
+            for k, (old, new) in enumerate(zip(self.gathered, here, strict=True))
+        ]
         self.gathered = summed
 
     @property

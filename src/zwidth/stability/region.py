@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, DelayModel
-from zwidth.batching import map_flat
+from zwidth.batching import as_float64, map_flat
 from zwidth.errors import InputError
 from zwidth.loop import check_delay_model, frequency_loop, line_at_minus_one
 from zwidth.stability.boundary import boundary
 from zwidth.stability.curve import lobe_end
-from zwidth.stability.poles import unstable_poles
+from zwidth.stability.methods import is_stable
 from zwidth.stability.ridge import alpha_max
 
 
@@ -46,8 +46,11 @@ def lobe(delta: float, d: float, *, delay: DelayModel = "held", points: int = 40
     """Frequencies along the first lobe of the boundary curve, and its alpha and beta there."""
     check_delay_model(delay)
     for name, value in (("delta", delta), ("d", d)):
-        if np.ndim(value) != 0 or not (np.isfinite(value) and value >= 0):
+        number = as_float64(name, value)
+        if number.ndim or not (np.isfinite(number) and number >= 0):
             raise InputError(f"{name}: got {value!r}; a single finite number of at least 0 is needed")
+    if not isinstance(points, int | np.integer) or isinstance(points, bool) or points < 8:
+        raise InputError(f"points: got {points!r}; a whole number of at least 8 is needed")
     columns = [np.array([float(delta)]), np.array([float(d)])]
     end = float(map_flat(_lobe_end_kernel, columns, (delay,), fused=False)[0])
     top = float(alpha_max(delta, d, delay=delay).omega)
@@ -76,12 +79,12 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
         delta: normalized physical damping b T/m, >= 0, a single number.
         d: delay in periods, >= 0, a single number.
         delay: "held" or "fractional_power".
-        points: how many points of the curve to take.
+        points: how many points of the curve to take, >= 8.
 
     Returns:
         StableRegion: ``alpha``, ``beta``, ``omega`` (0 and pi on the straight parts), ``piece`` (see `Piece`);
-        ``verified`` tells that poles were counted on both sides of every third of the outline: inside stable, outside
-        not. It is False for a fractional power, which has no poles to count. ``area`` in units of alpha times beta.
+        ``verified`` tells that stability was decided on both sides of every third edge of the outline: inside stable,
+        outside not. It is False for a fractional power, which has no poles. ``area`` in units of alpha times beta.
 
     Raises:
         InputError: an argument is no single number in range, or ``delay`` is unknown.
@@ -128,7 +131,7 @@ def _cut_by_line(omega, alpha, beta, piece, delta: float, d: float) -> tuple[np.
 
 
 def _sides_are_right(alpha: np.ndarray, beta: np.ndarray, delta: float, d: float) -> bool:
-    """Count poles a little inside and outside the middle of every third edge."""
+    """Whether the loop is stable a little inside, and not a little outside, the middle of every third edge."""
     scale_alpha, scale_beta = np.ptp(alpha), np.ptp(beta)
     x, y = alpha / scale_alpha, beta / scale_beta
     dx, dy = np.diff(x, append=x[0]), np.diff(y, append=y[0])
@@ -139,15 +142,16 @@ def _sides_are_right(alpha: np.ndarray, beta: np.ndarray, delta: float, d: float
     normal_x, normal_y = (-dy / length)[use], (dx / length)[use]
     # Farther than a chord sags from the curve it replaces.
     step = 2e-3
-    counts = [
+    inside, outside = (
         np.asarray(
-            unstable_poles(
+            is_stable(
                 (middle_x + side * step * normal_x) * scale_alpha,
                 (middle_y + side * step * normal_y) * scale_beta,
                 delta,
                 d,
+                method="schur_cohn",
             )
         )
         for side in (1.0, -1.0)
-    ]
-    return bool(use.size and np.all(counts[0] == 0) and np.all(counts[1] > 0))
+    )
+    return bool(use.size and inside.all() and not outside.any())

@@ -98,7 +98,7 @@ def _smooth_omega(loop: FrequencyLoop, d: Array, delay: str) -> tuple[Array, Arr
     wall = jax.lax.stop_gradient(stored(frequency_boundary(start, loop, delay), d))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(wall.alpha.dtype).tiny)
     scale_beta = jnp.maximum(jnp.abs(wall.beta), scale_alpha)
-    tolerance = 16 * jnp.finfo(start.dtype).eps
+    tolerance = float(16 * jnp.finfo(start.dtype).eps)
     solution = optimistix.root_find(
         kkt_residual,
         optimistix.Newton(rtol=tolerance, atol=tolerance),

@@ -26,10 +26,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zwidth import phi
 from zwidth._types import Array
-from zwidth.loop import valid_device
-from zwidth.plant import held_plant, split_delay
+from zwidth.stability.devices import Device, device
 
 # Beyond these the single lobe is not assumed.
 VERIFIED_DELAY = 500.0
@@ -43,9 +41,8 @@ _SIN = [1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 62270208
 _ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
 _COS = [1.0, -1 / 2, 1 / 24, -1 / 720, 1 / 40320, -1 / 3628800, 1 / 479001600, -1 / 87178291200, 1 / 20922789888000]
 
-SHORT_FIELDS = ("ok", "delta", "f", "p1", "p2", "psi", "em", "a1", "a2", "a0", "u0", "u1", "v1", "tilt", "start")
 LONG_FIELDS = (
-    *("ok", "delta", "k", "g0", "g1", "g2", "h0", "h1", "v0", "v1", "v2", "b1", "b2"),
+    *("delta", "k", "g0", "g1", "g2", "h0", "h1", "v0", "v1", "v2", "b1", "b2"),
     *("end", "top", "bow", "sin_bow", "bend"),
 )
 
@@ -63,68 +60,51 @@ def _sin_cos(x: Array) -> tuple[Array, Array]:
     return x * _horner(_SIN, square), _horner(_COS, square)
 
 
-def short_device(delta: Array, d: Array) -> Array:
-    """What rows with d < 1 need of a device: `SHORT_FIELDS` along a new first axis."""
-    ok = valid_device(delta, d) & (d < 1)
-    delta, f = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 0.0)
-    plant = held_plant(delta, f)
-    t = 1.0 - f
-    p1 = phi.phi1(delta)
-    p1_t, psi_t = phi.phi1(delta * t), phi.psi(delta * t)
-    # V b = y (u0 + u1 y): both coefficients are sums of terms of one sign.
-    u0 = 4.0 * p1 * (f * f * plant.em + f * p1 + t * (f * p1_t + t * psi_t) + plant.a0)
-    u1 = -16.0 * plant.a0 * (f + t * p1_t)
-    v1 = -4.0 * (plant.a1 * (plant.a2 + plant.a0) + 4.0 * plant.a2 * plant.a0)
-    tilt = 0.5 * plant.gap / (1.0 + plant.c)
-    start = p1 * ((1.0 + f) * plant.em + p1)
-    fields = (ok, delta, f, p1, phi.phi2(delta), phi.psi(delta), plant.em, plant.a1, plant.a2, plant.a0)
-    return jnp.stack([jnp.asarray(field, delta.dtype) for field in (*fields, u0, u1, v1, tilt, start)])
-
-
-def short_row(beta: Array, fields: Array) -> Array:
+def short_row(beta: Array, device: Device) -> Array:
     """The limit for d < 1, where the lobe is a quadratic in y; 0 where no alpha is stable, NaN for bad input.
 
     Beyond the corner, the double pole at z = -1, only the line bounds the row.
     """
-    ok, delta, f, p1, p2, psi, em, a1, a2, a0, u0, u1, v1, tilt, start = fields
+    delta, _, f, _, em, p1, p2, psi, p1_t, psi_t, a2, a1, a0, tilt = device
     b = beta + delta
+    # For d = 0 the row ends at phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
     whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + p2 * b))
+    # V b = y (u0 + u1 y): both coefficients are sums of terms of one sign.
+    t = 1.0 - f
+    u0 = 4.0 * p1 * (f * f * em + f * p1 + t * (f * p1_t + t * psi_t) + a0)
+    u1 = -16.0 * a0 * (f + t * p1_t)
+    v1 = -4.0 * (a1 * (a2 + a0) + 4.0 * a2 * a0)
+    v2 = 16.0 * a2 * a0
     linear = u0 - b * v1
-    square = linear * linear + 4.0 * b * p1 * p1 * (u1 - 16.0 * b * a2 * a0)
+    square = linear * linear + 4.0 * b * p1 * p1 * (u1 - b * v2)
     y = 2.0 * b * p1 * p1 / (linear + jnp.sqrt(jnp.maximum(square, 0.0)))
-    slope = -4.0 * (a1 + (3.0 + em) * a0)
-    curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / (p1 * p1 + y * (v1 + 16.0 * a2 * a0 * y))
+    start, slope = p1 * ((1.0 + f) * em + p1), -4.0 * (a1 + (3.0 + em) * a0)
+    curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / (p1 * p1 + y * (v1 + v2 * y))
     corner_reached = (tilt > 0) & (start + slope + 16.0 * a0 > 0)
     beyond = jnp.where(corner_reached, jnp.inf, 0.0)
     fractional = jnp.where((square >= 0) & (y <= 1), curve, beyond)
     limit = jnp.where(f == 0, whole, fractional)
     line = 1.0 / jnp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
     limit = jnp.where(tilt > 0, jnp.minimum(limit, line), limit)
-    return _finish(limit, b, beta, ok)
+    return _finish(limit, b)
 
 
-def _finish(limit: Array, b: Array, beta: Array, ok: Array) -> Array:
-    limit = jnp.where((b > 0) & (limit > 0), limit, 0.0)
-    return jnp.where((ok > 0) & jnp.isfinite(beta), limit, jnp.nan)
+def _finish(limit: Array, b: Array) -> Array:
+    return jnp.where(jnp.isfinite(b), jnp.where((b > 0) & (limit > 0), limit, 0.0), jnp.nan)
 
 
-def long_device(delta: Array, d: Array) -> Array:
+def long_device(device: Device) -> Array:
     """What rows with d >= 1 need of a device, its lobe's end included: `LONG_FIELDS` along a new first axis."""
-    ok = valid_device(delta, d) & (d >= 1)
-    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
-    whole, f = split_delay(d)
-    plant = held_plant(delta, f)
-    c, em, a2, a1, a0, _ = plant
+    delta, whole, f, _, em, p1, _, _, _, _, a2, a1, a0, _ = device
     k = whole + 0.5
-    p1 = phi.phi1(delta)
     sigma, mu = a2 + a0, a2 - a0
     g = (em * p1, -2.0 * (p1 + sigma * em - 2.0 * mu), 8.0 * a0)
     h = (p1 * (p1 + f * em), -4.0 * a0)
     v = (p1 * p1, -4.0 * (a1 * sigma + 4.0 * a2 * a0), 16.0 * a2 * a0)
     b1 = 2.0 * p1 - 4.0 * mu + 2.0 * delta * (sigma * (sigma - a1) - 8.0 * a2 * a0)
     b2 = -8.0 * a0 * (1.0 - 2.0 * delta * a2)
-    fields = [jnp.asarray(ok, delta.dtype), delta, k, *g, *h, *v, b1, b2]
-    end = _lobe_end(fields, em / (p1 + f * em), d)
+    fields = [delta, k, *g, *h, *v, b1, b2]
+    end = _lobe_end(fields, em / (p1 + f * em), whole + f)
     total, d_total, scale, d_scale = _offset(_Angles(end, fields), fields)
     top = total / scale
     # Rows start from sqrt(b/top) = sin(bow w/end)/sin(bow), with the slope of the curve at the lobe's end, where
@@ -142,7 +122,7 @@ class _Angles:
     """The trigonometric terms of one frequency, from two short series."""
 
     def __init__(self, omega: Array, fields: list[Array] | Array):
-        _, _, k, g0, g1, g2, h0, h1, v0, v1, v2, b1, b2, *_ = fields
+        _, k, g0, g1, g2, h0, h1, v0, v1, v2, b1, b2, *_ = fields
         s4, c4 = _sin_cos(0.25 * omega)
         sk4, ck4 = _sin_cos(0.25 * k * omega)
         # Differences of cosines are formed from half angles, which keeps their relative accuracy at small w.
@@ -162,7 +142,7 @@ class _Angles:
 
 def _offset(at: _Angles, fields: list[Array] | Array) -> tuple[Array, Array, Array, Array]:
     """``b = beta + delta`` on the curve as T/Q, accurate relative to b itself, with the derivatives of T and Q."""
-    k, s, c = fields[2], at.s, at.c
+    k, s, c = fields[1], at.s, at.c
     total = c * at.base + at.E * at.drop + s * c * 2.0 * at.sin_k * at.H
     d_total = c * at.dbase - 0.5 * s * at.base + at.dE * at.drop + at.E * (k * at.sin_k - 0.5 * s)
     d_total += at.H * (at.sin_k * (1.0 - 2.0 * s * s) + 2.0 * k * s * c * at.cos_k) + 2.0 * s * c * at.sin_k * at.dH
@@ -195,7 +175,7 @@ def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
     Newton's method on that phase, nearly linear in w; ``ratio`` is E/H at w = 0 and places the start between
     pi/(2 (n+1)), for no damping, and pi/(n+1).
     """
-    turns = fields[2] + 0.5
+    turns = fields[1] + 0.5
     limit = jnp.pi / (d + 0.5)
 
     def step(_: int, omega: Array) -> Array:
@@ -217,7 +197,7 @@ def long_row(beta: Array, fields: Array) -> Array:
     b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
     lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
     """
-    ok, delta, end, top, bow, sin_bow, bend = fields[0], fields[1], *fields[-5:]
+    delta, end, top, bow, sin_bow, bend = fields[0], *fields[-5:]
     b = beta + delta
     inside = (b > 0) & (b < top)
     goal = jnp.where(inside, b, 0.5 * top)
@@ -227,13 +207,13 @@ def long_row(beta: Array, fields: Array) -> Array:
     for _ in range(_ROW_STEPS):
         omega = jnp.clip(omega - _newton_step(goal, _Angles(omega, fields), fields), 0.0, end)
     at = _Angles(omega, fields)
-    x = _turned(at, fields[2] + 0.5)
+    x = _turned(at, fields[1] + 0.5)
     numerator, denominator = 2.0 * at.s * x.across, at.c * at.V
     # The last step is taken in alpha itself.
     step = _newton_step(goal, at, fields)
     numerator -= step * (at.c * x.across + 2.0 * at.s * x.d_across)
     denominator -= step * (at.c * at.dV - 0.5 * at.s * at.V)
-    return _finish(jnp.where(inside, numerator / denominator, 0.0), b, beta, ok)
+    return _finish(jnp.where(inside, numerator / denominator, 0.0), b)
 
 
 def _arcsine(x: Array) -> Array:
@@ -253,8 +233,6 @@ def _newton_step(goal: Array, at: _Angles, fields: list[Array] | Array) -> Array
 
 
 def limit_kernel(beta: Array, delta: Array, d: Array) -> Array:
-    """The limit for any delay, elementwise, for use inside a transformation; NaN outside the verified range."""
-    short = short_row(beta, short_device(delta, d))
-    long = long_row(beta, long_device(delta, d))
-    known = (delta <= VERIFIED_DAMPING) & (d <= VERIFIED_DELAY)
-    return jnp.where(known, jnp.where(d < 1, short, long), jnp.nan)
+    """The limit for any delay, for use inside a transformation; it means something in the verified range only."""
+    here = device(delta, d)
+    return jnp.where(d < 1, short_row(beta, here), long_row(beta, long_device(here)))

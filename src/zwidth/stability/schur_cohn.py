@@ -13,16 +13,15 @@ which loses nothing as delta grows, where the recursion itself fails.
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from itertools import pairwise
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth import phi
 from zwidth._types import Array
 from zwidth.grouping import Degree
-from zwidth.loop import plant_of, valid_device
+from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import PIECE, DeviceWork, Points, by_degree, fields_of, per_device
 from zwidth.stability.recursion import UNROLLED, Ends, Signed, Verdict, reduce_to
 
@@ -32,29 +31,6 @@ _DOUBT = 1e-7
 _LOOP_PIECE = 1 << 12
 
 
-class Device(NamedTuple):
-    """What the recursion needs of (delta, d), computed once a device; NaN where they are out of range."""
-
-    delta: Array
-    c: Array
-    p1: Array
-    a2: Array
-    a1: Array
-    a0: Array
-    tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
-
-
-def device_kernel(delta: Array, d: Array, degree: Degree) -> Device:
-    """The `Device` of one (delta, d)."""
-    ok = valid_device(delta, d)
-    safe = jnp.where(ok, delta, 1.0)
-    plant = plant_of(safe, jnp.where(ok, d, float(degree.whole)), degree)
-    sign = -1.0 if degree.whole % 2 else 1.0
-    tilt = sign * 0.5 * plant.gap / (1.0 + plant.c)
-    fields = (safe, plant.c, phi.phi1(safe), plant.a2, plant.a1, plant.a0, tilt)
-    return Device(*(jnp.where(ok, field, jnp.nan) for field in fields))
-
-
 def polynomial(alpha: Array, beta: Array, device: Device, degree: Degree) -> Ends:
     """P by its ends: ``z^k (z - 1)(z - c)`` at the top, ``N(z) ((alpha + beta) z - beta)`` at the bottom."""
     n = [device.a1, device.a2]
@@ -62,7 +38,7 @@ def polynomial(alpha: Array, beta: Array, device: Device, degree: Degree) -> End
         n.insert(0, device.a0)
     total = alpha + beta
     low: list[Signed | None] = [Signed(-1, n[0] * beta)]
-    low += [Signed(1, left * total - right * beta) for left, right in zip(n, n[1:], strict=False)]
+    low += [Signed(1, left * total - right * beta) for left, right in pairwise(n)]
     low.append(Signed(1, n[-1] * total))
     one = jnp.ones_like(device.c)
     top: list[Signed | None] = [Signed(1, one), Signed(-1, one + device.c), Signed(1, device.c)]
@@ -98,9 +74,8 @@ def _work(degree: Degree, dtype: str, doubt: bool) -> DeviceWork:
     def kernel(alpha: Array, beta: Array, fields: Array) -> Array:
         return labels(alpha.astype(dtype), beta.astype(dtype), Device(*fields.astype(dtype)), degree, doubt)
 
-    device = jax.jit(lambda delta, d: jnp.stack(device_kernel(delta, d, degree)))
     piece = _LOOP_PIECE if degree.poles > UNROLLED else PIECE
-    return DeviceWork(device, jax.jit(kernel), len(Device._fields), np.int8 if doubt else np.bool_, piece)
+    return DeviceWork(compiled_device(), jax.jit(kernel), np.int8 if doubt else np.bool_, piece)
 
 
 def schur_cohn_map(points: Points, dtype: str = "float64", doubt: bool = False) -> np.ndarray:

@@ -104,8 +104,9 @@ def _zero_stiffness(study: BoundaryStudy) -> Outcome:
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[DampingInterval]:
     """The virtual damping that is stable for alpha -> 0, over delta, for every delay."""
     columns = [np.tile(deltas, delays.size), np.repeat(delays, deltas.size)]
-    upper = np.asarray(map_flat(_upper_kernel, columns, (delay,), _BATCH, fused=False)).reshape(delays.size, deltas.size)
-    return [DampingInterval(float(d), delay, deltas, -deltas, row) for d, row in zip(delays, upper, strict=True)]
+    upper = map_flat(_upper_kernel, columns, (delay,), _BATCH, fused=False)
+    rows = np.asarray(upper).reshape(delays.size, deltas.size)
+    return [DampingInterval(float(d), delay, deltas, -deltas, row) for d, row in zip(delays, rows, strict=True)]
 
 
 def _upper_kernel(delta, d, delay: str):

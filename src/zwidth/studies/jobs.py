@@ -32,7 +32,10 @@ class Job:
 
 
 def jobs_of(config: Config) -> list[Job]:
-    """The studies in their order, but for sweeps, which have stores of their own; then, where figures of the paper are repeated, its numbers as well."""
+    """The studies in their order; then, where figures of the paper are repeated, its numbers as well.
+
+    Sweeps are left out: they have stores of their own.
+    """
     studies = [study for study in config.studies if not isinstance(study, SweepStudy)]
     jobs = [Job(study.name, study.kind, _performer(study, config)) for study in studies]
     if any((getattr(study, "figure", None) or "").startswith("fig") for study in config.studies):

@@ -8,12 +8,13 @@ import numpy as np
 
 from zwidth.figures import draw_map
 from zwidth.figures.data import MapData, SIScale
-from zwidth.stability.passivity import passivity_margin
-from zwidth.stability.poles import radius_by_companion
+from zwidth.stability.methods import is_stable, spectral_radius
+from zwidth.stability.passivity import is_passive
 from zwidth.studies.outcome import Outcome
 from zwidth.sweep.studies import MapStudy
 
 _TYPES = {"stable": np.bool_, "spectral_radius": np.float64, "passive": np.bool_}
+_FUNCTIONS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": is_passive}
 
 
 def run_map(study: MapStudy, si: SIScale | None) -> Outcome:
@@ -24,13 +25,8 @@ def run_map(study: MapStudy, si: SIScale | None) -> Outcome:
     for delta_index, d_index in np.ndindex(delta.size, d.size):
         place = (slice(None), slice(None), delta_index, d_index)
         wall = (alpha[:, None], beta[None, :], float(delta[delta_index]), float(d[d_index]))
-        if "stable" in outputs or "spectral_radius" in outputs:
-            radius = np.asarray(radius_by_companion(*wall))
-            for name, values in (("stable", radius < 1.0), ("spectral_radius", radius)):
-                if name in outputs:
-                    outputs[name][place] = values
-        if "passive" in outputs:
-            outputs["passive"][place] = np.asarray(passivity_margin(*wall)) > 0
+        for name in outputs:
+            outputs[name][place] = np.asarray(_FUNCTIONS[name](*wall))
     data = MapData(alpha, beta, delta, d, outputs, si)
     figures = {f"_{name}": partial(draw_map, data, name) for name in outputs} if min(alpha.size, beta.size) > 1 else {}
     return Outcome(arrays={"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}, figures=figures)

@@ -23,7 +23,7 @@ from zwidth.stability.ridge import alpha_max
 from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
-from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
+from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, Family
 
 Columns: TypeAlias = tuple[np.ndarray, ...]
 
@@ -64,7 +64,7 @@ def _devices(block: Block) -> dict[str, np.ndarray]:
     found = {
         "alpha_max": alpha,
         "beta_at_max": beta,
-        "kind": np.where(good, kind, 255).astype(np.uint8),
+        "kind": np.where(good, kind, NOT_COMPUTED).astype(np.uint8),
         "ridge_status": status.astype(np.uint8),
     }
     if block.mass.size:
@@ -120,7 +120,8 @@ def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
         plane[~(alpha > 0)] = False
     known = (block.delta <= VERIFIED_DAMPING) & (block.d <= VERIFIED_DELAY)
     if not known.all():
-        rest = Block(*(part[~known] if part.size else part for part in block[:6]), block.rows)
+        parts = {name: part[~known] for name, part in block._asdict().items() if np.size(part) and name != "rows"}
+        rest = block._replace(**parts)
         stable[~known] = _radius(rest, (int((~known).sum()), *shape[1:])) < 1.0
     return stable
 

@@ -7,7 +7,7 @@ from collections.abc import Generator, Iterable
 from typing import TYPE_CHECKING, Any
 
 from zwidth.errors import InputError
-from zwidth.sweep.jobs import MAX_ATTEMPTS, Finished, Job, Perform, attempt
+from zwidth.sweep.jobs import Finished, Job, Perform, failure_of
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -61,7 +61,14 @@ def _many(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finish
     def hand_out() -> None:
         job = next(waiting, None)
         if job is not None:
-            future = client.submit(attempt, perform, job, key=f"{_name(job)}-{os.urandom(4).hex()}", pure=False)
+            future = client.submit(
+                perform,
+                job.path,
+                job.task.family,
+                job.task.index,
+                key=f"{_name(job)}-{os.urandom(4).hex()}",
+                pure=False,
+            )
             of_future[future.key] = job
             completed.add(future)
 
@@ -69,17 +76,17 @@ def _many(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finish
         hand_out()
     for future in completed:
         job = of_future.pop(future.key)
-        error: Any = future.exception() if future.status != "finished" else None
-        yield future.result() if error is None else Finished(job, _explained(error))
+        # The result is nothing: to fetch it would only fail where its worker has died since.
+        error = None if future.status == "finished" else future.exception()
+        yield Finished(job) if error is None else _failure_of(job, error)
         hand_out()
 
 
-def _explained(error: BaseException) -> str:
+def _failure_of(job: Job, error: Any) -> Finished:
     """What dask says of a task that it could not do, in words of ours where its worker died."""
-    name = type(error).__name__
-    if name == "KilledWorker":
-        return f"KilledWorker: its worker died every time it was tried, at least {MAX_ATTEMPTS} times"
-    return f"{name}: {error}"
+    if type(error).__name__ == "KilledWorker":
+        return Finished(job, "KilledWorker: its worker died every time it was tried")
+    return failure_of(job, error)
 
 
 def _name(job: Job) -> str:

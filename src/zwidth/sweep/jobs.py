@@ -38,9 +38,13 @@ def attempt(perform: Perform, job: Job) -> Finished:
     try:
         perform(job.path, job.task.family, job.task.index)
     except Exception as error:
-        number = _errno_of(error)
-        return Finished(job, f"{type(error).__name__}: {error}", number in _HOPELESS)
+        return failure_of(job, error)
     return Finished(job)
+
+
+def failure_of(job: Job, error: BaseException) -> Finished:
+    """What an exception means for a job and the others."""
+    return Finished(job, f"{type(error).__name__}: {error}", _errno_of(error) in _HOPELESS)
 
 
 def _errno_of(error: BaseException | None) -> int | None:

@@ -71,10 +71,7 @@ _ALL = (
         "device",
         "uint8",
         "kind of that optimum: smooth, or a corner with a double pole at z = -1",
-        "",
-        None,
-        False,
-        _KINDS,
+        attributes=_KINDS,
     ),
     Output("stiffness_max", "device", "float64", "largest stable stiffness K", "N/m", physical_only=True),
     Output(

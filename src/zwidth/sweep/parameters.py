@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 
 from zwidth.sweep.axes import MAX_DELAY_PERIODS, Axis, Entry, axis_of, axis_schema
@@ -79,7 +80,7 @@ class DelayValues(Axis):
     axis: Axis
     unit: str
 
-    def values(self):
+    def values(self) -> np.ndarray:
         """The delays in ``unit``."""
         return self.axis.values()
 

@@ -289,11 +289,10 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 
     Example:
         >>> import tempfile, zwidth
-        >>> from zwidth.sweep.config import Config
-        >>> from zwidth.sweep.engine import run_sweeps
+        >>> from zwidth.sweep.engine import Config, run_sweeps
         >>> axes = {"alpha": [0.1, 0.9], "beta": 0.1, "delta": 0.1, "d": 1}
-        >>> study = {"kind": "sweep", "name": "small", "axes": axes}
-        >>> config = Config.model_validate({"version": 1, "name": "example", "studies": [study]})
+        >>> studies = [{"kind": "sweep", "name": "small", "axes": axes}]
+        >>> config = Config.model_validate({"version": 1, "name": "example", "studies": studies})
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     _ = run_sweeps(config, folder)
         ...     zwidth.open_dataset(folder).stable.values

@@ -242,7 +242,9 @@ class SweepStudy(Study):
     @property
     def families(self) -> dict[Family, tuple[str, ...]]:
         """The outputs of walls and those of devices."""
-        groups = {family: tuple(n for n in self.outputs if OUTPUTS[n].family == family) for family in STATUS_OF}
+        groups: dict[Family, tuple[str, ...]] = {
+            family: tuple(name for name in self.outputs if OUTPUTS[name].family == family) for family in STATUS_OF
+        }
         return {family: names for family, names in groups.items() if names}
 
     @property

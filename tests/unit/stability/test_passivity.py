@@ -1,14 +1,13 @@
 """Passivity at any delay: eq. (21), the condition as printed scanned over frequency, and a linear program."""
 
-import itertools
 import math
 
 import jax
 import numpy as np
 import pytest
-import tolerances as tol
 from scipy.optimize import linprog
 
+import tolerances as tol
 import zwidth
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.stability.passivity import passive_stiffness_slope
@@ -62,7 +61,7 @@ def test_any_delay_by_a_scan_of_frequencies(d):
 
 def test_hundreds_of_periods():
     margin = zwidth.passivity_margin(0.001, 0.1, 1.0, 500)
-    scanned = 1.0 - needed_by_scan(0.001, 0.1, 500, frequencies=2_000_000)
+    scanned = 1.0 - needed_by_scan(0.001, 0.1, 500, frequencies=400_000)
     assert margin == pytest.approx(scanned, abs=tol.PASSIVITY_SCAN.float64 * size(0.001, 0.1, 1.0, 500))
 
 
@@ -105,7 +104,9 @@ def slope_by_linear_program(d, frequencies=20_000):
     return solved.x
 
 
-@pytest.mark.parametrize("d, exact", [(0, 2.0), (1, 2 * math.sqrt(2) - 2), (2, 4 - 2 * math.sqrt(3)), (3, None), (5, None)])
+@pytest.mark.parametrize(
+    "d, exact", [(0, 2.0), (1, 2 * math.sqrt(2) - 2), (2, 4 - 2 * math.sqrt(3)), (3, None), (5, None)]
+)
 def test_the_stiffest_passive_wall(d, exact):
     slope, beta = passive_stiffness_slope(d)
     expected = slope_by_linear_program(d)
@@ -127,7 +128,7 @@ def test_the_stiffest_passive_wall_of_a_held_delay_is_on_the_edge():
 
 @pytest.mark.parametrize("d", [-1, np.nan, [1, 2]])
 def test_the_stiffest_passive_wall_needs_one_delay(d):
-    with pytest.raises(InputError, match="d: got .*; a single finite number of at least 0 is needed"):
+    with pytest.raises(InputError, match=r"d: got .*; a single finite number of at least 0 is needed"):
         passive_stiffness_slope(d)
 
 
@@ -146,20 +147,23 @@ def test_points_out_of_range():
     margin = zwidth.passivity_margin(0.1, 0.1, deltas, delays)
     np.testing.assert_array_equal(np.isnan(margin), [False, True, True, True, True, True])
     assert margin[0] == zwidth.passivity_margin(0.1, 0.1, 1.0, np.array([0.0]))[0]
-    np.testing.assert_array_equal(zwidth.is_passive(0.1, 0.1, deltas, delays), [True, False, False, False, False, False])
+    np.testing.assert_array_equal(
+        zwidth.is_passive(0.1, 0.1, deltas, delays), [True, False, False, False, False, False]
+    )
 
 
-def test_derivatives(x64):
-    for (alpha, beta), d in itertools.product([(0.3, 0.2), (0.3, -0.2)], [0, 1, 2.3]):
-        gradient = jax.grad(lambda wall, d=d: zwidth.passivity_margin(*wall, d))((alpha, beta, 2.0))
-        assert float(gradient[2]) == 1.0
-        if d == 0:
-            np.testing.assert_allclose(gradient[:2], (-0.5, -np.sign(beta)), atol=1e-9)
-        h = 1e-6
-        points = np.array([[alpha + h, alpha - h, alpha, alpha], [beta, beta, beta + h, beta - h]])
-        up_a, down_a, up_b, down_b = zwidth.passivity_margin(*points, 2.0, d)
-        np.testing.assert_allclose(gradient[:2], ((up_a - down_a) / (2 * h), (up_b - down_b) / (2 * h)), atol=1e-6)
-    assert np.isnan(jax.grad(lambda delta: zwidth.passivity_margin(0.1, 0.1, delta, 1))(-1.0))
+@pytest.mark.parametrize("d", [0, 2.3])
+def test_derivatives(d, x64):
+    gradient = jax.jit(jax.vmap(jax.grad(lambda wall: zwidth.passivity_margin(*wall, d))))
+    walls = np.array([(0.3, 0.2, 2.0), (0.3, -0.2, 2.0), (0.3, 0.2, -1.0)])
+    got = np.asarray(gradient(walls))
+    assert np.isnan(got[2]).all()
+    h = 1e-6
+    for k, step in enumerate(h * np.eye(3)):
+        up, down = (zwidth.passivity_margin(*(walls[:2] + s * step).T, d) for s in (1, -1))
+        np.testing.assert_allclose(got[:2, k], (up - down) / (2 * h), atol=1e-6)
+    if d == 0:
+        np.testing.assert_allclose(got[:2], [(-0.5, -1, 1), (-0.5, 1, 1)], atol=1e-9)
 
 
 def test_a_traced_delay_is_refused():

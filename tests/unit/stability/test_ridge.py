@@ -13,7 +13,7 @@ import pytest
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
-from zwidth.loop import frequency_boundary, frequency_loop
+from zwidth.loop import frequency_loop
 from zwidth.stability.curve import corner
 from zwidth.stability.poles import unstable_poles
 from zwidth.stability.ridge import RidgeKind, ridge_kernel

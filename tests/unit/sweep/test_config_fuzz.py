@@ -1,6 +1,7 @@
 """Whatever the bytes, reading ends soon, with a configuration or with a ConfigError."""
 
 import json
+import os
 import random
 import time
 from pathlib import Path
@@ -12,7 +13,8 @@ from zwidth.errors import ConfigError
 from zwidth.sweep.config import Config, load_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
-SEEDS = range(300)
+# More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/sweep/test_config_fuzz.py
+SEEDS = range(int(os.environ.get("ZWIDTH_MUTATIONS", "300")))
 # Far above what reading takes (some 50 ms), far below what a quadratic reader would take.
 LONGEST_SECONDS = 5.0
 

@@ -1,1 +1,0 @@
-"""Measuring what each method costs and how wrong it can be, beside the tools people would use otherwise."""
