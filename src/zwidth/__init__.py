@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
-    from zwidth.assess import Assessment as Assessment
-    from zwidth.assess import assess as assess
+    from zwidth.assessment import Assessment as Assessment
+    from zwidth.assessment import assess as assess
     from zwidth.errors import ConfigError as ConfigError
     from zwidth.errors import InputError as InputError
     from zwidth.errors import StoreExistsError as StoreExistsError
@@ -49,8 +49,8 @@ if TYPE_CHECKING:
 
 # public name -> the module that defines it
 _HOME = {
-    "Assessment": "zwidth.assess",
-    "assess": "zwidth.assess",
+    "Assessment": "zwidth.assessment",
+    "assess": "zwidth.assessment",
     "ConfigError": "zwidth.errors",
     "InputError": "zwidth.errors",
     "StoreExistsError": "zwidth.errors",

@@ -83,12 +83,15 @@ def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
     if leaves[0].ndim == 1:
         return leaves
     longest = max(leaf.shape[1] for leaf in leaves)
-    filler = 0.0 if lead else np.nan
     filled = []
     for leaf in leaves:
         missing = longest - leaf.shape[1]
-        width = ((0, 0), (missing, 0) if lead else (0, missing))
-        filled.append(numpy.pad(leaf, width, constant_values=filler))
+        if lead:
+            # Zeros in front of a polynomial, NaN in front of one that is not defined.
+            front = numpy.where(numpy.isnan(leaf[:, :1]), np.nan, 0.0)
+            filled.append(numpy.concatenate([numpy.repeat(front, missing, axis=1), leaf], axis=1))
+        else:
+            filled.append(numpy.pad(leaf, ((0, 0), (0, missing)), constant_values=np.nan))
     return filled
 
 

@@ -247,8 +247,11 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
 
 def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
     ok = valid_wall(alpha, beta, delta, d)
+    # NaN that depends on the inputs: derivatives at a bad point are NaN too.
+    spread = alpha + beta + delta + d
+    poison = jnp.where(ok, 0.0, jnp.nan) * spread * (1.0 + spread)
     alpha, beta, delta = (jnp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    return jnp.where(ok, coefficients(alpha, beta, delta, d, degree), jnp.nan)
+    return coefficients(alpha, beta, delta, d, degree) + poison
 
 
 def char_poly_si(

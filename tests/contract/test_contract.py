@@ -118,6 +118,9 @@ def test_arguments_are_left_as_they_are(case):
 @pytest.mark.parametrize("value", ["1", 1j, None, ["1"], [1.0, [2.0]], {}], ids=repr)
 def test_what_is_no_real_number_is_named(case, value):
     for name in case.good:
+        if value is None and case.name == "boundary_point" and name not in ("delta", "d"):
+            # There None says that the line is not given.
+            continue
         with pytest.raises(InputError, match=rf"^{name}\w*: got .*real number"):
             case.call(**(case.arguments | {name: value}))
 

@@ -36,7 +36,7 @@ def check(
     as_json: bool,
 ) -> None:
     """Judge one wall: stable, passive, how far from the boundary."""
-    from zwidth.assess import assess
+    from zwidth.assessment import assess
     from zwidth.scene import Device, Scene, Timing, VirtualWall
 
     scene = Scene(Device(mass, damping), Timing(period, delay), VirtualWall(stiffness, virtual_damping))

@@ -9,7 +9,7 @@ import click
 from zwidth.quantities import plain, with_unit
 
 if TYPE_CHECKING:
-    from zwidth.assess import Assessment
+    from zwidth.assessment import Assessment
     from zwidth.scene import Scene
 
 

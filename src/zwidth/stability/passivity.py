@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import as_float64, is_traced, pointwise
+from zwidth.batching import as_float64, is_traced, pointwise, to_caller
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.loop import poison, valid_wall
 from zwidth.plant import split_delay
@@ -167,7 +167,12 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         >>> bool(zwidth.is_passive(0.2, 0.3, 1.0, 0)), bool(zwidth.is_passive(0.2, 0.9, 1.0, 0))
         (True, False)
     """
-    return passivity_margin(alpha, beta, delta, d) > 0
+    values = (alpha, beta, delta, d)
+    margin = passivity_margin(*values)
+    if is_traced(*values):
+        return margin > 0
+    # Compared by NumPy: outside float64 mode JAX would warn of the type it keeps.
+    return to_caller(np.asarray(margin) > 0, values)
 
 
 def passive_stiffness_slope(d: float) -> tuple[float, float]:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.assess import Assessment, assess
+from zwidth.assessment import Assessment, assess
 from zwidth.figures import draw_recommendation
 from zwidth.figures.data import BoundaryData, RecommendationData, Response, SIScale
 from zwidth.quantities import plain, with_unit
