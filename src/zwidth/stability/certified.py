@@ -163,7 +163,8 @@ def _settled(points: Points, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.
     if not balls.available() or np.sum(d[rest] + 1.0) >= _SECOND_PASS_FROM:
         for edge in (False, True):
             index = rest[(alpha[rest] == 0) == edge]
-            stable[index], status[index] = _second_pass(Points(*(column[index] for column in points)), edge)
+            if index.size:
+                stable[index], status[index] = _second_pass(Points(*(column[index] for column in points)), edge)
         rest = rest[status[rest] == Status.UNDECIDED]
     if balls.available():
         near = rest[d[rest] <= _LONGEST_FOR_BALLS]
