@@ -78,8 +78,10 @@ def certified_stable(
 
     Example:
         >>> from zwidth.stability.certified import certified_stable
-        >>> certified_stable([0.3, 0.6, -0.1], 0.5, 0.0, 0).stable.tolist()
-        [True, False, False]
+        >>> certified_stable([0.3, 0.6, 0.7], 0.5, 0.0, 0).stable.tolist()
+        [True, True, False]
+
+        The boundary is at 3/5; the float64 number 0.6 is 2e-17 below it.
     """
     laid = lay_out((alpha, beta, delta, d))
     points, shape = laid.points, laid.points.shape
