@@ -47,12 +47,14 @@ def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> 
     """Decide one valid point, taken as exact, with alpha > 0, or alpha = 0 and beta > delta."""
     edge = alpha == 0
     # A stage of the recursion costs up to a bit.
-    bits = FIRST_BITS << (int(d) // FIRST_BITS).bit_length()
-    while bits <= max_bits:
+    bits = min(FIRST_BITS << (int(d) // FIRST_BITS).bit_length(), max_bits)
+    while True:
         inside = _all_inside(alpha, beta, delta, d, bits)
         if inside is not None:
             return Verdict(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
-        bits *= 2
+        if bits == max_bits:
+            break
+        bits = min(2 * bits, max_bits)
     if delta == 0:
         return _decide_rational(alpha, beta, d, max_bits)
     return Verdict(False, Status.UNDECIDED, max_bits)
@@ -185,10 +187,15 @@ def _decide_rational(alpha: float, beta: float, d: float, max_bits: int) -> Verd
     paired = exact.gcd(flint.fmpq_poly(exact.coeffs()[::-1]))
     if paired.degree() == 0:
         return undecided
-    rest = (exact / paired).numer().coeffs()
+    rest = (exact / paired).numer()
     bits = max_bits
     with flint.ctx.workprec(bits):
-        inside = schur_cohn([flint.arb(value) for value in rest])
+        inside = schur_cohn([flint.arb(value) for value in rest.coeffs()])
+        if inside is None:
+            # The recursion also stops where the zeros' product is one; none of them is on the circle.
+            found: Any = rest.complex_roots()
+            sizes = [abs(zero) for zero, _multiplicity in found]
+            inside = False if any(size > 1 for size in sizes) else all(size < 1 for size in sizes) or None
         if inside is False:
             return Verdict(False, Status.OK, bits)
         roots: Any = paired.numer().complex_roots()

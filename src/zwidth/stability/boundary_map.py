@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth.stability.devices import Device, compiled_device
-from zwidth.stability.layout import DeviceWork, Points, device_ok, per_device, split
+from zwidth.stability.layout import DeviceWork, Points, assemble, device_ok, per_device, split
 from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY, long_device, long_row, short_row
 
 # Smaller maps are compared by NumPy, with nothing to compile.
@@ -67,9 +67,12 @@ def _compiled(name: str) -> Any:
 
 def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
     """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range."""
-    return split(
-        (beta, delta, d), d >= 1, np.float64, lambda long, part: per_device(_rows(not long), [part[0]], *part[1:])
-    )
+    shape = np.broadcast_shapes(beta.shape, delta.shape, d.shape)
+
+    def of(long: bool, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
+        return per_device(_rows(not long), [beta], delta, d)
+
+    return assemble(split((beta, delta, d), d >= 1), shape, np.float64, of)
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:

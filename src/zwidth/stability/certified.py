@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -11,11 +11,21 @@ import numpy as np
 from jax import lax
 
 from zwidth._types import Array, ArrayLike
+from zwidth.errors import InputError
 from zwidth.grouping import Degree
 from zwidth.stability import balls
 from zwidth.stability.certified_crossover import crossover
 from zwidth.stability.certified_filter import OPEN, STABLE, HeldDevice, coefficients, device, recursion
-from zwidth.stability.layout import DeviceWork, Points, by_degree, fields_of, lay_out, per_device, point_ok
+from zwidth.stability.layout import (
+    DeviceWork,
+    Points,
+    assemble,
+    fields_of,
+    lay_out,
+    per_device,
+    point_ok,
+    split_by_degree,
+)
 from zwidth.status import Status
 
 # Beyond, the recursion leaves much open (0.3 % of a map at d = 16, 5 % at d = 20) and is hardly faster.
@@ -23,7 +33,7 @@ _RECURSION_UP_TO = 16
 # Smaller batches are filled up to this size, so that they share one compilation.
 _SMALLEST_BATCH = 1 << 10
 # Balls need memory and time in proportion to the delay.
-_LONGEST_FOR_BALLS = 100_000
+_LONGEST_FOR_BALLS = 20_000
 # Where balls would take about a second, compiling the second pass is cheaper.
 _SECOND_PASS_FROM = 40_000
 
@@ -54,17 +64,17 @@ def certified_stable(
         delta: normalized physical damping b T/m, >= 0.
         d: delay in periods, >= 0, whole or not. All four broadcast; one device (delta and d of size one) is fastest,
             above all with alpha and beta as two axes.
-        max_bits: the largest precision of the balls.
+        max_bits: the largest precision of the balls, 64 or more.
 
     Returns:
         CertifiedResult of NumPy arrays of the broadcast shape: ``stable``; ``status``; ``bits``, 0 where the filter
         or a sign decided, otherwise the precision that was needed. ``stable`` is False wherever the status is not OK:
         ON_BOUNDARY, no pole is outside and at least one exactly on the circle; UNDECIDED, more than ``max_bits`` is
-        needed, d exceeds 100,000, or the filter left the point open and the extra ``certified`` is not installed;
+        needed, d exceeds 20,000, or the filter left the point open and the extra ``certified`` is not installed;
         INVALID_INPUT, NaN, infinite or negative where it must not be.
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
+        InputError: an argument is no real number, shapes do not broadcast, or ``max_bits`` is below 64.
 
     Numerics:
         A label is a theorem about the float64 inputs, provided that XLA's ``+ - * /`` round correctly, as they do
@@ -83,9 +93,11 @@ def certified_stable(
 
         The boundary is at 3/5; the float64 number 0.6 is 2e-17 below it.
     """
+    if max_bits < 64:
+        raise InputError(f"max_bits: got {max_bits}, 64 or more is needed")
     laid = lay_out((alpha, beta, delta, d))
     points, shape = laid.points, laid.points.shape
-    code = by_degree(points, np.uint8, partial(_codes, pair=False, edge=False))
+    code = _filtered(points, pair=False, edge=False)
     stable, status, bits = np.asarray(code == STABLE), np.zeros(shape, np.int32), np.zeros(shape, np.int32)
     rest = np.flatnonzero(code == OPEN)
     if rest.size:
@@ -96,11 +108,18 @@ def certified_stable(
     return CertifiedResult(*map(laid.spread, (stable, status, bits)))
 
 
-def _codes(degree: Degree, points: Points, *, pair: bool, edge: bool) -> np.ndarray:
-    """The filter's code of points of one degree, of their broadcast shape."""
+def _filtered(points: Points, *, pair: bool, edge: bool) -> np.ndarray:
+    """The filter's code of every point, of the broadcast shape."""
+
+    def of(degree: Degree, *part: np.ndarray) -> np.ndarray:
+        short = degree.whole <= _RECURSION_UP_TO and not pair
+        return _codes(_work(degree.whole if short else None, degree.fractional, pair, edge), Points(*part))
+
+    return assemble(split_by_degree(points), points.shape, np.uint8, of)
+
+
+def _codes(work: DeviceWork, points: Points) -> np.ndarray:
     shape = points.shape
-    short = degree.whole <= _RECURSION_UP_TO and not pair
-    work = _work(degree.whole if short else None, degree.fractional, pair, edge)
     if points.is_dense:
         device_shape = np.broadcast_shapes(points.delta.shape, points.d.shape)
         devices = [np.broadcast_to(array, device_shape).reshape(-1) for array in (points.delta, points.d)]
@@ -165,8 +184,7 @@ def _settled(points: Points, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.
     if not balls.available() or np.sum(d[rest] + 1.0) >= _SECOND_PASS_FROM:
         for edge in (False, True):
             index = rest[(alpha[rest] == 0) == edge]
-            if index.size:
-                stable[index], status[index] = _second_pass(Points(*(column[index] for column in points)), edge)
+            stable[index], status[index] = _second_pass(Points(*(column[index] for column in points)), edge)
         rest = rest[status[rest] == Status.UNDECIDED]
     if balls.available():
         near = rest[d[rest] <= _LONGEST_FOR_BALLS]
@@ -176,6 +194,6 @@ def _settled(points: Points, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.
 
 def _second_pass(points: Points, edge: bool) -> tuple[np.ndarray, np.ndarray]:
     """Let the crossover try again, pairs included: stable and status."""
-    code = by_degree(points, np.uint8, partial(_codes, pair=True, edge=edge))
+    code = _filtered(points, pair=True, edge=edge)
     decided = np.where((code == STABLE) & edge, Status.ON_BOUNDARY, Status.OK)
     return (code == STABLE) & (not edge), np.where(code == OPEN, Status.UNDECIDED, decided)

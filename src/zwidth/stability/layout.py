@@ -95,45 +95,62 @@ def _repeats(array: np.ndarray, axis: int) -> bool:
     return bool(np.array_equal(first, array.take([-1], axis=axis)) and (array == first).all())
 
 
-def split(
-    arrays: tuple[np.ndarray, ...],
-    key: np.ndarray,
-    dtype: Any,
-    work: Callable[[Any, tuple[np.ndarray, ...]], np.ndarray],
-) -> np.ndarray:
-    """Fill an array of the common shape with ``work(value, parts)`` for the parts where ``key`` has that value.
+class Part(NamedTuple):
+    """Arguments that belong to one value of a key, and where their results go."""
+
+    value: Any
+    arrays: tuple[np.ndarray, ...]
+    place: tuple[Any, ...]
+
+
+def split(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> list[Part]:
+    """Group arguments by the values of a key that broadcasts with them.
 
     Where the key varies along one axis the parts keep their layout; where it varies along several, the points are
     listed one by one.
     """
-    shape = np.broadcast_shapes(*(array.shape for array in arrays))
     key = fold(key)
     values = np.unique(key)
     if values.size <= 1:
-        return work(values[0] if values.size else 0, arrays)
-    out = np.empty(shape, dtype)
+        return [Part(values[0] if values.size else 0, arrays, (...,))]
     varying = [axis for axis, length in enumerate(key.shape) if length > 1]
+    parts = []
     if len(varying) == 1:
         axis, along = varying[0], key.reshape(-1)
         for value in values:
             index = np.flatnonzero(along == value)
-            parts = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
-            out[(slice(None),) * axis + (index,)] = work(value, parts)
-        return out
+            taken = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
+            parts.append(Part(value, taken, ((slice(None),) * axis + (index,))))
+        return parts
     everywhere = np.broadcast_arrays(key, *arrays)
     for value in values:
         mine = everywhere[0] == value
-        out[mine] = work(value, tuple(array[mine] for array in everywhere[1:]))
-    return out
+        parts.append(Part(value, tuple(array[mine] for array in everywhere[1:]), (mine,)))
+    return parts
 
 
-def by_degree(points: Points, dtype: Any, work: Callable[[Degree, Points], np.ndarray]) -> np.ndarray:
-    """Fill an array of the broadcast shape with ``work(degree, part)`` for the parts of one degree each."""
+def split_by_degree(points: Points) -> list[Part]:
+    """Group points by the `Degree` of their polynomial; an impossible delay counts as 0."""
     defined = np.where(np.isfinite(points.d) & (points.d >= 0), points.d, 0.0)
     whole = np.floor(defined)
     # Twice the whole part, plus one where a fraction remains, names a degree.
     code = 2 * whole + (defined != whole)
-    return split(points, code, dtype, lambda value, part: work(Degree(int(value // 2), bool(value % 2)), Points(*part)))
+    return [
+        Part(Degree(int(value // 2), bool(value % 2)), arrays, place) for value, arrays, place in split(points, code)
+    ]
+
+
+def assemble(
+    parts: list[Part], shape: tuple[int, ...], dtype: Any, work: Callable[..., np.ndarray], several: int = 0
+) -> np.ndarray:
+    """Put the results of ``work(value, *arrays)`` where they belong; ``several`` of them lie along an axis in front."""
+    if len(parts) == 1:
+        return work(parts[0].value, *parts[0].arrays)
+    out = np.empty((several, *shape) if several else shape, dtype)
+    front = (slice(None),) if several else ()
+    for value, arrays, place in parts:
+        out[front + place] = work(value, *arrays)
+    return out
 
 
 def device_ok(points: Points) -> np.ndarray:
@@ -168,9 +185,10 @@ class DeviceWork(NamedTuple):
     """A compiled function of (delta, d) and one of points with its result: what is shared, and what is not."""
 
     device: Callable[[Any, Any], Any]  # (delta, d) -> fields along a new first axis
-    kernel: Callable[..., Any]  # (*columns, fields) -> one value a point
+    kernel: Callable[..., Any]  # (*columns, fields) -> one value a point, or several along a new first axis
     dtype: Any
     piece: int = PIECE
+    several: int = 0
 
 
 def per_device(work: DeviceWork, columns: list[np.ndarray], delta: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -183,10 +201,13 @@ def per_device(work: DeviceWork, columns: list[np.ndarray], delta: np.ndarray, d
     device_shape = np.broadcast_shapes(delta.shape, d.shape)
     deltas, delays = (np.broadcast_to(array, device_shape).reshape(-1) for array in (delta, d))
     flat = [np.broadcast_to(column, shape).reshape(-1) for column in columns]
+    if not flat[0].size:
+        return np.empty((work.several, *shape) if work.several else shape, work.dtype)
     owner = None
     if deltas.size > 1:
         owner = np.broadcast_to(np.arange(deltas.size).reshape(device_shape), shape).reshape(-1)
-    return _in_pieces(work, flat, deltas, delays, owner).reshape(shape)
+    values = _in_pieces(work, flat, deltas, delays, owner)
+    return values.reshape((work.several, *shape) if work.several else shape)
 
 
 def _in_pieces(
@@ -194,7 +215,7 @@ def _in_pieces(
 ) -> np.ndarray:
     count = flat[0].size
     shared = 4 * delta.size <= count or delta.size == 1
-    out = np.empty(count, work.dtype)
+    out = np.empty((work.several, count) if work.several else count, work.dtype)
     with jax.enable_x64(True):
         fields = fields_of(work, delta, d) if shared else None
         for part, size in pieces(count, work.piece):
@@ -207,7 +228,7 @@ def _in_pieces(
             else:
                 here = np.asarray(fields)[:, padded(owner[part], size)]
             values = work.kernel(*(padded(column[part], size) for column in flat), here)
-            out[part] = np.asarray(values)[: part.stop - part.start]
+            out[..., part] = np.asarray(values)[..., : part.stop - part.start]
     return out
 
 

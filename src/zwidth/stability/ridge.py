@@ -49,6 +49,8 @@ def alpha_max(
         delta: normalized physical damping b T/m, >= 0.
         d: delay in periods, >= 0, whole or not. Both broadcast.
         delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
+        method: "newton" solves the stationarity of the paper's loop in closed form, "kkt" the general conditions with
+            optimistix; "auto" is "newton".
 
     Returns:
         RidgePoint with arrays of the broadcast shape: ``alpha``; ``beta``, the damping that goes with it; ``omega``,

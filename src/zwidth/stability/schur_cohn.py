@@ -22,7 +22,7 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.grouping import Degree
 from zwidth.stability.devices import Device, compiled_device
-from zwidth.stability.layout import PIECE, DeviceWork, Points, by_degree, fields_of, per_device
+from zwidth.stability.layout import PIECE, DeviceWork, Points, assemble, fields_of, per_device, split_by_degree
 from zwidth.stability.recursion import UNROLLED, Ends, Signed, Verdict, reduce_to
 
 # A stage with 1 - k^2 below this may have lost half of the digits: the label is then doubtful.
@@ -97,7 +97,11 @@ def schur_cohn_map(points: Points, dtype: str = "float64", doubt: bool = False) 
         Schur 1918; Cohn 1922; Jury 1964 (the last conditions).
     """
     out = np.int8 if doubt else np.bool_
-    return by_degree(points, out, lambda degree, part: _of_degree(part, degree, dtype, doubt))
+
+    def of(degree: Degree, *part: np.ndarray) -> np.ndarray:
+        return _of_degree(Points(*part), degree, dtype, doubt)
+
+    return assemble(split_by_degree(points), points.shape, out, of)
 
 
 def _of_degree(points: Points, degree: Degree, dtype: str, doubt: bool) -> np.ndarray:

@@ -78,6 +78,9 @@ def test_filter_alone_decides_nearly_all_of_a_map(monkeypatch, delta, d):
         ((0.0, np.nextafter(2.0, 1.0), 0.0, 0.0), Status.ON_BOUNDARY, False),
         # A pole exactly at z = -1, others outside.
         ((2.0, 3.0, 0.0, 1.5), Status.OK, False),
+        # Poles exactly at +-j, others outside.
+        ((4.0, -2.0, 0.0, 3.0), Status.OK, False),
+        ((0.0, 2.0, 0.0, 4.0), Status.OK, False),
         # Next to z = 1.
         ((1e-300, 0.1, 0.1, 1.0), Status.OK, True),
         ((5e-324, 0.1, 0.1, 0.0), Status.OK, True),
@@ -155,6 +158,8 @@ def test_shapes_broadcast_and_may_be_empty():
         certified_stable([0.1, 0.2], [0.1, 0.2, 0.3], 0.1, 1)
     with pytest.raises(InputError, match="alpha"):
         certified_stable("soft", 0.1, 0.1, 1)
+    with pytest.raises(InputError, match="max_bits"):
+        certified_stable(0.1, 0.1, 0.1, 1, max_bits=32)
 
 
 def test_without_balls_open_points_are_undecided(monkeypatch):
