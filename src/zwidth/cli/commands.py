@@ -9,6 +9,7 @@ import click
 
 from zwidth import __version__
 from zwidth.cli import sweeps
+from zwidth.cli.bench import bench
 from zwidth.cli.options import json_option, physical_options
 from zwidth.cli.words import row, verdict_lines
 from zwidth.quantities import plain, with_unit
@@ -118,5 +119,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (sweeps.run, sweeps.verify, sweeps.export):
+for command in (sweeps.run, sweeps.verify, sweeps.export, bench):
     cli.add_command(command)

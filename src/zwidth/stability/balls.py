@@ -71,6 +71,14 @@ def _all_inside(alpha: float, beta: float, delta: float, d: float, bits: int) ->
         return _sparse_schur_cohn(_coefficients(flint.arb(alpha), flint.arb(beta), plant, whole))
 
 
+def polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> list[Any]:
+    """The coefficients of P as balls, lowest power first."""
+    import flint
+
+    with flint.ctx.workprec(bits):
+        return _coefficients(flint.arb(alpha), flint.arb(beta), _device(delta, d, bits), int(d)).dense()
+
+
 class _BallDevice(NamedTuple):
     c: Any
     numerator: tuple[Any, ...]  # lowest power first; two terms for a whole delay

@@ -7,6 +7,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
+from zwidth import accuracy as costs
 from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import is_traced, to_caller
 from zwidth.errors import InputError, check_choice
@@ -28,9 +29,9 @@ RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)
 # delay, it runs the recursion first and solves only the rows of doubtful points.
 _MANY_ROWS = 1 << 20
 _SHORT_DELAY = 40.0
-# "auto" takes companion eigenvalues for so few points, of moderate degree.
+# "auto" takes companion eigenvalues, with all digits, for so few points of delays up to this.
 _FEW_POINTS = 1 << 12
-_FEW_POLES = 36
+_FEW_PERIODS = 32.0
 _DEFAULT_ACCURACY = 1e-9
 # Closer in, the rounding errors of its own test would spoil Newton's certificate.
 _LEAST_CERTIFIED = 1e-10
@@ -73,6 +74,7 @@ def is_stable(
     d: ArrayLike,
     *,
     method: StabilityMethod = "auto",
+    accuracy: float | None = None,
     dtype: Any = None,
     delay: DelayModel = "held",
 ) -> Array:
@@ -91,6 +93,8 @@ def is_stable(
             at every point; "companion" computes all poles; "certified" never guesses (`zwidth.stability_of` names
             the points it leaves open). "auto" is "boundary", for maps and scattered points; with more than a million
             scattered rows of d <= 40 the recursion decides the clear points first, in a fraction of the time.
+        accuracy: with "auto", take the cheapest method that was measured to err only this close to the boundary
+            (relative distance in alpha), see `zwidth.accuracy.choose`; 0 for proof, as "certified".
         dtype: "float32" for a faster, rougher recursion (method "schur_cohn" or "auto"); by default float64.
         delay: only "held" has poles.
 
@@ -116,11 +120,13 @@ def is_stable(
         array([ True,  True, False])
     """
     values = (alpha, beta, delta, d)
-    _check_stability(method, dtype, delay)
+    _check_stability(method, accuracy, dtype, delay)
     if is_traced(*values):
-        return traced.stable(values, method)
+        # Every other accuracy is kept by what runs inside a transformation.
+        return traced.stable(values, "certified" if accuracy == 0 else method)
     laid = lay_out(values)
-    return to_caller(laid.spread(_decide(laid.points, method, dtype)[0]), values)
+    chosen, dtype = _stability_choice(laid.points, method, accuracy, dtype)
+    return to_caller(laid.spread(_decide(laid.points, chosen, dtype)[0]), values)
 
 
 def stability_of(
@@ -130,6 +136,7 @@ def stability_of(
     d: ArrayLike,
     *,
     method: StabilityMethod = "auto",
+    accuracy: float | None = None,
     dtype: Any = None,
     delay: DelayModel = "held",
 ) -> Stability:
@@ -141,6 +148,7 @@ def stability_of(
         delta: normalized physical damping b T/m, >= 0.
         d: delay in periods, >= 0. All four broadcast.
         method: as for `zwidth.is_stable`.
+        accuracy: as for `zwidth.is_stable`.
         dtype: as for `zwidth.is_stable`.
         delay: only "held" has poles.
 
@@ -162,23 +170,47 @@ def stability_of(
         array([0, 1], dtype=int32)
     """
     values = (alpha, beta, delta, d)
-    _check_stability(method, dtype, delay)
+    _check_stability(method, accuracy, dtype, delay)
     _refuse_traced(values, "stability_of", "is_stable")
     laid = lay_out(values)
-    stable, used, status = _decide(laid.points, method, dtype)
+    chosen, dtype = _stability_choice(laid.points, method, accuracy, dtype)
+    stable, used, status = _decide(laid.points, chosen, dtype)
     ok = point_ok(laid.points)
     status = np.where(ok, Status.OK if status is None else status, Status.INVALID_INPUT)
     codes = (status.astype(np.int32), np.asarray(used, np.int32))
     return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
 
 
-def _check_stability(method: str, dtype: Any, delay: str) -> None:
+def _check_stability(method: str, accuracy: float | None, dtype: Any, delay: str) -> None:
     check_has_poles(delay)
     check_choice("method", method, STABILITY_METHODS)
+    if accuracy is not None:
+        if not (np.ndim(accuracy) == 0 and np.isfinite(accuracy) and 0 <= accuracy < 1):
+            raise InputError(f"accuracy: got {accuracy!r}, a distance of at least 0 (for proof) and below 1 is needed")
+        if method != "auto" or dtype is not None:
+            raise InputError(
+                f"accuracy: got {accuracy!r} with method={method!r} and dtype={dtype!r}; an accuracy chooses both: "
+                "leave them out, or leave the accuracy out"
+            )
     if dtype is not None and np.dtype(dtype) not in (np.float32, np.float64):
         raise InputError(f"dtype: got {dtype!r}, allowed are 'float32' and 'float64'")
     if _is_float32(dtype) and method not in ("auto", "schur_cohn"):
         raise InputError(f"dtype: got 'float32' with method={method!r}; only 'schur_cohn' has a float32 form")
+
+
+def _stability_choice(points: Points, method: str, accuracy: float | None, dtype: Any) -> tuple[str, Any]:
+    """Method and precision for an accuracy; what was asked for where there is none."""
+    if accuracy is None:
+        return method, dtype
+    choice = _cheapest("stable", points, accuracy)
+    return choice.method, choice.dtype if choice.dtype == "float32" else None
+
+
+def _cheapest(quantity: costs.Quantity, points: Points, accuracy: float) -> costs.Choice:
+    good = points.d[np.isfinite(points.d)]
+    longest = float(np.max(good, initial=0.0))
+    layout: costs.Layout = "map" if points.is_dense else "scattered"
+    return costs.choose(quantity, d=longest, points=points.size, layout=layout, accuracy=accuracy)
 
 
 def _is_float32(dtype: Any) -> bool:
@@ -259,8 +291,8 @@ def spectral_radius(
             (1, N) and beta of shape (M, 1).
         method: "newton" follows the largest pole across a map (scattered points start from a coarse bisection) and
             proves each value; "bisection" halves an interval by the Schur-Cohn test; "companion" computes all poles.
-            "auto" is "companion" for fewer than 4096 points of d <= 32 and wherever an accuracy below 1e-10 is asked
-            for, else "newton".
+            "auto" is "companion" for fewer than 4096 points of d <= 32, else "newton"; where an accuracy is given, the
+            cheapest that was measured to keep it, see `zwidth.accuracy.choose`.
         accuracy: relative error asked for; 1e-9 by default. At least 1e-10 for "newton", 1e-14 for "bisection".
         delay: only "held" has poles.
 
@@ -286,11 +318,11 @@ def spectral_radius(
         1.207346
     """
     values = (alpha, beta, delta, d)
-    accuracy = _check_radius(method, accuracy, delay)
+    wanted = _check_radius(method, accuracy, delay)
     if is_traced(*values):
-        return traced.radius(values, method, accuracy)
+        return traced.radius(values, method, wanted)
     laid = lay_out(values)
-    radii, _ = _radii(laid.points, method, accuracy)
+    radii, _ = _radii(laid.points, method, wanted, asked=accuracy is not None)
     found = radii.radius if np.all(ok := point_ok(laid.points)) else np.where(ok, radii.radius, np.nan)
     return to_caller(laid.spread(found), values)
 
@@ -338,10 +370,10 @@ def radius_of(
         (True, '1.207346')
     """
     values = (alpha, beta, delta, d)
-    accuracy = _check_radius(method, accuracy, delay)
+    wanted = _check_radius(method, accuracy, delay)
     _refuse_traced(values, "radius_of", "spectral_radius")
     laid = lay_out(values)
-    radii, used = _radii(laid.points, method, accuracy)
+    radii, used = _radii(laid.points, method, wanted, asked=accuracy is not None)
     ok = np.broadcast_to(point_ok(laid.points), laid.points.shape)
     bounded = np.isfinite(radii.error)
     status = np.where(ok, np.where(bounded, Status.OK, Status.NOT_CONVERGED), Status.INVALID_INPUT)
@@ -365,11 +397,13 @@ def _check_radius(method: str, accuracy: float | None, delay: str) -> float:
     return float(accuracy)
 
 
-def _radii(points: Points, method: str, accuracy: float) -> tuple[Radii, Any]:
+def _radii(points: Points, method: str, accuracy: float, asked: bool) -> tuple[Radii, Any]:
     """Results, and the `Method` of each point (or one for all)."""
-    if method == "auto":
-        few = points.size < _FEW_POINTS and not np.any(points.d > _FEW_POLES - 4)
-        method = "companion" if few or accuracy < _LEAST_CERTIFIED else "newton"
+    if method == "auto" and asked:
+        method = "companion" if accuracy < _LEAST_CERTIFIED else _cheapest("spectral_radius", points, accuracy).method
+    elif method == "auto":
+        few = points.size < _FEW_POINTS and not np.any(points.d > _FEW_PERIODS)
+        method = "companion" if few else "newton"
     if method == "companion":
         return by_companion(points), Method.COMPANION
     if method == "bisection":

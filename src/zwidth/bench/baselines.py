@@ -1,0 +1,82 @@
+"""The tools people would use otherwise, called as they would call them: spectral radii of walls."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth.bench.problems import Walls
+from zwidth.loop import char_poly
+
+
+class Baseline(NamedTuple):
+    """A tool's function, and the largest batch that is worth its time at degree 4."""
+
+    radius: Callable[[Walls], np.ndarray]
+    points: int
+    only_whole: bool = False
+
+
+def _coefficients(walls: Walls) -> np.ndarray:
+    return np.asarray(char_poly(*walls.listed()))
+
+
+def companions(walls: Walls) -> np.ndarray:
+    """The companion matrices of every wall, of shape (points, degree, degree)."""
+    monic = _coefficients(walls)
+    size = monic.shape[1] - 1
+    matrices = np.zeros((monic.shape[0], size, size))
+    matrices[:, 0, :] = -monic[:, 1:]
+    matrices[:, np.arange(1, size), np.arange(size - 1)] = 1.0
+    return matrices
+
+
+def _numpy_eigvals(walls: Walls) -> np.ndarray:
+    return np.abs(np.linalg.eigvals(companions(walls))).max(axis=1)
+
+
+def _numpy_roots(walls: Walls) -> np.ndarray:
+    return np.array([np.abs(np.roots(row)).max() for row in _coefficients(walls)])
+
+
+@cache
+def _jax_radius() -> Any:
+    return jax.jit(lambda matrices: jnp.abs(jnp.linalg.eigvals(matrices)).max(axis=1))
+
+
+def _jax_eigvals(walls: Walls) -> np.ndarray:
+    with jax.enable_x64(True):
+        return np.asarray(_jax_radius()(companions(walls)))
+
+
+def _python_control(walls: Walls) -> np.ndarray:
+    """Discretize, close the loop, ask for the poles."""
+    control: Any = import_module("control")
+    radii = []
+    for alpha, beta, delta, d in zip(*walls.listed(), strict=True):
+        device = control.ss([[0.0, 1.0], [0.0, -delta]], [[0.0], [1.0]], [[1.0, 0.0]], [[0.0]])
+        plant = control.c2d(device, 1.0, "zoh")
+        # (alpha z + beta (z - 1)) / z^(1 + d): the wall with its delay.
+        denominator = [1.0] + [0.0] * (1 + int(d))
+        wall = control.tf2ss(control.tf([alpha + beta, -beta], denominator, 1.0))
+        radii.append(np.abs(control.feedback(plant, wall).poles()).max())
+    return np.array(radii)
+
+
+def available() -> dict[str, Baseline]:
+    """Every baseline that is installed."""
+    found = {
+        "np.linalg.eigvals": Baseline(_numpy_eigvals, 20_000),
+        "jnp.linalg.eigvals": Baseline(_jax_eigvals, 20_000),
+        "np.roots loop": Baseline(_numpy_roots, 1_000),
+    }
+    if find_spec("control"):
+        found["python-control"] = Baseline(_python_control, 50, only_whole=True)
+    return found

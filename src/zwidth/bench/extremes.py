@@ -1,0 +1,142 @@
+"""The corners of the model: which method still tells stable from unstable there, judged by the certified one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.bench.problems import Walls
+from zwidth.stability.boundary import boundary
+from zwidth.stability.certified import certified_stable
+from zwidth.stability.methods import is_stable
+from zwidth.stability.region import lobe
+from zwidth.stability.ridge import alpha_max
+from zwidth.status import Status
+
+DELTAS = (0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-4, 1.0, 50.0, 700.0, 750.0, 1e4, 1e6)
+DELAYS = (0.0, 5e-324, 0.5, float(np.nextafter(1.0, 0.0)), 1.0, 8.0, 50.0, 100.0, 200.0, 500.0)
+DISTANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-15)
+METHODS = (("boundary", "float64"), ("schur_cohn", "float64"), ("schur_cohn", "float32"), ("companion", "float64"))
+# Beyond, compiling takes minutes.
+_LONGEST = {"schur_cohn": 50.0, "companion": 50.0}
+
+
+class Group(NamedTuple):
+    """Walls that are extreme in one way, and for each how far it is from the boundary, or NaN where nobody says."""
+
+    name: str
+    walls: Walls
+    distance: np.ndarray
+
+
+class Outcome(NamedTuple):
+    """What one method makes of one group at one delay."""
+
+    method: str
+    dtype: str
+    group: str
+    d: float
+    points: int
+    wrong: int
+    farthest: float  # the largest distance at which a label was wrong; 0 where none was, NaN where unknown
+
+
+def groups(d: float) -> Iterator[Group]:
+    """Every group of walls at one delay."""
+    rng = np.random.default_rng(20061101)
+    yield _group("near the boundary", [_near(delta, d, rng) for delta in DELTAS], d)
+    yield _group("near the start, beta = -delta", [_start(delta) for delta in DELTAS], d)
+    yield _group("soft walls, alpha from 1e-300", [_soft(delta) for delta in DELTAS], d)
+    yield _group("around the ridge (double and triple poles)", [_ridge(delta, d) for delta in DELTAS], d)
+
+
+def _group(name: str, parts: list[tuple[np.ndarray, ...]], d: float) -> Group:
+    alpha, beta, delta, distance = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Group(name, Walls(alpha, beta, delta, np.full(alpha.size, d)), distance)
+
+
+def _near(delta: float, d: float, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
+    end = float(lobe(delta, d, points=16)[0][-1])
+    distance = np.repeat(DISTANCES, 4)
+    curve = boundary(rng.uniform(0.02, 0.98, distance.size) * end, delta, d)
+    alpha = np.asarray(curve.alpha) * (1.0 + distance * np.tile([1.0, -1.0], distance.size // 2))
+    return alpha, np.asarray(curve.beta), np.full(distance.size, delta), distance
+
+
+def _start(delta: float) -> tuple[np.ndarray, ...]:
+    beta = [-delta]
+    for _ in range(3):
+        beta = [np.nextafter(beta[0], -np.inf), *beta, np.nextafter(beta[-1], np.inf)]
+    count = len(beta)
+    alpha = np.full(count, 1e-12)
+    return alpha, np.array(beta), np.full(count, delta), np.full(count, np.nan)
+
+
+def _soft(delta: float) -> tuple[np.ndarray, ...]:
+    alpha = 10.0 ** np.array([-300.0, -200.0, -100.0, -30.0, -16.0, -8.0])
+    return alpha, np.full(alpha.size, 1e-3 * (1.0 + delta)), np.full(alpha.size, delta), np.full(alpha.size, np.nan)
+
+
+def _ridge(delta: float, d: float) -> tuple[np.ndarray, ...]:
+    top = alpha_max(delta, d)
+    distance = np.repeat(DISTANCES, 2)
+    scale = 1.0 + distance * np.tile([1.0, -1.0], len(DISTANCES))
+    alpha, beta = float(top.alpha) * scale, np.full(distance.size, float(top.beta))
+    return alpha, beta, np.full(distance.size, delta), distance
+
+
+def judge(d: float) -> Iterator[Outcome]:
+    """What every method makes of every group; points exactly on the boundary have no label and are left out."""
+    for group in groups(d):
+        truth = certified_stable(*group.walls)
+        known = np.asarray(truth.status) == Status.OK
+        walls = Walls(*(part[known] for part in group.walls))
+        for method, dtype in METHODS:
+            if d > _LONGEST.get(method, np.inf):
+                continue
+            got = is_stable(*walls, method=method, dtype="float32" if dtype == "float32" else None)  # type: ignore[arg-type]
+            wrong = np.asarray(got) != np.asarray(truth.stable)[known]
+            farthest = float(np.max(group.distance[known][wrong], initial=0.0))
+            yield Outcome(method, dtype, group.name, d, int(known.sum()), int(wrong.sum()), farthest)
+
+
+def report(delays: tuple[float, ...] = DELAYS) -> str:
+    """A Markdown table of every method and group over the delays: wrong labels, and the farthest of them."""
+    found = [outcome for d in delays for outcome in judge(d)]
+    lines = [
+        "# Which method holds where",
+        "",
+        'Labels of each method at the extremes, compared with `method="certified"`, which proves its labels. Devices',
+        f"of delta = {', '.join(f'{delta:g}' for delta in DELTAS)}. A cell has the number of wrong labels and, where",
+        "the distance from the boundary is known, the farthest of them (relative, in alpha). Empty: not offered at",
+        "such delays.",
+        "",
+        "Written by `scripts/refresh_extremes.py`.",
+        "",
+    ]
+    for name in dict.fromkeys(outcome.group for outcome in found):
+        lines += [f"## {name[0].upper()}{name[1:]}", "", f"| method | {' | '.join(_delay(d) for d in delays)} |"]
+        lines += ["|---|" + "--:|" * len(delays)]
+        for method, dtype in METHODS:
+            cells = []
+            for d in delays:
+                mine = [o for o in found if (o.method, o.dtype, o.group, o.d) == (method, dtype, name, d)]
+                cells.append(_cell(mine[0]) if mine else "")
+            lines.append(f"| {method}{' float32' if dtype == 'float32' else ''} | {' | '.join(cells)} |")
+        lines.append("")
+    return "\n".join(lines)
+
+
+def _delay(d: float) -> str:
+    if d == np.nextafter(1.0, 0.0):
+        return "d = 1 - ulp"
+    return f"d = {d:g}"
+
+
+def _cell(outcome: Outcome) -> str:
+    if not outcome.wrong:
+        return f"0 of {outcome.points}"
+    where = f", {outcome.farthest:.0e}" if outcome.farthest > 0 else ""
+    return f"{outcome.wrong} of {outcome.points}{where}"

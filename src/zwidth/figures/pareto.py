@@ -1,0 +1,138 @@
+"""Speed against error: what each method costs and how wrong it can be, a panel for each delay."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
+
+from zwidth.figures import style
+
+# Where no error was seen; left of every measured one.
+_NONE_SEEN = 1e-17
+_RANGE = (3e-18, 1.0)
+_TICKS = [_NONE_SEEN, 1e-14, 1e-11, 1e-8, 1e-5, 1e-2]
+_COLORS = {"stable": style.BLUE, "spectral_radius": style.VERMILION, "alpha_max": style.GREEN}
+_NAMES = {"stable": "stable or not", "spectral_radius": "spectral radius", "alpha_max": "stiffest wall"}
+_SHAPES = {"float64": "o", "float32": "s"}
+
+
+class Mark(NamedTuple):
+    """One measurement."""
+
+    quantity: str
+    method: str
+    dtype: str
+    layout: str
+    d: float
+    rate: float
+    error: float
+
+
+def draw_pareto(marks: Sequence[Mark]) -> Figure:
+    """Draw points a second over the worst error seen, both logarithmic: up and to the left is better.
+
+    Filled marks: maps (alpha and beta as axes); open ones: scattered points. Circles: float64; squares: float32.
+
+    Args:
+        marks: the measurements; of several with one name the first is drawn.
+
+    Returns:
+        A new figure, unknown to pyplot.
+    """
+    delays = sorted({mark.d for mark in marks})
+    columns = min(3, len(delays))
+    rows = -(-len(delays) // columns)
+    with style.house_style():
+        figure, axes = style.new_figure(
+            max(3.4 * columns, 5.0), 3.6 * rows + 0.5, rows, columns, sharex=True, sharey=True
+        )
+        for ax, d in zip(axes.ravel(), delays, strict=False):
+            _draw_panel(ax, [mark for mark in marks if mark.d == d])
+            ax.set_title(f"d = {d:g}")
+        for ax in axes.ravel()[len(delays) :]:
+            ax.set_visible(False)
+        _shared_axes(axes, marks)
+        figure.legend(handles=_legend(marks), loc="outside lower center", ncols=4)
+    return figure
+
+
+def draw(marks: Sequence[Mark], stem: Path) -> tuple[Path, Path]:
+    """Draw and write PNG and SVG."""
+    return style.save(draw_pareto(marks), stem)
+
+
+def _draw_panel(ax: Axes, marks: Sequence[Mark]) -> None:
+    drawn: dict[tuple[str, ...], Mark] = {}
+    for mark in marks:
+        drawn.setdefault(mark[:4], mark)
+    labelled: dict[str, list[Mark]] = {}
+    for mark in drawn.values():
+        color = _COLORS[mark.quantity]
+        ax.plot(
+            max(mark.error, _NONE_SEEN),
+            mark.rate,
+            _SHAPES[mark.dtype],
+            color=color,
+            markerfacecolor=color if mark.layout == "map" else "white",
+            markersize=5.5,
+            markeredgewidth=1.1,
+        )
+        labelled.setdefault(f"{mark.quantity} {mark.method} {mark.dtype}", []).append(mark)
+    # One name for the two marks of a method, beside the faster one; names in one place move apart.
+    tops = [max(group, key=lambda mark: mark.rate) for group in labelled.values()]
+    places = 10 ** style.spread([np.log10(top.rate) for top in tops], 0.34)
+    for top, place in zip(tops, places, strict=True):
+        x = max(top.error, _NONE_SEEN)
+        left = x > 1e-6
+        ax.annotate(
+            top.method,
+            (x, place),
+            xytext=(-7 if left else 7, 0),
+            textcoords="offset points",
+            ha="right" if left else "left",
+            va="center",
+            fontsize=6.8,
+            color=_COLORS[top.quantity],
+        )
+    ax.axvline(10 * _NONE_SEEN, color=style.GRAY, linewidth=0.5, linestyle=style.DOTTED)
+
+
+def _shared_axes(axes: np.ndarray, marks: Sequence[Mark]) -> None:
+    rates = [mark.rate for mark in marks]
+    for ax in axes.ravel():
+        ax.set_xscale("log")
+        ax.set_yscale("log")
+        ax.set_xlim(*_RANGE)
+        ax.set_ylim(min(rates) / 3, max(rates) * 5)
+        ax.xaxis.set_major_locator(FixedLocator(_TICKS))
+        ax.xaxis.set_minor_locator(NullLocator())
+        ax.xaxis.set_major_formatter(
+            FuncFormatter(lambda x, _: "none" if x < 1e-16 else f"$10^{{{round(np.log10(x))}}}$")
+        )
+        ax.yaxis.set_major_locator(LogLocator(numticks=12))
+        ax.yaxis.set_minor_locator(NullLocator())
+        ax.grid(axis="y", color="#E8E8E8", linewidth=0.6)
+    for ax in axes[-1]:
+        ax.set_xlabel("worst error seen")
+    for ax in axes[:, 0]:
+        ax.set_ylabel("points per second")
+
+
+def _legend(marks: Sequence[Mark]) -> list[Line2D]:
+    def dot(label: str, **options: object) -> Line2D:
+        return Line2D([], [], linestyle="none", markersize=5.5, label=label, **options)  # type: ignore[arg-type]
+
+    quantities = {mark.quantity for mark in marks}
+    handles = [dot(_NAMES[name], marker="o", color=color) for name, color in _COLORS.items() if name in quantities]
+    handles.append(dot("map", marker="o", color=style.GRAY))
+    handles.append(dot("scattered points", marker="o", color=style.GRAY, markerfacecolor="white"))
+    if any(mark.dtype == "float32" for mark in marks):
+        handles.append(dot("float32", marker="s", color=style.GRAY))
+    return handles

@@ -1,0 +1,80 @@
+"""The benchmark's own parts: problems with proved answers, a tiny run, and what is written of it."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from zwidth import accuracy
+from zwidth.bench import problems, report, suite
+from zwidth.bench.baselines import available
+from zwidth.cli.commands import cli
+from zwidth.errors import InputError
+from zwidth.figures.pareto import Mark, draw_pareto
+
+
+def test_labels_near_the_boundary_are_those_of_their_side():
+    truth = problems.near_boundary(1.0, 240)
+    assert 200 < truth.stable.size <= 240
+    assert 0.3 < truth.stable.mean() < 0.7
+    # By roots of 60 digits and more, which the certified method does not use.
+    some = np.arange(0, truth.stable.size, 9)
+    for wall, stable in zip(zip(*(part[some] for part in truth.walls), strict=True), truth.stable[some], strict=True):
+        assert (problems.exact_radius(*map(float, wall)) < 1) == stable
+
+
+def test_every_tool_finds_the_same_radii():
+    walls, radius = problems.with_radius(1.0, 20)
+    for name, tool in available().items():
+        np.testing.assert_allclose(tool.radius(walls), radius, rtol=1e-10, err_msg=name)
+
+
+@pytest.fixture(scope="module")
+def rows():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(suite, "_SECONDS", 0.0)
+        return suite.measure(suite.Sizes((0.0,), 40_000, 10_000, 60, 10))
+
+
+def test_a_tiny_run_measures_every_method(rows):
+    methods = {(row.quantity, row.method) for row in rows if not row.baseline}
+    assert len(methods) == 4 + 3 + 2
+    assert {row.method for row in rows if row.baseline} == set(available())
+    for row in rows:
+        assert row.rate > 0
+        assert row.first_seconds >= 0
+        assert row.error < 1e-2
+        if row.method == "certified":
+            assert row.wrong == 0
+
+
+def test_what_is_written_can_be_read(rows, tmp_path):
+    report.write(rows, tmp_path)
+    document = json.loads((tmp_path / "bench.json").read_text())
+    assert len(document["rows"]) == len(rows)
+    assert document["environment"]["jax"]
+    text = (tmp_path / "bench.md").read_text()
+    assert text.count("|\n") > len(rows)
+    assert "np.linalg.eigvals" in (tmp_path / "summary.txt").read_text()
+    assert (tmp_path / "pareto.png").stat().st_size > 10_000
+    costs = accuracy.parse(report.costs(rows))
+    assert accuracy.choose("stable", d=0, points=10**6, layout="map", accuracy=1e-9, costs=costs).error <= 1e-9
+
+
+def test_the_figure_has_a_panel_for_each_delay_and_a_mark_for_each_method():
+    marks = [Mark("stable", "boundary", "float64", "map", d, 1e9, 0.0) for d in (0.0, 1.0, 4.0, 8.0)] + [
+        Mark("stable", "schur_cohn", "float32", "scattered", 0.0, 1e8, 1e-4)
+    ]
+    figure = draw_pareto(marks)
+    assert [ax.get_title(loc="left") for ax in figure.axes if ax.get_visible()] == ["d = 0", "d = 1", "d = 4", "d = 8"]
+    drawn = [line.get_data() for line in figure.axes[0].lines if len(line.get_xdata()) == 1]
+    assert [float(y[0]) for _, y in drawn] == [1e9, 1e8]
+
+
+def test_results_are_not_overwritten(tmp_path):
+    (tmp_path / "bench.json").write_text("{}")
+    with pytest.raises(InputError, match="--overwrite"):
+        CliRunner().invoke(cli, ["bench", "--out", str(tmp_path)], catch_exceptions=False)
+    with pytest.raises(InputError, match="not a folder"):
+        CliRunner().invoke(cli, ["bench", "--out", str(tmp_path / "bench.json" / "x")], catch_exceptions=False)
