@@ -119,7 +119,8 @@ def run(
                 memory=memory,
                 progress=progress,
             )
-        _keep_config(path, folder)
+        if not result.hopeless:
+            _keep_config(path, folder)
         _tell(result, path, folder, out, shard)
     if not ok:
         raise SystemExit(_EXIT_FAILED)
@@ -189,8 +190,8 @@ def _tell(result: SweepResult, path: Path, folder: Path, out: Path | None, shard
     where, part = f" --out {out}" if out else "", f" --shard {shard[0]}/{shard[1]}" if shard else ""
     again = f"zwidth run {path}{where} --resume{part}"
     if result.hopeless:
-        click.echo(f"zwidth: out: {folder}: {result.hopeless}; the disk is full or read-only, or a limit on files is "
-                   f"reached; make room and go on with: {again}", err=True)  # fmt: skip
+        click.echo(f"zwidth: out: {folder}: {result.hopeless}", err=True)
+        click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {again}", err=True)
         raise SystemExit(_EXIT_FAILED)
     for chunk, error in result.failed.items():
         click.echo(f"zwidth: chunk {chunk} failed: {error}", err=True)

@@ -12,6 +12,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from zwidth.sweep.compiled import mend_compilation_cache
 from zwidth.sweep.jobs import MAX_ATTEMPTS, Finished, Job, Perform, attempt
 
 # Never fork a process in which JAX may have started: its threads do not survive, its locks do.
@@ -100,6 +101,7 @@ def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _share_processors(number, count)
+    mend_compilation_cache()
     while True:
         try:
             job: Any = pipe.recv()

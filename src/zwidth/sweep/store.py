@@ -27,7 +27,7 @@ from zwidth.errors import StoreError, StoreExistsError
 from zwidth.sweep.files import checksum, write_whole
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
-from zwidth.sweep.plan import FamilyPlan, Plan, Task, kept_plan
+from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.record import digest
 from zwidth.sweep.sweeps import SweepStudy
 
@@ -112,9 +112,10 @@ class Store:
         # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
-    def _files(self, family: FamilyPlan, index: int) -> list[Path]:
+    def files(self, task: Task) -> list[Path]:
         """The files that hold a chunk, in the order of its variables."""
-        key = "/".join(("c", *map(str, family.position(index))))
+        family = self.plan.family(task.family)
+        key = "/".join(("c", *map(str, family.position(task.index))))
         return [self.path / name / key for name in family.variables]
 
     def _flag(self, task: Task) -> Path:
@@ -132,7 +133,7 @@ class Store:
         """Write all variables of a chunk, then mark it as done."""
         family = self.plan.family(task.family)
         place = family.place(task.index)
-        files = self._files(family, task.index)
+        files = self.files(task)
         shape = tuple(part.stop - part.start for part in place)
         with _quiet():
             for name, file in zip(family.variables, files, strict=True):
@@ -152,7 +153,7 @@ class Store:
         kept = self._flag(task).read_bytes()
         if len(kept) != 4 * len(family.variables):
             return "its record of checksums is damaged"
-        files = zip(family.variables, self._files(family, task.index), np.frombuffer(kept, "<u4"), strict=True)
+        files = zip(family.variables, self.files(task), np.frombuffer(kept, "<u4"), strict=True)
         wrong = [(name, file) for name, file, expected in files if checksum(file) != expected]
         return ", ".join(f"{name} is {'damaged' if file.exists() else 'missing'}" for name, file in wrong)
 
