@@ -118,5 +118,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (sweeps.run, sweeps.verify, sweeps.export):
+for command in sweeps.COMMANDS:
     cli.add_command(command)
