@@ -15,7 +15,7 @@ from zwidth.figures.plane import label_outside, panel_grid, scale_axis
 from zwidth.figures.sweep_data import CurvesData, PlaneData, Quantity
 
 # Characters of names that fit beside each other above the panels.
-_LINE = 44
+_LINE = 56
 
 
 def draw_curves(data: CurvesData, quantity: Quantity) -> Figure:

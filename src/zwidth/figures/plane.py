@@ -24,6 +24,8 @@ _EDGES = {"margin": 0.0, "spectral_radius": 1.0}
 _STEEP = 100.0
 # A region that fills less of its panel than this has no room for labels.
 _LABELLED = 0.1
+# Less than this cannot be seen.
+_SEEN = 0.003
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
 
 
@@ -66,6 +68,9 @@ def panel_grid(count: int, columns: int) -> tuple[Figure, list[Axes]]:
     flat = list(axes.flat)
     for spare in flat[count:]:
         spare.remove()
+    for above in flat[max(0, count - columns) : count]:
+        # The lowest of its column, in the last row or not.
+        above.tick_params(labelbottom=True)
     return figure, flat[:count]
 
 
@@ -145,7 +150,7 @@ def _draw_contours(ax: Axes, data: PlaneData, values: Any, quantity: Quantity, n
         if quantity.look == "steep":
             within = values < levels.max()
         if within.filled(False).mean() > _LABELLED:
-            ax.clabel(drawn, fontsize=7, inline_spacing=2, fmt=lambda level: f"{level:.3g}")
+            ax.clabel(drawn, fontsize=7, inline_spacing=2, fmt=lambda level: f"{level:.4g}")
     if quantity.look == "diverging":
         _draw_line(ax, data, values, quantity.center)
 
@@ -221,7 +226,9 @@ def _explain(figure: Figure, axes: list[Axes], panels: tuple[Panel, ...], quanti
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(_missing(panel.fields[quantity.name]) for panel in panels):
         handles.append(Patch(facecolor=MISSING, label="not computed"))
-    if quantity.name != "kind" and any((panel.fields.get("kind", np.empty(0)) == 1).any() for panel in panels):
+    if quantity.name != "kind" and any(
+        (panel.fields["kind"] == 1).mean() > _SEEN for panel in panels if "kind" in panel.fields
+    ):
         handles.append(Patch(facecolor="white", hatch="////", edgecolor="#606060", linewidth=0, label="corner optimum"))
     if any(panel.peak is not None for panel in panels):
         handles.append(Line2D([], [], linestyle="", label="stiffest stable wall", **_PEAK))

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 FOLDER = "figures"
 
-# As many values as a panel resolves; of a finer grid every n-th is drawn.
-_RESOLVED = 1000
+# As many values as one panel, or one of several, resolves; of a finer grid every n-th is drawn.
+_RESOLVED, _RESOLVED_BY_MANY = 1000, 500
 # A grid of more panels than this says nothing on a page: evenly spaced values stand for all.
 _ACROSS = 3
 _MANY_PANELS = 9
@@ -218,9 +218,9 @@ class _View:
     def _plane(self, name: str) -> PlaneData:
         """Panels of a variable over two parameters."""
         x, y = self._axes(name)
-        thin = {dim: slice(None, None, -(-self.data.sizes[dim] // _RESOLVED)) for dim in (x, y)}
         rest = [str(dim) for dim in self.data[name].dims if dim not in (x, y)]
         places, columns = self._panels(rest)
+        thin = self._thin((x, y), len(places))
         names = [name]
         if name == "stable" and "passive" in self.data:
             names.append("passive")
@@ -238,6 +238,11 @@ class _View:
         scales = [self._scale(dim) for dim in (x, y)]
         scales = [replace(scale, values=scale.values[thin[scale.name]]) for scale in scales]
         return PlaneData(scales[0], scales[1], tuple(panels), columns)
+
+    def _thin(self, dims: tuple[str, str], panels: int) -> dict[str, slice]:
+        """Every n-th value along both axes of a plane."""
+        most = _RESOLVED if panels == 1 else _RESOLVED_BY_MANY
+        return {dim: slice(None, None, -(-self.data.sizes[dim] // most)) for dim in dims}
 
     def _peak(self, place: Mapping[str, int], x: str, y: str) -> tuple[float, float] | None:
         """The stiffest stable wall of a panel, where the plane is one of walls."""
@@ -284,10 +289,10 @@ class _View:
     def _outlines(self, name: str, level: float, family: list[str]) -> Figure:
         """Boundaries of many devices in each panel."""
         x, y = self._axes(name)
-        thin = {dim: slice(None, None, -(-self.data.sizes[dim] // _RESOLVED)) for dim in (x, y)}
         picked = _evenly(self.data.sizes[family[0]], _OUTLINES)
         rest = [str(dim) for dim in self.data[name].dims if dim not in (x, y, family[0])]
         places, columns = self._panels(rest)
+        thin = self._thin((x, y), len(places))
         panels = []
         for place in places:
             values = self._values(name, {**place, **thin, family[0]: picked}, [family[0], y, x])

@@ -118,12 +118,13 @@ class Store:
         key = "/".join(("c", *map(str, family.position(task.index))))
         return [self.path / name / key for name in family.variables]
 
-    def _flag(self, task: Task) -> Path:
+    def flag(self, task: Task) -> Path:
+        """The file that says by being there that a chunk is done."""
         return self.path / _checksums(task.family) / "c" / str(task.index) / "0"
 
     def is_done(self, task: Task) -> bool:
         """Whether a chunk is marked as done."""
-        return self._flag(task).exists()
+        return self.flag(task).exists()
 
     def missing(self) -> list[Task]:
         """The chunks that are not marked as done, in the order of the work."""
@@ -141,16 +142,16 @@ class Store:
                 file.unlink(missing_ok=True)
                 self._arrays[name][place if place else ...] = np.ascontiguousarray(values[name]).reshape(shape)
         sums = np.array([checksum(file) for file in files], dtype="<u4")
-        write_whole(self._flag(task), sums.tobytes())
+        write_whole(self.flag(task), sums.tobytes())
 
     def forget(self, task: Task) -> None:
         """Take back that a chunk is done."""
-        self._flag(task).unlink(missing_ok=True)
+        self.flag(task).unlink(missing_ok=True)
 
     def fault_of(self, task: Task) -> str:
         """What is wrong with a chunk that is marked as done; nothing where its files are what was written."""
         family = self.plan.family(task.family)
-        kept = self._flag(task).read_bytes()
+        kept = self.flag(task).read_bytes()
         if len(kept) != 4 * len(family.variables):
             return "its record of checksums is damaged"
         files = zip(family.variables, self.files(task), np.frombuffer(kept, "<u4"), strict=True)

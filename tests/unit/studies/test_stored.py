@@ -123,7 +123,7 @@ def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
     data = view._plane("stable")
     assert any((panel.fields["stable"] < 0).any() for panel in data.panels)
     # A grid finer than a page is thinned.
-    assert data.x.values.size == 1000
+    assert data.x.values.size == 500
     figure = draw_plane(data, view._quantity("stable"))
     assert "not computed" in [text.get_text() for text in figure.legends[0].get_texts()]
 
