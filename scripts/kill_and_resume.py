@@ -62,7 +62,7 @@ studies:
       d: {linear: {start: 0, stop: 9.5, num: 96}}
     outputs: [alpha_max, beta_at_max, kind]
 """
-LONGEST = 300.0
+LONGEST = 600.0
 
 
 class Trial:
@@ -238,6 +238,7 @@ def main() -> None:
     """Kill, resume, compare, and tell."""
     parser = argparse.ArgumentParser(description="Kill runs at random moments, resume and compare them.")
     parser.add_argument("--kills", type=int, default=50, help="of the parent, and as many of a worker [50]")
+    parser.add_argument("--victim", choices=("parent", "worker"), help="one of the two only")
     parser.add_argument("--seed", type=int, default=2006, help="of the random moments [2006]")
     parser.add_argument("--json", action="store_true", help="print JSON for machines")
     options = parser.parse_args()
@@ -246,6 +247,8 @@ def main() -> None:
         compared = sum(len(data) for _, data in trial.reference.values())
         report: dict[str, Any] = {"chunks_a_run": trial.chunks, "bytes_compared_a_run": compared}
         for name, kill in (("parent", kill_parent), ("worker", kill_worker)):
+            if options.victim not in (None, name):
+                continue
             moments, done, number = random.Random(f"{options.seed} {name}"), 0, 0
             trial.outcomes = Counter()
             while done < options.kills:
