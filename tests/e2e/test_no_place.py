@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import pytest
 import yaml
 
-from sweeping import AXES, assert_same, chunk_file, flags, flip, main_of, study, zwidth
+from sweeping import AXES, assert_same, chunk_file, failing_on_2, flags, flip, main_of, study, zwidth
 
 COMMANDS = [["run"], ["run", "--dry-run"], ["run", "--resume"]]
 
@@ -164,6 +164,17 @@ def test_verify_names_a_damaged_chunk_and_resume_repairs_it_alone(config, finish
     assert len(before.items() & flags(copy).items()) == 7
     assert main_of("verify", copy) == 0
     assert_same(finished, copy)
+
+
+def test_a_chunk_that_fails_is_named_and_the_exit_code_is_1(config, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("zwidth.sweep.chunks.perform", failing_on_2)
+    assert main_of("run", config, "--out", tmp_path / "out") == 1
+    out, err = capsys.readouterr()
+    assert "7 of 8 chunks done" in out
+    assert "zwidth: chunk map/wall/2 (d 1:2, delta 0:2, alpha 0:40, beta 0:300) failed: ArithmeticError: no" in err
+    assert f"try the failed chunks again with: zwidth run {config} --out {tmp_path}/out --resume" in err
+    assert main_of("verify", tmp_path / "out") == 1
+    assert "map.zarr: 7 of 8 chunks done, none damaged" in capsys.readouterr().out
 
 
 def test_a_store_of_another_configuration_is_refused(finished, tmp_path, capsys):
