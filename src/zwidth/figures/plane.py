@@ -160,16 +160,16 @@ def _levels(values: Any, quantity: Quantity, norm: Any) -> np.ndarray:
     low, high = float(values.min()), float(values.max())
     if quantity.look in ("logarithmic", "steep"):
         end = min(high, norm.vmax / 2.0) if quantity.look == "steep" else high
-        levels = LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end)
+        levels = np.asarray(LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end))
         levels = levels[levels <= end]
     elif quantity.look == "diverging":
         ends = (low, quantity.center) if quantity.below else (quantity.center, high)
-        levels = MaxNLocator(6).tick_values(*ends) if ends[0] < ends[1] else np.empty(0)
+        levels = np.asarray(MaxNLocator(6).tick_values(*ends)) if ends[0] < ends[1] else np.empty(0)
         levels = levels[levels != quantity.center]
         levels = levels[(levels < quantity.center) == quantity.below]
     else:
-        levels = MaxNLocator(8).tick_values(low, high)
-    return np.asarray(levels)[(np.asarray(levels) > low) & (np.asarray(levels) < high)]
+        levels = np.asarray(MaxNLocator(8).tick_values(low, high))
+    return levels[(levels > low) & (levels < high)]
 
 
 def _draw_corners(ax: Axes, data: PlaneData, panel: Panel) -> None:
