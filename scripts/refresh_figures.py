@@ -8,6 +8,8 @@ import tempfile
 from pathlib import Path
 
 import zwidth
+from zwidth.studies.stored import draw_stores
+from zwidth.sweep.engine import run_sweeps
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
@@ -17,6 +19,8 @@ SHOWN = {
     "paper": ("fig5", "fig10", "fig11", "passivity_cost"),
     "phantom": ("recommend",),
 }
+# The figure of configs/dense.yaml that is shown.
+STORED = "region_stable.svg"
 
 
 def main() -> None:
@@ -30,6 +34,11 @@ def main() -> None:
             for figure in figures:
                 shutil.copy(result.folder / f"{figure}.svg", TARGET)
                 print(TARGET.relative_to(ROOT) / f"{figure}.svg")
+        out = Path(folder, "dense")
+        run_sweeps(zwidth.load_config(ROOT / "configs" / "dense.yaml"), out)
+        drawn = {file.name: file for file in draw_stores(out)}
+        shutil.copy(drawn[STORED], TARGET)
+        print(TARGET.relative_to(ROOT) / STORED)
 
 
 if __name__ == "__main__":

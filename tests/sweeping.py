@@ -6,9 +6,11 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
+from zwidth.cli import main
 from zwidth.sweep.chunks import perform
 from zwidth.sweep.document import Config
 from zwidth.sweep.store import find_stores, open_dataset
@@ -55,21 +57,23 @@ def chunk_file(path, variable="stable", number=0):
     return sorted(file for file in (Path(path) / variable / "c").rglob("*") if file.is_file())[number]
 
 
-_MAIN = """
-import sys
-from zwidth.cli import main
-from zwidth.cli.commands import cli
-from zwidth.cli.sweeps import COMMANDS
-
-for command in COMMANDS:
-    cli.add_command(command)
-main()
-"""
-
-
 def command(*arguments):
     """The words that start the command line."""
-    return [sys.executable, "-c", _MAIN, *map(str, arguments)]
+    return [sys.executable, "-m", "zwidth", *map(str, arguments)]
+
+
+def main_of(*arguments):
+    """The exit code of the command line, run in this process, which its settings do not reach."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        # With a folder given, it makes none of the user's.
+        with patch.dict(os.environ, JAX_COMPILATION_CACHE_DIR=""):
+            main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        return end.code or 0
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    return 0
 
 
 def zwidth(*arguments, **options):

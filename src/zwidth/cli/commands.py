@@ -119,5 +119,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (sweeps.run, sweeps.verify, sweeps.export, bench):
+for command in (*sweeps.COMMANDS, bench):
     cli.add_command(command)

@@ -1,4 +1,4 @@
-"""Sweeps on the command line: the options of ``run`` that concern them, ``verify`` and ``export``."""
+"""Sweeps on the command line: the options of ``run`` that concern them, ``verify``, ``export`` and ``figures``."""
 
 from __future__ import annotations
 
@@ -119,7 +119,8 @@ def run(
                 memory=memory,
                 progress=progress,
             )
-        _keep_config(path, folder)
+        if not result.hopeless:
+            _keep_config(path, folder)
         _tell(result, path, folder, out, shard)
     if not ok:
         raise SystemExit(_EXIT_FAILED)
@@ -189,8 +190,8 @@ def _tell(result: SweepResult, path: Path, folder: Path, out: Path | None, shard
     where, part = f" --out {out}" if out else "", f" --shard {shard[0]}/{shard[1]}" if shard else ""
     again = f"zwidth run {path}{where} --resume{part}"
     if result.hopeless:
-        click.echo(f"zwidth: out: {folder}: {result.hopeless}; the disk is full or read-only, or a limit on files is "
-                   f"reached; make room and go on with: {again}", err=True)  # fmt: skip
+        click.echo(f"zwidth: out: {folder}: {result.hopeless}", err=True)
+        click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {again}", err=True)
         raise SystemExit(_EXIT_FAILED)
     for chunk, error in result.failed.items():
         click.echo(f"zwidth: chunk {chunk} failed: {error}", err=True)
@@ -292,5 +293,41 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
             click.echo(f"wrote {file}")
 
 
-COMMANDS = (run, verify, export)
+class Slice(click.ParamType):
+    """A value of a parameter: ``delta=0.1``."""
+
+    name = "name=value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, str]:
+        """Parse one option."""
+        if isinstance(value, tuple):
+            return value
+        name, equals, wanted = str(value).partition("=")
+        if equals and name.strip() and wanted.strip():
+            return name.strip(), wanted.strip()
+        self.fail(f"got {value!r}; write NAME=VALUE, as in delta=0.1", param, ctx)
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--at", multiple=True, type=Slice(), help="Draw this slice, as in --at delta=0.1 --at d=1.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
+@json_option
+def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool) -> None:
+    """Draw the sweeps in DIR, as PNG and SVG.
+
+    Stable and passive walls with their boundaries, contours of margins and settling times, surfaces of the stiffest
+    wall. --at chooses slices by the nearest value that the sweep has, in the units of the store; without it up to
+    three values of a parameter have a panel each.
+    """
+    from zwidth.studies.stored import draw_stores
+
+    files = draw_stores(
+        folder, out, at=dict(at), progress=None if as_json else lambda file: click.echo(f"wrote {file}")
+    )
+    if as_json:
+        click.echo(json.dumps({"files": [str(file) for file in files]}, indent=2))
+
+
+COMMANDS = (run, verify, export, figures)
 """What the command line gets from this module."""

@@ -10,18 +10,25 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from zwidth.errors import StoreExistsError
+from zwidth.sweep.files import check_folder
+from zwidth.sweep.store import SUFFIX
 
 RUN_FILE = "run.json"
 """The file that marks a folder as a finished run."""
 
+# What sweeps of the same configuration, in a shard that was faster, leave beside their stores.
+_OF_SWEEPS = ("config.yaml", "figures")
+
 
 def check_free(folder: Path, overwrite: bool) -> None:
-    """Refuse a folder that holds something, unless it is a run that may be overwritten."""
+    """Refuse a folder that holds something, unless it is a run that may be overwritten, or sweeps alone."""
     if not (folder.exists() or folder.is_symlink()):
+        check_folder(folder)
         return
     if not folder.is_dir():
         raise StoreExistsError(f"out: {folder} is a file, a folder is needed; choose another with --out DIR")
-    if not any(folder.iterdir()):
+    if holds_only_sweeps(folder):
+        check_folder(folder)
         return
     if not (folder / RUN_FILE).is_file():
         # Whatever it is, it was not written by a run: not ours to remove.
@@ -33,6 +40,12 @@ def check_free(folder: Path, overwrite: bool) -> None:
             f"out: {folder} already holds a run; choose another folder with --out DIR, remove it, or replace it with "
             "--overwrite"
         )
+
+
+def holds_only_sweeps(folder: Path) -> bool:
+    """Whether nothing but sweeps, finished or not, is in a folder."""
+    names = (path.name for path in folder.iterdir())
+    return all(name.endswith(SUFFIX) or name in _OF_SWEEPS or name.endswith(".partial") for name in names)
 
 
 @contextmanager
@@ -55,6 +68,12 @@ def staged(folder: Path, overwrite: bool) -> Iterator[Path]:
 def _replace(folder: Path, partial: Path, overwrite: bool) -> None:
     """Give the finished folder its name; another run may have taken it in the meantime."""
     check_free(folder, overwrite)
+    if folder.exists() and holds_only_sweeps(folder):
+        # The file that says that all is there comes last.
+        for path in sorted(partial.iterdir(), key=lambda path: path.name == RUN_FILE):
+            os.replace(path, folder / path.name)
+        partial.rmdir()
+        return
     old = partial.with_suffix(".old")
     if folder.exists():
         os.rename(folder, old)

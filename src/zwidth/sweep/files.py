@@ -2,10 +2,48 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import zlib
 from pathlib import Path
+
+from zwidth.errors import InputError
+
+REMEDIES = {
+    errno.ENOSPC: "make room on the disk",
+    errno.EDQUOT: "make room within your quota",
+    errno.EFBIG: "raise the limit on the size of files (ulimit -f)",
+    errno.EROFS: "choose a folder that can be written",
+    errno.EACCES: "choose a folder that you may write",
+    errno.EPERM: "choose a folder that you may write",
+    errno.ENOTDIR: "choose a folder whose path holds no file",
+    errno.ENOENT: "choose a folder that can be made",
+    errno.EEXIST: "choose another name",
+}
+"""What helps against errors of the system; no chunk of a sweep would escape the first six of them."""
+HOPELESS = frozenset(list(REMEDIES)[:6])
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder for results that cannot be made or written, as far as can be told without writing.
+
+    Raises:
+        InputError: a file is in its place or in its path, or it is read-only.
+    """
+    nearest = existing(folder)
+    if not nearest.is_dir():
+        where = "is a file" if nearest == folder.absolute() else f"cannot be made, for {nearest} is a file"
+        raise InputError(f"out: {folder} {where}; choose another folder with --out DIR")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        where = "is read-only" if nearest == folder.absolute() else f"cannot be made, for {nearest} is read-only"
+        raise InputError(f"out: {folder} {where}, at least to you; choose another folder with --out DIR")
+
+
+def existing(folder: Path) -> Path:
+    """The folder itself or the nearest path above it that exists."""
+    folder = folder.absolute()
+    return next(path for path in (folder, *folder.parents) if path.exists())
 
 
 def write_whole(path: Path, data: bytes) -> None:

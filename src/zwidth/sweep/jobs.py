@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Callable, Generator, Iterable
 from typing import NamedTuple, TypeAlias
 
+from zwidth.sweep.files import HOPELESS
 from zwidth.sweep.plan import Task
 
 Perform: TypeAlias = Callable[[str, str, int], None]
@@ -13,9 +13,6 @@ Perform: TypeAlias = Callable[[str, str, int], None]
 
 MAX_ATTEMPTS = 3
 """How often a chunk is tried whose worker is killed."""
-
-# What no other chunk would escape.
-_HOPELESS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EACCES, errno.EPERM}
 
 
 class Job(NamedTuple):
@@ -44,7 +41,7 @@ def attempt(perform: Perform, job: Job) -> Finished:
 
 def failure_of(job: Job, error: BaseException) -> Finished:
     """What an exception means for a job and the others."""
-    return Finished(job, f"{type(error).__name__}: {error}", _errno_of(error) in _HOPELESS)
+    return Finished(job, f"{type(error).__name__}: {error}", _errno_of(error) in HOPELESS)
 
 
 def _errno_of(error: BaseException | None) -> int | None:

@@ -45,11 +45,28 @@ class Output:
 
 _KINDS = {"flag_values": [0, 1, NOT_COMPUTED], "flag_meanings": "smooth corner unknown"}
 
+
+def _flags(no: str, yes: str) -> dict[str, Any]:
+    return {"flag_values": [0, 1], "flag_meanings": f"{no} {yes}"}
+
+
 _ALL = (
-    Output("stable", "wall", "bool", "whether every pole lies strictly inside the unit circle"),
+    Output(
+        "stable",
+        "wall",
+        "bool",
+        "whether every pole lies strictly inside the unit circle",
+        attributes=_flags("unstable", "stable"),
+    ),
     Output("spectral_radius", "wall", "float64", "largest pole magnitude"),
     Output("margin", "wall", "float64", "1 - spectral radius, positive for a stable wall"),
-    Output("passive", "wall", "bool", "whether the wall is passive at its delay"),
+    Output(
+        "passive",
+        "wall",
+        "bool",
+        "whether the wall is passive at its delay",
+        attributes=_flags("not_passive", "passive"),
+    ),
     Output(
         "passivity_margin",
         "wall",

@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from zwidth.errors import ResourceError
+from zwidth.sweep.files import check_folder, existing
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
 from zwidth.sweep.sweeps import SweepStudy
@@ -221,9 +222,13 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
         begun: studies that have a store, and part of their disk space, already.
 
     Raises:
+        InputError: the folder cannot be made or written.
         ResourceError: it does not fit; the message has the numbers and the remedy.
     """
-    free = shutil.disk_usage(_existing(folder)).free
+    check_folder(folder)
+    if not plans:
+        return
+    free = shutil.disk_usage(existing(folder)).free
     disk = sum(plan.disk for plan in plans if plan.study not in begun)
     if disk > free:
         raise ResourceError(
@@ -237,12 +242,6 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
             f"workers: {workers} of them may take {_size(memory)} of memory, but there are {_size(total)}; "
             "choose fewer with --workers N"
         )
-
-
-def _existing(folder: Path) -> Path:
-    """The folder itself or the nearest one above it that exists."""
-    folder = folder.absolute()
-    return next(path for path in (folder, *folder.parents) if path.exists())
 
 
 def _machine_memory() -> int:

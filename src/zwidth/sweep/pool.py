@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 from collections import Counter, deque
 from collections.abc import Generator, Iterable
@@ -12,10 +13,13 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from zwidth.sweep.compiled import mend_compilation_cache
 from zwidth.sweep.jobs import MAX_ATTEMPTS, Finished, Job, Perform, attempt
 
 # Never fork a process in which JAX may have started: its threads do not survive, its locks do.
 _CONTEXT = multiprocessing.get_context("spawn")
+# Seconds that a worker may take to end by itself.
+_PATIENCE = 3.0
 
 
 def in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[Finished]:
@@ -89,6 +93,12 @@ class _Worker:
 
     def stop(self) -> None:
         """End the process; what it was writing is not there yet under its name."""
+        # An idle one ends by itself when nobody can send it anything any more.
+        if self.job is None:
+            self.pipe.close()
+        else:
+            self.process.terminate()
+        self.process.join(_PATIENCE)
         self.process.kill()
         self.process.join()
         self.pipe.close()
@@ -98,8 +108,11 @@ def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
     """The life of a worker."""
     # Ctrl-C reaches the whole group of processes; the parent decides what becomes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ends as a program does, so that Python has no leaked semaphore to complain about.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     threading.Thread(target=_end_with_parent, daemon=True).start()
     _share_processors(number, count)
+    mend_compilation_cache()
     while True:
         try:
             job: Any = pipe.recv()

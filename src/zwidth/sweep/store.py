@@ -27,7 +27,7 @@ from zwidth.errors import StoreError, StoreExistsError
 from zwidth.sweep.files import checksum, write_whole
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
-from zwidth.sweep.plan import FamilyPlan, Plan, Task, kept_plan
+from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.record import digest
 from zwidth.sweep.sweeps import SweepStudy
 
@@ -112,17 +112,19 @@ class Store:
         # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
-    def _files(self, family: FamilyPlan, index: int) -> list[Path]:
+    def files(self, task: Task) -> list[Path]:
         """The files that hold a chunk, in the order of its variables."""
-        key = "/".join(("c", *map(str, family.position(index))))
+        family = self.plan.family(task.family)
+        key = "/".join(("c", *map(str, family.position(task.index))))
         return [self.path / name / key for name in family.variables]
 
-    def _flag(self, task: Task) -> Path:
+    def flag(self, task: Task) -> Path:
+        """The file that says by being there that a chunk is done."""
         return self.path / _checksums(task.family) / "c" / str(task.index) / "0"
 
     def is_done(self, task: Task) -> bool:
         """Whether a chunk is marked as done."""
-        return self._flag(task).exists()
+        return self.flag(task).exists()
 
     def missing(self) -> list[Task]:
         """The chunks that are not marked as done, in the order of the work."""
@@ -132,7 +134,7 @@ class Store:
         """Write all variables of a chunk, then mark it as done."""
         family = self.plan.family(task.family)
         place = family.place(task.index)
-        files = self._files(family, task.index)
+        files = self.files(task)
         shape = tuple(part.stop - part.start for part in place)
         with _quiet():
             for name, file in zip(family.variables, files, strict=True):
@@ -140,19 +142,19 @@ class Store:
                 file.unlink(missing_ok=True)
                 self._arrays[name][place if place else ...] = np.ascontiguousarray(values[name]).reshape(shape)
         sums = np.array([checksum(file) for file in files], dtype="<u4")
-        write_whole(self._flag(task), sums.tobytes())
+        write_whole(self.flag(task), sums.tobytes())
 
     def forget(self, task: Task) -> None:
         """Take back that a chunk is done."""
-        self._flag(task).unlink(missing_ok=True)
+        self.flag(task).unlink(missing_ok=True)
 
     def fault_of(self, task: Task) -> str:
         """What is wrong with a chunk that is marked as done; nothing where its files are what was written."""
         family = self.plan.family(task.family)
-        kept = self._flag(task).read_bytes()
+        kept = self.flag(task).read_bytes()
         if len(kept) != 4 * len(family.variables):
             return "its record of checksums is damaged"
-        files = zip(family.variables, self._files(family, task.index), np.frombuffer(kept, "<u4"), strict=True)
+        files = zip(family.variables, self.files(task), np.frombuffer(kept, "<u4"), strict=True)
         wrong = [(name, file) for name, file, expected in files if checksum(file) != expected]
         return ", ".join(f"{name} is {'damaged' if file.exists() else 'missing'}" for name, file in wrong)
 

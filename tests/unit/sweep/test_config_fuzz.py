@@ -9,12 +9,13 @@ from pathlib import Path
 import pytest
 import yaml
 
+from sweeping import main_of
 from zwidth.errors import ConfigError
 from zwidth.sweep.config import Config, load_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 # More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/sweep/test_config_fuzz.py
-SEEDS = range(int(os.environ.get("ZWIDTH_MUTATIONS", "300")))
+SEEDS = range(int(os.environ.get("ZWIDTH_MUTATIONS", "150")))
 # Far above what reading takes (some 50 ms), far below what a quadratic reader would take.
 LONGEST_SECONDS = 5.0
 
@@ -111,3 +112,86 @@ def test_any_bytes_end_in_a_config_or_a_clear_error(seed, tmp_path):
         assert str(fault).isprintable()
         assert fault.remedy
     assert time.perf_counter() - start < LONGEST_SECONDS
+
+
+def flipped(data, rng):
+    """The file with some bits of some bytes flipped."""
+    data = bytearray(data)
+    for _ in range(rng.randint(1, 4)):
+        data[rng.randrange(len(data))] ^= 1 << rng.randrange(8)
+    return bytes(data)
+
+
+def rearranged(data, rng):
+    """The tree with keys exchanged, values taken from elsewhere, out of range, or of another kind; as JSON."""
+    tree = yaml.safe_load(data)
+    for _ in range(rng.randint(1, 3)):
+        options = list(places(tree))
+        place = rng.choice(options)
+        match rng.randrange(4):
+            case 0:
+                tree = with_value(tree, place, rng.choice(ODD_VALUES))
+            case 1:
+                tree = with_value(tree, place, value_at(tree, rng.choice(options)))
+            case 2:
+                tree = with_value(tree, place, scaled(value_at(tree, place), rng))
+            case _:
+                tree = with_keys_swapped(tree, rng)
+    return json.dumps(tree).encode()
+
+
+def value_at(tree, path):
+    for key in path:
+        tree = tree[key]
+    return tree
+
+
+def scaled(value, rng):
+    """A number far from what it was, with its unit where it has one."""
+    factor = rng.choice([-1, 0, 1e-12, 1e-3, 1e3, 1e12, 1e300])
+    if isinstance(value, int | float):
+        return value * factor
+    words = str(value).split()
+    try:
+        return " ".join([repr(float(words[0]) * factor), *words[1:]])
+    except (IndexError, ValueError):
+        return f"{value}{value}"
+
+
+def with_keys_swapped(tree, rng):
+    """A copy in which two keys of the whole tree are exchanged wherever they stand."""
+    keys = sorted({place[-1] for place in places(tree) if isinstance(place[-1], str)})
+    one, other = rng.choice(keys), rng.choice(keys)
+    names = {one: other, other: one}
+
+    def copy(part):
+        if isinstance(part, dict):
+            return {names.get(key, key): copy(value) for key, value in part.items()}
+        return [copy(item) for item in part] if isinstance(part, list) else part
+
+    return copy(tree)
+
+
+# More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/sweep/test_config_fuzz.py -k plan
+@pytest.mark.parametrize("seed", SEEDS)
+def test_any_mutation_ends_in_a_plan_or_in_exit_code_2(seed, tmp_path, capsys):
+    rng = random.Random(f"plan {seed}")
+    shipped = rng.choice(sorted(CONFIGS.glob("*.yaml")))
+    path = tmp_path / "fuzzed.yaml"
+    path.write_bytes(rng.choice([flipped, rearranged, mutated])(shipped.read_bytes(), rng))
+    (tmp_path / "devices.csv").write_bytes((CONFIGS / "devices.csv").read_bytes())
+    start = time.perf_counter()
+    code = main_of("run", "--dry-run", path, "--out", tmp_path / "out")
+    assert time.perf_counter() - start < LONGEST_SECONDS
+    out, err = capsys.readouterr()
+    lines = err.splitlines()
+    assert code == (2 if lines else 0)
+    assert out or lines
+    for line in lines:
+        # The file with line, column and field, or the option that does not fit the machine.
+        named = line.startswith((f"zwidth: {path}:", "zwidth: out: ", "zwidth: workers: "))
+        assert named or f"{tmp_path}/" in line, line
+        assert "; " in line, line
+        assert not any(word in line for word in ("Error", "Traceback", "Exception")), line
+        assert line.isprintable()
+    assert not (tmp_path / "out").exists()

@@ -3,8 +3,9 @@
 import warnings
 
 import pytest
+import yaml
 
-from sweeping import assert_same, config_of, killed_on_2, killed_once_on_2
+from sweeping import assert_same, config_of, killed_on_2, killed_once_on_2, main_of, study
 from zwidth.errors import InputError
 from zwidth.sweep.engine import run_sweeps
 
@@ -52,6 +53,18 @@ def test_a_chunk_that_always_kills_its_worker_is_named(cluster, tmp_path):
     assert chunk.startswith("map/wall/2 ")
     assert error.startswith("KilledWorker: its worker died every time")
     assert result.computed == result.total - 1
+
+
+def test_the_command_line_names_it_and_ends_with_exit_code_1(cluster, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("zwidth.sweep.chunks.perform", killed_on_2)
+    path = tmp_path / "sweep.yaml"
+    path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
+    assert main_of("run", path, "--out", tmp_path / "out", "--scheduler", cluster) == 1
+    out, err = capsys.readouterr()
+    assert "7 of 8 chunks done" in out
+    assert "zwidth: chunk map/wall/2 (" in err
+    assert ") failed: KilledWorker: its worker died every time it was tried" in err
+    assert "Traceback" not in err
 
 
 def test_no_scheduler_at_the_address(tmp_path, monkeypatch):

@@ -34,7 +34,9 @@ def test_a_dataset_is_lazy_and_says_what_it_is(folder):
     assert {"zwidth", "jax", "numpy"} <= set(data.attrs["versions"])
     assert data.attrs["config"]["name"] == "test"
     assert len(data.attrs["config_sha256"]) == 64
-    assert len(data.status.attrs["flag_values"]) == len(data.status.attrs["flag_meanings"].split())
+    for name in ("status", "stable"):
+        assert len(data[name].attrs["flag_values"]) == len(data[name].attrs["flag_meanings"].split())
+    assert data.stable.attrs["flag_meanings"] == "unstable stable"
     assert not data.stable.sel(stiffness=1e6).values.any()
 
 

@@ -121,6 +121,14 @@ def test_values_do_not_depend_on_workers(finished, tmp_path):
     assert_same(folder, tmp_path)
 
 
+def test_no_output_depends_on_workers(tmp_path):
+    config = config_of(study(axes=FEW, outputs=(*ALL, "alpha_max", "beta_at_max", "kind")))
+    assert run_sweeps(config, tmp_path / "here").ok
+    # A worker has fewer processors, and its kernels fewer threads.
+    assert run_sweeps(config, tmp_path / "there", workers=2).ok
+    assert_same(tmp_path / "here", tmp_path / "there")
+
+
 def test_shards_complete_each_other(finished, tmp_path):
     config, folder = finished
     results = [run_sweeps(config, tmp_path, shard=(number, 3)) for number in (1, 2, 3)]

@@ -1,0 +1,120 @@
+"""Runs that are killed or stopped at any moment, and what becomes of them."""
+
+import os
+import random
+import signal
+import time
+
+import pytest
+import yaml
+
+from sweeping import assert_same, flags, start, study, zwidth
+
+# Few, for each of them costs the start of a program: scripts/kill_and_resume.py tries a hundred.
+MOMENTS = 3
+# Twenty chunks of a million points: enough steps to be stopped between.
+AXES = {
+    "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 1000}},
+    "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 1000}},
+    "delta": {"linear": {"start": 0.0, "stop": 2.0, "num": 10}},
+    "d": [1, 2],
+}
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    """The file of a sweep over many chunks."""
+    path = tmp_path_factory.mktemp("config") / "sweep.yaml"
+    text = yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study("map", AXES)]})
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def undisturbed(config, tmp_path_factory):
+    """Its results, and how long it took to begin and then to end."""
+    folder = tmp_path_factory.mktemp("undisturbed") / "out"
+    started = time.monotonic()
+    process = start("run", config, "--out", folder)
+    begun = wait_for_chunks(process, folder, 1)
+    errors = process.communicate(timeout=300)[1]
+    assert process.returncode == 0, errors
+    return folder, begun - started, time.monotonic() - begun
+
+
+def wait_for_chunks(process, folder, count):
+    """The time at which a run has done some chunks, or is at its end."""
+    deadline = time.monotonic() + 240
+    while len(flags(folder)) < count and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.005)
+    return time.monotonic()
+
+
+def kill_group(process):
+    os.killpg(process.pid, signal.SIGKILL)
+    process.communicate()
+
+
+def test_killed_at_any_moment_a_run_resumes(config, undisturbed, tmp_path):
+    reference, beginning, working = undisturbed
+    moments = random.Random(20061)
+    before = {}
+    for number in range(MOMENTS):
+        process = start("run", config, "--out", tmp_path, "--resume")
+        if number % 3 == 0:
+            # While it starts, makes its store or checks what is there.
+            time.sleep(moments.uniform(0.1, 1.2) * beginning)
+        else:
+            wait_for_chunks(process, tmp_path, len(before) + 1)
+            time.sleep(moments.uniform(0, 0.5 / MOMENTS) * working)
+        kill_group(process)
+        assert before.items() <= flags(tmp_path).items()
+        before = flags(tmp_path)
+    result = zwidth("run", config, "--out", tmp_path, "--resume")
+    assert result.returncode == 0, result.stderr
+    # Nothing that was marked as done was computed again.
+    assert before.items() <= flags(tmp_path).items()
+    assert zwidth("verify", tmp_path).returncode == 0
+    assert_same(reference, tmp_path)
+    assert list(tmp_path.rglob("*.partial")) == []
+
+
+def test_a_parent_that_is_killed_takes_its_workers_along(config, undisturbed, tmp_path):
+    process = start("run", config, "--out", tmp_path, "--workers", "2")
+    wait_for_chunks(process, tmp_path, 2)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    deadline = time.monotonic() + 60
+    while group_lives(process.pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not group_lives(process.pid)
+    result = zwidth("run", config, "--out", tmp_path, "--resume")
+    assert result.returncode == 0, result.stderr
+    assert_same(undisturbed[0], tmp_path)
+
+
+def group_lives(group):
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+@pytest.mark.parametrize("number, options", [(signal.SIGINT, ["--workers", "1"]), (signal.SIGTERM, [])])
+def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number, options):
+    process = start("run", config, "--out", tmp_path / "out", *options)
+    wait_for_chunks(process, tmp_path / "out", 1)
+    os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130, errors
+    assert f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out" in errors
+    assert "--resume" in errors
+    assert "Traceback" not in errors
+
+
+def test_the_plan_is_printed_without_doing_anything(config, tmp_path):
+    result = zwidth("run", config, "--out", tmp_path / "out", "--dry-run")
+    assert result.returncode == 0, result.stderr
+    assert "20,000,000 (d 2 x delta 10 x alpha 1000 x beta 1000)" in result.stdout
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,220 @@
+"""Full disks, folders that cannot be written and damaged stores, as the command line tells of them."""
+
+import json
+import os
+import resource
+import shutil
+from contextlib import contextmanager
+
+import pytest
+import yaml
+
+from sweeping import AXES, assert_same, chunk_file, failing_on_2, flags, flip, main_of, study, zwidth
+
+COMMANDS = [["run"], ["run", "--dry-run"], ["run", "--resume"]]
+
+
+def written(path, *studies):
+    """A configuration file."""
+    path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": list(studies)}), encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    return written(tmp_path_factory.mktemp("config") / "sweep.yaml", study())
+
+
+@pytest.fixture(scope="module")
+def finished(config, tmp_path_factory):
+    """The folder of a run that nothing disturbed."""
+    folder = tmp_path_factory.mktemp("finished") / "out"
+    assert main_of("run", config, "--out", folder) == 0
+    return folder
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    """A copy of it, to be damaged."""
+    shutil.copytree(finished, tmp_path / "out")
+    return tmp_path / "out"
+
+
+@contextmanager
+def as_nobody():
+    """Permissions do not bind root: be somebody else for a moment, with everything imported."""
+    root = os.geteuid() == 0
+    if root:
+        os.setresuid(65534, 65534, 0)
+    try:
+        yield
+    finally:
+        if root:
+            os.setresuid(0, 0, 0)
+
+
+def readable_by_all(folder):
+    """Let another user reach a folder of pytest's."""
+    for path in (folder, *folder.parents):
+        if path.stat().st_uid == os.geteuid() and path.stat().st_mode & 0o077 == 0:
+            path.chmod(path.stat().st_mode | 0o055)
+
+
+def test_no_room_for_a_file_ends_the_run_and_room_lets_it_go_on(tmp_path):
+    def limit():
+        resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, 12_000))
+
+    # Random enough that its chunks do not shrink below the limit.
+    axes = {**AXES, "d": 1, "delta": 0.1, "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 1000}}}
+    config, out = written(tmp_path / "rough.yaml", study(axes=axes, outputs=("margin",))), tmp_path / "out"
+    # A cache of its own: under the limit the compiled kernels stay halves, too.
+    result = zwidth(
+        "run", config, "--out", out, preexec_fn=limit, env={**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    )
+    assert result.returncode == 1
+    first, second = (line for line in result.stderr.splitlines() if line.startswith("zwidth:"))
+    assert first.startswith(f"zwidth: out: {out}: ")
+    assert "File too large" in first
+    assert f"make room and go on with: zwidth run {config} --out {out} --resume" in second
+    for noise in ("Traceback", "UserWarning", "compilation cache"):
+        assert noise not in result.stderr
+    assert list(out.rglob("*.partial")) == []
+    assert main_of("run", config, "--out", out, "--resume") == 0
+    assert main_of("verify", out) == 0
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+@pytest.mark.parametrize("name", ["sweep", "others"])
+def test_a_file_in_the_place_of_the_folder_is_refused(config, words, name, tmp_path, capsys):
+    if name == "others":
+        config = written(tmp_path / "others.yaml", {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0})
+    file = tmp_path / "a_file"
+    file.touch()
+    for out, says in ((file, "is a file"), (file / "below", f"cannot be made, for {file} is a file")):
+        assert main_of(*words, config, "--out", out) == 2
+        message = capsys.readouterr().err
+        assert message.startswith(f"zwidth: out: {out} {says}")
+        assert "choose another" in message
+    assert file.read_bytes() == b""
+
+
+@pytest.mark.usefixtures("finished")
+def test_a_read_only_folder_is_refused(config, tmp_path, capsys):
+    readable_by_all(tmp_path)
+    readable_by_all(config.parent)
+    folder = tmp_path / "locked"
+    folder.mkdir()
+    folder.chmod(0o555)
+    with as_nobody():
+        assert main_of("run", config, "--out", folder / "out") == 2
+    says = f"zwidth: out: {folder}/out cannot be made, for {folder} is read-only, at least to you; choose another"
+    assert capsys.readouterr().err.startswith(says)
+
+
+def test_a_store_that_became_read_only_ends_the_run_with_a_message(config, copy, capsys):
+    next(iter(flags(copy))).unlink()
+    readable_by_all(copy)
+    readable_by_all(config.parent)
+    for path in (copy / "map.zarr").rglob("*"):
+        path.chmod(0o555 if path.is_dir() else 0o444)
+    copy.chmod(0o777)
+    with as_nobody():
+        assert main_of("run", config, "--out", copy, "--resume") == 1
+    assert "Permission denied" in (message := capsys.readouterr().err)
+    assert "go on with: zwidth run" in message
+    assert main_of("run", config, "--out", copy, "--resume") == 0
+
+
+def test_what_the_disk_has_no_room_for_is_refused_before_any_work(config, tmp_path, capsys):
+    axes = {name: {"linear": {"start": 0, "stop": 1, "num": num}} for name, num in (("alpha", 10**6), ("beta", 10**5))}
+    axes |= {"delta": [0.1, 0.2, 0.3, 0.4, 0.5], "d": 1}
+    huge = written(tmp_path / "huge.yaml", study(axes=axes, outputs=("margin",)))
+    assert main_of("run", huge, "--out", tmp_path / "out") == 2
+    assert "free, but the results may take" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "damage, says",
+    [
+        (lambda file: flip(file, 5), "stable is damaged"),
+        (lambda file: file.write_bytes(file.read_bytes()[:-3]), "stable is damaged"),
+        (lambda file: file.write_bytes(b""), "stable is damaged"),
+        (lambda file: file.write_bytes(file.read_bytes() + b"x"), "stable is damaged"),
+        (lambda file: file.unlink(), "stable is missing"),
+    ],
+    ids=["flipped", "truncated", "emptied", "longer", "removed"],
+)
+def test_verify_names_a_damaged_chunk_and_resume_repairs_it_alone(config, finished, copy, damage, says, capsys):
+    damage(chunk_file(copy / "map.zarr", "stable", 3))
+    before = flags(copy)
+    assert main_of("verify", copy) == 1
+    out, err = capsys.readouterr()
+    assert "map.zarr: 8 of 8 chunks done, 1 damaged" in out
+    (line,) = err.splitlines()
+    assert line.startswith(f"zwidth: {copy}/map.zarr: wall/3 (d ")
+    assert line.endswith(f": {says}")
+    assert main_of("verify", copy, "--json") == 1
+    report = json.loads(capsys.readouterr().out)["map.zarr"]
+    assert (report["ok"], report["done"], len(report["damaged"])) == (False, 8, 1)
+    assert main_of("run", config, "--out", copy, "--resume") == 0
+    out, err = capsys.readouterr()
+    assert f"repaired map/{line.partition('map.zarr: ')[2]}" in err
+    assert "8 of 8 chunks done (1 now)" in out
+    assert len(before.items() & flags(copy).items()) == 7
+    assert main_of("verify", copy) == 0
+    assert_same(finished, copy)
+
+
+def test_a_chunk_that_fails_is_named_and_the_exit_code_is_1(config, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("zwidth.sweep.chunks.perform", failing_on_2)
+    assert main_of("run", config, "--out", tmp_path / "out") == 1
+    out, err = capsys.readouterr()
+    assert "7 of 8 chunks done" in out
+    assert "zwidth: chunk map/wall/2 (d 1:2, delta 0:2, alpha 0:40, beta 0:300) failed: ArithmeticError: no" in err
+    assert f"try the failed chunks again with: zwidth run {config} --out {tmp_path}/out --resume" in err
+    assert main_of("verify", tmp_path / "out") == 1
+    assert "map.zarr: 7 of 8 chunks done, none damaged" in capsys.readouterr().out
+
+
+def test_a_store_of_another_configuration_is_refused(finished, tmp_path, capsys):
+    before = flags(finished)
+    changed = written(tmp_path / "changed.yaml", study(axes={**AXES, "delta": [0.0, 0.1, 1.0, 2.5]}))
+    assert main_of("run", changed, "--out", finished, "--resume") == 2
+    key, remedy = capsys.readouterr().err.splitlines()
+    assert "studies[map].axes.delta[3]: the store was made with 3.0, the configuration has 2.5" in key
+    assert "change the configuration back, or choose another folder with --out DIR" in remedy
+    assert flags(finished) == before
+
+
+def test_a_damaged_description_of_a_store_is_told(config, copy, capsys):
+    text = (copy / "map.zarr" / "zarr.json").read_text(encoding="utf-8")
+    for damaged in (text[:100], "", "[]", text.replace("float64", "float32")):
+        (copy / "map.zarr" / "zarr.json").write_text(damaged, encoding="utf-8")
+        assert main_of("verify", copy) == 1
+        assert main_of("run", config, "--out", copy, "--resume") == 2
+        assert "map.zarr/zarr.json: " in capsys.readouterr().err
+
+
+def test_a_folder_without_a_store_is_told(tmp_path, capsys):
+    for words in (["verify", tmp_path], ["export", tmp_path, "--csv", tmp_path / "x.csv"], ["verify", tmp_path / "no"]):
+        assert main_of(*words) == 2
+        assert "holds no store of a sweep" in capsys.readouterr().err
+
+
+def test_the_plan_of_a_configuration_without_sweeps(tmp_path, capsys):
+    config = written(tmp_path / "others.yaml", {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0})
+    assert main_of("run", "--dry-run", config, "--out", tmp_path / "out") == 0
+    assert "study r\n  2 points" in capsys.readouterr().out
+    assert not (tmp_path / "out").exists()
+
+
+def test_other_studies_go_beside_sweeps_that_were_faster(tmp_path, capsys):
+    ridge = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0}
+    config, out = written(tmp_path / "both.yaml", ridge, study()), tmp_path / "out"
+    assert main_of("run", config, "--out", out, "--shard", "2/2") == 0
+    assert not (out / "run.json").exists()
+    assert main_of("run", config, "--out", out, "--shard", "1/2") == 0
+    assert (out / "run.json").is_file()
+    assert (out / "r.csv").is_file()
+    assert main_of("verify", out) == 0
