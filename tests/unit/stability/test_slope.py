@@ -1,5 +1,7 @@
 """The slope of eq. (22) against its limit polynomial, closed forms, and the ridge at strong damping."""
 
+from functools import cache
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,11 +64,16 @@ def test_is_the_limit_of_the_ridge(model):
         np.testing.assert_allclose(ratio, slope, rtol=30 / delta)
 
 
+@cache
+def compiled_slopes(model):
+    return jax.jit(jax.vmap(jax.value_and_grad(lambda d: slope_kernel(d, model))))
+
+
 def slopes_of_slope(d, model):
+    """The slope and its derivative; padded, so that every model is compiled once."""
     with jax.enable_x64(True):
-        d = jnp.asarray(d, dtype=float)
-        first = jax.jit(jax.vmap(jax.value_and_grad(lambda x: slope_kernel(x, model))))
-        return [np.asarray(leaf) for leaf in first(d)]
+        padded = np.resize(np.asarray(d, dtype=float), 16)
+        return [np.asarray(leaf)[: len(d)] for leaf in compiled_slopes(model)(padded)]
 
 
 def test_derivative_in_d():
@@ -81,11 +88,8 @@ def test_derivative_in_d():
 
 
 def test_one_sided_at_whole_delays():
-    at, after, before = (
-        slopes_of_slope([1.0, 2.0, 3.0], "held"),
-        slopes_of_slope([1 + 1e-9, 2 + 1e-9, 3 + 1e-9], "held"),
-        slopes_of_slope([1 - 1e-9, 2 - 1e-9, 3 - 1e-9], "held"),
-    )
+    whole = np.array([1.0, 2.0, 3.0])
+    before, at, after = (slopes_of_slope(whole + step, "held") for step in (-1e-9, 0.0, 1e-9))
     np.testing.assert_allclose(before[0], at[0], rtol=1e-8)
     np.testing.assert_allclose(after[1], at[1], atol=1e-7)
     assert (before[1] < at[1] - 0.1).all()
