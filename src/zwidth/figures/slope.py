@@ -71,7 +71,10 @@ def _label_limits(ax: Axes, data: SlopeData, colors: dict[float, object]) -> Non
     """The delay of each curve to the right of its end, on an axis whose heights are logarithms."""
     low, high = np.log(ax.get_ylim())
     heights = [(float(np.log(limit)) - low) / (high - low) for limit in data.limits]
-    named = {path.d: height for path, height in zip(data.paths, heights, strict=True)}
+    named: dict[float, float] = {}
+    # Where both models are drawn the held one, which comes first, is named.
+    for path, height in sorted(zip(data.paths, heights, strict=True), key=lambda pair: pair[0].delay_model != "held"):
+        named.setdefault(path.d, height)
     places = style.spread(list(named.values()), 0.05)
     for d, place in zip(named, places, strict=True):
         at = (1.015, float(place))
