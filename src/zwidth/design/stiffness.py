@@ -19,6 +19,8 @@ from zwidth.stability.ridge import ridge_kernel
 from zwidth.status import Status
 
 _NAMES = ("mass", "period", "delta", "d")
+# Small enough for the second-level cache, as for `zwidth.alpha_max`.
+_CHUNK = 1 << 13
 
 
 def check_stiffness(stiffness: ArrayLike) -> None:
@@ -62,7 +64,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         19865 N/m
     """
     device = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    return pointwise(_max_stiffness_kernel, _NAMES, (mass, period, device.delta, device.d))
+    return pointwise(_max_stiffness_kernel, _NAMES, (mass, period, device.delta, device.d), chunk=_CHUNK)
 
 
 def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array) -> Array:
@@ -126,7 +128,9 @@ def sensitivities(
     """
     check_delay_model(delay_model)
     device = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    return pointwise(_sensitivities_kernel, _NAMES, (mass, period, device.delta, device.d), (delay_model,))
+    return pointwise(
+        _sensitivities_kernel, _NAMES, (mass, period, device.delta, device.d), (delay_model,), chunk=_CHUNK
+    )
 
 
 def _sensitivities_kernel(mass: Array, period: Array, delta: Array, d: Array, delay_model: str) -> Sensitivities:
