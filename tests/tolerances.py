@@ -111,7 +111,10 @@ RIDGE_SLOPE_FLOOR = Tolerance(
     1e-15, "Relative to |alpha| + |beta| over the unit of the variable: terms of that size are rounded and subtracted."
 )
 RIDGE_CURVATURE = Tolerance(
-    1e-11, "Relative, beside 16 rounding errors of alpha's terms: implicit derivatives divide by alpha'' once."
+    1e-11, "Relative, beside RIDGE_CURVATURE_FLOOR: implicit derivatives divide by alpha'' once."
+)
+RIDGE_CURVATURE_FLOOR = rounding_errors(
+    16, "Relative to |alpha| + |beta| over the units of both variables: about 16 terms of that size are added up."
 )
 RIDGE_ORACLE = Tolerance(1e-11, "Relative: bisection of a slope leaves omega with sqrt(eps) of the curve's curvature.")
 LIMIT_SLOPE = rounding_errors(8, "Relative: the same method as RIDGE, on a plant of three numbers.")

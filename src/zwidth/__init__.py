@@ -13,6 +13,26 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from zwidth.assessment import Assessment as Assessment
     from zwidth.assessment import assess as assess
+    from zwidth.design.area import passive_area as passive_area
+    from zwidth.design.area import stable_area as stable_area
+    from zwidth.design.damping import DampingChoice as DampingChoice
+    from zwidth.design.damping import FastestWall as FastestWall
+    from zwidth.design.damping import fastest_damping as fastest_damping
+    from zwidth.design.damping import fastest_wall as fastest_wall
+    from zwidth.design.damping import modulus_margin as modulus_margin
+    from zwidth.design.damping import most_robust_damping as most_robust_damping
+    from zwidth.design.requirements import Requirement as Requirement
+    from zwidth.design.requirements import allowed_delay as allowed_delay
+    from zwidth.design.requirements import required_damping as required_damping
+    from zwidth.design.requirements import required_mass as required_mass
+    from zwidth.design.requirements import required_period as required_period
+    from zwidth.design.robust import RobustStiffness as RobustStiffness
+    from zwidth.design.robust import RobustWall as RobustWall
+    from zwidth.design.robust import robust_max_stiffness as robust_max_stiffness
+    from zwidth.design.robust import robust_wall as robust_wall
+    from zwidth.design.stiffness import Sensitivities as Sensitivities
+    from zwidth.design.stiffness import max_stiffness as max_stiffness
+    from zwidth.design.stiffness import sensitivities as sensitivities
     from zwidth.errors import ConfigError as ConfigError
     from zwidth.errors import InputError as InputError
     from zwidth.errors import StoreExistsError as StoreExistsError
@@ -51,6 +71,26 @@ if TYPE_CHECKING:
 _HOME = {
     "Assessment": "zwidth.assessment",
     "assess": "zwidth.assessment",
+    "passive_area": "zwidth.design.area",
+    "stable_area": "zwidth.design.area",
+    "DampingChoice": "zwidth.design.damping",
+    "FastestWall": "zwidth.design.damping",
+    "fastest_damping": "zwidth.design.damping",
+    "fastest_wall": "zwidth.design.damping",
+    "modulus_margin": "zwidth.design.damping",
+    "most_robust_damping": "zwidth.design.damping",
+    "Requirement": "zwidth.design.requirements",
+    "allowed_delay": "zwidth.design.requirements",
+    "required_damping": "zwidth.design.requirements",
+    "required_mass": "zwidth.design.requirements",
+    "required_period": "zwidth.design.requirements",
+    "RobustStiffness": "zwidth.design.robust",
+    "RobustWall": "zwidth.design.robust",
+    "robust_max_stiffness": "zwidth.design.robust",
+    "robust_wall": "zwidth.design.robust",
+    "Sensitivities": "zwidth.design.stiffness",
+    "max_stiffness": "zwidth.design.stiffness",
+    "sensitivities": "zwidth.design.stiffness",
     "ConfigError": "zwidth.errors",
     "InputError": "zwidth.errors",
     "StoreExistsError": "zwidth.errors",
@@ -90,11 +130,17 @@ __all__ = [
     "Assessment",
     "BoundaryPoint",
     "ConfigError",
+    "DampingChoice",
     "Device",
+    "FastestWall",
     "InputError",
+    "Requirement",
     "RidgeKind",
     "RidgePoint",
+    "RobustStiffness",
+    "RobustWall",
     "Scene",
+    "Sensitivities",
     "StableRegion",
     "Status",
     "StepResponse",
@@ -104,22 +150,36 @@ __all__ = [
     "VirtualWall",
     "ZwidthError",
     "__version__",
+    "allowed_delay",
     "alpha_max",
     "assess",
     "boundary",
     "boundary_point",
     "char_poly",
     "denormalize",
+    "fastest_damping",
+    "fastest_wall",
     "is_passive",
     "is_stable",
     "load_config",
+    "max_stiffness",
+    "modulus_margin",
+    "most_robust_damping",
     "normalize",
     "open_dataset",
+    "passive_area",
     "passivity_margin",
     "poles",
+    "required_damping",
+    "required_mass",
+    "required_period",
+    "robust_max_stiffness",
+    "robust_wall",
     "run",
+    "sensitivities",
     "spectral_radius",
     "stability_of",
+    "stable_area",
     "stable_region",
     "step_response",
     "stiffness_slope",

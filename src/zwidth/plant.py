@@ -42,30 +42,20 @@ def held_plant(delta: Array, fraction: Array) -> Plant:
     f = fraction
     t = 1.0 - f
     e_t = phi.decay(delta * t)
-    p1_t, p1_f = phi.phi1(delta * t), phi.phi1(delta * f)
-    p2_t, p2_f = phi.phi2(delta * t), phi.phi2(delta * f)
-    psi_t, psi_f = phi.psi(delta * t), phi.psi(delta * f)
-    a2 = t * t * p2_t
-    a1 = t * t * psi_t + t * f * e_t * p1_f + f * f * p2_f + t * f * p1_t * p1_f
-    a0 = e_t * f * f * psi_f
+    at_t, at_f = phi.phi_functions(delta * t), phi.phi_functions(delta * f)
+    a2 = t * t * at_t.phi2
+    a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
+    a0 = e_t * f * f * at_f.psi
     gap = (
-        t * t * phi.gap(delta * t)
-        - t * f * p1_f * (e_t + p1_t)
-        - f * f * (phi.gap(delta * f) + delta * t * p1_t * psi_f)
+        t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
     )
     return Plant(phi.decay(delta), delta * phi.phi1(delta), a2, a1, a0, gap)
 
 
 def undelayed_plant(delta: Array) -> Plant:
     """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
-    return Plant(
-        phi.decay(delta),
-        delta * phi.phi1(delta),
-        phi.phi2(delta),
-        phi.psi(delta),
-        jnp.zeros_like(delta),
-        phi.gap(delta),
-    )
+    at = phi.phi_functions(delta)
+    return Plant(phi.decay(delta), delta * at.phi1, at.phi2, at.psi, jnp.zeros_like(delta), at.gap)
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:

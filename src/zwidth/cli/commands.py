@@ -11,7 +11,7 @@ from zwidth import __version__
 from zwidth.cli import sweeps
 from zwidth.cli.bench import bench
 from zwidth.cli.options import json_option, physical_options
-from zwidth.cli.words import row, verdict_lines
+from zwidth.cli.words import SlopesInWords, row, verdict_lines
 from zwidth.quantities import plain, with_unit
 
 
@@ -73,7 +73,8 @@ def ridge(
 ) -> None:
     """Print the stiffest stable wall of a device.
 
-    The device is given by --delta and --d, or by its physical data.
+    The device is given by --delta and --d, or by its physical data; then what a little more damping, mass, rate or
+    delay would change is printed as well.
     """
     import numpy as np
 
@@ -100,6 +101,10 @@ def ridge(
     if scene is not None:
         wall = scene.to_si(alpha=point.alpha, beta=point.beta)
         result |= {"stiffness_max": float(wall.stiffness), "virtual_damping": float(wall.virtual_damping)}
+        slopes = SlopesInWords.of(scene, delay_model)
+        result["sensitivities"] = slopes.as_dict()
+    else:
+        slopes = None
     if as_json:
         click.echo(json.dumps(result, indent=2, allow_nan=False))
         return
@@ -109,6 +114,8 @@ def ridge(
     if scene is not None:
         click.echo(row("K_max", with_unit(result["stiffness_max"], "N/m")))
         click.echo(row("B", with_unit(result["virtual_damping"], "N s/m")))
+    for line in slopes.lines() if slopes is not None else ():
+        click.echo(line)
 
 
 @cli.command()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from math import isfinite
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,6 +17,44 @@ if TYPE_CHECKING:
 
 def row(label: str, text: str) -> str:
     return f"{label:<22}{text}"
+
+
+@dataclass(frozen=True)
+class SlopesInWords:
+    """The derivatives of K_max of one device: name, value, unit and what a small step comes to."""
+
+    rows: tuple[tuple[str, float, str, str], ...]
+
+    @classmethod
+    def of(cls, scene: Scene, delay_model: str) -> SlopesInWords:
+        from zwidth.design.stiffness import sensitivities, sensitivity_lines
+
+        device = {
+            "mass": scene.device.mass,
+            "damping": scene.device.damping,
+            "period": scene.timing.period,
+            "delay": scene.timing.delay,
+        }
+        gain = sensitivities(**device, delay_model=delay_model)  # pyright: ignore[reportArgumentType]  (click checked it)
+        words = sensitivity_lines(**device, delay_model=delay_model)  # pyright: ignore[reportArgumentType]
+        values = (gain.per_damping, gain.per_mass, gain.per_period, gain.per_delay)
+        names, units = ("damping", "mass", "period", "delay"), ("N s/m", "kg", "s", "s")
+        return cls(tuple(zip(names, map(float, values), units, words, strict=True)))
+
+    def lines(self) -> list[str]:
+        """For people."""
+        symbols = {"damping": "b", "mass": "m", "period": "T", "delay": "t_d"}
+        return [
+            row(f"dK_max/d{symbols[name]}", f"{with_unit(value, f'N/m per {unit}')}: {words}")
+            for name, value, unit, words in self.rows
+        ]
+
+    def as_dict(self) -> dict[str, dict[str, Any]]:
+        """For machines; null stands for an infinite slope, which JSON cannot write."""
+        return {
+            name: {"value": value if isfinite(value) else None, "unit": f"N/m per {unit}"}
+            for name, value, unit, _ in self.rows
+        }
 
 
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:

@@ -6,17 +6,21 @@ import math
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from zwidth._types import Array, ArrayLike
+from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import is_traced, pointwise
 from zwidth.errors import InputError
+from zwidth.loop import check_delay_model
 from zwidth.quantities import with_unit
 from zwidth.scene import normalize
 from zwidth.stability.ridge import ridge_kernel
 from zwidth.status import Status
 
 _NAMES = ("mass", "period", "delta", "d")
+# Small enough for the second-level cache, as for `zwidth.alpha_max`.
+_CHUNK = 1 << 13
 
 
 def check_stiffness(stiffness: ArrayLike) -> None:
@@ -60,7 +64,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         19865 N/m
     """
     device = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    return pointwise(_max_stiffness_kernel, _NAMES, (mass, period, device.delta, device.d))
+    return pointwise(_max_stiffness_kernel, _NAMES, (mass, period, device.delta, device.d), chunk=_CHUNK)
 
 
 def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array) -> Array:
@@ -80,7 +84,12 @@ class Sensitivities(NamedTuple):
 
 
 def sensitivities(
-    *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike, delay: ArrayLike = 0.0
+    *,
+    mass: ArrayLike,
+    damping: ArrayLike = 0.0,
+    period: ArrayLike,
+    delay: ArrayLike = 0.0,
+    delay_model: DelayModel = "held",
 ) -> Sensitivities:
     """Return the stiffest stable wall and what it gains per unit of mass, damping, period and delay.
 
@@ -92,6 +101,7 @@ def sensitivities(
         damping: b in N s/m, >= 0.
         period: T in s, > 0.
         delay: t_d in s, >= 0. All four broadcast.
+        delay_model: "held" (exact) or "fractional_power" (the paper's z^(1+d)).
 
     Returns:
         Sensitivities of the broadcast shape: ``stiffness_max`` in N/m, ``per_mass`` in N/m per kg, ``per_damping``
@@ -104,7 +114,8 @@ def sensitivities(
         Exact derivatives, about 1e-14. At zero damping and at zero delay they are those from the right. At every
         other whole d both sides agree, since a force that arrives a little later moves the sampled position by a
         little times the velocity, which is continuous; second derivatives there are those from the right, and for
-        strong damping the first turns within about m/b around it. Traceable.
+        strong damping the first turns within about m/b around it. With the fractional power strong damping makes
+        ``per_delay`` -inf at zero delay. Traceable.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -115,13 +126,16 @@ def sensitivities(
         >>> print(f"{gain.per_damping:.0f} N/m per N s/m")
         572 N/m per N s/m
     """
+    check_delay_model(delay_model)
     device = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    return pointwise(_sensitivities_kernel, _NAMES, (mass, period, device.delta, device.d))
+    return pointwise(
+        _sensitivities_kernel, _NAMES, (mass, period, device.delta, device.d), (delay_model,), chunk=_CHUNK
+    )
 
 
-def _sensitivities_kernel(mass: Array, period: Array, delta: Array, d: Array) -> Sensitivities:
+def _sensitivities_kernel(mass: Array, period: Array, delta: Array, d: Array, delay_model: str) -> Sensitivities:
     def alpha_and_status(delta: Array, d: Array) -> tuple[Array, Array]:
-        point = ridge_kernel(delta, d, "held")
+        point = ridge_kernel(delta, d, delay_model)
         return point.alpha, point.status
 
     (alpha, status), (by_delta, by_d) = jax.value_and_grad(alpha_and_status, (0, 1), has_aux=True)(delta, d)
@@ -130,7 +144,8 @@ def _sensitivities_kernel(mass: Array, period: Array, delta: Array, d: Array) ->
         alpha * mass * rate * rate,
         (alpha - delta * by_delta) * rate * rate,
         by_delta * rate,
-        (delta * by_delta - d * by_d - 2.0 * alpha) * mass * rate**3,
+        # No delay needs no product, which an infinite slope would make NaN.
+        (delta * by_delta - jnp.where(d > 0.0, d * by_d, 0.0) - 2.0 * alpha) * mass * rate**3,
         by_d * mass * rate**3,
         status,
     )
@@ -141,7 +156,9 @@ def _one_percent(value: float) -> float:
     return 10.0 ** (math.floor(math.log10(value) + 0.5) - 2)
 
 
-def sensitivity_lines(*, mass: float, damping: float = 0.0, period: float, delay: float = 0.0) -> list[str]:
+def sensitivity_lines(
+    *, mass: float, damping: float = 0.0, period: float, delay: float = 0.0, delay_model: DelayModel = "held"
+) -> list[str]:
     """Say in words what a little more of each property of one device buys or costs.
 
     Each line is a derivative times a step: one N s/m, and about one percent of the mass and of the period.
@@ -151,6 +168,7 @@ def sensitivity_lines(*, mass: float, damping: float = 0.0, period: float, delay
         damping: b in N s/m, >= 0.
         period: T in s, > 0.
         delay: t_d in s, >= 0. Single numbers.
+        delay_model: "held" or "fractional_power".
 
     Returns:
         Four lines: damping, mass, sampling period (at the same delay in seconds), delay.
@@ -166,7 +184,7 @@ def sensitivity_lines(*, mass: float, damping: float = 0.0, period: float, delay
     for name, value in (("mass", mass), ("damping", damping), ("period", period), ("delay", delay)):
         if np.ndim(value) != 0:
             raise InputError(f"{name}: got an array of shape {np.shape(value)}; a single number is needed")
-    gain = sensitivities(mass=mass, damping=damping, period=period, delay=delay)
+    gain = sensitivities(mass=mass, damping=damping, period=period, delay=delay, delay_model=delay_model)
     if gain.status != Status.OK:
         raise InputError(f"mass, damping, period, delay: {Status(int(gain.status)).message}")
     step_m, step_t = _one_percent(float(mass)), _one_percent(float(period))
@@ -183,4 +201,6 @@ def _effect(change: float) -> str:
     """ "buys 0.5 kN/m", "costs 3 N/m"."""
     if change == 0:
         return "changes nothing"
+    if not math.isfinite(change):
+        return f"{'buys' if change > 0 else 'costs'} stiffness at an infinite rate at first"
     return f"{'buys' if change > 0 else 'costs'} {with_unit(abs(float(change)), 'N/m', 3)}"

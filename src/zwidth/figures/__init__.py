@@ -6,6 +6,7 @@ an Axes of yours where one is given:
     draw_boundary         Figs. 5, 7, 8: boundaries over alpha and beta
     draw_zero_stiffness   Figs. 6, 9: boundaries over delta and beta for alpha -> 0
     draw_ridge            Fig. 10: maximum stiffness over delta
+    draw_slope            eq. (22): maximum stiffness over strong damping
     draw_step             Fig. 11: step responses
     draw_passivity_cost   stiffest passive and stiffest stable wall over delta
     draw_map              stable, spectral radius or passive over alpha and beta
@@ -16,6 +17,7 @@ from zwidth.figures.boundary import draw_boundary
 from zwidth.figures.passivity_cost import draw_passivity_cost
 from zwidth.figures.recommendation import draw_recommendation
 from zwidth.figures.ridge import draw_ridge
+from zwidth.figures.slope import draw_slope
 from zwidth.figures.stability_map import draw_map
 from zwidth.figures.step import draw_step
 from zwidth.figures.style import house_style, save
@@ -27,6 +29,7 @@ __all__ = [
     "draw_passivity_cost",
     "draw_recommendation",
     "draw_ridge",
+    "draw_slope",
     "draw_step",
     "draw_zero_stiffness",
     "house_style",

@@ -97,6 +97,29 @@ class RidgeData:
 
 
 @dataclass(frozen=True)
+class SlopeCurve:
+    """The slope g(d) of maximum stiffness over strong damping, for one delay model."""
+
+    delay_model: DelayModel
+    d: np.ndarray
+    slope: np.ndarray
+
+
+@dataclass(frozen=True)
+class SlopeData:
+    """alpha_max over delta together with what alpha_max/delta tends to.
+
+    Attributes:
+        limits: g(d) of every path, in their order.
+        curves: g over a range of delays.
+    """
+
+    paths: tuple[RidgePath, ...]
+    limits: tuple[float, ...]
+    curves: tuple[SlopeCurve, ...]
+
+
+@dataclass(frozen=True)
 class PassivityCost:
     """The stiffest stable and the stiffest passive wall over delta, for one delay."""
 

@@ -62,8 +62,13 @@ def alpha_max(
 
     Numerics:
         alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable: `jit`, `vmap`,
-        `grad`, `jvp` and second derivatives, in delta and d. Derivatives at whole d are those from the right.
-        Float64 when called directly; the ambient precision inside somebody's own `jit`.
+        `grad`, `jvp` and second derivatives, in delta and d; NaN where the status is not 0. Float64 when called
+        directly; the ambient precision inside somebody's own `jit`.
+
+        alpha's first derivatives are continuous, also where the corner takes over (d = 0: delta = 3.65936162742...)
+        and at whole d > 0; its second derivatives and the first ones of beta and omega jump there. At a whole d they
+        are those from the right, at the take-over those of the kind that is returned, and omega is left like a square
+        root. With the fractional power a corner exists at d = 0 only: derivatives in d are -inf there.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII, eqs. (24), (25).

@@ -157,17 +157,19 @@ def stationarity(s: Array, curve: Curve, D: Array, delay: str) -> tuple[Array, A
     return first, 2.0 * s * (rho * (2.0 * slope + y * bend) - weighted * ddrho)
 
 
-def ends_in_corner(curve: Curve, D: Array) -> Array:
+def ends_in_corner(curve: Curve, D: Array, known: Array) -> Array:
     """Whether the ridge is the double pole at z = -1: the lobe reaches y = 1 with alpha > 0, still rising.
 
-    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0.
+    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0. ``known`` is
+    `Start.corner`, which decides where it can.
     """
     g1 = sum(curve.g1[1:], curve.g1[0])
     g2 = curve.g2[0] + curve.g2[1]
     value, slope = g1 - g2, curve.g1[1] + 2.0 * curve.g1[2] - 2.0 * g2 - curve.g2[1]
     rho, drho = curve.gap**2, 4.0 * (curve.b * curve.gap - curve.k**2)
     rising = rho * (value + slope) - value * drho >= 0.0
-    return (D <= 1.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0) & rising
+    judged = (D <= 1.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0) & rising
+    return jnp.where(known == 0.0, judged, known > 0.0)
 
 
 class Start(NamedTuple):
@@ -175,12 +177,19 @@ class Start(NamedTuple):
 
     scale: Array  # u = 1/(d + 1)
     strength: Array  # t = r/(r + 3) with r = delta (d + 1): 0 undamped, 1 for delta -> infinity
+    corner: Array  # whether the ridge is a corner, where (delta, d) alone says so: 1 yes, -1 no, 0 unknown
+
+
+# The last smooth delta at d = 0: the corner takes over at 3.6593616274217835070, 4e-18 above this float64. Judged by
+# rounded coefficients of the curve, its next neighbors would fall on either side.
+_TAKE_OVER = 3.6593616274217835
 
 
 def start_of(delta: Array, d: Array) -> Start:
     """Where to begin for one (delta, d)."""
     r = delta * (d + 1.0)
-    return jax.lax.stop_gradient(Start(1.0 / (d + 1.0), r / (r + 3.0)))
+    corner = jnp.where(d == 0.0, jnp.where(delta > _TAKE_OVER, 1.0, -1.0), 0.0)
+    return jax.lax.stop_gradient(Start(1.0 / (d + 1.0), r / (r + 3.0), corner))
 
 
 # For every delta and d, s (d + 1) lies between 0.53 and 1.25, and the fit below is within 4 %: four steps then leave
@@ -191,7 +200,7 @@ _FRACTIONAL_STEPS = 12
 
 def _first(start: Start, lower: Array, upper: Array) -> Array:
     """A fit of s by least squares over delta and d, clipped to the bracket."""
-    u, t = start
+    u, t, _ = start
     return jnp.clip((0.551 + 0.493 * t + (t * u) ** 2 * (1.204 * u - 0.701)) * u, lower, upper)
 
 
@@ -247,8 +256,10 @@ def ridge_point(curve: Curve, D: Array, start: Start, delay: str) -> tuple[Array
     """The s of the ridge, exactly 1 at a corner, and the last step taken; differentiable in ``curve`` and D."""
     solve = _solve_fractional if delay == "fractional_power" else _solve_held
     s, last = solve(curve, D, start)
-    corner = ends_in_corner(curve, D)
-    return jnp.where(corner, 1.0, s), jnp.where(corner, 0.0, last)
+    corner = ends_in_corner(curve, D, start.corner)
+    # Just before the take-over a smooth optimum may round to the corner's place.
+    smooth = jnp.minimum(s, 1.0 - 0.5 * jnp.finfo(s.dtype).eps)
+    return jnp.where(corner, 1.0, smooth), jnp.where(corner, 0.0, last)
 
 
 @ridge_point.defjvp

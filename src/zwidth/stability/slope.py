@@ -63,6 +63,6 @@ def slope_kernel(d: Array, delay: str) -> Array:
     zero, one = jnp.zeros_like(d), jnp.ones_like(d)
     # delta N(z) for delta -> infinity: the velocity follows the force at once, e^-delta and its like vanish.
     plant = Plant(c=zero, em=one, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
-    start = jax.lax.stop_gradient(Start(1.0 / (d + 1.0), one))
+    start = jax.lax.stop_gradient(Start(1.0 / (d + 1.0), one, zero))
     ridge = newton_ridge(plant, lag, start, delay)
     return ridge.alpha * jnp.where(ridge.converged, 1.0, jnp.nan)

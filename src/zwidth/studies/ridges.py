@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from zwidth.figures import draw_ridge
-from zwidth.figures.data import DelayModel, RidgeData, RidgePath
+from zwidth.figures import draw_ridge, draw_slope
+from zwidth.figures.data import DelayModel, RidgeData, RidgePath, SlopeCurve, SlopeData
 from zwidth.stability.ridge import RidgeKind, RidgePoint, alpha_max
+from zwidth.stability.slope import stiffness_slope
 from zwidth.status import Status
 from zwidth.studies.outcome import Outcome, stack
 from zwidth.sweep.studies import RidgeStudy
 
 # Every batch has this size, so that a run with many of them compiles the ridge once for each delay model.
 _BATCH = 4096
+# A path that goes this far shows what alpha_max/delta tends to: within some percent.
+_STRONG_DAMPING = 100.0
+# Delays at which g(d) is sampled between two whole ones; it has kinks at these.
+_SLOPE_SAMPLES = 64
 
 
 def ridges(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> RidgePoint:
@@ -70,5 +77,19 @@ def run_ridge(study: RidgeStudy) -> Outcome:
         more, remarks = ridge_paths(study.delta.values(), delays, model)
         paths += more
         notes += remarks
-    draw = partial(draw_ridge, RidgeData(tuple(paths)), two_scalings=study.figure == "fig10")
-    return Outcome(table=stack(ridge_columns(path) for path in paths), figures={"": draw}, notes=tuple(notes))
+    figures: dict[str, Callable[[], Figure]] = {
+        "": partial(draw_ridge, RidgeData(tuple(paths)), two_scalings=study.figure == "fig10")
+    }
+    if min(float(path.delta.max()) for path in paths) >= _STRONG_DAMPING:
+        figures["_slope"] = partial(draw_slope, slope_data(tuple(paths)))
+    return Outcome(table=stack(ridge_columns(path) for path in paths), figures=figures, notes=tuple(notes))
+
+
+def slope_data(paths: tuple[RidgePath, ...]) -> SlopeData:
+    """Add to paths of maximum stiffness what alpha_max/delta tends to, and that limit over the delay."""
+    limits = tuple(float(stiffness_slope(path.d, delay=path.delay_model)) for path in paths)
+    longest = max(1.0, np.ceil(max(path.d for path in paths)))
+    d = np.linspace(0.0, longest, int(longest) * _SLOPE_SAMPLES + 1)
+    models = dict.fromkeys(path.delay_model for path in paths)
+    curves = tuple(SlopeCurve(model, d, np.asarray(stiffness_slope(d, delay=model))) for model in models)
+    return SlopeData(paths, limits, curves)

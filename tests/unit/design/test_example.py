@@ -31,6 +31,7 @@ def test_the_configuration_is_read():
     config = zwidth.load_config(ROOT / "configs" / "design.yaml")
     assert [study.name for study in config.studies] == [
         "what_damping_buys",
+        "strong_damping",
         "what_each_change_buys",
         "walls",
         "recommended",

@@ -33,6 +33,12 @@ def path(d=0.0, delay_model="held"):
     return records.RidgePath(d, delay_model, delta, (1.0 + delta) / (1.0 + d), 0.5 - 0.1 * delta, delta / 10, kind)
 
 
+def slopes():
+    d = np.linspace(0.0, 1.0, 9)
+    curves = tuple(records.SlopeCurve(model, d, 4.0 - 3.0 * d) for model in ("held", "fractional_power"))
+    return records.SlopeData((path(), path(0.5), path(0.5, "fractional_power")), (4.0, 2.5, 1.5), curves)
+
+
 def interval(d=0.0, delay_model="held"):
     delta = np.linspace(0.0, 2.0, 11)
     return records.DampingInterval(d, delay_model, delta, -delta, 2.0 / (1.0 + d) + delta)
@@ -93,6 +99,7 @@ EVERY_FIGURE = {
     "ridge": lambda ax=None: figures.draw_ridge(
         records.RidgeData((path(), path(0.5), path(0.5, "fractional_power"))), ax
     ),
+    "slope": lambda ax=None: figures.draw_slope(slopes(), ax),
     "passivity cost": lambda ax=None: figures.draw_passivity_cost(records.PassivityData((cost(0.0), cost(1.0))), ax),
     "step": lambda ax=None: figures.draw_step(
         records.StepData((response("first"), response("second", np.nan)), True), ax
@@ -251,6 +258,24 @@ def test_the_ridge_comes_in_two_scalings():
         assert_drawn(far, label, each.delta, each.alpha_max)
         inside = each.delta <= 1.0
         assert_drawn(near, label, each.delta[inside], each.alpha_max[inside])
+
+
+def test_the_slope_is_drawn_beside_its_limit():
+    ratio, limit = drawn("slope").axes
+    given = slopes()
+    for each, value in zip(given.paths, given.limits, strict=True):
+        shown = each.delta >= 0.1
+        label = f"alpha_max/delta, d = {each.d:g}, {each.delay_model}"
+        assert_drawn(ratio, label, each.delta[shown], each.alpha_max[shown] / each.delta[shown])
+        assert any(
+            np.all(line.get_ydata() == value) for line in ratio.lines if line.get_label() == f"g, d = {each.d:g}"
+        )
+    for curve in given.curves:
+        assert_drawn(limit, f"g, {curve.delay_model}", curve.d, curve.slope)
+    # The name of a delay stands at the end of its held curve.
+    places = {text.get_text(): text.xy[1] for text in ratio.texts}
+    low, high = np.log(ratio.get_ylim())
+    assert places["$d = 0.5$"] == pytest.approx((np.log(2.5) - low) / (high - low), abs=0.03)
 
 
 def test_passivity_cost_shows_both_maxima_and_their_ratio():

@@ -10,7 +10,7 @@ from zwidth.studies.boundaries import outline, run_boundary, stable_intervals
 from zwidth.studies.maps import run_map
 from zwidth.studies.outcome import csv_text, stack
 from zwidth.studies.passivity import passive_edge, run_passivity, stiffest_passive, unit_outline
-from zwidth.studies.ridges import needed_models, ridge_paths, run_ridge
+from zwidth.studies.ridges import needed_models, ridge_paths, run_ridge, slope_data
 from zwidth.studies.steps import run_step
 from zwidth.sweep.responses import StepStudy
 from zwidth.sweep.studies import BoundaryStudy, MapStudy, PassivityStudy, RidgeStudy
@@ -110,6 +110,16 @@ def test_a_ridge_study_tables_every_curve():
     outcome = run_ridge(study)
     assert list(outcome.table["delay_model"]) == ["held"] * 4 + ["fractional_power"] * 2
     assert list(outcome.figures) == [""]
+
+
+def test_strong_damping_is_drawn_with_its_limit():
+    study = RidgeStudy.model_validate({"kind": "ridge", "name": "r", "delta": [1, 1e4], "d": [0, 1]})
+    outcome = run_ridge(study)
+    assert list(outcome.figures) == ["", "_slope"]
+    data = slope_data(tuple(ridge_paths(np.array([1.0, 1e4]), np.array([0.0, 1.0]), "held")[0]))
+    assert data.limits == pytest.approx((4.0, 1.0), rel=1e-14)
+    assert [path.alpha_max[-1] / 1e4 for path in data.paths] == pytest.approx(data.limits, rel=1e-3)
+    assert [curve.delay_model for curve in data.curves] == ["held"]
 
 
 def test_an_outline_has_names_for_its_pieces():

@@ -1,0 +1,203 @@
+#!/usr/bin/env python3
+"""Measure alpha_max: how many queries a second with value and gradient, beside optimistix' Newton method.
+
+    python benchmarks/bench_ridge.py [--count 200000] [--json FILE]
+
+Every row is compiled before it is timed, and waited for; the time is the best of several runs. The error beside it is
+the largest relative one over the smooth held points of tests/reference/ridge_extended.json with delta from 1e-3 to
+1e4, for alpha, and for its slopes relative to |slope| + alpha/(1 + delta) and |slope| + alpha.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+
+import zwidth
+from zwidth.loop import frequency_boundary, frequency_loop
+from zwidth.stability.ridge import ridge_kernel
+
+REFERENCE = Path(__file__).resolve().parents[1] / "tests" / "reference" / "ridge_extended.json"
+# On a busy machine the best of many short runs is closest to what the processor can do.
+LEAST_RUNS, LEAST_SECONDS, QUERIES = 7, 3.0, 5000
+
+
+class Row(NamedTuple):
+    """One measurement: time to trace and compile, points a second of wall and of processor time, relative errors."""
+
+    name: str
+    compile_seconds: float
+    compile_processor_seconds: float
+    points_per_second: float
+    points_per_processor_second: float
+    error: float
+    slope_error: float
+
+
+def fast(delta: jax.Array, d: jax.Array) -> jax.Array:
+    """alpha_max of one point by the library's own route."""
+    return ridge_kernel(delta, d, "held").alpha
+
+
+def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
+    """The same with optimistix' Newton method on the slope of the closed-form curve; smooth optima only."""
+
+    def slope(omega: jax.Array, point: tuple[jax.Array, jax.Array]) -> jax.Array:
+        loop = frequency_loop(*point, "held")
+        return jax.grad(lambda w: frequency_boundary(w, loop, "held").alpha)(omega)
+
+    # As good a start as the fast route has, which fits s = sin(omega/2): within 4 %.
+    u, t = 1.0 / (d + 1.0), delta * (d + 1.0) / (delta * (d + 1.0) + 3.0)
+    start = 2.0 * jnp.arcsin(jnp.minimum((0.551 + 0.493 * t + (t * u) ** 2 * (1.204 * u - 0.701)) * u, 0.999))
+    solver = optimistix.Newton(rtol=1e-13, atol=1e-13)
+    omega = optimistix.root_find(
+        slope, solver, jax.lax.stop_gradient(start), args=(delta, d), max_steps=16, throw=False
+    ).value
+    return frequency_boundary(omega, frequency_loop(delta, d, "held"), "held").alpha
+
+
+def timed(call: Callable[[], Any]) -> tuple[float, float]:
+    """The best time of one call, and the least processor time of one, in seconds."""
+    best, least, runs = np.inf, np.inf, 0
+    begin = time.perf_counter()
+    while runs < LEAST_RUNS or time.perf_counter() - begin < LEAST_SECONDS:
+        start, busy = time.perf_counter(), time.process_time()
+        jax.block_until_ready(call())
+        best, least = min(best, time.perf_counter() - start), min(least, time.process_time() - busy)
+        runs += 1
+    return best, least
+
+
+def errors(alpha: Any, by_delta: Any, by_d: Any, rows: list[dict[str, str]]) -> tuple[float, float]:
+    """The largest relative error of alpha and of its slopes at the reference points."""
+    exact = {
+        name: np.array([float(row[name]) for row in rows]) for name in ("alpha", "delta", "alpha_delta", "alpha_d")
+    }
+    size = exact["alpha"]
+    of_slopes = [
+        np.abs(by_delta - exact["alpha_delta"]) / (np.abs(exact["alpha_delta"]) + size / (1 + exact["delta"])),
+        np.abs(by_d - exact["alpha_d"]) / (np.abs(exact["alpha_d"]) + size),
+    ]
+    return float(np.max(np.abs(alpha / size - 1))), float(np.max(of_slopes))
+
+
+def traced_row(name: str, kernel: Callable[..., Any], points: tuple[np.ndarray, ...], rows: list) -> Row:
+    """Value and gradient of one kernel as one program of its own."""
+    function = jax.jit(jax.vmap(jax.value_and_grad(kernel, (0, 1))))
+    start, busy = time.perf_counter(), time.process_time()
+    compiled = function.lower(*points).compile()
+    seconds = time.perf_counter() - start, time.process_time() - busy
+    arguments = [jnp.asarray(column) for column in points]
+    speeds = (points[0].size / best for best in timed(lambda: compiled(*arguments)))
+    alpha, (by_delta, by_d) = function(*reference_points(rows))
+    return Row(name, *seconds, *speeds, *errors(alpha, by_delta, by_d, rows))
+
+
+def reference_points(rows: list[dict[str, str]]) -> tuple[np.ndarray, ...]:
+    return tuple(np.array([float(row[name]) for row in rows]) for name in ("delta", "d"))
+
+
+def public_row(points: tuple[np.ndarray, ...], rows: list) -> Row:
+    """`zwidth.sensitivities` of NumPy arrays: K_max and all four slopes, on every processor."""
+
+    def call(delta: np.ndarray, d: np.ndarray) -> zwidth.Sensitivities:
+        return zwidth.sensitivities(mass=1.0, damping=delta, period=1.0, delay=d)
+
+    start, busy = time.perf_counter(), time.process_time()
+    call(*points)
+    first = time.perf_counter() - start, time.process_time() - busy
+    best = timed(lambda: call(*points))
+    gain = call(*reference_points(rows))
+    return Row(
+        "zwidth.sensitivities",
+        *(with_compilation - without for with_compilation, without in zip(first, best, strict=True)),
+        *(points[0].size / seconds for seconds in best),
+        *errors(gain.stiffness_max, gain.per_damping, gain.per_delay, rows),
+    )
+
+
+def one_query() -> dict[str, float]:
+    """Microseconds of one call for one number, and of a call that computes nothing, through the same door."""
+    zwidth.alpha_max(0.1, 1.0)
+    packed = jax.jit(lambda point: jnp.stack([point[0], point[1], point[0], point[1], point[0]]))
+    point = np.array([0.1, 1.0])
+
+    def many(call: Callable[[], Any]) -> float:
+        """The median of single calls: whatever else runs on the machine interrupts few of them."""
+        times = np.empty(QUERIES)
+        for index in range(QUERIES):
+            start = time.perf_counter()
+            call()
+            times[index] = time.perf_counter() - start
+        return float(np.median(times)) * 1e6
+
+    return {
+        "zwidth.alpha_max": many(lambda: zwidth.alpha_max(0.1, 1.0)),
+        "dispatch": many(lambda: np.asarray(packed(point))),
+    }
+
+
+def measure(count: int) -> dict[str, Any]:
+    """All rows, in float64."""
+    rng = np.random.default_rng(0)
+    # No corners, which the comparison does not know.
+    points = 10 ** rng.uniform(-3, 2, count), rng.uniform(0.3, 8, count)
+    rows = [
+        row
+        for row in json.loads(REFERENCE.read_text())
+        if row["model"] == "held" and row["kind"] == "smooth" and float(row["d"]) > 0.2
+        if 1e-3 <= float(row["delta"]) <= 1e4
+    ]
+    with jax.enable_x64(True):
+        results = [
+            traced_row("fast route", fast, points, rows),
+            public_row(points, rows),
+            traced_row("optimistix Newton", by_optimistix, points, rows),
+        ]
+    return {
+        "count": count,
+        "processors": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "load": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "machine": platform.processor() or platform.machine(),
+        "jax": jax.__version__,
+        "rows": [row._asdict() for row in results],
+        "ratio": results[0].points_per_second / results[2].points_per_second,
+        "one_query_us": one_query(),
+    }
+
+
+def main() -> None:
+    """Print the table; write it where asked."""
+    parser = argparse.ArgumentParser(description="Value and gradient of alpha_max, beside optimistix' Newton method.")
+    parser.add_argument("--count", type=int, default=200_000, help="points in the batch")
+    parser.add_argument("--json", type=Path, help="write the results to this file")
+    options = parser.parse_args()
+    result = measure(options.count)
+    print(f"value and gradient, {result['count']} points, {result['processors']} processors, load {result['load']:.1f}")
+    print(f"{'':<22}{'compile':>9}{'(cpu)':>9}{'points/s':>11}{'per cpu s':>11}{'error':>9}{'of slopes':>11}")
+    for row in result["rows"]:
+        print(
+            f"{row['name']:<22}{row['compile_seconds']:>7.2f} s{row['compile_processor_seconds']:>7.2f} s"
+            f"{row['points_per_second'] / 1e6:>9.2f} M{row['points_per_processor_second'] / 1e6:>9.2f} M"
+            f"{row['error']:>9.0e}{row['slope_error']:>11.0e}"
+        )
+    print(f"fast route over optimistix Newton: {result['ratio']:.1f}")
+    query = result["one_query_us"]
+    print(f"one query: {query['zwidth.alpha_max']:.1f} us, of which dispatch {query['dispatch']:.1f} us")
+    if options.json:
+        options.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

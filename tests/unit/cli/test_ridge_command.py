@@ -1,0 +1,60 @@
+"""What `zwidth ridge` prints: the wall, and what a little more of each property changes, with units."""
+
+import json
+import re
+
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+
+DEVICE = ["--mass", "100 g", "--damping", "10", "--period", "1 ms", "--delay", "1 ms"]
+
+
+def ridge(*arguments):
+    result = CliRunner().invoke(cli, ["ridge", *arguments])
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+def test_sensitivities_are_printed_with_units_and_in_words():
+    assert ridge(*DEVICE).splitlines()[-4:] == [
+        "dK_max/db             572.2 N/m per N s/m: one more N s/m of damping buys 572 N/m",
+        "dK_max/dm             141.4 kN/m per kg: 1 g more mass buys 141 N/m",
+        "dK_max/dT             -15.34 MN/m per s: a sampling period 10 µs shorter buys 153 N/m (same delay in seconds)",
+        "dK_max/dt_d           -18.67 MN/m per s: 10 µs more delay costs 187 N/m",
+    ]
+
+
+def test_machines_get_the_same_numbers():
+    printed = json.loads(ridge(*DEVICE, "--json"))
+    gain = zwidth.sensitivities(mass=0.1, damping=10.0, period=1e-3, delay=1e-3)
+    assert printed["stiffness_max"] == pytest.approx(gain.stiffness_max, rel=1e-14)
+    assert {name: entry["unit"] for name, entry in printed["sensitivities"].items()} == {
+        "damping": "N/m per N s/m",
+        "mass": "N/m per kg",
+        "period": "N/m per s",
+        "delay": "N/m per s",
+    }
+    for name, entry in printed["sensitivities"].items():
+        assert entry["value"] == pytest.approx(getattr(gain, f"per_{name}"), rel=1e-13)
+
+
+def test_an_infinite_slope_is_said_and_is_valid_json():
+    corner = ["--mass", "0.1", "--damping", "500", "--period", "1e-3", "--delay-model", "fractional_power"]
+    assert "10 µs more delay costs stiffness at an infinite rate at first" in ridge(*corner)
+    slopes = json.loads(ridge(*corner, "--json"))["sensitivities"]
+    assert slopes["delay"]["value"] is None
+    assert all(slopes[name]["value"] is not None for name in ("damping", "mass", "period"))
+
+
+def test_a_normalized_device_has_no_si_sensitivities():
+    printed = ridge("--delta", "0.1", "--d", "1")
+    assert not re.search("K_max|per", printed)
+    assert "sensitivities" not in json.loads(ridge("--delta", "0.1", "--d", "1", "--json"))
+
+
+@pytest.mark.parametrize("arguments", [[], ["--delta", "1"], ["--mass", "1"], ["--delta", "1", "--d", "-1"]])
+def test_wrong_use_exits_with_2(arguments):
+    assert CliRunner().invoke(cli, ["ridge", *arguments]).exit_code == 2
