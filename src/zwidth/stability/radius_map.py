@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.grouping import Degree
+from zwidth.grouping import Degree, degree_of
 from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import DeviceWork, Points, assemble, padded, per_device, split_by_degree
 from zwidth.stability.poles import companion_chunk, pole_kernel
@@ -141,6 +141,16 @@ def _alone(degree: Degree) -> DeviceWork:
         return jnp.stack([found.radius, jnp.asarray(found.ok, found.radius.dtype), z.re, z.im])
 
     return DeviceWork(compiled_device(), _apart(kernel), np.float64, _LOOP_PIECE, several=4)
+
+
+def certified_columns(
+    alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray, accuracy: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radii of equally many values of each, all of one degree, and whether each is proved; the others say nothing."""
+    degree = degree_of(d[0])
+    tolerance = np.full(alpha.size, accuracy)
+    values = per_device(_alone(degree), [alpha, beta, tolerance], delta, d)
+    return values[0], values[1] > 0
 
 
 def _by_newton(points: Points, degree: Degree, accuracy: float) -> np.ndarray:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import product
 from typing import TypeAlias
 
@@ -19,6 +20,7 @@ from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.passivity import _sample_count as sample_count
 from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.poles import companion_chunk, radius_by_companion
+from zwidth.stability.radius_map import certified_columns
 from zwidth.stability.ridge import alpha_max
 from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY
 from zwidth.status import Status
@@ -30,6 +32,7 @@ Columns: TypeAlias = tuple[np.ndarray, ...]
 # Small where a point is expensive, for a sweep of a few points pays for a whole piece; the last one is for rows.
 _PIECE = 1 << 9
 _ROW_PIECE = 1 << 12
+_NEWTON_PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
@@ -37,9 +40,11 @@ _MANY_ROWS = 256
 _DECAY = math.log(50.0)
 
 
-def compute(family: Family, outputs: tuple[str, ...], block: Block, methods: dict[str, str]) -> dict[str, np.ndarray]:
+def compute(
+    family: Family, outputs: tuple[str, ...], block: Block, methods: dict[str, str], accuracy: float | None = None
+) -> dict[str, np.ndarray]:
     """Every output of a family on a block, and its status; walls in shape (D, A, B), devices in shape (D,)."""
-    found = _devices(block) if family == "device" else _walls(outputs, block, methods)
+    found = _devices(block) if family == "device" else _walls(outputs, block, methods, accuracy)
     return {name: found[name] for name in (*outputs, STATUS_OF[family])}
 
 
@@ -73,12 +78,15 @@ def _devices(block: Block) -> dict[str, np.ndarray]:
     return found
 
 
-def _walls(outputs: tuple[str, ...], block: Block, methods: dict[str, str]) -> dict[str, np.ndarray]:
+def _walls(
+    outputs: tuple[str, ...], block: Block, methods: dict[str, str], accuracy: float | None
+) -> dict[str, np.ndarray]:
     """What belongs to walls."""
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
     found: dict[str, np.ndarray] = {}
     if {"spectral_radius", "margin", "settling_time"} & set(outputs):
-        found["spectral_radius"] = radius = _radius(block, shape)
+        wanted = accuracy if methods["spectral_radius"] == "newton" else None
+        found["spectral_radius"] = radius = _radius(block, shape, wanted)
         found["margin"] = 1.0 - radius
         if "settling_time" in outputs:
             found["settling_time"] = _settling_time(radius, block)
@@ -173,8 +181,19 @@ def _by_device(
     return result
 
 
-def _radius(block: Block, shape: tuple[int, ...]) -> np.ndarray:
-    return _by_device(_radius_columns, block, shape, _degrees)
+def _radius(block: Block, shape: tuple[int, ...], accuracy: float | None = None) -> np.ndarray:
+    """By companion eigenvalues; to a given accuracy, by Newton's method wherever that is proved."""
+    if accuracy is None:
+        return _by_device(_radius_columns, block, shape, _degrees)
+    return _by_device(lambda columns: _proved_radius_columns(columns, accuracy), block, shape, _degrees)
+
+
+def _proved_radius_columns(columns: Columns, accuracy: float) -> np.ndarray:
+    radius, proved = in_pieces(partial(certified_columns, accuracy=accuracy), columns, _NEWTON_PIECE)
+    rest = ~proved
+    if rest.any():
+        radius[rest] = _radius_columns(tuple(column[rest] for column in columns))
+    return radius
 
 
 def _radius_columns(columns: Columns) -> np.ndarray:

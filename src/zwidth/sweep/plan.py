@@ -6,12 +6,13 @@ import math
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from zwidth.accuracy import choose, table
 from zwidth.errors import ResourceError
 from zwidth.sweep.files import check_folder, existing
 from zwidth.sweep.grid import Grid
@@ -32,6 +33,9 @@ _FEWEST_CHUNKS = 16
 _SMALLEST_CHUNK = 2**15
 _LAID_OUT_BYTES = 96 * 2**20
 _RADIUS_OUTPUTS = {"spectral_radius", "margin", "settling_time"}
+# Closer in, rounding errors spoil the proofs of Newton's method; for longer delays its compilation takes minutes.
+_LEAST_PROVED = 1e-10
+_LONGEST_PROVED = 50.0
 
 Methods: TypeAlias = dict[str, str]
 Rate: TypeAlias = Callable[[str, str, float], float]
@@ -101,6 +105,8 @@ class Plan:
         study: name of the study.
         families: how its outputs are cut into chunks.
         methods: the method of every output that has a choice.
+        reasons: why it is that one.
+        model: what is modelled, in words.
         memory: bytes that a chunk takes while it is computed, at most.
         disk: bytes that the store takes, estimated from above.
         seconds: time on one core, a rough guess.
@@ -109,6 +115,8 @@ class Plan:
     study: str
     families: tuple[FamilyPlan, ...]
     methods: Methods
+    reasons: Methods
+    model: str
     memory: int
     disk: int
     seconds: float
@@ -147,8 +155,9 @@ class Plan:
             yield f"  {', '.join(family.outputs)}"
             yield f"    points   {points:,} ({size or 'one point'})"
             yield f"    chunks   {family.count:,} of {chunk or '1'}"
-        chosen = ", ".join(f"{name} by {method}" for name, method in sorted(self.methods.items()))
-        yield f"  methods    {chosen or 'no choice'}"
+        yield f"  model      {self.model}"
+        for name, method in sorted(self.methods.items()):
+            yield f"  method     {name} by {method}: {self.reasons[name]}"
         yield f"  memory     {_size(self.memory)} a chunk, and {_size(IDLE_MEMORY)} a worker"
         yield f"  disk       {_size(self.disk)} at most"
         yield f"  time       about {_time(self.seconds)} on one core"
@@ -163,8 +172,10 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY, rate: Rate | None = No
         rate: points a second of an output by a method at a number of poles; a rough table where left out.
     """
     grid = Grid(study)
-    methods = choose_methods(study, grid)
-    poles = _most_periods(study, grid) + 4.0
+    chosen = choose_methods(study, grid)
+    methods = {name: method for name, (method, _) in chosen.items()}
+    longest = _most_periods(study, grid)
+    poles = longest + 4.0
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
         slowness = sum(1.0 / (rate or _rate)(name, methods.get(name, ""), poles) for name in _computed(outputs))
@@ -177,7 +188,9 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY, rate: Rate | None = No
         seconds += size * slowness
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
     disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
-    return Plan(study.name, tuple(families), methods, largest + _LAID_OUT_BYTES, disk, seconds)
+    reasons = {name: reason for name, (_, reason) in chosen.items()}
+    model = _model(longest)
+    return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
 def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
@@ -187,7 +200,7 @@ def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
         FamilyPlan(plan.family, plan.outputs, plan.dims, plan.shape, tuple(kept["chunks"][plan.family]))
         for plan in fresh.families
     )
-    return Plan(study.name, families, dict(kept["methods"]), fresh.memory, fresh.disk, fresh.seconds)
+    return replace(fresh, families=families, methods=dict(kept["methods"]))
 
 
 def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
@@ -202,14 +215,43 @@ def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
     return tuple(reversed(chunks))
 
 
-def choose_methods(study: SweepStudy, grid: Grid) -> Methods:
-    """The method of every output that has a choice; it depends on the study alone, never on the machine."""
+def choose_methods(study: SweepStudy, grid: Grid) -> dict[str, tuple[str, str]]:
+    """The method of every output that has a choice, and why; it depends on the study alone, never on the machine."""
     methods = {}
     if "stable" in study.outputs:
-        methods["stable"] = "boundary"
+        methods["stable"] = ("boundary", "no pole is needed: the stiffest stable wall of each row, then a comparison")
     if _RADIUS_OUTPUTS & set(study.outputs):
-        methods["spectral_radius"] = "companion"
+        methods["spectral_radius"] = _radius_method(study, grid)
     return methods
+
+
+def _radius_method(study: SweepStudy, grid: Grid) -> tuple[str, str]:
+    """Newton's method where the shipped table has it within the accuracy and cheaper, else companion eigenvalues."""
+    if study.accuracy is None:
+        return "companion", "no accuracy is given: all digits"
+    longest = _most_periods(study, grid)
+    if study.accuracy < _LEAST_PROVED or longest > _LONGEST_PROVED:
+        return "companion", f"Newton's method proves 1e-10 at best, for delays of up to {_LONGEST_PROVED:g} periods"
+    offered = [cost for cost in table(shipped=True) if cost.method in ("newton", "companion")]
+    choice = choose(
+        "spectral_radius",
+        d=longest,
+        points=grid.size_of("wall"),
+        layout="scattered",
+        accuracy=study.accuracy,
+        costs=offered,
+    )
+    return choice.method, choice.why
+
+
+def _model(longest: float) -> str:
+    """What is modelled, in words."""
+    degree = math.floor(longest) + 3
+    if longest == math.floor(longest):
+        return f"damped mass, zero-order hold, held delay: polynomials of degree up to {degree}"
+    return (
+        f"damped mass, zero-order hold, held delay, also in part of a period: polynomials of degree up to {degree + 1}"
+    )
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
@@ -295,6 +337,8 @@ def _rate(output: str, method: str, poles: float) -> float:
         return 3e8
     if output == "passive":
         return 1.5e6 / poles
+    if method == "newton":
+        return 4e5 * 4.0 / poles
     return 1e6 / (poles / 4.0) ** 2.5
 
 
