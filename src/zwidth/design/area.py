@@ -20,7 +20,7 @@ _NODES, _PANEL_NODES = 48, 12
 # Where the lobe may be cut by the line of real poles it is sampled this often, then bisected.
 _SAMPLES, _BISECTIONS = 256, 52
 _SHORTEST_PANEL, _PANEL_TOLERANCE = 1e-11, 1e-13
-_CHUNK = 1 << 10
+_CHUNK, _LEAST = 1 << 10, 1 << 4
 
 
 def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
@@ -52,7 +52,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{stable_area(0.0, 0):.4f}")
         0.9096
     """
-    return pointwise(_stable_area_kernel, ("delta", "d"), (delta, d), chunk=_CHUNK, fused=False)
+    return pointwise(_stable_area_kernel, ("delta", "d"), (delta, d), chunk=_CHUNK, fused=False, least=_LEAST)
 
 
 def _stable_area_kernel(delta: Array, d: Array) -> Array:

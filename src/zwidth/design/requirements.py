@@ -28,6 +28,8 @@ _LEAST, _MOST = 0.2, 6.0
 # as good as massless.
 _LIMIT = 1e6
 _CHUNK = 1 << 11
+# Smaller batches are filled up: compiling for one more size takes far longer than solving for this many devices.
+_LEAST_BATCH = 1 << 6
 
 
 class Requirement(NamedTuple):
@@ -53,7 +55,7 @@ def _requirement(
 
 
 def _pointwise(kernel: Callable[..., Any], names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Requirement:
-    return pointwise(kernel, names, values, chunk=_CHUNK, fused=False)
+    return pointwise(kernel, names, values, chunk=_CHUNK, fused=False, least=_LEAST_BATCH)
 
 
 def _positive(*values: Array) -> Array:

@@ -21,6 +21,8 @@ from zwidth.status import Status
 _NAMES = ("mass", "period", "delta", "d")
 # Small enough for the second-level cache, as for `zwidth.alpha_max`.
 _CHUNK = 1 << 13
+# Smaller batches are filled up, so that they share a compilation.
+_LEAST = 1 << 6
 
 
 def check_stiffness(stiffness: ArrayLike) -> None:
@@ -64,7 +66,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         19865 N/m
     """
     device = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    return pointwise(_max_stiffness_kernel, _NAMES, (mass, period, device.delta, device.d), chunk=_CHUNK)
+    return pointwise(_max_stiffness_kernel, _NAMES, (mass, period, device.delta, device.d), chunk=_CHUNK, least=_LEAST)
 
 
 def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array) -> Array:
@@ -129,7 +131,7 @@ def sensitivities(
     check_delay_model(delay_model)
     device = normalize(mass=mass, damping=damping, period=period, delay=delay)
     return pointwise(
-        _sensitivities_kernel, _NAMES, (mass, period, device.delta, device.d), (delay_model,), chunk=_CHUNK
+        _sensitivities_kernel, _NAMES, (mass, period, device.delta, device.d), (delay_model,), chunk=_CHUNK, least=_LEAST
     )
 
 

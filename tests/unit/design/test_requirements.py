@@ -106,7 +106,8 @@ def test_derivatives_are_those_of_the_inverse_function(x64):
     def needed(stiffness, mass):
         return required_damping(stiffness, mass=mass, period=1e-3, delay=1e-3).value
 
-    by_stiffness, by_mass = jax.grad(needed, (0, 1))(float(wanted[0]), 0.1)
+    slopes = jax.jit(jax.grad(needed, (0, 1)), compiler_options={"xla_disable_hlo_passes": "fusion"})
+    by_stiffness, by_mass = slopes(float(wanted[0]), 0.1)
     np.testing.assert_allclose(by_stiffness, 1 / gain.per_damping[0], rtol=1e-10)
     np.testing.assert_allclose(by_mass, -gain.per_mass[0] / gain.per_damping[0], rtol=1e-10)
 
