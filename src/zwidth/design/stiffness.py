@@ -131,7 +131,12 @@ def sensitivities(
     check_delay_model(delay_model)
     device = normalize(mass=mass, damping=damping, period=period, delay=delay)
     return pointwise(
-        _sensitivities_kernel, _NAMES, (mass, period, device.delta, device.d), (delay_model,), chunk=_CHUNK, least=_LEAST
+        _sensitivities_kernel,
+        _NAMES,
+        (mass, period, device.delta, device.d),
+        (delay_model,),
+        chunk=_CHUNK,
+        least=_LEAST,
     )
 
 
