@@ -208,11 +208,14 @@ def _solve_held(curve: Curve, D: Array, start: Start) -> tuple[Array, Array]:
     """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
     lower, upper = 0.5 * start.scale, jnp.minimum(1.0, 1.3 * start.scale)
     s = _first(start, lower, upper)
-    before = s
-    for _ in range(_HELD_STEPS):
+
+    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        s, _ = state
         value, slope = stationarity(s, curve, D, "held")
-        before, s = s, jnp.clip(s - value / slope, lower, upper)
-    return s, s - before
+        new = jnp.clip(s - value / slope, lower, upper)
+        return new, new - s
+
+    return jax.lax.fori_loop(0, _HELD_STEPS, step, (s, s))
 
 
 def _solve_fractional(curve: Curve, D: Array, start: Start) -> tuple[Array, Array]:
