@@ -90,6 +90,6 @@ def slope_data(paths: tuple[RidgePath, ...]) -> SlopeData:
     limits = tuple(float(stiffness_slope(path.d, delay=path.delay_model)) for path in paths)
     longest = max(1.0, np.ceil(max(path.d for path in paths)))
     d = np.linspace(0.0, longest, int(longest) * _SLOPE_SAMPLES + 1)
-    models: dict[DelayModel, None] = dict.fromkeys(path.delay_model for path in paths)
+    models: dict[DelayModel, None] = {path.delay_model: None for path in paths}
     curves = tuple(SlopeCurve(model, d, np.asarray(stiffness_slope(d, delay=model))) for model in models)
     return SlopeData(paths, limits, curves)

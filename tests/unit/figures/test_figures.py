@@ -268,7 +268,9 @@ def test_the_slope_is_drawn_beside_its_limit():
         label = f"alpha_max/delta, d = {each.d:g}, {each.delay_model}"
         assert_drawn(ratio, label, each.delta[shown], each.alpha_max[shown] / each.delta[shown])
         assert any(
-            np.all(line.get_ydata() == value) for line in ratio.lines if line.get_label() == f"g, d = {each.d:g}"
+            np.all(np.asarray(line.get_ydata()) == value)
+            for line in ratio.lines
+            if line.get_label() == f"g, d = {each.d:g}"
         )
     for curve in given.curves:
         assert_drawn(limit, f"g, {curve.delay_model}", curve.d, curve.slope)
