@@ -95,11 +95,12 @@ def map_flat(
     chunk: int = CHUNK,
     fused: bool = True,
     least: int = 1,
+    threads: int | None = None,
 ) -> Any:
     """Apply a one-point kernel to every row of equally long columns, in float64; NumPy leaves come back.
 
-    Pieces hold ``chunk`` points and run on as many threads as there are processors. A piece is never shorter than
-    ``least``: the compiler treats very short ones differently, to the last place.
+    Pieces hold ``chunk`` points and run on ``threads`` threads, by default as many as there are processors. A piece is
+    never shorter than ``least``: the compiler treats very short ones differently, to the last place.
     """
     count = columns[0].size
     function = _compiled(kernel, static, fused)
@@ -122,8 +123,8 @@ def map_flat(
     store(0, first)
     if count > size:
         # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
-        with ThreadPoolExecutor(_processors()) as threads:
-            list(threads.map(lambda start: store(start, run(start)), range(size, count, size)))
+        with ThreadPoolExecutor(threads or _processors()) as pool:
+            list(pool.map(lambda start: store(start, run(start)), range(size, count, size)))
     return whole
 
 

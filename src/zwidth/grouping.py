@@ -51,11 +51,12 @@ def by_degree(
     static: tuple[Any, ...] = (),
     lead: bool = False,
     chunk: Callable[[Degree], int] = lambda degree: batching.CHUNK,
+    threads: int | None = None,
 ) -> Any:
     """Apply ``kernel(alpha, beta, delta, d, degree, *static)`` to points whose delays may differ.
 
     Results that are vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for
-    coefficients) or NaN behind (for poles).
+    coefficients) or NaN behind (for poles). ``threads`` as for `zwidth.batching.map_flat`.
     """
     if batching.is_traced(*values):
         return _by_degree_traced(kernel, values, static, lead)
@@ -64,7 +65,7 @@ def by_degree(
     parts, places = [], []
     for degree, index in groups(columns[3]):
         picked = [column[index] for column in columns]
-        parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree)))
+        parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), threads=threads))
         places.append(index)
     if not parts:
         parts, places = [batching.map_flat(kernel, columns, (Degree(0, False), *static))], [np.arange(0)]

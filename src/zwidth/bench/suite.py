@@ -111,6 +111,12 @@ def measure(sizes: Sizes, tell: Callable[[str], None] = lambda _: None) -> list[
     return rows
 
 
+def _fewer(points: int, d: float) -> int:
+    """As many points as take about the same time at long delays; where all poles are computed, far fewer."""
+    slower = (1.0 + d / 8.0) ** 2 if points <= 20_000 else 1.0 + d / 40.0
+    return max(16, int(points / slower))
+
+
 def _possible(method: str, d: float) -> bool:
     return d <= _LONGEST.get(method, np.inf)
 
@@ -144,7 +150,7 @@ def _labels(d: float, sizes: Sizes) -> Iterator[Row]:
             ("map", problems.grid, sizes.map_points),
             ("scattered", problems.scattered, sizes.map_points // 16),
         ):
-            walls = make(d, min(points, slow.get(method, points)) // (1 + int(d) // 40))
+            walls = make(d, _fewer(min(points, slow.get(method, points)), d))
             first, warm = clock(lambda classify=classify, walls=walls: classify(walls))
             yield Row("stable", method, dtype, layout, d, walls.points, first, walls.points / warm, *error)
 
@@ -161,14 +167,14 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
         error = radius_error(radius, d, sizes.roots)
         largest = {"newton": sizes.map_points // 4}.get(method, 20_000)
         for layout, make in (("map", problems.grid), ("scattered", problems.scattered)):
-            walls = make(d, (largest if layout == "map" else min(largest, 100_000)) // (1 + int(d) // 10))
+            walls = make(d, _fewer(largest if layout == "map" else min(largest, 100_000), d))
             first, warm = clock(lambda radius=radius, walls=walls: radius(walls))
             yield Row("spectral_radius", method, "float64", layout, d, walls.points, first, walls.points / warm, *error)
     for name, tool in available().items():
         if d > 50 or (tool.only_whole and d != int(d)):
             continue
         error = radius_error(tool.radius, d, sizes.roots)
-        walls = problems.scattered(d, max(20, tool.points // (1 + int(d) // 4)))
+        walls = problems.scattered(d, max(20, _fewer(tool.points, d)))
         first, warm = clock(lambda tool=tool, walls=walls: tool.radius(walls))
         rate = walls.points / warm
         yield Row("spectral_radius", name, "float64", "scattered", d, walls.points, first, rate, *error, baseline=True)

@@ -11,6 +11,10 @@ from zwidth.loop import check_has_poles, coefficients, evaluate, plant_of, poiso
 # The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
 _POLISHING_STEPS = 3
 
+# XLA hands eigenvalues of a batch to threads of its own and waits for them: two batches at one time were seen to wait
+# for each other for ever.
+_THREADS = 1
+
 
 def companion(monic: Array) -> Array:
     """The companion matrix whose eigenvalues are the zeros of a monic polynomial, highest power first."""
@@ -84,17 +88,17 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
         np.True_
     """
     check_has_poles(delay)
-    return by_degree(pole_kernel, (alpha, beta, delta, d), chunk=companion_chunk)
+    return by_degree(pole_kernel, (alpha, beta, delta, d), chunk=companion_chunk, threads=_THREADS)
 
 
 def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
     """The spectral radius at every point, from the poles."""
-    return by_degree(radius_kernel, (alpha, beta, delta, d), chunk=companion_chunk)
+    return by_degree(radius_kernel, (alpha, beta, delta, d), chunk=companion_chunk, threads=_THREADS)
 
 
 def unstable_poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
     """How many poles lie on or outside the unit circle; -1 where the input is out of range."""
-    return by_degree(_count_kernel, (alpha, beta, delta, d), chunk=companion_chunk)
+    return by_degree(_count_kernel, (alpha, beta, delta, d), chunk=companion_chunk, threads=_THREADS)
 
 
 def _count_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
