@@ -73,6 +73,7 @@ def markdown(rows: Sequence[Row]) -> str:
         "which one was wrong; of a number, the largest relative one.",
         "",
     ]
+    lines += _questions(rows)
     reference = {row.d: row.rate for row in rows if row.method == REFERENCE}
     for quantity, title in _TITLES.items():
         lines += [
@@ -93,6 +94,30 @@ def markdown(rows: Sequence[Row]) -> str:
             )
         lines.append("")
     return "\n".join(lines)
+
+
+# What may be asked of a map, from the least to the most, and what answers it.
+_QUESTIONS = {
+    "stable or not": ("stable", "boundary", "map"),
+    "stable or not, each label proved": ("stable", "certified", "map"),
+    "the largest pole, to 1e-9, proved": ("spectral_radius", "newton", "map"),
+    "all poles": ("spectral_radius", "companion", "map"),
+    "the stiffest wall of as many devices": ("alpha_max", "newton", "scattered"),
+}
+
+
+def _questions(rows: Sequence[Row]) -> list[str]:
+    """What is saved by asking for no more than is needed: time of a million points."""
+    delays = sorted({row.d for row in rows})
+    lines = ["### What each question costs", "", "Seconds for a million points, compilation apart.", ""]
+    lines += [f"| question | {' | '.join(f'd = {d:g}' for d in delays)} |", "|---|" + "--:|" * len(delays)]
+    for question, key in _QUESTIONS.items():
+        cells = []
+        for d in delays:
+            rates = [row.rate for row in rows if (row.quantity, row.method, row.layout) == key and row.d == d]
+            cells.append(f"{1e6 / rates[0]:.2g}" if rates else "")
+        lines.append(f"| {question} | {' | '.join(cells)} |")
+    return [*lines, ""]
 
 
 def summary(rows: Sequence[Row]) -> str:
