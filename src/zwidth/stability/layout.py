@@ -164,11 +164,11 @@ def point_ok(points: Points) -> np.ndarray:
     return np.isfinite(points.alpha) & np.isfinite(points.beta) & device_ok(points)
 
 
-def pieces(count: int, piece: int = PIECE) -> Iterator[tuple[slice, int]]:
-    """Slices that cover ``count`` values, each with the compiled size to which it is padded."""
+def pieces(count: int, piece: int = PIECE, least: int = 1) -> Iterator[tuple[slice, int]]:
+    """Slices that cover ``count`` values, each with the compiled size to which it is padded, not below ``least``."""
     for start in range(0, count, piece):
         stop = min(start + piece, count)
-        yield slice(start, stop), min(piece, 1 << max(stop - start - 1, 0).bit_length())
+        yield slice(start, stop), min(piece, max(least, 1 << max(stop - start - 1, 0).bit_length()))
 
 
 def padded(column: np.ndarray, size: int) -> np.ndarray:
@@ -189,6 +189,7 @@ class DeviceWork(NamedTuple):
     dtype: Any
     piece: int = PIECE
     several: int = 0
+    least: int = 1  # a shorter batch is filled up: the compiler treats very short ones differently, to the last place
 
 
 def per_device(work: DeviceWork, columns: list[np.ndarray], delta: np.ndarray, d: np.ndarray) -> np.ndarray:
@@ -218,7 +219,7 @@ def _in_pieces(
     out = np.empty((work.several, count) if work.several else count, work.dtype)
     with jax.enable_x64(True):
         fields = fields_of(work, delta, d) if shared else None
-        for part, size in pieces(count, work.piece):
+        for part, size in pieces(count, work.piece, work.least):
             if fields is None:
                 # Not shared, so there are several devices, each point with its own.
                 rows = np.asarray(owner)[part]

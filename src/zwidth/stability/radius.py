@@ -179,13 +179,20 @@ def over(left: Pole, right: Pole) -> Pole:
 
 
 def newton(z: Pole, steps: int, alpha: Array, beta: Array, device: Device, degree: Degree) -> tuple[Pole, Pole]:
-    """So many steps from z; the result, and the last step."""
-    step = z
-    for _ in range(steps):
+    """So many steps from z; the result, and the last step.
+
+    A loop, not a chain: fused, a chain computes every step again for each step that follows.
+    """
+
+    def step(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        z = Pole(state[0], state[1])
         at = evaluate(z, alpha, beta, device, degree)
-        step = over(at.value, at.slope)
-        z = Pole(z.re - step.re, z.im - step.im)
-    return z, step
+        by = over(at.value, at.slope)
+        return z.re - by.re, z.im - by.im, by.re, by.im
+
+    zero = jnp.zeros_like(z.re * alpha * beta)
+    found = jax.lax.fori_loop(0, steps, step, (z.re + zero, z.im + zero, zero, zero))
+    return Pole(found[0], found[1]), Pole(found[2], found[3])
 
 
 class Accepted(NamedTuple):
@@ -216,16 +223,6 @@ def start(alpha: Array, beta: Array, high: Array, device: Device, degree: Degree
     real = discriminant >= 0
     re = jnp.where(real, half + jnp.where(half < 0, -root, root), half)
     return Pole(re * high, jnp.where(real, 0.0, root) * high)
-
-
-def single(
-    alpha: Array, beta: Array, device: Device, degree: Degree, coarse: int, steps: int, tolerance: Array
-) -> tuple[Accepted, Pole]:
-    """The radius of a point without neighbors: coarse bisection, Newton, certificate."""
-    low, high = bracket(alpha, beta, device, degree)
-    _, high = bisect(alpha, beta, low, high, coarse, device, degree)
-    z, step = newton(start(alpha, beta, high, device, degree), steps, alpha, beta, device, degree)
-    return accept(z, step, tolerance, alpha, beta, device, degree), z
 
 
 def sure_error(alpha: Array, beta: Array, radius: Array, accuracy: Array, device: Device, degree: Degree) -> Array:

@@ -21,7 +21,18 @@ from zwidth.grouping import Degree, degree_of
 from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import DeviceWork, Points, assemble, padded, per_device, split_by_degree
 from zwidth.stability.poles import companion_chunk, pole_kernel
-from zwidth.stability.radius import Pole, accept, bisect, bracket, evaluate, newton, over, single, sure_error
+from zwidth.stability.radius import (
+    Accepted,
+    Pole,
+    accept,
+    bisect,
+    bracket,
+    evaluate,
+    newton,
+    over,
+    start,
+    sure_error,
+)
 
 # Points along each side of a cell that shares one node.
 _CELL = 16
@@ -35,6 +46,7 @@ _STEPS_ALONE = 4
 COMPANION_POLES = 40
 # Kernels that pass over their points many times work on as many as stay in the cache.
 _LOOP_PIECE = 1 << 12
+_LEAST = 64
 
 
 class Radii(NamedTuple):
@@ -126,21 +138,51 @@ def _coarse_steps(degree: Degree) -> int:
     return steps_for(0.03 / degree.poles, degree)
 
 
-def _apart(kernel: Callable[..., Any]) -> Any:
-    """Compile operation by operation: fused, XLA computes what several steps share again for each of them."""
-    return jax.jit(kernel, compiler_options={"xla_disable_hlo_passes": "fusion"})
+class _Stages(NamedTuple):
+    """The way to one pole, each stage compiled apart: fused, XLA computes what two of them share over and over."""
+
+    coarse: Callable[..., Any]  # an upper bound of the radius
+    first: Callable[..., Any]  # the largest pole, roughly
+    steps: Callable[..., Any]  # the pole and the last step
+    last: Callable[..., Any]  # radius, and whether it is proved
+
+    def pole(self, alpha: Any, beta: Any, fields: Any) -> tuple[Any, ...]:
+        """Real and imaginary part of the pole and of the last step."""
+        high = self.coarse(alpha, beta, fields)
+        return self.steps(*self.first(alpha, beta, high, fields), alpha, beta, fields)
+
+
+@cache
+def _stages(degree: Degree) -> _Stages:
+    def coarse(alpha: Array, beta: Array, fields: Array) -> Array:
+        device = Device(*fields)
+        low, high = bracket(alpha, beta, device, degree)
+        return bisect(alpha, beta, low, high, _coarse_steps(degree), device, degree)[1]
+
+    def first(alpha: Array, beta: Array, high: Array, fields: Array) -> tuple[Array, ...]:
+        z = start(alpha, beta, high, Device(*fields), degree)
+        return z.re, z.im
+
+    def steps(re: Array, im: Array, alpha: Array, beta: Array, fields: Array) -> tuple[Array, ...]:
+        z, step = newton(Pole(re, im), _STEPS_ALONE, alpha, beta, Device(*fields), degree)
+        return z.re, z.im, step.re, step.im
+
+    def last(re, im, step_re, step_im, tolerance: Array, alpha: Array, beta: Array, fields: Array) -> Accepted:
+        return accept(Pole(re, im), Pole(step_re, step_im), tolerance, alpha, beta, Device(*fields), degree)
+
+    return _Stages(*map(jax.jit, (coarse, first, steps, last)))
 
 
 @cache
 def _alone(degree: Degree) -> DeviceWork:
-    """Radius, acceptance and pole of points without neighbors."""
+    """Radius and acceptance of points without neighbors."""
+    stages = _stages(degree)
 
-    def kernel(alpha: Array, beta: Array, tolerance: Array, fields: Array) -> Array:
-        device = Device(*fields)
-        found, z = single(alpha, beta, device, degree, _coarse_steps(degree), _STEPS_ALONE, tolerance)
-        return jnp.stack([found.radius, jnp.asarray(found.ok, found.radius.dtype), z.re, z.im])
+    def kernel(alpha: Any, beta: Any, tolerance: Any, fields: Any) -> np.ndarray:
+        found = stages.last(*stages.pole(alpha, beta, fields), tolerance, alpha, beta, fields)
+        return np.stack([np.asarray(found.radius), np.asarray(found.ok, np.float64)])
 
-    return DeviceWork(compiled_device(), _apart(kernel), np.float64, _LOOP_PIECE, several=4)
+    return DeviceWork(compiled_device(), kernel, np.float64, _LOOP_PIECE, several=2, least=_LEAST)
 
 
 def certified_columns(
@@ -186,14 +228,21 @@ def _map_axes(points: Points) -> tuple[int, int] | None:
 def _cells(degree: Degree) -> Any:
     """The compiled work on nodes, and on the points of their cells; arrays (cells, points, cells, points)."""
 
-    def node(alpha: Array, beta: Array, tolerance: Array, fields: Array) -> Array:
-        device = Device(*fields)
-        alpha, beta = jnp.broadcast_arrays(alpha, beta)
-        _, z = single(alpha, beta, device, degree, _coarse_steps(degree), _STEPS_ALONE, tolerance)
-        at = evaluate(z, alpha, beta, device, degree)
+    stages = _stages(degree)
+
+    def slopes(re: Array, im: Array, alpha: Array, beta: Array, fields: Array) -> Array:
+        z = Pole(re, im)
+        at = evaluate(z, alpha, beta, Device(*fields), degree)
         by_alpha = over(z * at.n, at.slope)
         by_beta = over(z.shifted(-1.0) * at.n, at.slope)
         return jnp.stack([alpha, beta, z.re, z.im, -by_alpha.re, -by_alpha.im, -by_beta.re, -by_beta.im])
+
+    compiled = jax.jit(slopes)
+
+    def node(alpha: np.ndarray, beta: np.ndarray, fields: Any) -> Any:
+        alpha, beta = (np.ascontiguousarray(array) for array in np.broadcast_arrays(alpha, beta))
+        re, im, _, _ = stages.pole(alpha, beta, fields)
+        return compiled(re, im, alpha, beta, fields)
 
     def cell(alpha: Array, beta: Array, tolerance: Array, nodes: Array, fields: Array) -> tuple[Array, Array]:
         device = Device(*fields)
@@ -204,7 +253,7 @@ def _cells(degree: Degree) -> Any:
         found = accept(z, step, tolerance, alpha, beta, device, degree)
         return found.radius, found.ok
 
-    return _apart(node), jax.jit(cell)
+    return node, jax.jit(cell)
 
 
 def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
@@ -225,7 +274,7 @@ def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
             pair = (down[:, :, None, None], across[None, None])
             alpha, beta = pair if transposed else pair[::-1]
             middle = (pair[0][:, _CELL // 2, None], pair[1][..., _CELL // 2, None])
-            nodes = node(*(middle if transposed else middle[::-1]), tolerance, fields)
+            nodes = node(*(middle if transposed else middle[::-1]), fields)
             here, good = cell(alpha, beta, tolerance, nodes, fields)
             stop = min(top + height, rows)
             for whole, part in ((radius, here), (ok, good)):
