@@ -2,15 +2,22 @@
 
 import json
 import os
-import resource
 import shutil
+import subprocess
+import sys
 from contextlib import contextmanager
 
 import pytest
 import yaml
 
-from sweeping import AXES, assert_same, chunk_file, failing_on_2, flags, flip, main_of, study, zwidth
+from sweeping import AXES, assert_same, chunk_file, command, failing_on_2, flags, flip, main_of, study
 
+# A limit set between fork and exec would have Python code run in a copy of a process with JAX's threads.
+LIMITED = """
+import os, resource, sys
+resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, 12_000))
+os.execv(sys.argv[1], sys.argv[1:])
+"""
 COMMANDS = [["run"], ["run", "--dry-run"], ["run", "--resume"]]
 
 
@@ -61,16 +68,13 @@ def readable_by_all(folder):
 
 
 def test_no_room_for_a_file_ends_the_run_and_room_lets_it_go_on(tmp_path):
-    def limit():
-        resource.setrlimit(resource.RLIMIT_FSIZE, (12_000, 12_000))
-
     # Random enough that its chunks do not shrink below the limit.
     axes = {**AXES, "d": 1, "delta": 0.1, "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 1000}}}
     config, out = written(tmp_path / "rough.yaml", study(axes=axes, outputs=("margin",))), tmp_path / "out"
     # A cache of its own: under the limit the compiled kernels stay halves, too.
-    result = zwidth(
-        "run", config, "--out", out, preexec_fn=limit, env={**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
-    )
+    environment = {**os.environ, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    words = [sys.executable, "-c", LIMITED, *command("run", config, "--out", out)]
+    result = subprocess.run(words, capture_output=True, text=True, check=False, timeout=300, env=environment)
     assert result.returncode == 1
     first, second = (line for line in result.stderr.splitlines() if line.startswith("zwidth:"))
     assert first.startswith(f"zwidth: out: {out}: ")

@@ -278,6 +278,9 @@ def fastest_wall(delta: float, d: float) -> FastestWall:
         A search over alpha, each step of which is `fastest_damping`. Several poles meet at the optimum: the radius is
         right to about 1e-5 (what float64 knows of a triple pole), alpha and beta to about 1e-3.
 
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17).
+
     Example:
         >>> from zwidth.design import fastest_wall
         >>> wall = fastest_wall(0.0, 0)

@@ -152,6 +152,9 @@ def robust_wall(
         Bisection over K, to 1e-9, assuming that a wall can always be made softer. It holds for the sampled devices;
         for those between them it is evidence, not proof.
 
+    References:
+        Hulin, Preusche, Hirzinger 2006, sections V, VII.
+
     Example:
         >>> from zwidth.design import robust_wall
         >>> wall = robust_wall(mass=0.1, damping=10, period=1e-3, delay=1e-3)
