@@ -211,7 +211,9 @@ def accept(
     outside = circle(alpha, beta, inverse * (1.0 - tolerance), device, degree)
     allowed = tolerance / (degree.poles + 1)
     near = step.square < allowed * allowed * square
-    return Accepted(square * inverse, outside.sure & near)
+    # Of a real pole no root need be taken: the one at z = 1 of a wall without stiffness stays exactly there.
+    radius = jnp.where(z.im == 0, jnp.abs(z.re), square * inverse)
+    return Accepted(radius, outside.sure & near)
 
 
 def start(alpha: Array, beta: Array, high: Array, device: Device, degree: Degree) -> Pole:

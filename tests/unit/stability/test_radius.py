@@ -134,3 +134,9 @@ def test_inside_a_transformation(method, x64):
     assert got == pytest.approx(float(exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-8)
     with pytest.raises(InputError, match="newton"):
         jax.jit(lambda alpha: zwidth.spectral_radius(alpha, 0.5, 0.1, 1.5, method="newton"))(0.5)
+
+
+def test_a_wall_without_stiffness_keeps_its_pole_at_one_exactly():
+    found = radius_of(0.0, np.linspace(0.0, 0.5, 9), 0.1, 1.5, method="newton")
+    assert found.certified.any()
+    np.testing.assert_array_equal(found.radius[found.certified], 1.0)
