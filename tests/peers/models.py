@@ -1,4 +1,4 @@
-"""The closed loop as peers see it: built from differential equations with scipy's matrix exponential alone.
+"""The device and the closed loop from their differential equations, by scipy's matrix exponential alone.
 
 Nothing here shares a formula with the library: no phi-function, no normalized polynomial.
 """
@@ -17,34 +17,6 @@ def advance(mass, damping, duration):
     generator = np.array([[0.0, 1.0, 0.0], [0.0, -damping / mass, 1.0 / mass], [0.0, 0.0, 0.0]])
     step = expm(generator * duration)
     return step[:2, :2], step[:2, 2]
-
-
-def held_loop(mass, damping, period, stiffness, virtual_damping, d):
-    """The closed loop's state matrix for any delay d = n + f, by expm over the two parts of the period.
-
-    State: x_k, v_k, x_(k-1), and the forces computed at k-1, ..., k-1-n. Period k is driven by the force of k-1-n
-    during [0, f T) and by that of k-n afterwards.
-    """
-    n = int(np.floor(d))
-    f = d - n
-    first, by_older = advance(mass, damping, f * period)
-    second, by_newer = advance(mass, damping, (1.0 - f) * period)
-    size = 3 + n + 1
-    loop = np.zeros((size, size))
-    feedback = np.zeros(size)
-    feedback[0] = -(stiffness + virtual_damping / period)
-    feedback[2] = virtual_damping / period
-    loop[:2, :2] = second @ first
-    loop[:2, 3 + n] += second @ by_older
-    if n == 0:
-        loop[:2] += np.outer(by_newer, feedback)
-    else:
-        loop[:2, 3 + n - 1] += by_newer
-    loop[2, 0] = 1.0
-    loop[3] = feedback
-    for k in range(n):
-        loop[4 + k, 3 + k] = 1.0
-    return loop
 
 
 def simulate(mass, damping, period, stiffness, virtual_damping, d, force, fractions, periods):

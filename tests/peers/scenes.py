@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import expm
+
+from peers.models import advance
 
 COUNT = 200
 
@@ -56,12 +57,9 @@ def continuous(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
 
 
 def held(loop: Loop, duration: float) -> tuple[np.ndarray, np.ndarray]:
-    """The state after ``duration`` from the state and from a force held for that long, by a matrix exponential."""
-    a, b = continuous(loop)
-    block = np.zeros((3, 3))
-    block[:2, :2], block[:2, 2:] = a, b
-    whole = expm(block * duration)
-    return whole[:2, :2], whole[:2, 2:]
+    """The state after ``duration`` from the state and from a force held for that long."""
+    transition, by_force = advance(loop.mass, loop.damping, duration)
+    return transition, by_force[:, None]
 
 
 def closed_loop_matrix(loop: Loop) -> np.ndarray:

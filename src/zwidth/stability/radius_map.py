@@ -70,15 +70,14 @@ def steps_for(accuracy: float, degree: Degree) -> int:
     return max(1, ceil(log2(log(2.0 * degree.poles) / accuracy)))
 
 
-def bisected(points: Points, accuracy: float, steps: int | None = None) -> Radii:
-    """Bisection alone: as many steps as the accuracy needs, or the given number."""
-    return _collected(points, lambda degree, part: _bisected(part, degree, accuracy, steps))
+def bisected(points: Points, accuracy: float) -> Radii:
+    """Bisection alone, in as many steps as the accuracy needs."""
+    return _collected(points, lambda degree, part: _bisected(part, degree, accuracy))
 
 
-def _bisected(points: Points, degree: Degree, accuracy: float, steps: int | None) -> np.ndarray:
-    count = steps_for(accuracy, degree) if steps is None else steps
+def _bisected(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
     shape = points.shape
-    constants = [np.broadcast_to(np.float64(value), (1,) * len(shape)) for value in (count, accuracy)]
+    constants = [np.full((1,) * len(shape), value, np.float64) for value in (steps_for(accuracy, degree), accuracy)]
     return per_device(_bisection(degree), [points.alpha, points.beta, *constants], points.delta, points.d)
 
 
@@ -227,7 +226,6 @@ def _map_axes(points: Points) -> tuple[int, int] | None:
 @cache
 def _cells(degree: Degree) -> Any:
     """The compiled work on nodes, and on the points of their cells; arrays (cells, points, cells, points)."""
-
     stages = _stages(degree)
 
     def slopes(re: Array, im: Array, alpha: Array, beta: Array, fields: Array) -> Array:
