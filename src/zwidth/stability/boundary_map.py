@@ -21,6 +21,8 @@ from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY, long_de
 _WORTH_COMPILING = 1 << 16
 # A place in the order that no count reaches: alpha <= 0 and NaN are never stable.
 _NEVER = np.iinfo(np.int16).max
+# A pattern is as long as two rows: with fewer rows it would be a cost of its own.
+_ENOUGH_ROWS = 8
 
 
 class BoundaryMap(NamedTuple):
@@ -81,24 +83,42 @@ def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
     if np.prod(shape) < _WORTH_COMPILING:
         return (alpha > 0) & (alpha < limit)
     varying = [axis for axis, length in enumerate(alpha.shape) if length > 1]
-    if len(varying) == 1 and limit.shape[varying[0]] == 1 and alpha.size < _NEVER:
-        return _compare_places(alpha, limit)
+    if len(varying) == 1 and limit.shape[varying[0]] == 1:
+        values = alpha.reshape(-1)
+        if varying[0] == alpha.ndim - 1 and limit.size >= _ENOUGH_ROWS and np.all(values[1:] >= values[:-1]):
+            return _copied_rows(values, limit)
+        if alpha.size < _NEVER:
+            return _compare_places(alpha, limit)
     with jax.enable_x64(True):
         return np.asarray(_compiled("between")(alpha, limit))
+
+
+def _copied_rows(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """The same for ascending alpha along the last axis: each row is a piece of one pattern, copied at memory speed.
+
+    The pattern is true up to its middle; a row that ends after ``count`` alphas starts ``count`` before the middle.
+    """
+    pattern = np.zeros(2 * alpha.size, bool)
+    pattern[: alpha.size] = True
+    pieces = np.lib.stride_tricks.sliding_window_view(pattern, alpha.size)
+    stable: np.ndarray = pieces[alpha.size - _below(alpha, limit)]
+    not_positive = np.searchsorted(alpha, 0.0, side="right")
+    if not_positive:
+        stable[:, :not_positive] = False
+    return stable.reshape(*limit.shape[:-1], alpha.size)
+
+
+def _below(ordered: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """How many alphas lie below each limit; none where the limit is NaN, which would sort last."""
+    return np.searchsorted(ordered, np.where(np.isnan(limit), -np.inf, limit).reshape(-1))
 
 
 def _compare_places(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
     """The same by places in the order of alpha: 16 bits a value, five times the speed of 64, and exact."""
     values = alpha.reshape(-1)
-    if np.all(values[1:] >= values[:-1]):
-        ordered, place = values, np.arange(values.size, dtype=np.int16)
-    else:
-        order = np.argsort(values, kind="stable")
-        ordered = values[order]
-        place = np.empty(values.size, np.int16)
-        place[order] = np.arange(values.size, dtype=np.int16)
+    order = np.argsort(values, kind="stable")
+    place = np.empty(values.size, np.int16)
+    place[order] = np.arange(values.size, dtype=np.int16)
     place = np.where(values > 0, place, np.int16(_NEVER))
-    # How many alphas lie below the limit; none where the limit is NaN, which would sort last.
-    ends = np.where(np.isnan(limit), 0.0, limit).reshape(-1)
-    count = np.searchsorted(ordered, ends).astype(np.int16)
+    count = _below(values[order], limit).astype(np.int16)
     return np.asarray(_compiled("less")(place.reshape(alpha.shape), count.reshape(limit.shape)))

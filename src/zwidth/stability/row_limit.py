@@ -33,9 +33,10 @@ from zwidth.stability.devices import Device, device
 VERIFIED_DELAY = 500.0
 VERIFIED_DAMPING = 1e6
 
-# From the starting points below each sequence doubles its digits a step; the last step only confirms.
+# From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
+# 2 leave a row with some 2e-9 of its frequency, which the step in alpha behind them squares.
 _END_STEPS = 6
-_ROW_STEPS = 3
+_ROW_STEPS = 2
 
 _SIN = [1.0, -1 / 6, 1 / 120, -1 / 5040, 1 / 362880, -1 / 39916800, 1 / 6227020800, -1 / 1307674368000]
 _ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
