@@ -47,7 +47,8 @@ def polynomial(alpha: Array, beta: Array, device: Device, degree: Degree) -> End
 
 def labels(alpha: Array, beta: Array, device: Device, degree: Degree, doubt: bool = False) -> Array:
     """The label of each point, or with ``doubt`` 1 for stable plus 2 for doubtful; any broadcast shapes, one dtype."""
-    gate = (alpha > 0) & (device.tilt * (alpha + 2.0 * beta) < 1.0)
+    # What does not depend on alpha stands apart: XLA takes it out of the loop along alpha.
+    gate = (alpha > 0) & (device.tilt * alpha < 1.0 - device.tilt * (2.0 * beta))
     if degree == Degree(0, False):
         stable = gate & _cubic(alpha, beta, device)
         return stable.astype(jnp.int8) if doubt else stable
@@ -63,8 +64,8 @@ def labels(alpha: Array, beta: Array, device: Device, degree: Degree, doubt: boo
 
 def _cubic(alpha: Array, beta: Array, device: Device) -> Array:
     b = beta + device.delta
-    left = device.a1 * alpha * (device.p1 + device.a2 * b)
-    return (jnp.abs(device.a1 * beta) < 1.0) & (left < device.p1 * b * (1.0 - device.a1 * beta))
+    damped = device.a1 * beta
+    return (jnp.abs(damped) < 1.0) & (alpha * (device.a1 * (device.p1 + device.a2 * b)) < device.p1 * b * (1.0 - damped))
 
 
 @cache
