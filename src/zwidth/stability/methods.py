@@ -14,7 +14,7 @@ from zwidth.errors import InputError, check_choice
 from zwidth.loop import check_has_poles
 from zwidth.stability import traced
 from zwidth.stability.boundary_map import boundary_map
-from zwidth.stability.layout import Points, lay_out, point_ok
+from zwidth.stability.layout import Points, lay_out, picked, point_ok
 from zwidth.stability.poles import unstable_poles
 from zwidth.stability.radius_map import COMPANION_POLES, Radii, bisected, by_companion, by_newton
 from zwidth.stability.schur_cohn import schur_cohn_map
@@ -243,7 +243,7 @@ def _by_boundary(points: Points) -> tuple[np.ndarray, Any]:
     known = np.broadcast_to(found.known, points.shape)
     rest = ~known
     stable = found.stable.copy()
-    stable[rest] = schur_cohn_map(_picked(points, rest))
+    stable[rest] = schur_cohn_map(picked(points, rest))
     return stable, np.where(known, Method.BOUNDARY, Method.SCHUR_COHN)
 
 
@@ -252,12 +252,8 @@ def _recursion_first(points: Points) -> tuple[np.ndarray, np.ndarray]:
     stable, doubtful = (code & 1).astype(bool), code >= 2
     used = np.where(doubtful, Method.BOUNDARY, Method.SCHUR_COHN)
     if doubtful.any():
-        stable[doubtful], used[doubtful] = _by_boundary(_picked(points, doubtful))
+        stable[doubtful], used[doubtful] = _by_boundary(picked(points, doubtful))
     return stable, used
-
-
-def _picked(points: Points, mask: np.ndarray) -> Points:
-    return Points(*(array[mask] for array in np.broadcast_arrays(*points)))
 
 
 def _certified(points: Points) -> tuple[np.ndarray, Any, np.ndarray]:

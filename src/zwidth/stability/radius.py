@@ -81,15 +81,21 @@ def bracket(alpha: Array, beta: Array, device: Device, degree: Degree) -> tuple[
 def bisect(
     alpha: Array, beta: Array, low: Array, high: Array, steps: Array | int, device: Device, degree: Degree
 ) -> tuple[Array, Array]:
-    """Halve the logarithm of a bracket so many times; its upper end always passes the test."""
+    """Halve the logarithm of a bracket so many times; its upper end always passes the test.
 
-    def step(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = jnp.sqrt(low * high)
-        inside = circle(alpha, beta, 1.0 / middle, device, degree, margin=False).inside
-        return jnp.where(inside, low, middle), jnp.where(inside, middle, high)
+    The lower end is the upper one times a width that shrinks the same way everywhere: with one number to decide about,
+    not two, XLA runs the test once a step.
+    """
 
-    return jax.lax.fori_loop(0, steps, step, (low, high))
+    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+        inverse, half = state
+        middle = inverse * half
+        inside = circle(alpha, beta, middle, device, degree, margin=False).inside
+        return jnp.where(inside, middle, inverse), jnp.sqrt(half)
+
+    inverse, half = jax.lax.fori_loop(0, steps, step, (1.0 / high, jnp.sqrt(high / low)))
+    high = 1.0 / inverse
+    return high / (half * half), high
 
 
 @dataclass(frozen=True)
@@ -181,31 +187,24 @@ def over(left: Pole, right: Pole) -> Pole:
 def newton(z: Pole, steps: int, alpha: Array, beta: Array, device: Device, degree: Degree) -> tuple[Pole, Pole]:
     """So many steps from z; the result, and the last step.
 
-    A loop, not a chain: fused, a chain computes every step again for each step that follows.
+    XLA makes one loop over the points out of all steps, and of what comes before and behind, where a single array
+    comes out at the end; with two it would compute every step again for each step that follows.
     """
-
-    def step(_: int, state: tuple[Array, ...]) -> tuple[Array, ...]:
-        z = Pole(state[0], state[1])
+    by = z
+    for _ in range(steps):
         at = evaluate(z, alpha, beta, device, degree)
         by = over(at.value, at.slope)
-        return z.re - by.re, z.im - by.im, by.re, by.im
-
-    zero = jnp.zeros_like(z.re * alpha * beta)
-    found = jax.lax.fori_loop(0, steps, step, (z.re + zero, z.im + zero, zero, zero))
-    return Pole(found[0], found[1]), Pole(found[2], found[3])
-
-
-class Accepted(NamedTuple):
-    """|z|, and whether the radius is proved to lie within the tolerance of it."""
-
-    radius: Array
-    ok: Array
+        z = Pole(z.re - by.re, z.im - by.im)
+    return z, by
 
 
 def accept(
     z: Pole, step: Pole, tolerance: Array | float, alpha: Array, beta: Array, device: Device, degree: Degree
-) -> Accepted:
-    """The certificate: a pole is near z, and every pole is inside ``|z|(1 + tolerance)``."""
+) -> Array:
+    """The certificate: a pole is near z, and every pole is inside ``|z|(1 + tolerance)``.
+
+    |z| where that is proved, ``-|z|`` where it is not: one array for two results, see `newton`.
+    """
     square = z.square
     inverse = _inverse_root(square)
     outside = circle(alpha, beta, inverse * (1.0 - tolerance), device, degree)
@@ -213,15 +212,17 @@ def accept(
     near = step.square < allowed * allowed * square
     # Of a real pole no root need be taken: the one at z = 1 of a wall without stiffness stays exactly there.
     radius = jnp.where(z.im == 0, jnp.abs(z.re), square * inverse)
-    return Accepted(radius, outside.sure & near)
+    return jnp.where(outside.sure & near, radius, -radius)
 
 
 def start(alpha: Array, beta: Array, high: Array, device: Device, degree: Degree) -> Pole:
     """The largest zero of the quadratic left over on a circle just outside the largest pole, times its radius."""
-    q2, q1, q0 = circle(alpha, beta, 1.0 / high, device, degree, margin=False).quadratic
-    half = -0.5 * q1 / q2
-    discriminant = half * half - q0 / q2
-    root = jnp.sqrt(jnp.abs(discriminant))
+    q2, q1, q0 = circle(alpha, beta, _reciprocal(high), device, degree, margin=False).quadratic
+    scale = _reciprocal(q2)
+    half = -0.5 * q1 * scale
+    discriminant = half * half - q0 * scale
+    size = jnp.abs(discriminant)
+    root = size * _inverse_root(size)
     real = discriminant >= 0
     re = jnp.where(real, half + jnp.where(half < 0, -root, root), half)
     return Pole(re * high, jnp.where(real, 0.0, root) * high)

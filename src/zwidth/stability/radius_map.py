@@ -19,10 +19,9 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.grouping import Degree, degree_of
 from zwidth.stability.devices import Device, compiled_device
-from zwidth.stability.layout import DeviceWork, Points, assemble, padded, per_device, split_by_degree
+from zwidth.stability.layout import DeviceWork, Points, assemble, padded, per_device, picked, split_by_degree
 from zwidth.stability.poles import companion_chunk, pole_kernel
 from zwidth.stability.radius import (
-    Accepted,
     Pole,
     accept,
     bisect,
@@ -41,7 +40,9 @@ _BAND = 16
 # Smaller maps are not worth a compilation of their own.
 _WORTH_CELLS = 1 << 14
 _STEPS_IN_CELL = 3
-_STEPS_ALONE = 4
+# Up to this degree XLA makes one loop over the points of many Newton steps; of more it would make several, and each
+# would compute all steps before it again.
+_STEPS_IN_ONE = 40
 # Up to this degree the few points that no certificate accepts get companion eigenvalues.
 COMPANION_POLES = 40
 # Kernels that pass over their points many times work on as many as stay in the cache.
@@ -87,8 +88,9 @@ def _bisection(degree: Degree) -> DeviceWork:
         device = Device(*fields)
         low, high = bracket(alpha, beta, device, degree)
         low, high = bisect(alpha, beta, low, high, jnp.int32(steps[0]), device, degree)
-        half = 0.5 * (high - low)
-        radius = low + half
+        # The lower end is known to some ulp.
+        half = 0.5 * (high - low) + 4e-15 * high
+        radius = 0.5 * (low + high)
         beyond = sure_error(alpha, beta, high, accuracy, device, degree)
         return jnp.stack([radius, half + beyond, jnp.zeros_like(radius)])
 
@@ -132,56 +134,79 @@ def by_newton(points: Points, accuracy: float) -> Radii:
     return _collected(points, lambda degree, part: _by_newton(part, degree, accuracy))
 
 
-def _coarse_steps(degree: Degree) -> int:
-    """Halvings after which the radius is known to a small part of the distance between poles."""
-    return steps_for(0.03 / degree.poles, degree)
+class _Effort(NamedTuple):
+    """How near the start comes before Newton's method takes over, and how many steps of it follow."""
+
+    known: float  # the radius, to this part of it over the degree: the distance between poles
+    steps: int
 
 
-class _Stages(NamedTuple):
-    """The way to one pole, each stage compiled apart: fused, XLA computes what two of them share over and over."""
+# Nearly all points need the first; where two poles are almost equally large, or almost meet, the second tells them
+# apart.
+_EFFORTS = (_Effort(0.03, 4), _Effort(1e-6, 9))
 
-    coarse: Callable[..., Any]  # an upper bound of the radius
-    first: Callable[..., Any]  # the largest pole, roughly
-    steps: Callable[..., Any]  # the pole and the last step
-    last: Callable[..., Any]  # radius, and whether it is proved
 
-    def pole(self, alpha: Any, beta: Any, fields: Any) -> tuple[Any, ...]:
-        """Real and imaginary part of the pole and of the last step."""
-        high = self.coarse(alpha, beta, fields)
-        return self.steps(*self.first(alpha, beta, high, fields), alpha, beta, fields)
+class _Search(NamedTuple):
+    """The way to the largest pole of a point by itself, in stages compiled apart, each with one array as its result."""
+
+    coarse: Callable[..., Any]  # (alpha, beta, steps, fields) -> an upper bound of the radius
+    near: Callable[..., Any]  # (steps, alpha, beta, bound, fields) -> the pole, complex, after so many Newton steps
+    step: Callable[..., Any]  # (pole, alpha, beta, fields) -> the pole after one more
+    last: Callable[..., Any]  # (pole, alpha, beta, tolerance, fields) -> the radius, negative where it is not proved
 
 
 @cache
-def _stages(degree: Degree) -> _Stages:
-    def coarse(alpha: Array, beta: Array, fields: Array) -> Array:
+def _search(degree: Degree) -> _Search:
+    def coarse(alpha: Array, beta: Array, steps: Array, fields: Array) -> Array:
         device = Device(*fields)
         low, high = bracket(alpha, beta, device, degree)
-        return bisect(alpha, beta, low, high, _coarse_steps(degree), device, degree)[1]
+        return bisect(alpha, beta, low, high, steps, device, degree)[1]
 
-    def first(alpha: Array, beta: Array, high: Array, fields: Array) -> tuple[Array, ...]:
-        z = start(alpha, beta, high, Device(*fields), degree)
-        return z.re, z.im
+    def follow(steps: int, z: Pole, alpha: Array, beta: Array, fields: Array) -> Array:
+        z, _ = newton(z, steps, alpha, beta, Device(*fields), degree)
+        return jax.lax.complex(z.re, z.im)
 
-    def steps(re: Array, im: Array, alpha: Array, beta: Array, fields: Array) -> tuple[Array, ...]:
-        z, step = newton(Pole(re, im), _STEPS_ALONE, alpha, beta, Device(*fields), degree)
-        return z.re, z.im, step.re, step.im
+    def near(steps: int, alpha: Array, beta: Array, high: Array, fields: Array) -> Array:
+        return follow(steps, start(alpha, beta, high, Device(*fields), degree), alpha, beta, fields)
 
-    def last(re, im, step_re, step_im, tolerance: Array, alpha: Array, beta: Array, fields: Array) -> Accepted:
-        return accept(Pole(re, im), Pole(step_re, step_im), tolerance, alpha, beta, Device(*fields), degree)
+    def last(z: Array, alpha: Array, beta: Array, tolerance: Array, fields: Array) -> Array:
+        device = Device(*fields)
+        found, step = newton(Pole(z.real, z.imag), 1, alpha, beta, device, degree)
+        return accept(found, step, tolerance, alpha, beta, device, degree)
 
-    return _Stages(*map(jax.jit, (coarse, first, steps, last)))
+    compiled = jax.jit(near, static_argnums=0)
+    one = jax.jit(lambda z, *values: follow(1, Pole(z.real, z.imag), *values))
+
+    def near_stepwise(steps: int, alpha: Any, beta: Any, high: Any, fields: Any) -> Any:
+        z = compiled(0, alpha, beta, high, fields)
+        for _ in range(steps):
+            z = one(z, alpha, beta, fields)
+        return z
+
+    return _Search(jax.jit(coarse), compiled if _is_short(degree) else near_stepwise, one, jax.jit(last))
+
+
+def _is_short(degree: Degree) -> bool:
+    return degree.poles <= _STEPS_IN_ONE
 
 
 @cache
-def _alone(degree: Degree) -> DeviceWork:
-    """Radius and acceptance of points without neighbors."""
-    stages = _stages(degree)
+def _alone(degree: Degree, effort: int) -> DeviceWork:
+    """The radius of points without neighbors, negative where it is not proved."""
+    search = _search(degree)
+    halvings = np.int32(steps_for(_EFFORTS[effort].known / degree.poles, degree))
 
-    def kernel(alpha: Any, beta: Any, tolerance: Any, fields: Any) -> np.ndarray:
-        found = stages.last(*stages.pole(alpha, beta, fields), tolerance, alpha, beta, fields)
-        return np.stack([np.asarray(found.radius), np.asarray(found.ok, np.float64)])
+    def kernel(alpha: Any, beta: Any, tolerance: Any, fields: Any) -> Any:
+        high = search.coarse(alpha, beta, halvings, fields)
+        z = search.near(_EFFORTS[effort].steps - 1, alpha, beta, high, fields)
+        return search.last(z, alpha, beta, tolerance, fields)
 
-    return DeviceWork(compiled_device(), kernel, np.float64, _LOOP_PIECE, several=2, least=_LEAST)
+    return DeviceWork(compiled_device(), kernel, np.float64, _LOOP_PIECE, least=_LEAST)
+
+
+def _alone_at(points: Points, degree: Degree, accuracy: float, effort: int) -> np.ndarray:
+    tolerance = np.broadcast_to(np.float64(accuracy), (1,) * len(points.shape))
+    return per_device(_alone(degree, effort), [points.alpha, points.beta, tolerance], points.delta, points.d)
 
 
 def certified_columns(
@@ -189,9 +214,17 @@ def certified_columns(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Radii of equally many values of each, all of one degree, and whether each is proved; the others say nothing."""
     degree = degree_of(d[0])
-    tolerance = np.full(alpha.size, accuracy)
-    values = per_device(_alone(degree), [alpha, beta, tolerance], delta, d)
-    return values[0], values[1] > 0
+    points = Points(alpha, beta, delta, d)
+    found = _alone_at(points, degree, accuracy, 0)
+    _again(points, degree, accuracy, found)
+    return np.abs(found), found > 0
+
+
+def _again(points: Points, degree: Degree, accuracy: float, found: np.ndarray) -> None:
+    """Try what was not proved with more effort, in place."""
+    left = ~(found > 0)
+    if np.any(left):
+        found[left] = _alone_at(picked(points, left), degree, accuracy, 1)
 
 
 def _by_newton(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
@@ -226,10 +259,10 @@ def _map_axes(points: Points) -> tuple[int, int] | None:
 @cache
 def _cells(degree: Degree) -> Any:
     """The compiled work on nodes, and on the points of their cells; arrays (cells, points, cells, points)."""
-    stages = _stages(degree)
+    search = _search(degree)
 
-    def slopes(re: Array, im: Array, alpha: Array, beta: Array, fields: Array) -> Array:
-        z = Pole(re, im)
+    def slopes(pole: Array, alpha: Array, beta: Array, fields: Array) -> Array:
+        z = Pole(pole.real, pole.imag)
         at = evaluate(z, alpha, beta, Device(*fields), degree)
         by_alpha = over(z * at.n, at.slope)
         by_beta = over(z.shifted(-1.0) * at.n, at.slope)
@@ -239,19 +272,33 @@ def _cells(degree: Degree) -> Any:
 
     def node(alpha: np.ndarray, beta: np.ndarray, fields: Any) -> Any:
         alpha, beta = (np.ascontiguousarray(array) for array in np.broadcast_arrays(alpha, beta))
-        re, im, _, _ = stages.pole(alpha, beta, fields)
-        return compiled(re, im, alpha, beta, fields)
+        effort = _EFFORTS[0]
+        high = search.coarse(alpha, beta, np.int32(steps_for(effort.known / degree.poles, degree)), fields)
+        return compiled(search.near(effort.steps, alpha, beta, high, fields), alpha, beta, fields)
 
-    def cell(alpha: Array, beta: Array, tolerance: Array, nodes: Array, fields: Array) -> tuple[Array, Array]:
-        device = Device(*fields)
+    def placed(alpha: Array, beta: Array, nodes: Array) -> Pole:
         alpha0, beta0, re, im, re_a, im_a, re_b, im_b = nodes
         da, db = alpha - alpha0, beta - beta0
-        z = Pole(re + re_a * da + re_b * db, im + im_a * da + im_b * db)
-        z, step = newton(z, _STEPS_IN_CELL, alpha, beta, device, degree)
-        found = accept(z, step, tolerance, alpha, beta, device, degree)
-        return found.radius, found.ok
+        return Pole(re + re_a * da + re_b * db, im + im_a * da + im_b * db)
 
-    return node, jax.jit(cell)
+    def cell(alpha: Array, beta: Array, tolerance: Array, nodes: Array, fields: Array) -> Array:
+        device = Device(*fields)
+        z, step = newton(placed(alpha, beta, nodes), _STEPS_IN_CELL, alpha, beta, device, degree)
+        return accept(z, step, tolerance, alpha, beta, device, degree)
+
+    def complex_start(alpha: Array, beta: Array, nodes: Array) -> Array:
+        z = placed(alpha, beta, nodes)
+        return jax.lax.complex(z.re, z.im)
+
+    first = jax.jit(complex_start)
+
+    def cell_stepwise(alpha: Any, beta: Any, tolerance: Any, nodes: Any, fields: Any) -> Any:
+        z = first(alpha, beta, nodes)
+        for _ in range(_STEPS_IN_CELL - 1):
+            z = search.step(z, alpha, beta, fields)
+        return search.last(z, alpha, beta, tolerance, fields)
+
+    return node, jax.jit(cell) if _is_short(degree) else cell_stepwise
 
 
 def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
@@ -261,7 +308,7 @@ def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
     outer, inner = (points.alpha, points.beta) if transposed else (points.beta, points.alpha)
     rows, columns = outer.size, inner.size
     across = _cut(inner.reshape(-1), _CELL)
-    radius, ok = np.empty((rows, columns)), np.empty((rows, columns), bool)
+    found = np.empty((rows, columns))
     node, cell = _cells(degree)
     tolerance = np.full((1, 1, 1, 1), accuracy)
     height = _BAND * _CELL
@@ -273,12 +320,10 @@ def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
             alpha, beta = pair if transposed else pair[::-1]
             middle = (pair[0][:, _CELL // 2, None], pair[1][..., _CELL // 2, None])
             nodes = node(*(middle if transposed else middle[::-1]), fields)
-            here, good = cell(alpha, beta, tolerance, nodes, fields)
+            here = cell(alpha, beta, tolerance, nodes, fields)
             stop = min(top + height, rows)
-            for whole, part in ((radius, here), (ok, good)):
-                whole[top:stop] = np.asarray(part).reshape(height, -1)[: stop - top, :columns]
-    radius, ok = radius.reshape(points.shape), ok.reshape(points.shape)
-    return _completed(points, radius, ok, accuracy, lambda rest: _listed(rest, degree, accuracy))
+            found[top:stop] = np.asarray(here).reshape(height, -1)[: stop - top, :columns]
+    return _completed(points, degree, found.reshape(points.shape), accuracy)
 
 
 def _cut(values: np.ndarray, length: int) -> np.ndarray:
@@ -287,21 +332,19 @@ def _cut(values: np.ndarray, length: int) -> np.ndarray:
 
 
 def _listed(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
-    """Points one by one; what is not accepted, mostly double poles, is left to a method without certificate."""
-    tolerance = np.broadcast_to(np.float64(accuracy), (1,) * len(points.shape))
-    values = per_device(_alone(degree), [points.alpha, points.beta, tolerance], points.delta, points.d)
-    last = by_companion if degree.poles <= COMPANION_POLES else lambda rest: bisected(rest, accuracy)
-    return _completed(points, values[0], values[1] > 0, accuracy, lambda rest: np.stack(last(rest)))
+    """Points one by one."""
+    return _completed(points, degree, _alone_at(points, degree, accuracy, 0), accuracy)
 
 
-def _completed(
-    points: Points, radius: np.ndarray, ok: np.ndarray, accuracy: float, other: Callable[[Points], np.ndarray]
-) -> np.ndarray:
-    """Results of accepted points, and of ``other`` for the rest."""
+def _completed(points: Points, degree: Degree, found: np.ndarray, accuracy: float) -> np.ndarray:
+    """Results: what is proved, what more effort proves, and by a method without certificate, mostly double poles."""
+    found = np.array(found)
+    _again(points, degree, accuracy, found)
+    left = ~(found > 0)
     out = np.empty((3, *points.shape))
-    out[0], out[1], out[2] = radius, radius * accuracy, ok
-    left = ~ok
+    out[0], out[1], out[2] = np.abs(found), np.abs(found) * accuracy, ~left
     if np.any(left):
+        rest = picked(points, left)
         # A mask serves a single point, of no axes, too.
-        out[:, left] = other(Points(*(array[left] for array in np.broadcast_arrays(*points))))
+        out[:, left] = np.stack(by_companion(rest) if degree.poles <= COMPANION_POLES else bisected(rest, accuracy))
     return out

@@ -65,7 +65,8 @@ def labels(alpha: Array, beta: Array, device: Device, degree: Degree, doubt: boo
 def _cubic(alpha: Array, beta: Array, device: Device) -> Array:
     b = beta + device.delta
     damped = device.a1 * beta
-    return (jnp.abs(damped) < 1.0) & (alpha * (device.a1 * (device.p1 + device.a2 * b)) < device.p1 * b * (1.0 - damped))
+    stiffness = alpha * (device.a1 * (device.p1 + device.a2 * b))
+    return (jnp.abs(damped) < 1.0) & (stiffness < device.p1 * b * (1.0 - damped))
 
 
 @cache
