@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import jax.numpy as jnp
+import numpy as np
 
 from zwidth._types import Array, ArrayLike
+from zwidth.batching import is_traced
 from zwidth.grouping import Degree, by_degree
 from zwidth.loop import check_has_poles, coefficients, evaluate, plant_of, poison, valid_wall
 
@@ -22,14 +27,20 @@ def companion(monic: Array) -> Array:
     return jnp.concatenate([-monic[None, 1:], jnp.eye(size - 1, size, dtype=monic.dtype)])
 
 
-def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
-    """All poles of one point, shape (degree.poles,); NaN where the input is out of range."""
+def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool = False) -> Array:
+    """All poles of one point, shape (degree.poles,); NaN where the input is out of range.
+
+    With ``spring``, for walls without virtual damping, one pole is 0 and the matrix a row smaller.
+    """
     ok = valid_wall(alpha, beta, delta, d)
     spoiled = poison(ok, alpha, beta, delta, d)
     alpha, beta, delta = (jnp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     d = jnp.where(ok, d, float(degree.whole))
     plant = plant_of(delta, d, degree)
-    z = jnp.linalg.eigvals(companion(coefficients(alpha, beta, delta, d, degree)))
+    monic = coefficients(alpha, beta, delta, d, degree)
+    z = jnp.linalg.eigvals(companion(monic[:-1] if spring else monic))
+    if spring:
+        z = jnp.append(z, 0.0)
     for _ in range(_POLISHING_STEPS):
         value, slope = evaluate(z, alpha, beta, plant, degree)
         z = _safe_step(z, value, slope, alpha, beta, plant, degree)
@@ -45,9 +56,18 @@ def _safe_step(z, value, slope, alpha, beta, plant, degree: Degree) -> Array:
     return jnp.where(better & short, candidate, z)
 
 
-def radius_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
+def radius_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool = False) -> Array:
     """The spectral radius of one point from its companion matrix."""
-    return jnp.max(jnp.abs(pole_kernel(alpha, beta, delta, d, degree)))
+    return jnp.max(jnp.abs(pole_kernel(alpha, beta, delta, d, degree, spring)))
+
+
+def is_spring(beta: ArrayLike) -> bool:
+    """Whether all walls are known to be without virtual damping: one pole less to compute."""
+    return not is_traced(beta) and np.size(beta) > 0 and not np.any(np.asarray(beta) != 0)
+
+
+def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]) -> Array:
+    return by_degree(kernel, values, static=(is_spring(values[1]),), chunk=companion_chunk, threads=_THREADS)
 
 
 def companion_chunk(degree: Degree) -> int:
@@ -76,8 +96,9 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
         TracedDelayError: d is traced.
 
     Numerics:
-        Companion eigenvalues by LAPACK, O(degree^3) a point, then Newton steps on the factored polynomial. A simple
-        pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k).
+        Companion eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is 0; then Newton
+        steps on the factored polynomial. A simple pole is right to about 1e-15 times its condition; a k-fold pole to
+        about 1e-16^(1/k).
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -88,19 +109,19 @@ def poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, 
         np.True_
     """
     check_has_poles(delay)
-    return by_degree(pole_kernel, (alpha, beta, delta, d), chunk=companion_chunk, threads=_THREADS)
+    return _of_all_poles(pole_kernel, (alpha, beta, delta, d))
 
 
 def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
     """The spectral radius at every point, from the poles."""
-    return by_degree(radius_kernel, (alpha, beta, delta, d), chunk=companion_chunk, threads=_THREADS)
+    return _of_all_poles(radius_kernel, (alpha, beta, delta, d))
 
 
 def unstable_poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
     """How many poles lie on or outside the unit circle; -1 where the input is out of range."""
-    return by_degree(_count_kernel, (alpha, beta, delta, d), chunk=companion_chunk, threads=_THREADS)
+    return _of_all_poles(_count_kernel, (alpha, beta, delta, d))
 
 
-def _count_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
-    z = pole_kernel(alpha, beta, delta, d, degree)
+def _count_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
+    z = pole_kernel(alpha, beta, delta, d, degree, spring)
     return jnp.where(jnp.isnan(z[0]), -1, jnp.sum(jnp.abs(z) >= 1.0))

@@ -20,7 +20,7 @@ from zwidth._types import Array
 from zwidth.grouping import Degree, degree_of
 from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import DeviceWork, Points, assemble, padded, per_device, picked, split_by_degree
-from zwidth.stability.poles import companion_chunk, pole_kernel
+from zwidth.stability.poles import companion_chunk, is_spring, pole_kernel
 from zwidth.stability.radius import (
     Pole,
     accept,
@@ -98,9 +98,9 @@ def _bisection(degree: Degree) -> DeviceWork:
 
 
 @cache
-def _companion(degree: Degree) -> DeviceWork:
+def _companion(degree: Degree, spring: bool) -> DeviceWork:
     def point(alpha: Array, beta: Array, delta: Array, d: Array, *fields: Array) -> Array:
-        poles = pole_kernel(alpha, beta, delta, d, degree)
+        poles = pole_kernel(alpha, beta, delta, d, degree, spring)
         size = jnp.abs(poles)
         z = poles[jnp.argmax(size)]
         radius = jnp.max(size)
@@ -124,7 +124,7 @@ def by_companion(points: Points) -> Radii:
     """All poles of every point; the error is how far from the largest one computed a pole may be."""
 
     def of(degree: Degree, part: Points) -> np.ndarray:
-        return per_device(_companion(degree), list(part), part.delta, part.d)
+        return per_device(_companion(degree, is_spring(part.beta)), list(part), part.delta, part.d)
 
     return _collected(points, of)
 
@@ -215,9 +215,15 @@ def certified_columns(
     """Radii of equally many values of each, all of one degree, and whether each is proved; the others say nothing."""
     degree = degree_of(d[0])
     points = Points(alpha, beta, delta, d)
-    found = _alone_at(points, degree, accuracy, 0)
-    _again(points, degree, accuracy, found)
+    found = _proved_alone(points, degree, accuracy)
     return np.abs(found), found > 0
+
+
+def _proved_alone(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
+    """Radii of points one by one, negative where not proved."""
+    found = np.array(_alone_at(points, degree, accuracy, 0))
+    _again(points, degree, accuracy, found)
+    return found
 
 
 def _again(points: Points, degree: Degree, accuracy: float, found: np.ndarray) -> None:
@@ -230,14 +236,17 @@ def _again(points: Points, degree: Degree, accuracy: float, found: np.ndarray) -
 def _by_newton(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
     axes = _map_axes(points)
     if axes is None:
-        return _listed(points, degree, accuracy)
-    out = np.empty((3, *points.shape))
+        return _completed(points, degree, _proved_alone(points, degree, accuracy), accuracy)
+    devices = np.broadcast_shapes(points.delta.shape, points.d.shape)
+    if np.prod(devices) == 1:
+        return _completed(points, degree, _on_map(points, degree, accuracy), accuracy)
+    found = np.empty(points.shape)
     # One map for every device; the axes that are left are those of delta and d.
-    for place in np.ndindex(*np.broadcast_shapes(points.delta.shape, points.d.shape)):
+    for place in np.ndindex(*devices):
         delta, d = (array[_one(place, array.shape)] for array in (points.delta, points.d))
         where = tuple(slice(None) if axis in axes else slice(i, i + 1) for axis, i in enumerate(place))
-        out[(slice(None), *where)] = _on_map(Points(points.alpha, points.beta, delta, d), degree, accuracy)
-    return out
+        found[where] = _on_map(Points(points.alpha, points.beta, delta, d), degree, accuracy)
+    return _completed(points, degree, found, accuracy)
 
 
 def _one(place: tuple[int, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
@@ -302,7 +311,7 @@ def _cells(degree: Degree) -> Any:
 
 
 def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
-    """One device; the two varying axes are cut into cells, in bands along the first of them."""
+    """One device; the two varying axes are cut into cells, in bands along the first of them. Not proved: negative."""
     first = next(axis for axis, length in enumerate(points.shape) if length > 1)
     transposed = points.alpha.shape[first] > 1
     outer, inner = (points.alpha, points.beta) if transposed else (points.beta, points.alpha)
@@ -323,7 +332,9 @@ def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
             here = cell(alpha, beta, tolerance, nodes, fields)
             stop = min(top + height, rows)
             found[top:stop] = np.asarray(here).reshape(height, -1)[: stop - top, :columns]
-    return _completed(points, degree, found.reshape(points.shape), accuracy)
+    found = found.reshape(points.shape)
+    _again(points, degree, accuracy, found)
+    return found
 
 
 def _cut(values: np.ndarray, length: int) -> np.ndarray:
@@ -331,18 +342,14 @@ def _cut(values: np.ndarray, length: int) -> np.ndarray:
     return padded(values, -(-values.size // length) * length).reshape(-1, length)
 
 
-def _listed(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
-    """Points one by one."""
-    return _completed(points, degree, _alone_at(points, degree, accuracy, 0), accuracy)
-
-
 def _completed(points: Points, degree: Degree, found: np.ndarray, accuracy: float) -> np.ndarray:
-    """Results: what is proved, what more effort proves, and by a method without certificate, mostly double poles."""
-    found = np.array(found)
-    _again(points, degree, accuracy, found)
-    left = ~(found > 0)
+    """Results: what is proved, and by a method without certificate the rest, mostly double poles."""
+    proved = found > 0
     out = np.empty((3, *points.shape))
-    out[0], out[1], out[2] = np.abs(found), np.abs(found) * accuracy, ~left
+    # With an ellipsis these are views of a single point, of no axes, too.
+    np.multiply(np.abs(found, out=out[0, ...]), accuracy, out=out[1, ...])
+    out[2] = proved
+    left = ~proved
     if np.any(left):
         rest = picked(points, left)
         # A mask serves a single point, of no axes, too.
