@@ -10,7 +10,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from zwidth.bench.suite import Row
+from zwidth.bench.suite import FILTER, NO_BETA, NO_DELTA, Row
+from zwidth.stability.methods import RADIUS_METHODS, STABILITY_METHODS
 
 _FIELDS = ("quantity", "method", "dtype", "layout", "d", "first_seconds", "rate", "error")
 _TITLES = {
@@ -49,7 +50,7 @@ def costs(rows: Sequence[Row]) -> dict[str, Any]:
     """The table of `zwidth.accuracy`: of several sizes of one map the largest counts."""
     kept: dict[tuple[Any, ...], Row] = {}
     for row in rows:
-        if row.baseline or row.quantity == "alpha_max":
+        if row.baseline or row.method not in (*STABILITY_METHODS, *RADIUS_METHODS) or row.quantity == "alpha_max":
             continue
         key = (row.quantity, row.method, row.dtype, row.layout, row.d)
         if key not in kept:
@@ -102,6 +103,8 @@ _QUESTIONS = {
     "stable or not, each label proved": ("stable", "certified", "map"),
     "the largest pole, to 1e-9, proved": ("spectral_radius", "newton", "map"),
     "all poles": ("spectral_radius", "companion", "map"),
+    "all poles, beta = 0": ("spectral_radius", NO_BETA, "map"),
+    "all poles, delta = 0": ("spectral_radius", NO_DELTA, "map"),
     "the stiffest wall of as many devices": ("alpha_max", "newton", "scattered"),
 }
 
@@ -117,7 +120,8 @@ def _questions(rows: Sequence[Row]) -> list[str]:
             rates = [row.rate for row in rows if (row.quantity, row.method, row.layout) == key and row.d == d]
             cells.append(f"{1e6 / rates[0]:.2g}" if rates else "")
         lines.append(f"| {question} | {' | '.join(cells)} |")
-    return [*lines, ""]
+    left = max((row.open for row in rows if row.method == FILTER), default=0.0)
+    return [*lines, "", f"Proof: the filter alone leaves at most {100 * left:.2g} % of a map to signs and balls.", ""]
 
 
 def summary(rows: Sequence[Row]) -> str:

@@ -14,10 +14,13 @@ from zwidth.bench import problems
 from zwidth.bench.baselines import available
 from zwidth.bench.problems import Walls
 from zwidth.stability import balls
-from zwidth.stability.certified import certified_stable
+from zwidth.stability.certified import certified_stable, filtered
+from zwidth.stability.certified_filter import OPEN, STABLE
+from zwidth.stability.layout import lay_out
 from zwidth.stability.methods import is_stable, spectral_radius
 from zwidth.stability.ridge import RidgeMethod, alpha_max
 
+FILTER, NO_BETA, NO_DELTA = "certified, filter alone", "companion, beta = 0", "companion, delta = 0"
 # A measurement is repeated until it has taken this long, and at least this often.
 _SECONDS = 0.4
 _LEAST, _MOST = 3, 40
@@ -44,6 +47,7 @@ class Row:
         wrong: how many of ``checked`` labels were wrong; of other quantities, 0.
         checked: how many points the error was measured on, against ball arithmetic.
         baseline: whether it is a tool for comparison.
+        open: which share of the points it leaves undecided, where it may.
     """
 
     quantity: str
@@ -58,6 +62,7 @@ class Row:
     wrong: int
     checked: int
     baseline: bool = False
+    open: float = 0.0
 
     def as_dict(self) -> dict[str, Any]:
         """The fields as plain JSON values."""
@@ -153,6 +158,22 @@ def _labels(d: float, sizes: Sizes) -> Iterator[Row]:
             walls = make(d, _fewer(min(points, slow.get(method, points)), d))
             first, warm = clock(lambda classify=classify, walls=walls: classify(walls))
             yield Row("stable", method, dtype, layout, d, walls.points, first, walls.points / warm, *error)
+    if _possible("certified", d):
+        yield _filter_alone(d, sizes)
+
+
+def _filter_alone(d: float, sizes: Sizes) -> Row:
+    """What of "certified" runs at every point, and how much of a map it leaves to signs and balls."""
+    truth = problems.near_boundary(d, sizes.checked)
+    code = filtered(lay_out(truth.walls).points)
+    wrong = (code != OPEN) & ((code == STABLE) != truth.stable)
+    error = float(np.max(truth.distance, initial=0.0, where=wrong)), int(wrong.sum()), int(wrong.size)
+    walls = problems.grid(d, _fewer(sizes.map_points // 4, d))
+    points = lay_out(walls).points
+    first, warm = clock(lambda: filtered(points))
+    left = float(np.mean(filtered(points) == OPEN))
+    rate = walls.points / warm
+    return Row("stable", FILTER, "float64", "map", d, walls.points, first, rate, *error, open=left)
 
 
 def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
@@ -170,6 +191,7 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
             walls = make(d, _fewer(largest if layout == "map" else min(largest, 100_000), d))
             first, warm = clock(lambda radius=radius, walls=walls: radius(walls))
             yield Row("spectral_radius", method, "float64", layout, d, walls.points, first, walls.points / warm, *error)
+    yield from _smaller_loops(d, error)
     for name, tool in available().items():
         if d > 50 or (tool.only_whole and d != int(d)):
             continue
@@ -178,6 +200,20 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
         first, warm = clock(lambda tool=tool, walls=walls: tool.radius(walls))
         rate = walls.points / warm
         yield Row("spectral_radius", name, "float64", "scattered", d, walls.points, first, rate, *error, baseline=True)
+
+
+def _smaller_loops(d: float, error: tuple[float, int, int]) -> Iterator[Row]:
+    """All poles where a part of the loop is missing; the errors are those of the whole loop."""
+    if not _possible("companion", d):
+        return
+    walls = problems.grid(d, _fewer(20_000, d))
+    for name, smaller in (
+        (NO_BETA, walls._replace(beta=0 * walls.beta)),
+        (NO_DELTA, walls._replace(delta=np.zeros(1))),
+    ):
+        listed = smaller.listed()
+        first, warm = clock(lambda listed=listed: spectral_radius(*listed, method="companion"))
+        yield Row("spectral_radius", name, "float64", "map", d, listed.points, first, listed.points / warm, *error)
 
 
 def ridge_error(d: float, method: RidgeMethod = "newton") -> tuple[float, int, int]:

@@ -97,7 +97,7 @@ def certified_stable(
         raise InputError(f"max_bits: got {max_bits}, 64 or more is needed")
     laid = lay_out((alpha, beta, delta, d))
     points, shape = laid.points, laid.points.shape
-    code = _filtered(points, pair=False, edge=False)
+    code = filtered(points)
     stable, status, bits = np.asarray(code == STABLE), np.zeros(shape, np.int32), np.zeros(shape, np.int32)
     rest = np.flatnonzero(code == OPEN)
     if rest.size:
@@ -108,7 +108,7 @@ def certified_stable(
     return CertifiedResult(*map(laid.spread, (stable, status, bits)))
 
 
-def _filtered(points: Points, *, pair: bool, edge: bool) -> np.ndarray:
+def filtered(points: Points, *, pair: bool = False, edge: bool = False) -> np.ndarray:
     """The filter's code of every point, of the broadcast shape."""
 
     def of(degree: Degree, *part: np.ndarray) -> np.ndarray:
@@ -194,6 +194,6 @@ def _settled(points: Points, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.
 
 def _second_pass(points: Points, edge: bool) -> tuple[np.ndarray, np.ndarray]:
     """Let the crossover try again, pairs included: stable and status."""
-    code = _filtered(points, pair=True, edge=edge)
+    code = filtered(points, pair=True, edge=edge)
     decided = np.where((code == STABLE) & edge, Status.ON_BOUNDARY, Status.OK)
     return (code == STABLE) & (not edge), np.where(code == OPEN, Status.UNDECIDED, decided)

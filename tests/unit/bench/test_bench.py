@@ -39,14 +39,15 @@ def rows():
 
 def test_a_tiny_run_measures_every_method(rows):
     methods = {(row.quantity, row.method) for row in rows if not row.baseline}
-    assert len(methods) == 4 + 3 + 2
+    assert len(methods) == (4 + 1) + (3 + 2) + 2
     assert {row.method for row in rows if row.baseline} == set(available())
     for row in rows:
         assert row.rate > 0
         assert row.first_seconds >= 0
         assert row.error < 1e-2
-        if row.method == "certified":
+        if row.method in ("certified", suite.FILTER):
             assert row.wrong == 0
+        assert (row.open > 0) == (row.method == suite.FILTER)
 
 
 def test_what_is_written_can_be_read(rows, tmp_path):
