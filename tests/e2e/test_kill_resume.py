@@ -8,7 +8,7 @@ import time
 import pytest
 import yaml
 
-from sweeping import assert_same, flags, start, study, zwidth
+from sweeping import assert_same, flags, main_of, start, study, zwidth
 
 # Few, for each of them costs the start of a program: scripts/kill_and_resume.py tries a hundred.
 MOMENTS = 3
@@ -77,6 +77,25 @@ def test_killed_at_any_moment_a_run_resumes(config, undisturbed, tmp_path):
     assert zwidth("verify", tmp_path).returncode == 0
     assert_same(reference, tmp_path)
     assert list(tmp_path.rglob("*.partial")) == []
+
+
+def test_a_folder_in_which_a_run_computes_is_refused_until_it_is_killed(config, undisturbed, tmp_path, capsys):
+    process = start("run", config, "--out", tmp_path)
+    wait_for_chunks(process, tmp_path, 2)
+    # It holds still, so that it is not done too soon.
+    os.killpg(process.pid, signal.SIGSTOP)
+    assert process.poll() is None
+    before = flags(tmp_path)
+    for words in (["--resume"], ["--overwrite"], ["--shard", "1/2"]):
+        assert main_of("run", config, "--out", tmp_path, *words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"zwidth: out: {tmp_path}: another run computes in this folder (process {process.pid} ")
+    assert flags(tmp_path) == before
+    kill_group(process)
+    result = zwidth("run", config, "--out", tmp_path, "--resume")
+    assert result.returncode == 0, result.stderr
+    assert before.items() <= flags(tmp_path).items()
+    assert_same(undisturbed[0], tmp_path)
 
 
 def test_a_parent_that_is_killed_takes_its_workers_along(config, undisturbed, tmp_path):

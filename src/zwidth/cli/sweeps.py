@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import json
-import shutil
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +19,6 @@ from zwidth.quantities import plain
 if TYPE_CHECKING:
     from zwidth.sweep.document import Config
     from zwidth.sweep.engine import SweepEvent, SweepResult
-    from zwidth.sweep.sweeps import SweepStudy
 
 _SECONDS_BETWEEN_LINES = 10.0
 _EXIT_FAILED, _EXIT_STOPPED = 1, 130
@@ -105,14 +103,13 @@ def run(
     going_on = resume or shard is not None
     ok = _run_others(path, config, folder, overwrite, going_on, shard) if len(sweeps) < len(config.studies) else True
     if sweeps:
-        if overwrite:
-            _remove_stores(folder, sweeps)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         with _reporter() as progress:
             result = run_sweeps(
                 config,
                 folder,
                 resume=resume,
+                overwrite=overwrite,
                 workers=workers,
                 scheduler=scheduler,
                 shard=shard,
@@ -133,10 +130,14 @@ def _run_others(
     from zwidth.cli.progress import reporter
     from zwidth.studies import run as run_studies
     from zwidth.studies.folder import RUN_FILE
+    from zwidth.sweep.engine import sweeps_of
+    from zwidth.sweep.lock import holding
 
     if (shard and shard[0] > 1) or (going_on and (folder / RUN_FILE).is_file()):
         return True
-    with reporter() as progress:
+    # A folder that is overwritten is held by `run_studies`; one that sweeps never enter takes its name only when done.
+    held = holding(folder, shard) if sweeps_of(config) and not overwrite else nullcontext()
+    with held, reporter() as progress:
         result = run_studies(path, out=folder, overwrite=overwrite, progress=progress)
     done = len(result.studies) - len(result.failed)
     click.echo(f"{done} of {len(result.studies)} done, results in {result.folder}")
@@ -160,16 +161,6 @@ def _print_plan(config: Config, folder: Path, memory: int, workers: int | None) 
             click.echo(line)
     click.echo(f"results go to {folder}")
     check_resources(plans, folder, workers or 1)
-
-
-def _remove_stores(folder: Path, sweeps: list[SweepStudy]) -> None:
-    """Make room for stores to be made again; what is no store stays, and is then refused."""
-    from zwidth.sweep.resume import store_path
-
-    for study in sweeps:
-        path = store_path(folder, study)
-        if (path / "zarr.json").is_file() and not path.is_symlink():
-            shutil.rmtree(path)
 
 
 def _keep_config(path: Path, folder: Path) -> None:
