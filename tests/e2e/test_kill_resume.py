@@ -2,6 +2,7 @@
 
 import os
 import random
+import shlex
 import signal
 import time
 
@@ -122,14 +123,26 @@ def group_lives(group):
 
 @pytest.mark.parametrize("number, options", [(signal.SIGINT, ["--workers", "1"]), (signal.SIGTERM, [])])
 def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number, options):
-    process = start("run", config, "--out", tmp_path / "out", *options)
-    wait_for_chunks(process, tmp_path / "out", 1)
+    process = start("run", config, "--out", tmp_path / "an out", *options)
+    wait_for_chunks(process, tmp_path / "an out", 1)
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
-    assert f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out" in errors
-    assert "--resume" in errors
+    again = shlex.join(["zwidth", "run", str(config), "--out", str(tmp_path / "an out"), "--resume", *options])
+    assert errors.endswith(f"zwidth: stopped; what is done is kept, go on with: {again}\n")
     assert "Traceback" not in errors
+
+
+def test_stopped_before_its_first_chunk_a_run_says_the_same(config, tmp_path, monkeypatch, capsys):
+    def stopped(store, tasks):
+        raise KeyboardInterrupt
+
+    assert main_of("run", config, "--out", tmp_path, "--shard", "1/40") == 0
+    capsys.readouterr()
+    monkeypatch.setattr("zwidth.sweep.engine.repair", stopped)
+    assert main_of("run", config, "--out", tmp_path, "--resume") == 130
+    says = f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out {tmp_path} --resume\n"
+    assert capsys.readouterr().err == says
 
 
 def test_the_plan_is_printed_without_doing_anything(config, tmp_path):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
+import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -100,25 +101,30 @@ def run(
         _print_plan(config, folder, memory, workers)
         return
     sweeps = sweeps_of(config)
+    again = _again(path, out, workers, scheduler, shard)
     going_on = resume or shard is not None
     ok = _run_others(path, config, folder, overwrite, going_on, shard) if len(sweeps) < len(config.studies) else True
     if sweeps:
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with _reporter() as progress:
-            result = run_sweeps(
-                config,
-                folder,
-                resume=resume,
-                overwrite=overwrite,
-                workers=workers,
-                scheduler=scheduler,
-                shard=shard,
-                memory=memory,
-                progress=progress,
-            )
+        try:
+            with _reporter() as progress:
+                result = run_sweeps(
+                    config,
+                    folder,
+                    resume=resume,
+                    overwrite=overwrite,
+                    workers=workers,
+                    scheduler=scheduler,
+                    shard=shard,
+                    memory=memory,
+                    progress=progress,
+                )
+        except KeyboardInterrupt:
+            # Before the first chunk began.
+            _tell_stopped(again)
         if not result.hopeless:
             _keep_config(path, folder)
-        _tell(result, path, folder, out, shard)
+        _tell(result, folder, again)
     if not ok:
         raise SystemExit(_EXIT_FAILED)
 
@@ -172,14 +178,30 @@ def _keep_config(path: Path, folder: Path) -> None:
         write_whole(kept, path.read_bytes())
 
 
-def _tell(result: SweepResult, path: Path, folder: Path, out: Path | None, shard: tuple[int, int] | None) -> None:
+def _again(
+    path: Path, out: Path | None, workers: int | None, scheduler: str | None, shard: tuple[int, int] | None
+) -> str:
+    """The command that goes on with a run, as a shell takes it."""
+    words = ["zwidth", "run", str(path)]
+    words += ["--out", str(out)] if out else []
+    words += ["--resume"]
+    words += ["--shard", f"{shard[0]}/{shard[1]}"] if shard else []
+    words += ["--workers", str(workers)] if workers else []
+    words += ["--scheduler", scheduler] if scheduler else []
+    return shlex.join(words)
+
+
+def _tell_stopped(again: str) -> NoReturn:
+    click.echo(f"zwidth: stopped; what is done is kept, go on with: {again}", err=True)
+    raise SystemExit(_EXIT_STOPPED)
+
+
+def _tell(result: SweepResult, folder: Path, again: str) -> None:
     """The end of a run of sweeps; leaves with the exit code of what happened."""
     for found in result.repaired:
         click.echo(f"repaired {found}", err=True)
     done = result.computed + result.skipped
     click.echo(f"{done} of {result.total} chunks done ({result.computed} now), results in {folder}")
-    where, part = f" --out {out}" if out else "", f" --shard {shard[0]}/{shard[1]}" if shard else ""
-    again = f"zwidth run {path}{where} --resume{part}"
     if result.hopeless:
         click.echo(f"zwidth: out: {folder}: {result.hopeless}", err=True)
         click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {again}", err=True)
@@ -187,8 +209,7 @@ def _tell(result: SweepResult, path: Path, folder: Path, out: Path | None, shard
     for chunk, error in result.failed.items():
         click.echo(f"zwidth: chunk {chunk} failed: {error}", err=True)
     if result.interrupted:
-        click.echo(f"zwidth: stopped; what is done is kept, go on with: {again}", err=True)
-        raise SystemExit(_EXIT_STOPPED)
+        _tell_stopped(again)
     if result.failed:
         click.echo(f"zwidth: try the failed chunks again with: {again}", err=True)
         raise SystemExit(_EXIT_FAILED)
