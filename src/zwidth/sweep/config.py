@@ -181,8 +181,7 @@ class _Loader(Reader, Scanner, Parser, Composer, _Resolver):
             what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
             raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
         if getattr(event, "tag", None) is not None:
-            is_key = isinstance(parent, yaml.MappingNode) and index is None and isinstance(event, yaml.ScalarEvent)
-            field = dotted((*path, event.value) if is_key else path)
+            field = dotted((*path, event.value) if _is_key(parent, index, event) else path)
             what = f"got the tag {describe(event.tag)}"
             self.faults.append(Fault(self.file, *place, field, what, "tags are not used", "remove the tag"))
         above, self._path = self._path, path
@@ -204,6 +203,11 @@ def _step(index: Any) -> FieldPath:
     if isinstance(index, int):
         return (index,)
     return (index.value,) if isinstance(index, yaml.ScalarNode) else ()
+
+
+def _is_key(parent: yaml.Node | None, index: Any, event: yaml.Event) -> bool:
+    """Whether a node begins that is a key, and text."""
+    return isinstance(parent, yaml.MappingNode) and index is None and isinstance(event, yaml.ScalarEvent)
 
 
 class _Tree:
