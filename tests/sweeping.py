@@ -11,6 +11,7 @@ from unittest.mock import patch
 import numpy as np
 
 from zwidth.cli import main
+from zwidth.sweep import plan
 from zwidth.sweep.chunks import perform
 from zwidth.sweep.document import Config
 from zwidth.sweep.store import find_stores, open_dataset
@@ -27,6 +28,35 @@ def study(name="map", axes=None, outputs=("stable",), **fields):
     return {"kind": "sweep", "name": name, "axes": AXES if axes is None else axes, "outputs": list(outputs), **fields}
 
 
+WALLS = ("stable", "spectral_radius", "margin", "settling_time", "passive", "passivity_margin")
+DEVICES = ("alpha_max", "beta_at_max", "kind")
+FEW = {"alpha": [0.0, 0.1, 0.5], "beta": [-0.05, 0.1, 0.4, 0.9], "delta": [0.0, 0.3], "d": [0, 0.5, 2]}
+IN_SI = {
+    **{"mass": ["100 g", "1 kg"], "damping": [0, 10], "rate": "1 kHz", "delay": ["1 ms", "2.5 ms"]},
+    **{"stiffness": [0, 1000, 20_000], "virtual_damping": [0, 5, 40]},
+}
+
+
+def config_of_everything():
+    """Every output, in both kinds of units, and radii to an accuracy."""
+    return config_of(
+        study("map", FEW, (*WALLS, *DEVICES)),
+        study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-9),
+        study("si", IN_SI, (*WALLS, "stiffness_max", "virtual_damping_at_max")),
+    )
+
+
+def cut(monkeypatch, walls, devices):
+    """From now on, plan chunks of at most this many points; a run's other processes follow the plan in its store."""
+    whole = plan.chunk_shape
+
+    def chunk_shape(shape, target):
+        # Walls have two dimensions more than their devices.
+        return whole(shape, walls if len(shape) > 3 else devices)
+
+    monkeypatch.setattr(plan, "chunk_shape", chunk_shape)
+
+
 def config_of(*studies, name="test"):
     return Config.model_validate({"version": 1, "name": name, "studies": list(studies) or [study()]})
 
@@ -38,12 +68,15 @@ def values_of(path):
 
 
 def assert_same(first, second):
-    """Two stores hold the same values, bit by bit."""
-    one, other = values_of(first), values_of(second)
-    assert one.keys() == other.keys()
-    for name in one:
-        assert one[name].dtype == other[name].dtype
-        assert one[name].tobytes() == other[name].tobytes(), name
+    """Two stores, or all stores of two folders, hold the same values, bit by bit."""
+    stores = find_stores(Path(first))
+    assert [store.name for store in stores] == [store.name for store in find_stores(Path(second))]
+    for store, with_it in zip(stores, find_stores(Path(second)), strict=True):
+        one, other = values_of(store), values_of(with_it)
+        assert one.keys() == other.keys()
+        for name in one:
+            assert one[name].dtype == other[name].dtype
+            assert one[name].tobytes() == other[name].tobytes(), (store.name, name)
 
 
 def flags(path):

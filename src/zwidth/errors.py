@@ -26,6 +26,10 @@ class StoreError(ZwidthError):
     """A store that cannot be used: damaged, of another configuration, or of another version."""
 
 
+class StoreBusyError(StoreError):
+    """A folder of results in which another run computes."""
+
+
 class ResourceError(ZwidthError):
     """Work that does not fit into the memory or onto the disk there is."""
 

@@ -2,13 +2,14 @@
 
 import os
 import random
+import shlex
 import signal
 import time
 
 import pytest
 import yaml
 
-from sweeping import assert_same, flags, start, study, zwidth
+from sweeping import assert_same, flags, main_of, start, study, zwidth
 
 # Few, for each of them costs the start of a program: scripts/kill_and_resume.py tries a hundred.
 MOMENTS = 3
@@ -79,6 +80,25 @@ def test_killed_at_any_moment_a_run_resumes(config, undisturbed, tmp_path):
     assert list(tmp_path.rglob("*.partial")) == []
 
 
+def test_a_folder_in_which_a_run_computes_is_refused_until_it_is_killed(config, undisturbed, tmp_path, capsys):
+    process = start("run", config, "--out", tmp_path)
+    wait_for_chunks(process, tmp_path, 2)
+    # It holds still, so that it is not done too soon.
+    os.killpg(process.pid, signal.SIGSTOP)
+    assert process.poll() is None
+    before = flags(tmp_path)
+    for words in (["--resume"], ["--overwrite"], ["--shard", "1/2"]):
+        assert main_of("run", config, "--out", tmp_path, *words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"zwidth: out: {tmp_path}: another run computes in this folder (process {process.pid} ")
+    assert flags(tmp_path) == before
+    kill_group(process)
+    result = zwidth("run", config, "--out", tmp_path, "--resume")
+    assert result.returncode == 0, result.stderr
+    assert before.items() <= flags(tmp_path).items()
+    assert_same(undisturbed[0], tmp_path)
+
+
 def test_a_parent_that_is_killed_takes_its_workers_along(config, undisturbed, tmp_path):
     process = start("run", config, "--out", tmp_path, "--workers", "2")
     wait_for_chunks(process, tmp_path, 2)
@@ -103,14 +123,26 @@ def group_lives(group):
 
 @pytest.mark.parametrize("number, options", [(signal.SIGINT, ["--workers", "1"]), (signal.SIGTERM, [])])
 def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number, options):
-    process = start("run", config, "--out", tmp_path / "out", *options)
-    wait_for_chunks(process, tmp_path / "out", 1)
+    process = start("run", config, "--out", tmp_path / "an out", *options)
+    wait_for_chunks(process, tmp_path / "an out", 1)
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 130, errors
-    assert f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out" in errors
-    assert "--resume" in errors
+    again = shlex.join(["zwidth", "run", str(config), "--out", str(tmp_path / "an out"), "--resume", *options])
+    assert errors.endswith(f"zwidth: stopped; what is done is kept, go on with: {again}\n")
     assert "Traceback" not in errors
+
+
+def test_stopped_before_its_first_chunk_a_run_says_the_same(config, tmp_path, monkeypatch, capsys):
+    def stopped(store, tasks):
+        raise KeyboardInterrupt
+
+    assert main_of("run", config, "--out", tmp_path, "--shard", "1/40") == 0
+    capsys.readouterr()
+    monkeypatch.setattr("zwidth.sweep.engine.repair", stopped)
+    assert main_of("run", config, "--out", tmp_path, "--resume") == 130
+    says = f"zwidth: stopped; what is done is kept, go on with: zwidth run {config} --out {tmp_path} --resume\n"
+    assert capsys.readouterr().err == says
 
 
 def test_the_plan_is_printed_without_doing_anything(config, tmp_path):

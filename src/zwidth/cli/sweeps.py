@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-import shutil
+import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import click
 
@@ -20,7 +20,6 @@ from zwidth.quantities import plain
 if TYPE_CHECKING:
     from zwidth.sweep.document import Config
     from zwidth.sweep.engine import SweepEvent, SweepResult
-    from zwidth.sweep.sweeps import SweepStudy
 
 _SECONDS_BETWEEN_LINES = 10.0
 _EXIT_FAILED, _EXIT_STOPPED = 1, 130
@@ -102,26 +101,30 @@ def run(
         _print_plan(config, folder, memory, workers)
         return
     sweeps = sweeps_of(config)
+    again = _again(path, out, workers, scheduler, shard)
     going_on = resume or shard is not None
     ok = _run_others(path, config, folder, overwrite, going_on, shard) if len(sweeps) < len(config.studies) else True
     if sweeps:
-        if overwrite:
-            _remove_stores(folder, sweeps)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
-        with _reporter() as progress:
-            result = run_sweeps(
-                config,
-                folder,
-                resume=resume,
-                workers=workers,
-                scheduler=scheduler,
-                shard=shard,
-                memory=memory,
-                progress=progress,
-            )
+        try:
+            with _reporter() as progress:
+                result = run_sweeps(
+                    config,
+                    folder,
+                    resume=resume,
+                    overwrite=overwrite,
+                    workers=workers,
+                    scheduler=scheduler,
+                    shard=shard,
+                    memory=memory,
+                    progress=progress,
+                )
+        except KeyboardInterrupt:
+            # Before the first chunk began.
+            _tell_stopped(again)
         if not result.hopeless:
             _keep_config(path, folder)
-        _tell(result, path, folder, out, shard)
+        _tell(result, folder, again)
     if not ok:
         raise SystemExit(_EXIT_FAILED)
 
@@ -133,10 +136,14 @@ def _run_others(
     from zwidth.cli.progress import reporter
     from zwidth.studies import run as run_studies
     from zwidth.studies.folder import RUN_FILE
+    from zwidth.sweep.engine import sweeps_of
+    from zwidth.sweep.lock import holding
 
     if (shard and shard[0] > 1) or (going_on and (folder / RUN_FILE).is_file()):
         return True
-    with reporter() as progress:
+    # A folder that is overwritten is held by `run_studies`; one that sweeps never enter takes its name only when done.
+    held = holding(folder, shard) if sweeps_of(config) and not overwrite else nullcontext()
+    with held, reporter() as progress:
         result = run_studies(path, out=folder, overwrite=overwrite, progress=progress)
     done = len(result.studies) - len(result.failed)
     click.echo(f"{done} of {len(result.studies)} done, results in {result.folder}")
@@ -162,16 +169,6 @@ def _print_plan(config: Config, folder: Path, memory: int, workers: int | None) 
     check_resources(plans, folder, workers or 1)
 
 
-def _remove_stores(folder: Path, sweeps: list[SweepStudy]) -> None:
-    """Make room for stores to be made again; what is no store stays, and is then refused."""
-    from zwidth.sweep.resume import store_path
-
-    for study in sweeps:
-        path = store_path(folder, study)
-        if (path / "zarr.json").is_file() and not path.is_symlink():
-            shutil.rmtree(path)
-
-
 def _keep_config(path: Path, folder: Path) -> None:
     """A copy of the configuration beside its results."""
     from zwidth.sweep.files import write_whole
@@ -181,14 +178,30 @@ def _keep_config(path: Path, folder: Path) -> None:
         write_whole(kept, path.read_bytes())
 
 
-def _tell(result: SweepResult, path: Path, folder: Path, out: Path | None, shard: tuple[int, int] | None) -> None:
+def _again(
+    path: Path, out: Path | None, workers: int | None, scheduler: str | None, shard: tuple[int, int] | None
+) -> str:
+    """The command that goes on with a run, as a shell takes it."""
+    words = ["zwidth", "run", str(path)]
+    words += ["--out", str(out)] if out else []
+    words += ["--resume"]
+    words += ["--shard", f"{shard[0]}/{shard[1]}"] if shard else []
+    words += ["--workers", str(workers)] if workers else []
+    words += ["--scheduler", scheduler] if scheduler else []
+    return shlex.join(words)
+
+
+def _tell_stopped(again: str) -> NoReturn:
+    click.echo(f"zwidth: stopped; what is done is kept, go on with: {again}", err=True)
+    raise SystemExit(_EXIT_STOPPED)
+
+
+def _tell(result: SweepResult, folder: Path, again: str) -> None:
     """The end of a run of sweeps; leaves with the exit code of what happened."""
     for found in result.repaired:
         click.echo(f"repaired {found}", err=True)
     done = result.computed + result.skipped
     click.echo(f"{done} of {result.total} chunks done ({result.computed} now), results in {folder}")
-    where, part = f" --out {out}" if out else "", f" --shard {shard[0]}/{shard[1]}" if shard else ""
-    again = f"zwidth run {path}{where} --resume{part}"
     if result.hopeless:
         click.echo(f"zwidth: out: {folder}: {result.hopeless}", err=True)
         click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {again}", err=True)
@@ -196,8 +209,7 @@ def _tell(result: SweepResult, path: Path, folder: Path, out: Path | None, shard
     for chunk, error in result.failed.items():
         click.echo(f"zwidth: chunk {chunk} failed: {error}", err=True)
     if result.interrupted:
-        click.echo(f"zwidth: stopped; what is done is kept, go on with: {again}", err=True)
-        raise SystemExit(_EXIT_STOPPED)
+        _tell_stopped(again)
     if result.failed:
         click.echo(f"zwidth: try the failed chunks again with: {again}", err=True)
         raise SystemExit(_EXIT_FAILED)

@@ -6,18 +6,20 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from zwidth.errors import StoreExistsError
 from zwidth.sweep.files import check_folder
+from zwidth.sweep.lock import FOLDER as LOCKS
+from zwidth.sweep.lock import holding_if_used
 from zwidth.sweep.store import SUFFIX
 
 RUN_FILE = "run.json"
 """The file that marks a folder as a finished run."""
 
 # What sweeps of the same configuration, in a shard that was faster, leave beside their stores.
-_OF_SWEEPS = ("config.yaml", "figures")
+_OF_SWEEPS = ("config.yaml", "figures", LOCKS)
 
 
 def check_free(folder: Path, overwrite: bool) -> None:
@@ -54,15 +56,17 @@ def staged(folder: Path, overwrite: bool) -> Iterator[Path]:
 
     Its name ends in ``.partial``: what is left of a killed run is recognized, and never taken for a finished one.
     """
-    check_free(folder, overwrite)
-    partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
-    partial.mkdir(parents=True)
-    try:
-        yield partial
-        _replace(folder, partial, overwrite)
-    except BaseException:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise
+    # What is overwritten goes with all that is in it, sweeps that somebody still computes there included.
+    with holding_if_used(folder) if overwrite else nullcontext():
+        check_free(folder, overwrite)
+        partial = folder.with_name(f".{folder.name}.{secrets.token_hex(4)}.partial")
+        partial.mkdir(parents=True)
+        try:
+            yield partial
+            _replace(folder, partial, overwrite)
+        except BaseException:
+            shutil.rmtree(partial, ignore_errors=True)
+            raise
 
 
 def _replace(folder: Path, partial: Path, overwrite: bool) -> None:

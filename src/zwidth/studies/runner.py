@@ -50,6 +50,7 @@ def run(
     Raises:
         ConfigError: the configuration has faults.
         StoreExistsError: the folder is not empty; with ``overwrite``, only where it holds no run.
+        StoreBusyError: with ``overwrite``: another run computes sweeps in the folder.
 
     Numerics:
         Float64 throughout. The folder takes its name when all studies have ended; until then it is called

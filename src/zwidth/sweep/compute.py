@@ -145,8 +145,9 @@ def _limits(block: Block) -> np.ndarray:
     )
     limit = np.empty(block.beta.size)
     # Delays below one period have a kernel of their own: with both in a piece, its size would vary.
-    for short in (False, True):
-        index = np.flatnonzero((columns[2] < 1) == short)
+    for long in (False, True):
+        # As `row_limits` itself tells them apart: a delay that is NaN is not long.
+        index = np.flatnonzero((columns[2] >= 1) == long)
         if index.size:
             picked = tuple(column[index] for column in columns)
             limit[index] = in_pieces(lambda *piece: (row_limits(*piece),), picked, _ROW_PIECE)[0]

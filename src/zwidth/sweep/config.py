@@ -84,10 +84,10 @@ def load_config(path: str | bytes | os.PathLike[str]) -> Config:
     return config
 
 
-def _fail(file: str, place: tuple[int, int] | None, *parts: str) -> ConfigFileError:
+def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
     """An error with a single fault."""
     line, column = place or (None, None)
-    return ConfigFileError.of([Fault(file, line, column, "", *parts)])
+    return ConfigFileError.of([Fault(file, line, column, dotted(path), *parts)])
 
 
 def _read_text(file: str) -> str:
@@ -164,6 +164,7 @@ class _Loader(Reader, Scanner, Parser, Composer, _Resolver):
         _Resolver.__init__(self)
         self.file = file
         self.faults: list[Fault] = []
+        self._path: FieldPath = ()
         self._depth = 0
         self._nodes = 0
 
@@ -171,19 +172,23 @@ class _Loader(Reader, Scanner, Parser, Composer, _Resolver):
         """Compose one node, unless it is one too many."""
         event = self.peek_event()
         place = _mark_place(event.start_mark)
+        path = (*self._path, *_step(index))
         self._nodes += 1
         if self._nodes > MAX_NODES:
-            allowed = f"at most {MAX_NODES} values a file"
-            raise _fail(self.file, place, "too many values", allowed, "write long axes as linear or log")
+            what, allowed = "too many values", f"at most {MAX_NODES} values a file"
+            raise _fail(self.file, place, what, allowed, "write long axes as linear or log", path=path)
         if self._depth >= MAX_DEPTH:
-            allowed = f"at most {MAX_DEPTH} levels"
-            raise _fail(self.file, place, "the values are nested too deeply", allowed, "use fewer levels")
+            what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
+            raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
         if getattr(event, "tag", None) is not None:
+            field = dotted((*path, event.value) if _is_key(parent, index, event) else path)
             what = f"got the tag {describe(event.tag)}"
-            self.faults.append(Fault(self.file, *place, "", what, "tags are not used", "remove the tag"))
+            self.faults.append(Fault(self.file, *place, field, what, "tags are not used", "remove the tag"))
+        above, self._path = self._path, path
         self._depth += 1
         node = super().compose_node(parent, index)
         self._depth -= 1
+        self._path = above
         assert node is not None, "an event begins every node"
         if isinstance(event, yaml.ScalarEvent) and event.tag is not None:
             # The tag is a fault of its own; the value is read as if it were not there.
@@ -191,6 +196,18 @@ class _Loader(Reader, Scanner, Parser, Composer, _Resolver):
         if isinstance(event, yaml.AliasEvent):
             return _Alias("", node, event.start_mark, event.end_mark)
         return node
+
+
+def _step(index: Any) -> FieldPath:
+    """The way from a node to one below it: the place in a list, or the key; nothing where that is no text."""
+    if isinstance(index, int):
+        return (index,)
+    return (index.value,) if isinstance(index, yaml.ScalarNode) else ()
+
+
+def _is_key(parent: yaml.Node | None, index: Any, event: yaml.Event) -> bool:
+    """Whether a node begins that is a key, and text."""
+    return isinstance(parent, yaml.MappingNode) and index is None and isinstance(event, yaml.ScalarEvent)
 
 
 class _Tree:
@@ -274,7 +291,9 @@ class _Tree:
             self._alias_nodes += 1
             if self._alias_nodes > MAX_ALIAS_NODES or len(path) > MAX_DEPTH:
                 allowed = f"aliases may stand for at most {MAX_ALIAS_NODES} values, and never for themselves"
-                raise _fail(self.file, self.values[path], "too many values by alias", allowed, "write them out")
+                raise _fail(
+                    self.file, self.values[path], "too many values by alias", allowed, "write them out", path=path
+                )
         if isinstance(node, yaml.SequenceNode):
             return [self._convert(item, (*path, index), in_alias) for index, item in enumerate(node.value)]
         if isinstance(node, yaml.MappingNode):

@@ -7,13 +7,15 @@ import os
 import time
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 from zwidth.errors import InputError, StoreExistsError
 from zwidth.sweep.document import Config
 from zwidth.sweep.jobs import Finished, Job, Perform, in_this_process
+from zwidth.sweep.lock import holding
 from zwidth.sweep.plan import MEMORY, Plan, Task, check_resources, make_plan
-from zwidth.sweep.resume import check_same, new_store, repair, store_path, sweep_up
+from zwidth.sweep.resume import check_same, new_store, remove, repair, store_path, sweep_up
 from zwidth.sweep.store import Store
 from zwidth.sweep.sweeps import SweepStudy
 
@@ -86,6 +88,7 @@ def run_sweeps(
     out: str | os.PathLike[str],
     *,
     resume: bool = False,
+    overwrite: bool = False,
     workers: int | None = None,
     scheduler: str | None = None,
     shard: tuple[int, int] | None = None,
@@ -99,6 +102,7 @@ def run_sweeps(
         config: the configuration; studies of other kinds are left alone.
         out: the folder of the stores.
         resume: go on with stores that exist: chunks that are done and undamaged are not computed again.
+        overwrite: remove stores that exist, and start again.
         workers: how many processes compute on this machine; this process itself where left out. They are spawned: a
             script that asks for them does its work below ``if __name__ == "__main__":``.
         scheduler: address of a dask.distributed scheduler whose workers compute, and see the same folder.
@@ -112,7 +116,8 @@ def run_sweeps(
         does not keep the others from being computed; Ctrl-C ends the run with ``interrupted`` set.
 
     Raises:
-        StoreExistsError: a store exists and ``resume`` is not set.
+        StoreExistsError: a store exists and neither ``resume`` nor ``overwrite`` is set.
+        StoreBusyError: another run computes in this folder; shards (i, n) of one n do not exclude each other.
         StoreError: a store is damaged, or was made from another configuration or by other releases.
         ResourceError: the results do not fit on the disk, or the workers not into memory.
         InputError: options that exclude each other.
@@ -121,9 +126,31 @@ def run_sweeps(
         Float64. The values do not depend on chunks, workers or engine; on another kind of processor or with another
         release of JAX the last digits may differ.
     """
-    _check_options(workers, scheduler, shard)
+    _check_options(workers, scheduler, shard, going_on=resume or shard is not None, overwrite=overwrite)
     folder = Path(os.path.abspath(os.fsdecode(out)))
-    stores, repaired = _stores(config, folder, resume=resume, shard=shard, memory=memory, workers=workers or 1)
+    studies = sweeps_of(config)
+    plans = {study.name: make_plan(study, memory=memory) for study in studies}
+    # What does not fit is refused before anything is made.
+    check_resources(list(plans.values()), folder, workers or 1, begun=_found(studies, folder))
+    if not studies:
+        return SweepResult({}, 0, 0, 0)
+    with holding(folder, shard):
+        if overwrite:
+            for study in studies:
+                remove(folder, study)
+        stores, repaired = _stores(config, folder, plans, resume=resume, shard=shard)
+        engine = partial(_engine, workers=workers, scheduler=scheduler, perform=perform)
+        return _compute(stores, repaired, shard, engine, progress or (lambda event: None))
+
+
+def _compute(
+    stores: dict[str, Store],
+    repaired: list[str],
+    shard: tuple[int, int] | None,
+    engine: Callable[[list[Job]], Generator[Finished]],
+    progress: Callable[[SweepEvent], None],
+) -> SweepResult:
+    """Compute what is missing in the stores."""
     jobs, points, total = [], {}, 0
     for store in stores.values():
         tasks = _share(store.plan, shard)
@@ -131,11 +158,9 @@ def run_sweeps(
         for task in (task for task in tasks if not store.is_done(task)):
             jobs.append(Job(str(store.path), task))
             points[jobs[-1]] = store.plan.points(task)
-    if perform is None:
-        from zwidth.sweep.chunks import perform
     names = {str(store.path): name for name, store in stores.items()}
-    follower = _Follower(names, points, progress or (lambda event: None))
-    interrupted = follower.follow(_engine(jobs, workers, scheduler, perform)) if jobs else False
+    follower = _Follower(names, points, progress)
+    interrupted = follower.follow(engine(jobs)) if jobs else False
     failed = {
         f"{names[job.path]}/{stores[names[job.path]].plan.describe(job.task)}": error
         for job, error in follower.failed.items()
@@ -146,13 +171,17 @@ def run_sweeps(
     )
 
 
-def _check_options(workers: int | None, scheduler: str | None, shard: tuple[int, int] | None) -> None:
+def _check_options(
+    workers: int | None, scheduler: str | None, shard: tuple[int, int] | None, *, going_on: bool, overwrite: bool
+) -> None:
     if workers is not None and scheduler is not None:
         raise InputError("workers, scheduler: got both; the cluster has its own workers, give one of the two")
     if workers is not None and workers < 1:
         raise InputError(f"workers: got {workers}; at least 1")
     if shard is not None and not 1 <= shard[0] <= shard[1]:
         raise InputError(f"shard: got {shard[0]}/{shard[1]}; give i/n with 1 <= i <= n")
+    if overwrite and going_on:
+        raise InputError("overwrite: it starts again, resume and shard go on; give one of them")
 
 
 def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
@@ -161,12 +190,17 @@ def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
     return tasks if shard is None else tasks[shard[0] - 1 :: shard[1]]
 
 
+def _found(studies: list[SweepStudy], folder: Path) -> set[str]:
+    """The studies that have a store."""
+    return {study.name for study in studies if store_path(folder, study).exists()}
+
+
 def _stores(
-    config: Config, folder: Path, *, resume: bool, shard: tuple[int, int] | None, memory: int, workers: int
+    config: Config, folder: Path, plans: dict[str, Plan], *, resume: bool, shard: tuple[int, int] | None
 ) -> tuple[dict[str, Store], list[str]]:
     """The stores of all sweeps, made or found, and what was repaired in them."""
     studies = sweeps_of(config)
-    found = {study.name for study in studies if store_path(folder, study).exists()}
+    found = _found(studies, folder)
     if found and not resume and shard is None:
         first = next(store_path(folder, study) for study in studies if study.name in found)
         raise StoreExistsError(
@@ -176,8 +210,6 @@ def _stores(
     for study in studies:
         if study.name in found:
             check_same(Store(store_path(folder, study)), study)
-    plans = {study.name: make_plan(study, memory=memory) for study in studies}
-    check_resources(list(plans.values()), folder, workers, begun=found)
     stores, repaired = {}, []
     for study in studies:
         if shard is None:
@@ -190,7 +222,11 @@ def _stores(
     return stores, repaired
 
 
-def _engine(jobs: list[Job], workers: int | None, scheduler: str | None, perform: Perform) -> Generator[Finished]:
+def _engine(
+    jobs: list[Job], *, workers: int | None, scheduler: str | None, perform: Perform | None
+) -> Generator[Finished]:
+    if perform is None:
+        from zwidth.sweep.chunks import perform
     if scheduler is not None:
         from zwidth.sweep.distributed import on_cluster
 

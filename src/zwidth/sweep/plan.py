@@ -77,6 +77,11 @@ class FamilyPlan:
         """The outputs and the status: every one of them has a file for each chunk."""
         return (*self.outputs, STATUS_OF[self.family])
 
+    @property
+    def extent(self) -> str:
+        """Its dimensions and their sizes, for messages."""
+        return " x ".join(f"{dim} {size}" for dim, size in zip(self.dims, self.shape, strict=True)) or "one point"
+
     def position(self, index: int) -> tuple[int, ...]:
         """The position of a chunk along each dimension."""
         return tuple(int(part) for part in np.unravel_index(index, self.counts)) if self.counts else ()
@@ -138,6 +143,12 @@ class Plan:
         """A chunk for messages."""
         return self.family(task.family).describe(task.index)
 
+    @property
+    def extent(self) -> str:
+        """The axes of the largest family and how many values each has, for messages."""
+        family = max(self.families, key=lambda family: math.prod(family.shape))
+        return family.extent
+
     def as_dict(self) -> dict[str, Any]:
         """What a store keeps of the plan: later work on it must follow the same."""
         return {
@@ -149,11 +160,10 @@ class Plan:
         """The plan in words."""
         yield f"study {self.study}"
         for family in self.families:
-            size = " x ".join(f"{dim} {size}" for dim, size in zip(family.dims, family.shape, strict=True))
             chunk = " x ".join(map(str, family.chunks))
             points = math.prod(family.shape)
             yield f"  {', '.join(family.outputs)}"
-            yield f"    points   {points:,} ({size or 'one point'})"
+            yield f"    points   {points:,} ({family.extent})"
             yield f"    chunks   {family.count:,} of {chunk or '1'}"
         yield f"  model      {self.model}"
         for name, method in sorted(self.methods.items()):
@@ -273,9 +283,11 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
     free = shutil.disk_usage(existing(folder)).free
     disk = sum(plan.disk for plan in plans if plan.study not in begun)
     if disk > free:
+        largest = max((plan for plan in plans if plan.study not in begun), key=lambda plan: plan.disk)
         raise ResourceError(
-            f"out: {folder} has {_size(free)} free, but the results may take {_size(disk)}; "
-            "choose another folder with --out DIR, fewer outputs or fewer values on an axis"
+            f"out: {folder} has {_size(free)} free, but the results may take {_size(disk)}, most of them of "
+            f"studies[{largest.study}].axes ({largest.extent}); choose another folder with --out DIR, fewer outputs or "
+            "fewer values on an axis"
         )
     total = _machine_memory()
     memory = max(workers * (plan.memory + IDLE_MEMORY) for plan in plans)

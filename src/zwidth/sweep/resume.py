@@ -100,3 +100,10 @@ def sweep_up(folder: Path, study: SweepStudy) -> None:
         shutil.rmtree(left, ignore_errors=True)
     for left in path.rglob("*.partial"):
         left.unlink(missing_ok=True)
+
+
+def remove(folder: Path, study: SweepStudy) -> None:
+    """Make room for a store to be made again; what is no store stays, and is then refused."""
+    path = store_path(folder, study)
+    if (path / "zarr.json").is_file() and not path.is_symlink():
+        shutil.rmtree(path)

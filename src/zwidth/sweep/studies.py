@@ -28,7 +28,7 @@ def _only_held(value: Any) -> str:
     """A validator for a study that needs poles."""
     if one_of(*DELAY_MODELS)(value) == "fractional_power":
         raise problem(
-            f"got {describe(value)}, the study's own or the scene's",
+            f"got {describe(value)}, the study's own or that of scene.delay_model",
             "poles do not exist in this delay model, only the boundary and the ridge do; allowed is 'held'",
             "write 'delay_model: held' in this study, or use the kind 'boundary' or 'ridge'",
         )

@@ -15,8 +15,8 @@ FOLDER = Path(__file__).parents[2] / "data" / "bad_configs"
 # and how its remedy begins.
 FAULTS = {
     "a_list": [("1:1: got a list of 2 items", "write 'key: value' lines, or {key: value}")],
-    "alias_bomb": [("1:32: too many values by alias", "write them out")],
-    "alias_of_itself": [("4:5: too many values by alias", "write them out")],
+    "alias_bomb": [("1:32: d[0][0][8][8]: too many values by alias", "write them out")],
+    "alias_of_itself": [(f"4:5: studies{'[0]' * 20}: too many values by alias", "write them out")],
     "alias_undefined": [("3:10: not valid YAML", "define it before with '&', or remove the '*'")],
     "axis_boolean": [("7:16: studies[0].delta[1]: got true", "write a number such as 0.5")],
     "axis_empty": [("7:12: studies[0].delta: got an empty list", "fill the list")],
@@ -39,7 +39,7 @@ FAULTS = {
     "control_character": [("3:15: got the character '\\x07'", "remove it")],
     "damping_beyond_float": [("5:12: scene.damping: got 1e+300, whose normalized value delta is", "check the")],
     "damping_unit": [("5:12: scene.damping: got '10 N/m'", "did you mean 'N s/m'?")],
-    "deep_nesting": [("1:29: the values are nested too deeply", "use fewer levels")],
+    "deep_nesting": [(f"1:29: version{'[0]' * 19}: the values are nested too deeply", "use fewer levels")],
     "delay_axis_too_long": [("7:12: studies[0].d[1]: got 20000", "write a number in this range")],
     "delay_model_twice": [("8:26: studies[0].delay_models[1]: got 'held' twice, here and at", "remove it")],
     "delay_model_unknown": [("8:26: studies[0].delay_models[1]: got 'fractional-power'", "did you mean")],
@@ -142,10 +142,10 @@ FAULTS = {
     "substeps_zero": [("8:15: studies[0].substeps: got 0", "write a number in this range")],
     "tab": [("4:1: not valid YAML", "indent with spaces")],
     "tag": [
-        ("6:12: got the tag 'tag:yaml.org,2002:float'", "remove the tag"),
-        ("7:8: got the tag '!python/name:os.system'", "remove the tag"),
+        ("6:12: studies[0].delta: got the tag 'tag:yaml.org,2002:float'", "remove the tag"),
+        ("7:8: studies[0].d: got the tag '!python/name:os.system'", "remove the tag"),
     ],
-    "too_many_values": [("3:99997: too many values", "write long axes as linear or log")],
+    "too_many_values": [("3:99997: studies[49993]: too many values", "write long axes as linear or log")],
     "two_documents": [("8:1: a second document begins here", "remove the '---' or split the file")],
     "unclosed_bracket": [("7:6: not valid YAML", "close the bracket opened at line 6, column 12")],
     "unclosed_quote": [("5:1: not valid YAML", "check the quoted text that begins at line 3")],

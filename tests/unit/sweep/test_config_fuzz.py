@@ -3,7 +3,9 @@
 import json
 import os
 import random
+import re
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,7 +13,8 @@ import yaml
 
 from sweeping import main_of
 from zwidth.errors import ConfigError
-from zwidth.sweep.config import Config, load_config
+from zwidth.sweep.config import MAX_DEPTH, MAX_NODES, Config, load_config
+from zwidth.sweep.faults import dotted
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 # More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/sweep/test_config_fuzz.py
@@ -50,6 +53,60 @@ def mutated(data, rng):
                 rng.shuffle(lines)
                 data[:] = b"\n".join(lines)
     return bytes(data)
+
+
+def fields_of(data):
+    """Every field of a document by its path, as PyYAML reads it, "" for the whole; None where that is no YAML."""
+    try:
+        root = yaml.compose(data.decode("utf-8-sig"), Loader=yaml.SafeLoader)
+    except (yaml.YAMLError, ValueError, OverflowError, RecursionError):
+        return None
+    found = {}
+
+    def walk(node, path):
+        # Deeper, or more, than any file that is read may have.
+        if len(path) > 2 * MAX_DEPTH or len(found) > 2 * MAX_NODES:
+            return
+        found[dotted(path)] = node
+        if isinstance(node, yaml.MappingNode):
+            for key, value in node.value:
+                # Of a key that comes twice the first counts.
+                if isinstance(key, yaml.ScalarNode) and dotted((*path, key.value)) not in found:
+                    walk(value, (*path, key.value))
+        elif isinstance(node, yaml.SequenceNode):
+            for index, value in enumerate(node.value):
+                walk(value, (*path, index))
+
+    walk(root, ())
+    return found
+
+
+def check_named(fault, fields):
+    """A fault has a place, and names a field of the document, one that is missing in such a field, or a bad key."""
+    assert fault.line >= 1, fault
+    assert fault.column >= 1, fault
+    start, _, text = str(fault).partition(f"{fault.file}:{fault.line}:{fault.column}: ")
+    assert start == ""
+    if fields is None:
+        return
+    assert text.startswith(f"{fault.field}: ") or not fault.field
+    if fault.problem.startswith("got the key ") or fault.problem == "got a complex key":
+        # What is no text names no field; it is told itself, with the field that holds it.
+        assert isinstance(fields[fault.field], yaml.MappingNode), fault
+    elif fault.field:
+        if fault.problem == "missing":
+            above, _, name = fault.field.rpartition(".")
+            assert name in text
+            assert fault.field not in fields
+            assert isinstance(fields[above], yaml.MappingNode), fault
+        else:
+            # What a study has from the scene is wrong there.
+            supplied = f"scene.{fault.field.rpartition('.')[2]}"
+            assert fault.field in fields or (supplied in fields and supplied in fault.problem), fault
+    else:
+        # Only what is no mapping has no fields; then those that it needs are named.
+        assert not isinstance(fields[""], yaml.MappingNode), fault
+        assert "'version'" in text or "version, name and studies" in text, fault
 
 
 def outcome(path):
@@ -95,9 +152,44 @@ def test_any_value_anywhere_ends_in_a_config_or_a_clear_error(value, tmp_path):
         path.write_text(json.dumps(with_value(tree, place, value)), encoding="utf-8")
         config, faults = outcome(path)
         assert all(fault.problem and fault.allowed and fault.remedy for fault in faults)
+        fields = fields_of(path.read_bytes()) if faults else {}
+        for fault in faults:
+            check_named(fault, fields)
         if config is not None:
             dump = config.model_dump(mode="json", exclude_none=True)
             assert Config.model_validate(dump).model_dump(mode="json", exclude_none=True) == dump
+
+
+def test_a_fault_without_its_field_would_be_noticed(tmp_path):
+    path = tmp_path / "bad.yaml"
+    path.write_text("{version: 1, name: a, studies: [{kind: ridge, name: r, delta: -1, d: 0}]}", encoding="utf-8")
+    (fault,) = outcome(path)[1]
+    fields = fields_of(path.read_bytes())
+    check_named(fault, fields)
+    for wrong in ("", "delta", "studies[1].delta", "studies[0].delta.linear"):
+        with pytest.raises((AssertionError, KeyError)):
+            check_named(replace(fault, field=wrong), fields)
+    with pytest.raises(TypeError):
+        check_named(replace(fault, line=None), fields)
+
+
+@pytest.mark.parametrize(
+    "text, field",
+    [
+        ("version: 1\nname: !x a\nstudies: []\n", "name"),
+        ("version: 1\nname: a\n!x studies: []\n", "studies"),
+        ("version: 1\nname: a\nstudies: [{kind: map, name: m, d: !x [1]}]\n", "studies[0].d"),
+        ("version: 1\nname: " + "[" * 30 + "]" * 30, "name" + "[0]" * 19),
+        ("version: 1\nname: a\nx: &x [1]\nstudies: &s [*s]\n", "studies" + "[0]" * 20),
+        ("version: 1\nstudies:\n" + "- [" + "1," * 60_000 + "]", "studies[0][49994]"),
+    ],
+    ids=["tag", "tag on a key", "tag below", "depth", "alias", "number"],
+)
+def test_what_reading_itself_refuses_names_its_field(tmp_path, text, field):
+    path = tmp_path / "bad.yaml"
+    path.write_text(text, encoding="utf-8")
+    _, faults = outcome(path)
+    assert field in [fault.field for fault in faults], [str(fault)[:200] for fault in faults]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -108,7 +200,9 @@ def test_any_bytes_end_in_a_config_or_a_clear_error(seed, tmp_path):
     start = time.perf_counter()
     config, faults = outcome(path)
     assert isinstance(config, Config) or faults
+    fields = fields_of(path.read_bytes())
     for fault in faults:
+        check_named(fault, fields)
         assert str(fault).isprintable()
         assert fault.remedy
     assert time.perf_counter() - start < LONGEST_SECONDS
@@ -187,10 +281,18 @@ def test_any_mutation_ends_in_a_plan_or_in_exit_code_2(seed, tmp_path, capsys):
     lines = err.splitlines()
     assert code == (2 if lines else 0)
     assert out or lines
+    config, faults = outcome(path)
+    fields = fields_of(path.read_bytes()) if faults else {}
+    for fault in faults:
+        check_named(fault, fields)
+    if config is not None:
+        # What is wrong with no field may still be too large for the machine.
+        largest = "|".join(re.escape(study.name) for study in config.studies)
+        named = rf"zwidth: (out: .* of studies\[({largest})\]\.axes \(|workers: )"
+        assert all(re.match(named, line) for line in lines), lines
+    else:
+        assert lines == [f"zwidth: {fault}" for fault in faults]
     for line in lines:
-        # The file with line, column and field, or the option that does not fit the machine.
-        named = line.startswith((f"zwidth: {path}:", "zwidth: out: ", "zwidth: workers: "))
-        assert named or f"{tmp_path}/" in line, line
         assert "; " in line, line
         assert not any(word in line for word in ("Error", "Traceback", "Exception")), line
         assert line.isprintable()

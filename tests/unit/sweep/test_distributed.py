@@ -5,7 +5,16 @@ import warnings
 import pytest
 import yaml
 
-from sweeping import assert_same, config_of, killed_on_2, killed_once_on_2, main_of, study
+from sweeping import (
+    assert_same,
+    config_of,
+    config_of_everything,
+    cut,
+    killed_on_2,
+    killed_once_on_2,
+    main_of,
+    study,
+)
 from zwidth.errors import InputError
 from zwidth.sweep.engine import run_sweeps
 
@@ -39,6 +48,16 @@ def test_a_cluster_computes_the_same(cluster, finished, tmp_path):
     assert result.ok
     assert result.computed == result.total
     assert_same(finished, tmp_path)
+
+
+def test_no_output_depends_on_the_cluster_and_chunks(cluster, tmp_path, monkeypatch):
+    config = config_of_everything()
+    assert run_sweeps(config, tmp_path / "here").ok
+    cut(monkeypatch, 5, 3)
+    result = run_sweeps(config, tmp_path / "there", scheduler=cluster)
+    assert result.ok
+    assert result.computed > 50
+    assert_same(tmp_path / "here", tmp_path / "there")
 
 
 def test_work_of_a_killed_worker_is_done_by_another(cluster, finished, tmp_path):

@@ -57,7 +57,8 @@ def test_a_map_of_a_thousand_million_points_takes_megabytes():
 
 def test_what_does_not_fit_is_refused(tmp_path):
     plans = plan_sweeps(config_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin"))))
-    with pytest.raises(ResourceError, match=r"free, but the results may take 2\.\d+ TiB; choose another folder"):
+    says = r"free, but the results may take 2\.\d+ TiB, most of them of studies\[map\]\.axes \(.* x beta \d+\)"
+    with pytest.raises(ResourceError, match=says):
         check_resources(plans, tmp_path / "not" / "there", workers=1)
     with pytest.raises(ResourceError, match=r"workers: 100000 of them may take .*; choose fewer with --workers"):
         check_resources(plan_sweeps(config_of()), tmp_path, workers=100_000)

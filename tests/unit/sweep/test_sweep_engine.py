@@ -6,9 +6,14 @@ import pytest
 import zwidth
 from sweeping import (
     AXES,
+    DEVICES,
+    FEW,
+    WALLS,
     assert_same,
     chunk_file,
     config_of,
+    config_of_everything,
+    cut,
     disk_full_on_2,
     failing_on_2,
     flags,
@@ -25,9 +30,6 @@ from zwidth.sweep.engine import run_sweeps
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store, open_dataset
 from zwidth.sweep.verify import verify
-
-ALL = ("stable", "spectral_radius", "margin", "settling_time", "passive", "passivity_margin")
-FEW = {"alpha": [0.0, 0.1, 0.5], "beta": [-0.05, 0.1, 0.4, 0.9], "delta": [0.0, 0.3], "d": [0, 0.5, 2]}
 
 
 @pytest.fixture(scope="module")
@@ -51,8 +53,7 @@ def copy_of(finished, folder):
 
 
 def test_the_values_are_those_of_the_library(tmp_path):
-    outputs = (*ALL, "alpha_max", "beta_at_max", "kind")
-    run_sweeps(config_of(study(axes=FEW, outputs=outputs)), tmp_path)
+    run_sweeps(config_of(study(axes=FEW, outputs=(*WALLS, *DEVICES))), tmp_path)
     data = open_dataset(tmp_path).load()
     assert data.stable.dims == ("d", "delta", "alpha", "beta")
     assert data.stable.dtype == bool
@@ -101,16 +102,12 @@ MANY_ROWS = {"alpha": [0.1], "beta": {"linear": {"start": -0.1, "stop": 0.5, "nu
 
 @pytest.mark.parametrize("axes, target", [(FEW, 1), (FEW, 7), (MANY_ROWS, 11), (MANY_ROWS, 100)])
 def test_values_do_not_depend_on_chunks(tmp_path, monkeypatch, axes, target):
-    from zwidth.sweep import plan
-
     monkeypatch.setattr("zwidth.sweep.compute._PIECE", 16)
-    config = config_of(study(axes=axes, outputs=("stable", "spectral_radius", "passivity_margin")))
+    config = config_of(study(axes=axes, outputs=(*WALLS, *DEVICES)))
     run_sweeps(config, tmp_path / "whole")
-    whole = plan.chunk_shape
-    monkeypatch.setattr(plan, "chunk_shape", lambda shape, size: whole(shape, target if len(shape) > 3 else 2))
-    monkeypatch.setattr(plan, "_SMALLEST_CHUNK", 1)
+    cut(monkeypatch, target, 2)
     result = run_sweeps(config, tmp_path / "parts")
-    assert result.computed > 2
+    assert result.computed > 4
     assert_same(tmp_path / "whole", tmp_path / "parts")
 
 
@@ -121,12 +118,29 @@ def test_values_do_not_depend_on_workers(finished, tmp_path):
     assert_same(folder, tmp_path)
 
 
-def test_no_output_depends_on_workers(tmp_path):
-    config = config_of(study(axes=FEW, outputs=(*ALL, "alpha_max", "beta_at_max", "kind")))
-    assert run_sweeps(config, tmp_path / "here").ok
-    # A worker has fewer processors, and its kernels fewer threads.
-    assert run_sweeps(config, tmp_path / "there", workers=2).ok
-    assert_same(tmp_path / "here", tmp_path / "there")
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory):
+    """Every output, in the largest chunks there can be."""
+    folder = tmp_path_factory.mktemp("everything")
+    assert run_sweeps(config_of_everything(), folder).ok
+    return folder
+
+
+# Pieces of compiled kernels are filled up to a size of their own, whatever the chunk: what is compared here is whether
+# any value depends on the points beside it, on how many there are, or on how many processors a worker has.
+def test_no_output_depends_on_workers_and_chunks(everything, tmp_path, monkeypatch):
+    cut(monkeypatch, 7, 2)
+    result = run_sweeps(config_of_everything(), tmp_path, workers=2)
+    assert result.ok
+    assert result.computed > 40
+    assert_same(everything, tmp_path)
+
+
+def test_no_output_depends_on_shards_and_chunks(everything, tmp_path, monkeypatch):
+    cut(monkeypatch, 13, 3)
+    results = [run_sweeps(config_of_everything(), tmp_path, shard=(number, 3)) for number in (3, 1, 2)]
+    assert all(result.ok and result.computed > 5 for result in results)
+    assert_same(everything, tmp_path)
 
 
 def test_shards_complete_each_other(finished, tmp_path):
