@@ -1,0 +1,165 @@
+#!/usr/bin/env python3
+"""Measure what only a program of its own can show: the memory of large maps, and XLA's flags.
+
+    PYTHONPATH=src python benchmarks/bench_process.py [--quick] [--out benchmarks/results/process.md]
+
+zwidth sets no flag: who wants one sets ``XLA_FLAGS`` before Python starts. Every setting is measured in programs of
+its own, the settings by turns, several times; ratios are those of the medians.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+
+SETTINGS = {
+    "none": "",
+    "vector width 512": "--xla_cpu_prefer_vector_width=512",
+    "vector width 128": "--xla_cpu_prefer_vector_width=128",
+    "two CPU devices": "--xla_force_host_platform_device_count=2",
+    "one thread": "--xla_cpu_multi_thread_eigen=false",
+}
+# What is timed under every setting: quantity, method, delay, points.
+CASES = [
+    ("stable", "schur_cohn", 0.0, 4_000_000),
+    ("stable", "schur_cohn", 4.0, 4_000_000),
+    ("stable", "schur_cohn", 8.0, 4_000_000),
+    ("stable", "boundary", 4.0, 4_000_000),
+    ("spectral_radius", "newton", 4.0, 1_000_000),
+]
+# What is held against its memory: quantity, method, delay, bytes of the result a point.
+LARGE = [
+    ("stable", "boundary", 4.0, 1),
+    ("stable", "schur_cohn", 4.0, 1),
+    ("stable", "boundary", 500.0, 1),
+    ("spectral_radius", "newton", 4.0, 8),
+]
+
+
+def call(quantity: str, method: str, d: float, points: int):
+    """The function to measure, and how many points it computes."""
+    from zwidth.bench import problems
+    from zwidth.stability.methods import is_stable, spectral_radius
+
+    walls = problems.grid(d, points)
+    function = is_stable if quantity == "stable" else spectral_radius
+    return (lambda: function(*walls, method=method)), walls.points
+
+
+def time_cases(quick: bool) -> list[float]:
+    """Points a second of every case, by the median of some calls."""
+    rates = []
+    for quantity, method, d, points in CASES:
+        function, count = call(quantity, method, d, points // (16 if quick else 1))
+        function()
+        durations = []
+        for _ in range(3 if quick else 15):
+            start = time.perf_counter()
+            function()
+            durations.append(time.perf_counter() - start)
+        rates.append(count / statistics.median(durations))
+    return rates
+
+
+def peak() -> int:
+    """The largest memory of this program so far, in bytes."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
+
+
+def memory_of(quantity: str, method: str, d: float, points: int) -> list[int]:
+    """Points, and the growth of the peak by a large map after a small one has compiled and loaded everything."""
+    small, _ = call(quantity, method, d, 250_000)
+    small()
+    before = peak()
+    large, count = call(quantity, method, d, points)
+    assert np.asarray(large()).size == count
+    return [count, peak() - before]
+
+
+def in_program(arguments: list[str], flags: str = "") -> list:
+    """The JSON that this file prints when it is started with these arguments."""
+    environment = os.environ | ({"XLA_FLAGS": flags} if flags else {})
+    command = [sys.executable, __file__, *arguments]
+    done = subprocess.run(command, env=environment, check=True, capture_output=True, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def report(quick: bool) -> str:
+    """Both tables as Markdown."""
+    from zwidth.bench.report import environment
+
+    rates = {name: [] for name in SETTINGS}
+    for _ in range(1 if quick else 3):
+        for name, flags in SETTINGS.items():
+            rates[name].append(in_program(["--time", *(["--quick"] if quick else [])], flags))
+    middle = {name: [statistics.median(column) for column in zip(*runs, strict=True)] for name, runs in rates.items()}
+    here = environment()
+    lines = [
+        f"Measured on {here['cores']} cores ({here['processor']}) with JAX {here['jax']}, written by",
+        "`benchmarks/bench_process.py`.",
+        "",
+        "### XLA's flags",
+        "",
+        "zwidth sets none, and changes no setting of JAX. Speed of maps as a multiple of the speed without a flag, for",
+        "a user who sets `XLA_FLAGS` before Python starts:",
+        "",
+        "| `XLA_FLAGS` | " + " | ".join(f"{method}, d = {d:g}" for _, method, d, _ in CASES) + " |",
+        "|---|" + "--:|" * len(CASES),
+    ]
+    for name, flags in SETTINGS.items():
+        if flags:
+            ratios = [f"{mine / plain:.2f}" for mine, plain in zip(middle[name], middle["none"], strict=True)]
+            lines.append(f"| `{flags}` | {' | '.join(ratios)} |")
+    lines += [
+        "",
+        "### Memory of a large map",
+        "",
+        "Peak memory beyond that of a small map, after everything has been compiled, and beside it the result alone.",
+        "",
+        "| asked for | method | d | points | memory | of it the result |",
+        "|---|---|--:|--:|--:|--:|",
+    ]
+    for quantity, method, d, size in LARGE:
+        points = 10_000_000 if quick or quantity != "stable" else 100_000_000
+        count, grown = in_program(["--memory", quantity, method, str(d), str(points)])
+        asked = quantity.replace("_", " ")
+        lines.append(f"| {asked} | {method} | {d:g} | {count:,} | {_size(grown)} | {_size(count * size)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _size(count: float) -> str:
+    return f"{count / 1e6:,.0f} MB"
+
+
+def main() -> None:
+    """Measure, print, and write where a path is given."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small maps, one round")
+    parser.add_argument("--out", type=Path, help="write the tables there")
+    parser.add_argument("--time", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--memory", nargs=4, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.time:
+        print(json.dumps(time_cases(given.quick)))
+    elif given.memory:
+        quantity, method, d, points = given.memory
+        print(json.dumps(memory_of(quantity, method, float(d), int(points))))
+    else:
+        text = report(given.quick)
+        print(text)
+        if given.out:
+            given.out.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
