@@ -7,7 +7,7 @@ from zwidth.design.damping import fastest_damping as fastest_damping
 from zwidth.design.damping import fastest_wall as fastest_wall
 from zwidth.design.damping import most_robust_damping as most_robust_damping
 from zwidth.design.margin import modulus_margin as modulus_margin
-from zwidth.design.area import passive_area as passive_area
+from zwidth.design.passive import passive_area as passive_area
 from zwidth.design.requirements import Requirement as Requirement
 from zwidth.design.requirements import allowed_delay as allowed_delay
 from zwidth.design.requirements import required_damping as required_damping
