@@ -13,14 +13,14 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from zwidth.assessment import Assessment as Assessment
     from zwidth.assessment import assess as assess
-    from zwidth.design.area import passive_area as passive_area
     from zwidth.design.area import stable_area as stable_area
     from zwidth.design.damping import DampingChoice as DampingChoice
     from zwidth.design.damping import FastestWall as FastestWall
     from zwidth.design.damping import fastest_damping as fastest_damping
     from zwidth.design.damping import fastest_wall as fastest_wall
-    from zwidth.design.damping import modulus_margin as modulus_margin
     from zwidth.design.damping import most_robust_damping as most_robust_damping
+    from zwidth.design.margin import modulus_margin as modulus_margin
+    from zwidth.design.passive import passive_area as passive_area
     from zwidth.design.requirements import Requirement as Requirement
     from zwidth.design.requirements import allowed_delay as allowed_delay
     from zwidth.design.requirements import required_damping as required_damping
@@ -71,13 +71,13 @@ if TYPE_CHECKING:
 _HOME = {
     "Assessment": "zwidth.assessment",
     "assess": "zwidth.assessment",
-    "passive_area": "zwidth.design.area",
+    "passive_area": "zwidth.design.passive",
     "stable_area": "zwidth.design.area",
     "DampingChoice": "zwidth.design.damping",
     "FastestWall": "zwidth.design.damping",
     "fastest_damping": "zwidth.design.damping",
     "fastest_wall": "zwidth.design.damping",
-    "modulus_margin": "zwidth.design.damping",
+    "modulus_margin": "zwidth.design.margin",
     "most_robust_damping": "zwidth.design.damping",
     "Requirement": "zwidth.design.requirements",
     "allowed_delay": "zwidth.design.requirements",

@@ -46,26 +46,30 @@ def groups(d: np.ndarray) -> Iterator[tuple[Degree, np.ndarray]]:
 
 def by_degree(
     kernel: Callable[..., Any],
-    values: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike],
+    values: tuple[ArrayLike, ...],
     *,
+    names: tuple[str, ...] = NAMES,
     static: tuple[Any, ...] = (),
     lead: bool = False,
     chunk: Callable[[Degree], int] = lambda degree: batching.CHUNK,
+    fused: bool = True,
+    least: int = 1,
     threads: int | None = None,
 ) -> Any:
     """Apply ``kernel(alpha, beta, delta, d, degree, *static)`` to points whose delays may differ.
 
-    Results that are vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for
-    coefficients) or NaN behind (for poles). ``threads`` as for `zwidth.batching.map_flat`.
+    Other arguments may take the place of these if ``names`` says so; the last one is the delay. Results that are
+    vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN
+    behind (for poles). ``fused``, ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
     """
     if batching.is_traced(*values):
-        return _by_degree_traced(kernel, values, static, lead)
-    arrays = batching.broadcast(NAMES, values)
+        return _by_degree_traced(kernel, names, values, static, lead)
+    arrays = batching.broadcast(names, values)
     columns = [array.ravel() for array in arrays]
     parts, places = [], []
-    for degree, index in groups(columns[3]):
+    for degree, index in groups(columns[-1]):
         picked = [column[index] for column in columns]
-        parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), threads=threads))
+        parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), fused, least, threads))
         places.append(index)
     if not parts:
         parts, places = [batching.map_flat(kernel, columns, (Degree(0, False), *static))], [np.arange(0)]
@@ -96,8 +100,8 @@ def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
     return filled
 
 
-def _by_degree_traced(kernel: Callable[..., Any], values: tuple, static: tuple, lead: bool) -> Any:
-    delays = batching.concrete_delay(values[3])
+def _by_degree_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static: tuple, lead: bool) -> Any:
+    delays = batching.concrete_delay(values[-1])
     dtype = jnp.result_type(float)
     arrays = jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
     shape = arrays[0].shape
@@ -109,7 +113,7 @@ def _by_degree_traced(kernel: Callable[..., Any], values: tuple, static: tuple, 
         parts.append(jax.vmap(lambda *point, degree=degree: kernel(*point, degree, *static))(*picked))
         places.append(index)
     if not parts:
-        raise batching.InputError("alpha, beta, delta, d: got no point at all inside a JAX transformation")
+        raise batching.InputError(f"{', '.join(names)}: got no point at all inside a JAX transformation")
     order = np.argsort(np.concatenate(places), kind="stable")
 
     def gather(*leaves: jax.Array) -> jax.Array:

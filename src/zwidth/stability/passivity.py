@@ -32,6 +32,8 @@ _SAMPLES_PER_LAG = 12
 _PEAKS = 6
 _REFINEMENTS = 40
 _GOLDEN = 0.6180339887498949
+# The first peak lies at omega (d + 1) < 1.1 pi.
+_FIRST_HALF_WAVE = 1.25 * np.pi
 
 
 def needed_damping_at(omega: Array, alpha: Array, beta: Array, d: Array) -> Array:
@@ -68,6 +70,9 @@ def needed_damping(alpha: Array, beta: Array, d: Array, samples: int) -> Array:
     is_peak = (values >= padded[:-2]) & (values >= padded[2:])
     # Peaks may tie to within what the sampling resolves: the highest sample need not mark the highest peak.
     heights, best = jax.lax.top_k(jnp.where(is_peak, values, -jnp.inf), _PEAKS)
+    # Where d + 1 peaks nearly tie (small alpha, beta > 0) the first one was found to be the highest, for every d.
+    first = jnp.argmax(jnp.where(grid * (d + 1.0) <= _FIRST_HALF_WAVE, values, -jnp.inf))
+    heights, best = jnp.append(heights, values[first]), jnp.append(best, first)
     refined = jax.vmap(lambda center: _refined_peak(cost, center, jnp.pi / samples))(grid[best])
     return jnp.maximum(jnp.max(jnp.where(jnp.isfinite(heights), refined, -jnp.inf)), 0.0)
 

@@ -83,6 +83,14 @@ def test_the_passive_set_is_convex_and_a_cone(d):
     np.testing.assert_allclose(zwidth.passivity_margin(*(3 * one).T, d), 3 * first, rtol=0, atol=3 * allowed)
 
 
+@pytest.mark.parametrize("d, alpha, beta", [(12.0, 0.00788585704807089, 0.9951298014123421), (20.0, 0.00217, 0.999)])
+def test_the_highest_of_many_equal_peaks(d, alpha, beta):
+    # With hardly any spring all d + 1 peaks are about as high: the first one, between samples, is the highest.
+    omega = np.linspace(0, 1.5 * np.pi / (d + 1), 400_001)[1:]
+    needed = alpha * np.sin((d + 0.5) * omega) / (2 * np.sin(0.5 * omega)) - beta * np.cos((d + 1) * omega)
+    assert zwidth.passivity_margin(alpha, beta, 1.0, d) == pytest.approx(1.0 - needed.max(), abs=1e-10)
+
+
 @pytest.mark.parametrize("d, share", [(1, 0.42), (2, 0.62), (4, 0.77)])
 def test_eq_21_is_wrong_for_delays(d, share):
     delta = RANDOM.uniform(0.05, 3.0, 4000)
