@@ -8,8 +8,9 @@ of it; inside somebody's own transformation (`jit`, `grad`, ...) the ambient pre
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -29,6 +30,16 @@ CHUNK = 1 << 15
 def is_traced(*values: ArrayLike) -> bool:
     """Whether any argument is inside a JAX transformation."""
     return any(isinstance(value, jax.core.Tracer) for value in values)
+
+
+@contextmanager
+def concretely() -> Iterator[None]:
+    """Compute in float64 and at once, though the caller may be inside a JAX transformation that traces other values.
+
+    The settings belong to the thread and end with the block.
+    """
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        yield
 
 
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
@@ -58,7 +69,7 @@ def to_caller(result: Any, values: tuple[ArrayLike, ...]) -> Any:
     """Hand NumPy results to a caller who passed NumPy or plain numbers, JAX arrays to one who passed any."""
     if any(isinstance(value, jax.Array) for value in values):
         # Without this a caller with JAX's default precision would lose half of the digits on the way out.
-        with jax.enable_x64(True):
+        with concretely():
             return jax.tree.map(jnp.asarray, result)
     return jax.tree.map(lambda leaf: np.asarray(leaf)[()], result)
 
@@ -107,8 +118,7 @@ def map_flat(
     size = _padded_size(count, chunk, least)
 
     def run(start: int) -> Any:
-        # The setting belongs to the thread.
-        with jax.enable_x64(True):
+        with concretely():
             result = function(*(_piece(column, start, size) for column in columns))
             return jax.tree.map(np.asarray, result)
 
@@ -170,7 +180,12 @@ def _single(kernel: Callable[..., Any], point: list[float], static: tuple[Any, .
     with jax.enable_x64(True):
         packed = _packed(kernel, static, len(point), fused)
         if packed is not None:
-            return packed.unpack(np.asarray(packed.function(np.array(point))))
+            # Entering `concretely` takes a tenth of a query: only where a transformation is found to be under way.
+            vector = packed.function(np.array(point)) if fused else None
+            if vector is None or is_traced(vector):
+                with concretely():
+                    vector = packed.function(np.array(point))
+            return packed.unpack(np.asarray(vector))
     columns = [np.array([value]) for value in point]
     return jax.tree.map(lambda leaf: leaf[0], map_flat(kernel, columns, static, fused=fused))
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from zwidth import phi
 from zwidth._types import Array
-from zwidth.batching import as_float64
+from zwidth.batching import as_float64, concretely
 from zwidth.errors import InputError
 from zwidth.grouping import degree_of
 from zwidth.scene import Scene
@@ -124,7 +124,7 @@ def step_response(
     alpha, beta, delta, d, force = (float(number) for number in numbers.values())
     lag = degree_of(d).whole
     fractions = np.arange(substeps) / substeps
-    with jax.enable_x64(True):
+    with concretely():
         history = _simulate_jit(np.array([alpha, beta, delta, force]), fractions, d - lag, lag, int(periods))
     position, velocity, wall_force = (np.asarray(part).ravel() for part in history)
     time = (np.arange(periods)[:, None] + fractions).ravel()

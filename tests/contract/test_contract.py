@@ -168,6 +168,25 @@ def test_jit_and_vmap_agree_with_the_direct_call(case, x64):
             np.testing.assert_allclose(value, direct[name], rtol=1e-11, atol=1e-12, err_msg=name)
 
 
+@ALL
+def test_plain_numbers_inside_somebody_elses_transformation_are_computed_at_once(case):
+    expected = case.leaves(case.call(**case.arguments))
+    first = {name: values[0] for name, values in case.good.items()}
+    of_one = case.leaves(case.call(**first))
+    seen = {}
+
+    def traced(factor):
+        # A direct call as any other: NumPy in, NumPy out, to the last place.
+        seen["array"] = case.leaves(case.call(**case.arguments))
+        seen["number"] = case.leaves(case.call(**first))
+        return factor * 2.0
+
+    jax.jit(jax.vmap(jax.grad(traced)))(np.ones(2, np.float32))
+    assert all(type(value) is np.ndarray for value in seen["array"].values())
+    assert_same(seen["array"], expected)
+    assert_same(seen["number"], of_one)
+
+
 @LIGHT
 def test_inside_jit_the_ambient_precision_holds(case):
     function, values = traced(case)

@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from zwidth.batching import concretely
 from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import DeviceWork, Points, assemble, device_ok, per_device, split
 from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY, long_device, long_row, short_row
@@ -89,7 +90,7 @@ def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
             return _copied_rows(values, limit)
         if alpha.size < _NEVER:
             return _compare_places(alpha, limit)
-    with jax.enable_x64(True):
+    with concretely():
         return np.asarray(_compiled("between")(alpha, limit))
 
 
@@ -121,4 +122,5 @@ def _compare_places(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
     place[order] = np.arange(values.size, dtype=np.int16)
     place = np.where(values > 0, place, np.int16(_NEVER))
     count = _below(values[order], limit).astype(np.int16)
-    return np.asarray(_compiled("less")(place.reshape(alpha.shape), count.reshape(limit.shape)))
+    with concretely():
+        return np.asarray(_compiled("less")(place.reshape(alpha.shape), count.reshape(limit.shape)))

@@ -11,6 +11,7 @@ import numpy as np
 from jax import lax
 
 from zwidth._types import Array, ArrayLike
+from zwidth.batching import concretely
 from zwidth.errors import InputError
 from zwidth.grouping import Degree
 from zwidth.stability import balls
@@ -123,7 +124,7 @@ def _codes(work: DeviceWork, points: Points) -> np.ndarray:
     if points.is_dense:
         device_shape = np.broadcast_shapes(points.delta.shape, points.d.shape)
         devices = [np.broadcast_to(array, device_shape).reshape(-1) for array in (points.delta, points.d)]
-        with jax.enable_x64(True):
+        with concretely():
             fields = np.asarray(fields_of(work, *devices)).reshape(-1, *device_shape)
             return np.asarray(work.kernel(points.alpha, points.beta, fields))
     count = points.size

@@ -10,10 +10,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from zwidth.batching import as_float64
+from zwidth.batching import as_float64, concretely
 from zwidth.errors import InputError
 from zwidth.grouping import NAMES, Degree
 
@@ -223,7 +222,7 @@ def _in_pieces(
     count = flat[0].size
     shared = 4 * delta.size <= count or delta.size == 1
     out = np.empty((work.several, count) if work.several else count, work.dtype)
-    with jax.enable_x64(True):
+    with concretely():
         fields = fields_of(work, delta, d) if shared else None
         for part, size in pieces(count, work.piece, work.least):
             if fields is None:

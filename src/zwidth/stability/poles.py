@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import is_traced
+from zwidth.batching import as_float64, is_traced
 from zwidth.grouping import Degree, by_degree
 from zwidth.loop import check_has_poles, coefficients, evaluate, plant_of, poison, valid_wall
 
@@ -63,7 +63,7 @@ def radius_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Deg
 
 def is_spring(beta: ArrayLike) -> bool:
     """Whether all walls are known to be without virtual damping: one pole less to compute."""
-    return not is_traced(beta) and np.size(beta) > 0 and not np.any(np.asarray(beta) != 0)
+    return not is_traced(beta) and np.size(values := as_float64("beta", beta)) > 0 and not np.any(values)
 
 
 def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]) -> Array:

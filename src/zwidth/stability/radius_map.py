@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.batching import concretely
 from zwidth.grouping import Degree, degree_of
 from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import DeviceWork, Points, assemble, padded, per_device, picked, split_by_degree
@@ -321,7 +322,7 @@ def _on_map(points: Points, degree: Degree, accuracy: float) -> np.ndarray:
     node, cell = _cells(degree)
     tolerance = np.full((1, 1, 1, 1), accuracy)
     height = _BAND * _CELL
-    with jax.enable_x64(True):
+    with concretely():
         fields = compiled_device()(points.delta.reshape(-1), points.d.reshape(-1))[..., None, None, None]
         for top in range(0, rows, height):
             down = _cut(padded(outer.reshape(-1)[top : top + height], height), _CELL)

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.batching import concretely
 from zwidth.grouping import Degree
 from zwidth.stability.devices import Device, compiled_device
 from zwidth.stability.layout import PIECE, DeviceWork, Points, assemble, fields_of, per_device, split_by_degree
@@ -112,6 +113,6 @@ def _of_degree(points: Points, degree: Degree, dtype: str, doubt: bool) -> np.nd
         return per_device(work, [points.alpha, points.beta], points.delta, points.d)
     device_shape = np.broadcast_shapes(points.delta.shape, points.d.shape)
     deltas, delays = (np.broadcast_to(array, device_shape).reshape(-1) for array in (points.delta, points.d))
-    with jax.enable_x64(True):
+    with concretely():
         fields = np.asarray(fields_of(work, deltas, delays)).reshape(-1, *device_shape)
         return np.asarray(work.kernel(points.alpha, points.beta, fields)).reshape(points.shape)
