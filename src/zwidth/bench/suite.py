@@ -47,7 +47,7 @@ class Row:
         wrong: how many of ``checked`` labels were wrong; of other quantities, 0.
         checked: how many points the error was measured on, against ball arithmetic.
         baseline: whether it is a tool for comparison.
-        open: which share of the points it leaves undecided, where it may.
+        open: which share of the points with alpha > 0 it leaves undecided, where it may.
     """
 
     quantity: str
@@ -168,10 +168,11 @@ def _filter_alone(d: float, sizes: Sizes) -> Row:
     code = filtered(lay_out(truth.walls).points)
     wrong = (code != OPEN) & ((code == STABLE) != truth.stable)
     error = float(np.max(truth.distance, initial=0.0, where=wrong)), int(wrong.sum()), int(wrong.size)
-    walls = problems.grid(d, _fewer(sizes.map_points // 4, d))
+    walls = problems.grid(d, _fewer(sizes.map_points, d))
     points = lay_out(walls).points
     first, warm = clock(lambda: filtered(points))
-    left = float(np.mean(filtered(points) == OPEN))
+    # Walls without stiffness are left to signs.
+    left = float(np.mean((filtered(points) == OPEN)[:, points.alpha[0] > 0]))
     rate = walls.points / warm
     return Row("stable", FILTER, "float64", "map", d, walls.points, first, rate, *error, open=left)
 
@@ -191,7 +192,8 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
             walls = make(d, _fewer(largest if layout == "map" else min(largest, 100_000), d))
             first, warm = clock(lambda radius=radius, walls=walls: radius(walls))
             yield Row("spectral_radius", method, "float64", layout, d, walls.points, first, walls.points / warm, *error)
-    yield from _smaller_loops(d, error)
+        if method == "companion":
+            yield from _smaller_loops(d, error)
     for name, tool in available().items():
         if d > 50 or (tool.only_whole and d != int(d)):
             continue
@@ -204,8 +206,6 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
 
 def _smaller_loops(d: float, error: tuple[float, int, int]) -> Iterator[Row]:
     """All poles where a part of the loop is missing; the errors are those of the whole loop."""
-    if not _possible("companion", d):
-        return
     walls = problems.grid(d, _fewer(20_000, d))
     for name, smaller in (
         (NO_BETA, walls._replace(beta=0 * walls.beta)),
