@@ -168,7 +168,7 @@ def test_jit_and_vmap_agree_with_the_direct_call(case, x64):
             np.testing.assert_allclose(value, direct[name], rtol=1e-11, atol=1e-12, err_msg=name)
 
 
-@ALL
+@LIGHT
 def test_plain_numbers_inside_somebody_elses_transformation_are_computed_at_once(case):
     expected = case.leaves(case.call(**case.arguments))
     first = {name: values[0] for name, values in case.good.items()}

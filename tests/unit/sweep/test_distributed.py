@@ -43,20 +43,13 @@ def finished(tmp_path_factory):
     return folder
 
 
-def test_a_cluster_computes_the_same(cluster, finished, tmp_path):
-    result = run_sweeps(config_of(), tmp_path, scheduler=cluster)
-    assert result.ok
-    assert result.computed == result.total
-    assert_same(finished, tmp_path)
-
-
 def test_no_output_depends_on_the_cluster_and_chunks(cluster, tmp_path, monkeypatch):
     config = config_of_everything()
     assert run_sweeps(config, tmp_path / "here").ok
     cut(monkeypatch, 5, 3)
     result = run_sweeps(config, tmp_path / "there", scheduler=cluster)
     assert result.ok
-    assert result.computed > 50
+    assert result.computed == result.total > 50
     assert_same(tmp_path / "here", tmp_path / "there")
 
 
