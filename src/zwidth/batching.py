@@ -182,7 +182,7 @@ def _single(kernel: Callable[..., Any], point: list[float], static: tuple[Any, .
         if packed is not None:
             # Entering `concretely` takes a tenth of a query: only where a transformation is found to be under way.
             vector = packed.function(np.array(point)) if fused else None
-            if vector is None or is_traced(vector):
+            if vector is None or isinstance(vector, jax.core.Tracer):
                 with concretely():
                     vector = packed.function(np.array(point))
             return packed.unpack(np.asarray(vector))
