@@ -13,11 +13,11 @@ from sweeping import assert_same, flags, main_of, start, study, zwidth
 
 # Few, for each of them costs the start of a program: scripts/kill_and_resume.py tries a hundred.
 MOMENTS = 3
-# Twenty chunks of a million points: enough steps to be stopped between.
+# A hundred chunks of a million points: a second of work at least, and enough steps to be stopped between.
 AXES = {
     "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 1000}},
     "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 1000}},
-    "delta": {"linear": {"start": 0.0, "stop": 2.0, "num": 10}},
+    "delta": {"linear": {"start": 0.0, "stop": 2.0, "num": 50}},
     "d": [1, 2],
 }
 
@@ -148,5 +148,5 @@ def test_stopped_before_its_first_chunk_a_run_says_the_same(config, tmp_path, mo
 def test_the_plan_is_printed_without_doing_anything(config, tmp_path):
     result = zwidth("run", config, "--out", tmp_path / "out", "--dry-run")
     assert result.returncode == 0, result.stderr
-    assert "20,000,000 (d 2 x delta 10 x alpha 1000 x beta 1000)" in result.stdout
+    assert "100,000,000 (d 2 x delta 50 x alpha 1000 x beta 1000)" in result.stdout
     assert list(tmp_path.iterdir()) == []
