@@ -4,6 +4,11 @@ JAX keeps its default precision: the library's float64 must not depend on anyone
 """
 
 import os
+import signal
+
+# A shell that starts something in the background has it ignore Ctrl-C, and so would every program that tests start.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Set before anything imports matplotlib, and inherited by the programs that tests start.
 os.environ["MPLBACKEND"] = "Agg"
