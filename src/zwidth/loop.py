@@ -165,6 +165,11 @@ def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole:
     return jnp.where(inside, alpha, jnp.nan), jnp.where(inside, beta, jnp.nan)
 
 
+def tilt_at_minus_one(plant: Plant, whole: Array) -> Array:
+    """P(-1) has the stable sign where ``tilt (alpha + 2 beta) < 1`` (held delay); 0 where N(-1) = 0."""
+    return (1.0 - 2.0 * jnp.mod(whole, 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
+
+
 def line_at_minus_one(delta: Array, d: Array) -> Array:
     """``alpha + 2 beta`` on the line where a real pole crosses at z = -1 (held delay), for one point.
 

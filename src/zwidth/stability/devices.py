@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from zwidth import phi
 from zwidth._types import Array
-from zwidth.loop import valid_device
+from zwidth.loop import tilt_at_minus_one, valid_device
 from zwidth.plant import held_plant, split_delay
 
 
@@ -40,7 +40,6 @@ def device(delta: Array, d: Array) -> Device:
     whole, f = split_delay(d)
     plant = held_plant(delta, f)
     late = delta * (1.0 - f)
-    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
     fields = Device(
         delta,
         whole,
@@ -55,7 +54,7 @@ def device(delta: Array, d: Array) -> Device:
         plant.a2,
         plant.a1,
         plant.a0,
-        sign * 0.5 * plant.gap / (1.0 + plant.c),
+        tilt_at_minus_one(plant, whole),
     )
     return Device(*(jnp.where(ok, field, jnp.nan) for field in fields))
 

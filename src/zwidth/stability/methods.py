@@ -108,8 +108,7 @@ def is_stable(
     Numerics:
         Float64 when called directly, the ambient precision inside `jit`. Relative distances in alpha at which labels
         were seen to be wrong: boundary 1e-15, near the lobe's end 1e-15 of the largest alpha; schur_cohn 1e-12, 1e-9
-        for d >= 20, in float32 1e-3. Cost a point on a map: boundary 1e-10 s for any d; schur_cohn 2e-10 s (d = 0),
-        2e-9 s (d = 8); companion 1e-6 to 1e-5 s.
+        for d >= 20, in float32 1e-3. What a point costs: benchmarks/results/bench.md.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17), section V; Jury 1964.
