@@ -50,9 +50,9 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
-    from zwidth.stability.methods import is_stable as is_stable
-    from zwidth.stability.methods import spectral_radius as spectral_radius
-    from zwidth.stability.methods import stability_of as stability_of
+    from zwidth.stability.labels import is_stable as is_stable
+    from zwidth.stability.radii import spectral_radius as spectral_radius
+    from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
@@ -108,9 +108,9 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
-    "is_stable": "zwidth.stability.methods",
-    "spectral_radius": "zwidth.stability.methods",
-    "stability_of": "zwidth.stability.methods",
+    "is_stable": "zwidth.stability.labels",
+    "spectral_radius": "zwidth.stability.radii",
+    "stability_of": "zwidth.stability.labels",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
