@@ -51,11 +51,11 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
     from zwidth.stability.labels import is_stable as is_stable
-    from zwidth.stability.radii import spectral_radius as spectral_radius
     from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
+    from zwidth.stability.radii import spectral_radius as spectral_radius
     from zwidth.stability.region import StableRegion as StableRegion
     from zwidth.stability.region import stable_region as stable_region
     from zwidth.stability.ridge import RidgeKind as RidgeKind

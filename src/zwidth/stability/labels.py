@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import BLOCK, FEW, concretely, elementwise, in_blocks, is_number, to_caller
+from zwidth.batching import BLOCK, FEW, elementwise, in_blocks, is_number, to_caller
 from zwidth.domain import check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
