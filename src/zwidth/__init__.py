@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from zwidth.errors import StoreExistsError as StoreExistsError
     from zwidth.errors import TracedDelayError as TracedDelayError
     from zwidth.errors import ZwidthError as ZwidthError
+    from zwidth.kernel_cache import use_compilation_cache as use_compilation_cache
     from zwidth.loop import char_poly as char_poly
     from zwidth.response import StepResponse as StepResponse
     from zwidth.response import step_response as step_response
@@ -96,6 +97,7 @@ _HOME = {
     "StoreExistsError": "zwidth.errors",
     "TracedDelayError": "zwidth.errors",
     "ZwidthError": "zwidth.errors",
+    "use_compilation_cache": "zwidth.kernel_cache",
     "char_poly": "zwidth.loop",
     "StepResponse": "zwidth.response",
     "step_response": "zwidth.response",
@@ -183,6 +185,7 @@ __all__ = [
     "stable_region",
     "step_response",
     "stiffness_slope",
+    "use_compilation_cache",
 ]
 
 
