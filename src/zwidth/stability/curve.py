@@ -21,7 +21,7 @@ from zwidth._types import Array
 from zwidth.batching import tree_map
 from zwidth.loop import FrequencyLoop, frequency_boundary
 from zwidth.stability.devices import Device, Kind, device
-from zwidth.stability.row_limit import LONG_FIELDS, Angles, long_device, offset, turned
+from zwidth.stability.row_limit import LONG_FIELDS, Angles, long_device, long_row_point, offset, turned
 from zwidth.xp import epsilon, namespace, repeat
 
 # Where the fit of the peak puts it to 4 %, the secant method needs so many steps for 1e-9 of x, 1e-17 of alpha.
@@ -75,23 +75,29 @@ class Peak(NamedTuple):
     alpha: Array
 
 
-def device_of(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Device, Kind]:
-    """The device whose curve is meant. A fractional power is a whole delay that is no whole number."""
+def device_of(delta: Array, d: Array, delay: str, kind: Kind) -> Device:
+    """The device whose curve is meant. A fractional power is the formula of whole delays at any other number."""
     if delay == "held":
-        return device(delta, d, kind), kind
-    return device(delta, 0.0 * d, Kind(True, False, False))._replace(whole=d), kind
+        return device(delta, d, kind)
+    return device(delta, 0.0 * d, Kind(True, False, False))._replace(whole=d)
 
 
-def lobe(delta: Array, d: Array, delay: str, kind: Kind) -> Lobe:
-    """The lobe of one (delta, d), or of arrays of one shape, from the delays that `Kind` says may occur."""
-    here, _ = device_of(delta, d, delay, kind)
-    xp = namespace(delta, d)
-    fractional_power = delay == "fractional_power"
-    creeping = fractional_power and kind.short and kind.fractional
+def creeps(delay: str, kind: Kind) -> bool:
+    """Whether there may be a fractional power of less than one, whose lobe ends within any distance of pi.
+
+    No fit holds for it: it is solved by halving.
+    """
+    return delay == "fractional_power" and kind.short and kind.fractional
+
+
+def lobe(here: Device, d: Array, delay: str, kind: Kind) -> Lobe:
+    """The lobe of a device, or of arrays of one shape, from the delays that `Kind` says may occur."""
+    xp = namespace(here.delta, d)
+    creeping = creeps(delay, kind)
     has_long = kind.long or creeping
-    is_short = here.whole == 0 if fractional_power else here.whole < 1
+    is_short = here.whole < 1 if delay == "held" else here.whole == 0
     short, long, ends = None, None, []
-    to_corner = xp.zeros_like(delta, dtype=bool)
+    to_corner = here.delta < 0
     if kind.short:
         short = _short(here)
         root, to_corner = _short_end(short)
@@ -100,7 +106,7 @@ def lobe(delta: Array, d: Array, delay: str, kind: Kind) -> Lobe:
         long = list(long_device(here))
         if creeping:
             limit = np.pi / xp.maximum(1.0, d + 0.5)
-            crept = _bisect(lambda x: _long_wall(x, long).alpha > 0, _SMALLEST * limit, limit, xp)
+            crept = bisect_place(lambda x: _long_wall(x, long).alpha > 0, _SMALLEST * limit, limit, xp)
             long[_END] = xp.where(d < 1, crept, long[_END])
         ends.append(long[_END])
     if len(ends) < 2:
@@ -182,7 +188,7 @@ def spread(lobe: Lobe) -> Lobe:
     return tree_map(lambda value: None if value is None else value[..., None], parts)
 
 
-def _bisect(before: Any, low: Array, high: Array, xp: Any) -> Array:
+def bisect_place(before: Any, low: Array, high: Array, xp: Any) -> Array:
     """Where a condition ceases to hold between two positive places, by halving the logarithm of their ratio."""
 
     def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -195,11 +201,42 @@ def _bisect(before: Any, low: Array, high: Array, xp: Any) -> Array:
     return xp.sqrt(low) * xp.sqrt(high)
 
 
-def _creeps(lobe: Lobe) -> Array | None:
-    """Where no fit holds: a fractional power of less than one, whose lobe may end within any distance of pi."""
-    if lobe.long is None:
-        return None
+def _crept(lobe: Lobe) -> Array:
+    """Where `creeps` holds."""
     return (lobe.long[1] > 0.5) & (lobe.long[1] < 1.5)
+
+
+def row_end(beta: Array, lobe: Lobe, creeping: bool = False) -> tuple[Array, Array, Array]:
+    """The place where a row meets the lobe, whether it does, and whether it passes beyond the corner.
+
+    Where it does not, the nearer end of the lobe stands for it.
+    """
+    xp = namespace(beta, lobe.delta)
+    b = beta + lobe.delta
+    none = b != b
+    if lobe.short is not None:
+        u0, u1, *_, v1, v2 = lobe.short
+        linear = u0 - b * v1
+        square = linear * linear + 4.0 * b * (u1 - b * v2)
+        y = 2.0 * b / (linear + xp.sqrt(xp.maximum(square, 0.0)))
+        meets = (b > 0) & (square >= 0) & (y <= lobe.end)
+        y = xp.where(meets, y, xp.where(b > 0, lobe.end, 0.0))
+        beyond = (b > 0) & ~meets & lobe.to_corner
+        if lobe.long is None:
+            return y, meets, beyond
+    top = wall(lobe.end, lobe).b
+    on_lobe = (b > 0) & (b < top)
+    x = xp.where(on_lobe, long_row_point(beta, lobe.long)[1], xp.where(b > 0, lobe.end, 0.0))
+    if creeping:
+        crept = bisect_place(lambda x: wall(x, lobe).b < b, _SMALLEST * lobe.end, lobe.end, xp)
+        x = xp.where(_crept(lobe) & on_lobe, crept, x)
+    if lobe.short is None:
+        return x, on_lobe, none
+    return (
+        xp.where(lobe.is_short, y, x),
+        xp.where(lobe.is_short, meets, on_lobe),
+        lobe.is_short & beyond,
+    )
 
 
 def peak(lobe: Lobe, creeping: bool = False) -> Peak:
@@ -234,8 +271,8 @@ def peak(lobe: Lobe, creeping: bool = False) -> Peak:
     steps = _PEAK_STEPS if lobe.short is None else _PEAK_STEPS_SHORT
     x = repeat(steps, secant, (start, first, slope(start), slope(first)), xp)[1]
     if creeping:
-        crept = _bisect(lambda x: wall(x, lobe).d_alpha > 0, _SMALLEST * lobe.end, lobe.end, xp)
-        x = xp.where(_creeps(lobe), crept, x)
+        crept = bisect_place(lambda x: wall(x, lobe).d_alpha > 0, _SMALLEST * lobe.end, lobe.end, xp)
+        x = xp.where(_crept(lobe), crept, x)
     if lobe.short is not None:
         x = xp.where(lobe.to_corner & (wall(lobe.end, lobe).d_alpha >= 0), lobe.end, x)
     return Peak(x, wall(x, lobe).alpha)
@@ -250,8 +287,8 @@ def column_end(alpha: Array, top: Peak, lobe: Lobe, upper: bool, creeping: bool 
     x = _long_end_of_column(alpha, top, lobe, upper)
     if creeping:
         low, high = (top.x, lobe.end) if upper else (_SMALLEST * top.x, top.x)
-        crept = _bisect(lambda x: (wall(x, lobe).alpha < alpha) != upper, low, high, xp)
-        x = xp.where(_creeps(lobe), crept, x)
+        crept = bisect_place(lambda x: (wall(x, lobe).alpha < alpha) != upper, low, high, xp)
+        x = xp.where(_crept(lobe), crept, x)
     if lobe.short is None:
         return x, nowhere
     y, on_line = _short_end_of_column(alpha, top, lobe, upper)
