@@ -371,6 +371,9 @@ def _first_crossing(ray: _Ray, place: Array, curve: Lobe, creeping: bool) -> tup
     wide_ray = _Ray(*(part[..., None] for part in ray))
     offsets = wide_ray.offset(wall(places, wide))
     begins, ends = offsets[..., 0], offsets[..., -1]
+    # Where the lobe returns, alpha is 0 to the last digit.
+    returned = ray.dalpha * (wall(curve.end, curve).b - ray.b) + ray.dbeta * ray.alpha
+    ends = xp.where(upwards & ~curve.to_corner, returned, ends)
     leaves = xp.where(upwards, ends >= 0, (begins < 0) & (ends > 0))
     passed = offsets >= 0
     inner = passed[..., 1:-1]
