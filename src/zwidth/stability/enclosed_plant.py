@@ -2,8 +2,8 @@
 
 ``u = 2^-53``. No library's exp is trusted.
 
-- ``c = e^-x``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 15 terms below 3u: together
-  below 8u. Beyond x = 700 it is off by 1e-304 at most.
+- ``c = e^-x``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 15 terms below 3u:
+  together below 8u. Beyond x = 700 it is off by 1e-304 at most.
 - For x < 2.5 ``A = sum x^k/(k+2)!`` has positive terms only: 8u, hence ``psi = c A`` 17u and
   ``phi2 = c (1 + (x - 1) A)`` 20u, because ``|x - 1| A <= 1 + (x - 1) A``. For x >= 2.5, where c <= 0.083, the
   quotients lose little: phi1 4u, phi2 6u, psi 11u. ``phi1 = phi2 + psi`` is within 21u, ``em = delta phi1`` within 22u.

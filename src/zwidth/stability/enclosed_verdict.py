@@ -4,9 +4,9 @@ Every comparison is between balls, so that what it says holds for every number i
 given exactly and a whole box of walls and devices. Theorems: docs/theory/one-crossover.md (the crossover, and the phase
 there), docs/theory/one-lobe.md (rows below one period).
 
-The text is written for ``alpha >= 0`` and ``beta > -delta``. At alpha = 0, where a pole is at z = 1, its verdict is on the
-others, for ``beta > delta``: with ``P = (z - 1) R``, R is stable exactly if P is for every small alpha > 0, because the
-pole at 1 then moves inside, and everything below is continuous there (|B|^2 and |T|^2 lose the factor u).
+The text is written for ``alpha >= 0`` and ``beta > -delta``. At alpha = 0, where a pole is at z = 1, its verdict is on
+the others, for ``beta > delta``: with ``P = (z - 1) R``, R is stable exactly if P is for every small alpha > 0, because
+the pole at 1 then moves inside, and everything below is continuous there (|B|^2 and |T|^2 lose the factor u).
 """
 
 from __future__ import annotations
