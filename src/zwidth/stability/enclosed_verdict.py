@@ -69,15 +69,15 @@ TakeLag = Callable[[Any, Any, Any], Lag]
 def short_device(plant: Plant) -> Short:
     """The device for `short_verdict`."""
     p1, em, a2, a1, a0, f = plant.p1, plant.em, plant.a2, plant.a1, plant.a0, plant.f
-    line = (plant.c + 1.0) * 2.0
+    line = (plant.c + 1) * 2
     if a0 is None:
         return Short(plant, a2 - a1, line, None, (p1, a2, a1), (p1, p1, p1))
-    t = 1.0 - f
+    t = 1 - f
     slack = f * (f * em + p1) + t * (f * plant.p1_t + t * plant.psi_t) + a0
-    u0, u1 = p1 * slack * 4.0, a0 * (f + t * plant.p1_t) * -16.0
-    product = a2 * a0 * 4.0
-    size = (p1 * p1, (a1 * (a2 + a0) + product) * -4.0, product * 4.0)
-    curve = (p1 * (em + f * em + p1), (a1 + a0 * 3.0 + a0 * em) * -4.0, a0 * 16.0)
+    u0, u1 = p1 * slack * 4, a0 * (f + t * plant.p1_t) * -16
+    product = a2 * a0 * 4
+    size = (p1 * p1, (a1 * (a2 + a0) + product) * -4, product * 4)
+    curve = (p1 * (em + f * em + p1), (a1 + a0 * 3 + a0 * em) * -4, a0 * 16)
     return Short(plant, a2 - a1 + a0, line, (u0, u1), size, curve)
 
 
@@ -85,23 +85,24 @@ def short_verdict(alpha: Any, beta: Any, device: Short) -> Verdict:
     """The verdict for d < 1: alpha against the end of its row."""
     plant = device.plant
     # |L(-1)| < 1 is needed; without it there is no crossover.
-    height = device.gap * (alpha + beta * 2.0)
+    height = device.gap * (alpha + beta * 2)
     below, without = height < device.line, (height > device.line) | (height < -device.line)
     b = beta + plant.delta
     if device.linear is None:
         p1, phi2, psi = device.size
-        left, right = alpha * psi * (p1 + phi2 * b), p1 * b * (1.0 - psi * beta)
+        left, right = alpha * psi * (p1 + phi2 * b), p1 * b * (1 - psi * beta)
         return Verdict(below & (left < right), without | (left > right))
     (u0, u1), (v0, v1, v2), (g0, g1, g2) = device.linear, device.size, device.curve
     # Where on the lobe this beta is: lead y^2 - linear y + start = 0, the first zero.
     start, linear, lead = v0 * b, u0 - b * v1, b * v2 - u1
-    square = linear * linear - start * lead * 4.0
-    y = start * 2.0 / (linear + square.sqrt())
-    left, right = alpha * (v0 + y * (v1 + y * v2)), y * (g0 + y * (g1 + y * g2)) * 4.0
-    reached, missed = (square > 0) & (y < 1.0), (square < 0) | (y > 1.0)
-    # Beyond the lobe's end a row is stable up to the line, if the lobe ends at z = -1, or nowhere.
+    square = linear * linear - start * lead * 4
+    y = start * 2 / (linear + square.sqrt())
+    left, right = alpha * (v0 + y * (v1 + y * v2)), y * (g0 + y * (g1 + y * g2)) * 4
+    reached, missed = (square > 0) & (y < 1), (square < 0) | (y > 1)
+    # Beyond the lobe's end a row is stable up to the line, if the lobe ends at z = -1, or nowhere. It ends before where
+    # alpha would be negative at z = -1, or the line would lie below.
     end = g0 + g1 + g2
-    cornered, ended = (end > 0) & (device.gap > 0), end < 0
+    cornered, ended = (end > 0) & (device.gap > 0), (end < 0) | (device.gap < 0)
     stable = below & ((reached & (left < right)) | (missed & cornered))
     return Verdict(stable, without | (reached & (left > right)) | (ended & (missed | (left > right))))
 
@@ -111,7 +112,7 @@ def long_device(plant: Plant) -> Long:
     p1, a2, a1, a0 = plant.p1, plant.a2, plant.a1, plant.a0
     if a0 is None:
         return Long(plant, p1 * p1, a1 * a2, None, a2, a2)
-    corner, sigma = a2 * a0 * 4.0, a2 + a0
+    corner, sigma = a2 * a0 * 4, a2 + a0
     return Long(plant, p1 * p1, a1 * sigma + corner, corner, sigma, a2 - a0)
 
 
@@ -119,13 +120,13 @@ def long_verdict(alpha: Any, beta: Any, whole: Any, device: Long, solve: Solve, 
     """The verdict for d >= 1: the phase at the gain crossover, see `zwidth.stability.crossover`."""
     cubic = gain_cubic(alpha, beta, device)
     u, found = solve(cubic)
-    q = u * (2.0 - u)
+    q = u * (2 - u)
     lag = take_lag(u, q, whole)
     re, im = loop_vector(alpha, beta, u, q, device)
     phase = im * lag.cosine - re * lag.sine
     h0, h1, h2, h3 = cubic
     # w > pi/2, or no crossover at all.
-    late = h0 + h1 + h2 + (0.0 if h3 is None else h3) > 0
+    late = h0 + h1 + h2 + (0 if h3 is None else h3) > 0
     stable = found & lag.within & (im > 0) & (phase > 0)
     return Verdict(stable, late | (found & (lag.beyond | (im < 0) | (lag.within & (phase < 0)))))
 
@@ -133,10 +134,10 @@ def long_verdict(alpha: Any, beta: Any, whole: Any, device: Long, solve: Solve, 
 def gain_cubic(alpha: Any, beta: Any, device: Long) -> tuple[Any, Any, Any, Any]:
     """``|B|^2 - |T|^2`` by powers of u, the last one None for a whole delay."""
     plant, square, m1, corner, _, _ = device
-    spread, tall = beta * (alpha + beta) * 2.0, alpha * alpha
+    spread, tall = beta * (alpha + beta) * 2, alpha * alpha
     bend = (beta - plant.delta) * (beta + plant.delta) + alpha * beta
-    h0, h1 = square * tall, (square * bend - m1 * tall) * 2.0
-    h2 = m1 * spread * -2.0 - plant.c * 4.0
+    h0, h1 = square * tall, (square * bend - m1 * tall) * 2
+    h2 = m1 * spread * -2 - plant.c * 4
     if corner is None:
         return h0, h1, h2, None
     return h0, h1, corner * tall + h2, corner * spread
@@ -145,8 +146,8 @@ def gain_cubic(alpha: Any, beta: Any, device: Long) -> tuple[Any, Any, Any, Any]
 def loop_vector(alpha: Any, beta: Any, u: Any, q: Any, device: Long) -> tuple[Any, Any]:
     """Real and imaginary part of V = W M Z at ``u = 1 - cos w``; q = u (2 - u) is the square of sin w."""
     em, mu = device.plant.em, device.mu
-    side = alpha + beta * (u * 2.0 - em)
-    im = alpha * (em - u) + beta * u * (em + 2.0 - u * 2.0)
+    side = alpha + beta * (u * 2 - em)
+    im = alpha * (em - u) + beta * u * (em + 2 - u * 2)
     m_re = device.plant.p1 - device.sigma * u
     return q.sqrt() * (side * m_re - im * mu), im * m_re + q * side * mu
 
