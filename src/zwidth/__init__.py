@@ -50,6 +50,7 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.counting import count_poles as count_poles
     from zwidth.stability.methods import is_stable as is_stable
     from zwidth.stability.methods import spectral_radius as spectral_radius
     from zwidth.stability.methods import stability_of as stability_of
@@ -108,6 +109,7 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
+    "count_poles": "zwidth.stability.counting",
     "is_stable": "zwidth.stability.methods",
     "spectral_radius": "zwidth.stability.methods",
     "stability_of": "zwidth.stability.methods",
@@ -156,6 +158,7 @@ __all__ = [
     "boundary",
     "boundary_point",
     "char_poly",
+    "count_poles",
     "denormalize",
     "fastest_damping",
     "fastest_wall",
