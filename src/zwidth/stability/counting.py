@@ -17,12 +17,9 @@ _BLOCK = 1 << 10
 _ROUNDINGS = 8.0
 # Closer to the circle than this many units in the last place (of r^2), a complex root cannot be told in from out.
 _ON_CIRCLE = 16.0
-_SWEEPS = 2
 
 
-def count_poles(
-    zeros: ArrayLike, poles: ArrayLike, gain: ArrayLike, lag: ArrayLike, radius: ArrayLike = 1.0
-) -> Array:
+def count_poles(zeros: ArrayLike, poles: ArrayLike, gain: ArrayLike, lag: ArrayLike, radius: ArrayLike = 1.0) -> Array:
     """Count the closed loop's poles inside a circle.
 
     Counts, with multiplicity, the zeros of
@@ -36,29 +33,30 @@ def count_poles(
         zeros: b, real or complex, shape ``(..., l)``, l >= 0; conjugate pairs are usual and not needed.
         poles: p, likewise, shape ``(..., k)``. No order of l, k and lag is assumed.
         gain: factor of the zeros' product, real and finite; 0 counts ``lag`` and the p inside.
-        lag: whole number, >= 0 (up to 2^53).
+        lag: whole number, >= 0 (up to 2^52).
         radius: of the circle, > 0. It broadcasts with gain, lag and the leading axes of zeros and poles.
 
     Returns:
-        Array of whole numbers of the broadcast shape. -1 where an argument is out of its range, and where float64 cannot
-        tell: a pole of the closed loop closer to the circle than the rounding of its own position there, that is about
-        1e-14 relative for one well apart from others, 1e-7 for a nearly double one, and more than that where delay or
-        clusters of p and b make rounding count more. What is not -1 is proved as set out below.
+        Array of whole numbers of the broadcast shape. -1 where an argument is out of its range, and where float64
+        cannot tell: a closed-loop pole closer to the circle than the rounding of its own position there (about 1e-14
+        relative for one apart from others, 1e-7 for a nearly double one, more where the delay or clusters of zeros
+        and poles make rounding count more), or a complex open-loop pole within about 1e-9 of the circle while
+        the gain is below 1e-8. Every other number is proved as set out below.
 
     Raises:
         InputError: no numbers, a complex gain, lag or radius, shapes that do not broadcast, or a single number out of
             its range.
 
     Numerics:
-        With ``t = tan(w/2)``, ``z = r e^(jw)``, the two parts T + B of P have
-        ``|z - a|^2 (1 + t^2) = |(r - a) + j t (r + a)|^2``, so that ``|T|^2 - |B|^2`` is a real polynomial in t of degree
-        ``2 max(k, l)``. Its zeros are companion eigenvalues, improved by Weierstrass' corrections, each in a disk of Smith's
-        theorem with the rounding added. Where no disk meets the real axis, the larger part is known, and arg P keeps within
-        a quarter turn of its argument. The count is that of the larger part at z = -r, plus m at each crossover to B,
-        less m at each to T, m = round((arg T - arg B)/(2 pi)) with arguments continuous from w = 0. Each m must be the same on the
-        whole of its disk: then crossovers that nearly coincide, or were taken for none, change nothing.
-        Direct calls compute with NumPy in float64; under jit or vmap it is traced in the precision there, where
-        float32 answers -1 more often. Neither has a derivative.
+        On ``z = r e^(jw)``, with ``t = tan(w/2)``, ``|z - a|^2 (1 + t^2) = |(r - a) + j t (r + a)|^2``. Hence
+        ``|T|^2 - |B|^2``, for P = T + B, is a real polynomial in t of degree ``2 max(k, l)`` (over a power of 1 + t^2).
+        Its zeros are companion eigenvalues with one correction by Weierstrass, each in a disk of Smith's theorem with
+        the rounding added. Where no disk meets the real axis, one part is larger, and arg P keeps within a quarter turn
+        of its argument. The count is that of the larger part at z = -r, plus m at every crossover to B, less m at
+        every one to T, with m = round((arg T - arg B)/(2 pi)) and arguments that are continuous in w. -1 unless m is
+        the same on all of a disk: crossovers that nearly coincide, or are none, then change nothing.
+        Direct calls compute with NumPy, in float64; under jit or vmap the function is traced in the precision
+        there, and float32 answers -1 more often. A count has no derivative.
 
     References:
         Walton, Marshall 1987, IEE Proc. D 134(2) (crossovers of systems with delay); Nyquist 1932; Smith 1970,
@@ -73,22 +71,25 @@ def count_poles(
     """
     values = {"zeros": zeros, "poles": poles, "gain": gain, "lag": lag, "radius": radius}
     jax = sys.modules.get("jax")
-    if jax is not None and any(isinstance(value, jax.core.Tracer) for value in values.values()):
+    if jax is not None and any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(list(values.values()))):
         xp = jax.numpy
-        arrays = [xp.asarray(value, dtype=_kind(name)) for name, value in values.items()]
-        return _count(*_aligned(arrays, xp), xp)
-    arrays = [_checked(name, value) for name, value in values.items()]
-    shaped = _aligned(arrays, np)
-    shape = shaped[2].shape
-    flat = [column.reshape(math.prod(shape), *column.shape[len(shape) :]) for column in shaped]
-    counts = np.empty(flat[2].size, np.int64)
+        traced = [xp.asarray(value, dtype=_kind(name)) for name, value in values.items()]
+        return _count(_aligned(traced, xp), xp)
+    columns = _aligned([_checked(name, value) for name, value in values.items()], np)
+    shape = columns[2].shape
+    size = math.prod(shape)
+    columns = [column.reshape(size, *column.shape[len(shape) :]) for column in columns]
+    counts = np.empty(size, np.int64)
     with np.errstate(all="ignore"):
-        for start in range(0, counts.size, _BLOCK):
-            part = slice(start, start + _BLOCK)
-            counts[part] = _count(*(column[part] for column in flat), np)
-    if jax is not None and any(isinstance(value, jax.Array) for value in values.values()):
-        return jax.numpy.asarray(counts.reshape(shape))
-    return counts.reshape(shape)[()]
+        for start in range(0, size, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            counts[block] = _count([column[block] for column in columns], np)
+    counts = counts.reshape(shape)
+    if jax is None:
+        return counts[()]
+    from zwidth.batching import to_caller
+
+    return to_caller(counts, tuple(values.values()))
 
 
 def _kind(name: str) -> type:
@@ -111,7 +112,11 @@ def _checked(name: str, value: ArrayLike) -> np.ndarray:
             raise InputError(f"{name}: got {value!r}, a sequence of numbers is needed; write [{value!r}] for one")
         return array
     if array.ndim == 0 and not _in_range(name, array, np):
-        allowed = {"gain": "a finite number", "lag": "a whole number from 0 to 2^53", "radius": "a finite number above 0"}
+        allowed = {
+            "gain": "a finite number",
+            "lag": "a whole number from 0 to 2^52",
+            "radius": "a finite number above 0",
+        }
         raise InputError(f"{name}: got {value!r}, {allowed[name]} is needed; in an array such a loop counts -1")
     return array
 
@@ -121,7 +126,7 @@ def _in_range(name: str, value: Array, xp: Any) -> Array:
     if name == "radius":
         return good & (value > 0)
     if name == "lag":
-        return good & (value >= 0) & (value * xp.finfo(value.dtype).eps <= 2) & (value == xp.floor(value))
+        return good & (value >= 0) & (value * xp.finfo(value.dtype).eps <= 1) & (value == xp.floor(value))
     return good
 
 
@@ -138,189 +143,201 @@ def _aligned(arrays: list[Array], xp: Any) -> list[Array]:
     return roots + [xp.broadcast_to(array, shape) for array in arrays[2:]]
 
 
-# Below, the last axes are (part, factor) or (point, part, factor); part 0 is T, part 1 is B.
+class _Loop(NamedTuple):
+    """T and B on the circle z = r (1 + jt)/(1 - jt). Last axes: part (0 is T, 1 is B), factor."""
 
-
-class _Parts(NamedTuple):
-    """T and B on the circle, z = r (1 + jt)/(1 - jt): products of (u + jtv)/(1 + |t|) with their conjugates, weighted."""
-
-    u: Array
+    u: Array  # a factor z - a is (u + jtv)/(1 - jt): u = r - a, v = r + a, both over r + |a|
     v: Array
-    weight: Array  # T positive, B negative; the larger weight is 1
-    doubt: Array  # relative error of the weights and of what does not depend on t, in roundings
+    inside: Array  # r^2 - |a|^2 over (r + |a|)^2: positive for a inside
+    weight: Array  # of |T|^2 (positive) and |B|^2 (negative); the larger one is 1
+    doubt: Array  # relative error of the weights, in roundings
+    turns: Array  # powers of z that T has more than B
+    start: Array  # arg T - arg B at w = 0
 
 
-def _count(zeros: Array, poles: Array, gain: Array, lag: Array, radius: Array, xp: Any) -> Array:
-    """Count for arrays of one leading shape."""
+def _count(columns: list[Array], xp: Any) -> Array:
+    """Count for zeros, poles, gain, lag and radius of one leading shape."""
+    zeros, poles, gain, lag, radius = columns
     eps = float(xp.finfo(gain.dtype).eps)
     good = _in_range("gain", gain, xp) & _in_range("lag", lag, xp) & _in_range("radius", radius, xp)
-    good = good & xp.all(xp.isfinite(zeros), axis=-1) & xp.all(xp.isfinite(poles), axis=-1)
+    good = good & xp.isfinite(zeros).all(-1) & xp.isfinite(poles).all(-1)
     gain, lag, radius = xp.where(good, gain, 0.0), xp.where(good, lag, 0.0), xp.where(good, radius, 1.0)
-    # Factors z of the shorter product make both equally long; `turns` are the powers of z that T has more than B.
-    turns = lag + (poles.shape[-1] - zeros.shape[-1])
+    # Factors z make the shorter product as long as the other.
     size = max(poles.shape[-1], zeros.shape[-1])
-    roots = xp.stack([_padded(poles, size, xp), _padded(zeros, size, xp)], axis=-2)
+    missing = size - poles.shape[-1], size - zeros.shape[-1]
+    roots = xp.stack([_padded(poles, missing[0], xp), _padded(zeros, missing[1], xp)], axis=-2)
     roots = xp.where(good[..., None, None], roots, 0.0)
-    r = radius[..., None, None]
-
-    # E = ln |B/T|^2 without the factors. Where it is cut, only a count without any crossover is used.
-    scale = r + xp.abs(roots)
-    sizes = xp.sum(xp.log(scale), axis=-1)
-    logs = (xp.log(xp.where(gain == 0, 1.0, xp.abs(gain))), turns * xp.log(radius), sizes[..., 0], sizes[..., 1])
-    excess = 2.0 * (logs[0] - logs[1] - logs[2] + logs[3])
-    limit = 0.8 * float(np.log(xp.finfo(gain.dtype).max))
-    excess = xp.where(gain == 0, -limit, excess)
-    cut = (gain == 0) | (xp.abs(excess) > limit)
-    excess = xp.clip(excess, -limit, limit)
-    doubt = 2.0 * sum(xp.abs(part) for part in logs) + 2.0 * size + 2.0
-    weight = xp.stack([xp.exp(-xp.maximum(excess, 0.0)), -xp.exp(xp.minimum(excess, 0.0))], axis=-1)
-
-    roots, quarter = _turned(roots, r, excess, xp)
-    u, v = (r - roots) / scale, (r + roots) / scale
-    inside = ((r - roots.real) * (r + roots.real) - roots.imag**2) / scale**2
-    parts = _Parts(u, v, weight, doubt)
-    low, high, leading, proved = _intervals(parts, eps, xp)
+    turns = lag + (missing[1] - missing[0])
+    loop, roots, cut = _loop(roots, gain, turns, radius, xp)
+    low, high, leading, proved = _intervals(loop, eps, xp)
     met = xp.isfinite(low)
-    m, clear = _turns_between(parts, inside, turns, quarter, gain, (low, high), eps, xp)
+    m, clear = _turns_between(loop, low, high, eps, xp)
+    b_first, before, after, told = _larger(loop, roots, low, high, leading, eps, xp)
 
-    # Which part is larger: at z = -r (t infinite), after each interval, and where a root is on the circle.
-    first = leading < 0
-    on = (xp.abs(inside) <= _ON_CIRCLE * eps) & (roots.imag != 0)
-    near = xp.where(roots.real >= 0, roots.imag / (xp.abs(roots) + roots.real), (xp.abs(roots) - roots.real) / roots.imag)
-    near = xp.clip(xp.where(on, near, 0.0), -1e30, 1e30)
-    gaps = xp.isfinite(low[..., 1:])
-    middle = xp.where(gaps, 0.5 * high[..., :-1] + 0.5 * low[..., 1:], 0.0)
-    points = xp.concatenate([middle, near[..., 0, :], near[..., 1, :]], axis=-1)
-    value, noise = _difference(parts, points, eps, xp)
-    value, noise = value.real, noise
-    split = middle.shape[-1]
-    b_larger = xp.where(gaps, value[..., :split] < 0, first[..., None])
-    told = ~gaps | (high[..., :-1] >= low[..., 1:]) | (xp.abs(value[..., :split]) > noise[..., :split])
-    # A root on the circle to within rounding is as good inside as outside where its own part is the smaller one.
-    sign = xp.concatenate([xp.full((size,), -1.0), xp.full((size,), 1.0)])
-    smaller = value[..., split:] * sign.reshape((1,) * gain.ndim + (-1,)) > noise[..., split:]
-    on = xp.concatenate([on[..., 0, :], on[..., 1, :]], axis=-1)
-
-    after = xp.concatenate([b_larger, first[..., None]], axis=-1)[..., : low.shape[-1]]
-    before = xp.concatenate([first[..., None], b_larger], axis=-1)[..., : low.shape[-1]]
-    steps = xp.where(after, 1.0, 0.0) - xp.where(before, 1.0, 0.0)
-    count = xp.sum(inside >= 0, axis=-1)
-    count_t = lag + count[..., 0] - (size - poles.shape[-1])
-    count_b = count[..., 1] - (size - zeros.shape[-1])
-    total = xp.where(first, count_b, count_t) + xp.sum(xp.where(met, m * steps, 0.0), axis=-1)
-    sure = good & proved & xp.all(clear | ~met, axis=-1) & xp.all(told, axis=-1) & xp.all(smaller | ~on, axis=-1)
-    sure = sure & ~(cut & xp.any(met, axis=-1))
+    within = (loop.inside >= 0).sum(-1)
+    total = xp.where(b_first, within[..., 1] - missing[1], within[..., 0] - missing[0] + lag)
+    total = total + xp.where(met, m * (xp.where(after, 1.0, 0.0) - xp.where(before, 1.0, 0.0)), 0.0).sum(-1)
+    sure = good & proved & told & (clear | ~met).all(-1) & ~(cut & met.any(-1))
     return xp.where(sure, total, -1.0).astype(int)
 
 
-def _padded(roots: Array, size: int, xp: Any) -> Array:
-    missing = size - roots.shape[-1]
+def _padded(roots: Array, missing: int, xp: Any) -> Array:
     return xp.concatenate([roots, xp.zeros((*roots.shape[:-1], missing), roots.dtype)], axis=-1)
 
 
-def _turned(roots: Array, r: Array, excess: Array, xp: Any) -> tuple[Array, Array]:
-    """Turn the plane by quarters, without rounding, until T and B differ at z = -r, where t is infinite."""
-    scores = []
-    for unit in (1.0, -1.0, 1j, -1j):
-        far = xp.log(xp.abs(r + roots * unit) / (r + xp.abs(roots)))
-        score = xp.abs(excess + 2.0 * xp.sum(far[..., 1, :] - far[..., 0, :], axis=-1))
-        # Unturned data keep the relative accuracy of small w, so that one is preferred.
-        scores.append(xp.minimum(xp.where(xp.isnan(score), 0.0, score), 0.1))
-    best = xp.argmax(xp.stack(scores, axis=-1), axis=-1)
-    unit = xp.asarray([1.0, -1.0, 1j, -1j])[best]
-    return roots * unit[..., None, None], xp.asarray([0.0, 2.0, 1.0, 3.0])[best]
+def _loop(roots: Array, gain: Array, turns: Array, radius: Array, xp: Any) -> tuple[_Loop, Array, Array]:
+    """Scale and turn the plane; also the turned roots, and whether a weight too large or small for the type was cut."""
+    r = radius[..., None, None]
+    scale = r + xp.abs(roots)
+    logs = xp.log(scale)
+    log_gain, log_turns = xp.log(xp.where(gain == 0, 1.0, xp.abs(gain))), turns * xp.log(radius)
+    # ln |B/T|^2 without the factors. Where it is cut, only a count without any crossover is used: one part is larger on
+    # the whole circle already, and more so beyond the cut.
+    excess = 2.0 * (log_gain - log_turns + (logs[..., 1, :] - logs[..., 0, :]).sum(-1))
+    limit = 0.8 * math.log(xp.finfo(gain.dtype).max)
+    cut = (gain == 0) | (xp.abs(excess) > limit)
+    excess = xp.clip(xp.where(gain == 0, -limit, excess), -limit, limit)
+    doubt = 2.0 * (xp.abs(log_gain) + xp.abs(log_turns) + xp.abs(logs).sum((-2, -1)) + roots.shape[-1] + 1.0)
+    weight = xp.stack([xp.exp(-xp.maximum(excess, 0.0)), -xp.exp(xp.minimum(excess, 0.0))], axis=-1)
+
+    # Quarter turns round nothing. At z = -r, where t is infinite, T and B must differ; that real data keep the relative
+    # accuracy of small w unturned lets no turn come first.
+    units = xp.asarray([1.0, -1.0, 1j, -1j])
+    far = xp.log(xp.abs(r[..., None] + roots[..., None] * units.reshape((1,) * roots.ndim + (4,))) / scale[..., None])
+    score = xp.abs(excess[..., None] + 2.0 * (far[..., 1, :, :] - far[..., 0, :, :]).sum(-2))
+    best = xp.argmax(xp.minimum(xp.where(xp.isnan(score), 0.0, score), 0.1), axis=-1)
+    roots = roots * units[best][..., None, None]
+    u, v = (r - roots) / scale, (r + roots) / scale
+    angle = xp.angle(u).sum(-1)
+    quarters = xp.mod(xp.mod(turns, 4.0) * xp.asarray([0.0, 2.0, 1.0, 3.0])[best], 4.0)
+    start = angle[..., 0] - angle[..., 1] - xp.where(gain < 0, math.pi, 0.0) - 0.5 * math.pi * quarters
+    inside = ((r - roots.real) * (r + roots.real) - roots.imag**2) / scale**2
+    return _Loop(u, v, inside, weight, doubt, turns, start), roots, cut
 
 
-def _difference(parts: _Parts, t: Array, eps: float, xp: Any) -> tuple[Array, Array]:
+def _difference(loop: _Loop, t: Array, eps: float, xp: Any) -> tuple[Array, Array]:
     """|T|^2 - |B|^2 at the points t, over (1 + |t|)^(2 size), and a bound of its rounding."""
     t = t[..., None, None]
-    u, v = parts.u[..., None, :, :], parts.v[..., None, :, :]
+    u, v, jtv = loop.u[..., None, :, :], loop.v[..., None, :, :], 1j * t * loop.v[..., None, :, :]
     below = 1.0 + xp.abs(t)
-    plus, minus = (u + 1j * t * v) / below, (xp.conj(u) - 1j * t * xp.conj(v)) / below
-    worst = (xp.abs(u) + xp.abs(t) * xp.abs(v)) / below + 1e-300
+    plus, minus = (u + jtv) / below, (xp.conj(u) - 1j * t * xp.conj(v)) / below
+    worst = (xp.abs(u) + xp.abs(jtv)) / below + _smallest(xp, below)
     sizes = xp.maximum(xp.abs(plus), eps * worst), xp.maximum(xp.abs(minus), eps * worst)
-    relative = xp.sum(worst / sizes[0] + worst / sizes[1], axis=-1) + parts.doubt[..., None, None]
-    weight = parts.weight[..., None, :]
-    noise = xp.sum(xp.abs(weight) * xp.prod(sizes[0] * sizes[1], axis=-1) * relative, axis=-1)
-    return xp.sum(weight * xp.prod(plus * minus, axis=-1), axis=-1), _ROUNDINGS * eps * noise
+    relative = (worst / sizes[0] + worst / sizes[1]).sum(-1) + loop.doubt[..., None, None]
+    weight = loop.weight[..., None, :]
+    noise = (xp.abs(weight) * (sizes[0] * sizes[1]).prod(-1) * relative).sum(-1)
+    return (weight * (plus * minus).prod(-1)).sum(-1), _ROUNDINGS * eps * noise
 
 
-def _intervals(parts: _Parts, eps: float, xp: Any) -> tuple[Array, Array, Array, Array]:
-    """Intervals of t that hold every crossover, lower and upper ends sorted, infinite where a disk misses the real axis."""
-    # The polynomial's coefficients, lowest power first: products of |u|^2 + 2 t Im(u conj v) + t^2 |v|^2.
-    a0, a2 = xp.abs(parts.u) ** 2, xp.abs(parts.v) ** 2
-    a1 = 2.0 * (parts.u * xp.conj(parts.v)).imag
+def _smallest(xp: Any, like: Array) -> float:
+    """Return a number far below all others that leaves quotients finite."""
+    return math.sqrt(xp.finfo(like.dtype).tiny)
+
+
+def _intervals(loop: _Loop, eps: float, xp: Any) -> tuple[Array, Array, Array, Array]:
+    """Intervals of t that together hold every crossover, as sorted lower and upper ends.
+
+    They are infinite where a disk misses the real axis. Also the polynomial's leading coefficient, and whether all this
+    is proved.
+    """
+    # The coefficients, lowest power first: products of |u + jtv|^2 = |u|^2 + 2 t Im(u conj v) + t^2 |v|^2.
+    a0, a1, a2 = xp.abs(loop.u) ** 2, 2.0 * (loop.u * xp.conj(loop.v)).imag, xp.abs(loop.v) ** 2
     size = a0.shape[-1]
+    count = 2 * size
     poly = xp.ones((*a0.shape[:-1], 1), a0.dtype)
     for i in range(size):
-        none = xp.zeros((*poly.shape[:-1], 1), poly.dtype)
-        poly = (
-            xp.concatenate([poly * a0[..., i : i + 1], none, none], axis=-1)
-            + xp.concatenate([none, poly * a1[..., i : i + 1], none], axis=-1)
-            + xp.concatenate([none, none, poly * a2[..., i : i + 1]], axis=-1)
-        )
-    coefficients = xp.sum(parts.weight[..., None] * poly, axis=-2)
+        none = xp.zeros((*poly.shape[:-1], 2), poly.dtype)
+        wide = xp.concatenate([none, poly, none], axis=-1)
+        b0, b1, b2 = a0[..., i : i + 1], a1[..., i : i + 1], a2[..., i : i + 1]
+        poly = wide[..., 2:] * b0 + wide[..., 1:-1] * b1 + wide[..., :-2] * b2
+    coefficients = (loop.weight[..., None] * poly).sum(-2)
     leading = coefficients[..., -1]
-    doubt = _ROUNDINGS * eps * xp.sum(xp.abs(parts.weight) * poly[..., -1], axis=-1) * (parts.doubt + 2.0 * size)
+    doubt = _ROUNDINGS * eps * (xp.abs(loop.weight) * poly[..., -1]).sum(-1) * (loop.doubt + count)
     proved = xp.abs(leading) > doubt
     if not size:
-        return xp.zeros_like(coefficients[..., :0]), xp.zeros_like(coefficients[..., :0]), leading, proved
-    count = 2 * size
+        return coefficients[..., :0], coefficients[..., :0], leading, proved
     monic = coefficients[..., :-1] / xp.where(proved, leading, 1.0)[..., None]
-    proved = proved & xp.all(xp.isfinite(monic), axis=-1)
+    proved = proved & xp.isfinite(monic).all(-1)
     monic = xp.where(proved[..., None], monic, 1.0)
-    shift = xp.broadcast_to(xp.eye(count, count - 1, k=-1, dtype=monic.dtype), (*monic.shape, count - 1))
-    guess = xp.linalg.eigvals(xp.concatenate([shift, -monic[..., None]], axis=-1)) + 0j
-    for _ in range(_SWEEPS):
-        correction, _ = _weierstrass(parts, guess, leading, eps, xp)
-        guess = xp.where(xp.isfinite(correction), guess - correction, guess)
-    correction, noise = _weierstrass(parts, guess, leading, eps, xp)
-    share = xp.abs(leading) / xp.maximum(xp.abs(leading) - doubt, 0.0)
-    disk = 1.01 * count * (xp.abs(correction) + noise) * share[..., None]
-    proved = proved & xp.all(xp.isfinite(disk), axis=-1)
+    # In this order of the rows, large coefficients first, small zeros beside large ones keep their digits.
+    shift = xp.broadcast_to(xp.eye(count, count - 1, dtype=monic.dtype), (*monic.shape, count - 1))
+    guess = xp.linalg.eigvals(xp.concatenate([-monic[..., ::-1, None], shift], axis=-1)) + 0j
+    correction, _ = _corrections(loop, guess, leading, eps, xp)
+    guess = xp.where(xp.isfinite(correction), guess - correction, guess)
+    correction, noise = _corrections(loop, guess, leading, eps, xp)
+    # The one hundredth is for the rounding of the disks themselves.
+    safe = 1.01 * count * xp.abs(leading) / (xp.abs(leading) - doubt)
+    disk = safe[..., None] * (xp.abs(correction) + noise)
+    proved = proved & xp.isfinite(disk).all(-1)
     met = xp.abs(guess.imag) <= disk
+    # Sorted apart, the ends pair to other intervals with the same union.
     low = xp.sort(xp.where(met, guess.real - disk, xp.inf), axis=-1)
     high = xp.sort(xp.where(met, guess.real + disk, xp.inf), axis=-1)
     return low, high, leading, proved
 
 
-def _weierstrass(parts: _Parts, guess: Array, leading: Array, eps: float, xp: Any) -> tuple[Array, Array]:
-    """Correct every zero by p(guess)/(leading prod(guess - others)), and say what rounding adds to that."""
-    value, noise = _difference(parts, guess, eps, xp)
+def _corrections(loop: _Loop, guess: Array, leading: Array, eps: float, xp: Any) -> tuple[Array, Array]:
+    """Weierstrass: value/(leading prod(guess - other guesses)), to be subtracted, and what rounding adds to that."""
+    value, noise = _difference(loop, guess, eps, xp)
     far = 1.0 + xp.abs(guess)
-    apart = (guess[..., :, None] - guess[..., None, :]) / (far[..., :, None] * far[..., None, :])
+    apart = (guess[..., :, None] - guess[..., None, :]) / far[..., :, None]
     same = xp.eye(guess.shape[-1], dtype=bool).reshape((1,) * (guess.ndim - 1) + (guess.shape[-1],) * 2)
-    scale = leading[..., None] * xp.prod(xp.where(same, 1.0, apart), axis=-1)
-    scale = scale * xp.prod(xp.where(same, 1.0, far[..., None, :]), axis=-1)
+    scale = leading[..., None] * xp.where(same, 1.0, apart).prod(-1)
     return value * far / scale, noise * far / xp.abs(scale)
 
 
-def _turns_between(
-    parts: _Parts, inside: Array, turns: Array, quarter: Array, gain: Array, ends: tuple, eps: float, xp: Any
-) -> tuple[Array, Array]:
+def _turns_between(loop: _Loop, low: Array, high: Array, eps: float, xp: Any) -> tuple[Array, Array]:
     """m = round((arg T - arg B)/(2 pi)) on every interval, and whether it is one number there."""
-    u, v, inside = (value[..., None, :, :] for value in (parts.u, parts.v, inside))
+    u, v, inside = (value[..., None, :, :] for value in (loop.u, loop.v, loop.inside))
     size = xp.abs(u)
     # From t = 0 on, a factor turns by arg((u + jtv)/u), without a jump: that line meets 0 only if the root is on the
     # circle, where the limit from inside is taken.
-    rise = xp.where(size == 0, 1.0, inside / xp.where(size == 0, 1.0, size))
-    slant = (u * xp.conj(v)).imag / xp.where(size == 0, 1.0, size)
-    sign = xp.asarray([1.0, -1.0], dtype=gain.dtype).reshape((1,) * (u.ndim - 2) + (2, 1))
-    start = xp.sum((sign * xp.angle(u))[..., 0, :, :], axis=(-2, -1)) - xp.where(gain < 0, np.pi, 0.0)
-    start = start - 0.5 * np.pi * xp.mod(xp.mod(turns, 4.0) * quarter, 4.0)
-    angles = []
-    rounding = 4.0 * inside.shape[-1] + 4.0
-    for end in ends:
-        t = xp.where(xp.isfinite(end), end, 0.0)
-        whole = 2.0 * turns[..., None] * xp.arctan(t)
-        t = t[..., None, None]
-        angles.append((whole, sign * xp.arctan2(t * rise, size + t * slant)))
-        reach = xp.abs(u) + xp.abs(t) * xp.abs(v) + 1e-300
-        cond = xp.sum(reach / xp.maximum(xp.abs(u + 1j * t * v), eps * reach), axis=(-2, -1))
-        rounding = rounding + cond + xp.abs(whole)
+    zero = size == 0
+    rise = xp.where(zero, 1.0, inside / xp.where(zero, 1.0, size))
+    slant = (u * xp.conj(v)).imag / xp.where(zero, 1.0, size)
+    t = xp.concatenate([low, high], axis=-1)
+    t = xp.where(xp.isfinite(t), t, 0.0)
+    whole = 2.0 * loop.turns[..., None] * xp.arctan(t)
+    t = t[..., None, None]
+    angle = xp.arctan2(t * rise, size + t * slant)
+    reach = size + xp.abs(t * v) + _smallest(xp, size)
+    cond = (reach / xp.maximum(xp.abs(u + 1j * t * v), eps * reach)).sum((-2, -1))
+    rounding = _ROUNDINGS * eps * (cond + xp.abs(whole) + 8.0 * u.shape[-1] + 8.0)
+    n = low.shape[-1]
+    rounding = xp.maximum(rounding[..., :n], rounding[..., n:])
     # Every angle is monotone in t, so that the ends bound each of them, hence their sum.
     edges = []
-    for pick, side in ((xp.minimum, -1.0), (xp.maximum, 1.0)):
-        total = pick(angles[0][0], angles[1][0]) + xp.sum(pick(angles[0][1], angles[1][1]), axis=(-2, -1))
-        edges.append(xp.floor((start[..., None] + total + side * _ROUNDINGS * eps * rounding) / (2.0 * np.pi) + 0.5))
+    for pick, other, side in ((xp.minimum, xp.maximum, -rounding), (xp.maximum, xp.minimum, rounding)):
+        sums = pick(angle[..., :n, :, :], angle[..., n:, :, :]).sum(-1)[..., 0]
+        sums = sums - other(angle[..., :n, :, :], angle[..., n:, :, :]).sum(-1)[..., 1]
+        total = loop.start[..., None] + pick(whole[..., :n], whole[..., n:]) + sums + side
+        edges.append(xp.floor(total / (2.0 * math.pi) + 0.5))
     return edges[0], edges[0] == edges[1]
+
+
+def _larger(
+    loop: _Loop, roots: Array, low: Array, high: Array, leading: Array, eps: float, xp: Any
+) -> tuple[Array, Array, Array, Array]:
+    """Whether B is larger: at z = -r, before and after every interval; and whether all that is beyond rounding."""
+    first = leading < 0
+    n = low.shape[-1]
+    gaps = xp.isfinite(low[..., 1:])
+    middle = xp.where(gaps, 0.5 * high[..., :-1] + 0.5 * low[..., 1:], 0.0)
+    # A root on the circle to within rounding is as good inside as outside where its own part is the smaller one.
+    on = (xp.abs(loop.inside) <= _ON_CIRCLE * eps) & (roots.imag != 0)
+    length = xp.abs(roots)
+    near = xp.where(roots.real >= 0, roots.imag / (length + roots.real), (length - roots.real) / roots.imag)
+    near = xp.clip(xp.where(on, near, 0.0), -1e30, 1e30)
+    points = xp.concatenate([middle, near[..., 0, :], near[..., 1, :]], axis=-1)
+    value, noise = _difference(loop, points, eps, xp)
+    value, split = value.real, middle.shape[-1]
+    clear = xp.abs(value) > noise
+    told = (clear[..., :split] | ~gaps | (high[..., :-1] >= low[..., 1:])).all(-1)
+    # Half of what follows the gaps belongs to roots of T.
+    half = split + near.shape[-1]
+    told = told & (~on[..., 0, :] | (clear[..., split:half] & (value[..., split:half] < 0))).all(-1)
+    told = told & (~on[..., 1, :] | (clear[..., half:] & (value[..., half:] > 0))).all(-1)
+    larger = xp.where(gaps, value[..., :split] < 0, first[..., None])
+    after = xp.concatenate([larger, first[..., None]], axis=-1)[..., :n]
+    before = xp.concatenate([first[..., None], larger], axis=-1)[..., :n]
+    return first, before, after, told
