@@ -12,7 +12,7 @@ from zwidth._types import Array, ArrayLike
 from zwidth.errors import InputError
 
 # Concrete batches run in blocks of this many loops: their intermediate arrays then stay in the cache.
-_BLOCK = 1 << 10
+_BLOCK = 1 << 9
 # Roundings that one factor, one sum and one logarithm may add up to; twice what a count of the operations gives.
 _ROUNDINGS = 8.0
 # Closer to the circle than this many units in the last place (of r^2), a complex root cannot be told in from out.
@@ -262,6 +262,11 @@ def _intervals(loop: _Loop, eps: float, xp: Any) -> tuple[Array, Array, Array, A
     # In this order of the rows, large coefficients first, small zeros beside large ones keep their digits.
     shift = xp.broadcast_to(xp.eye(count, count - 1, dtype=monic.dtype), (*monic.shape, count - 1))
     guess = xp.linalg.eigvals(xp.concatenate([-monic[..., ::-1, None], shift], axis=-1)) + 0j
+    # Equal ones would divide by zero: parted as far as rounding parts a double zero.
+    tied = (guess[..., :, None] == guess[..., None, :]).sum(-1) > 1
+    circle = xp.asarray(np.exp(2j * np.pi * np.arange(count) / count)).astype(guess.dtype)
+    circle = math.sqrt(eps) * circle.reshape((1,) * (guess.ndim - 1) + (count,))
+    guess = guess + xp.where(tied, circle * xp.where(guess == 0, 1.0, xp.abs(guess)), 0.0)
     correction, _ = _corrections(loop, guess, leading, eps, xp)
     guess = xp.where(xp.isfinite(correction), guess - correction, guess)
     correction, noise = _corrections(loop, guess, leading, eps, xp)
