@@ -173,12 +173,15 @@ def _count(columns: list[Array], xp: Any) -> Array:
     met = xp.isfinite(low)
     m, clear = _turns_between(loop, low, high, eps, xp)
     b_first, before, after, told = _larger(loop, roots, low, high, leading, eps, xp)
+    t_alone, b_alone = _alone(loop, eps, xp)
 
     within = (loop.inside >= 0).sum(-1)
-    total = xp.where(b_first, within[..., 1] - missing[1], within[..., 0] - missing[0] + lag)
-    total = total + xp.where(met, m * (xp.where(after, 1.0, 0.0) - xp.where(before, 1.0, 0.0)), 0.0).sum(-1)
-    sure = good & proved & told & (clear | ~met).all(-1) & ~(cut & met.any(-1))
-    return xp.where(sure, total, -1.0).astype(int)
+    of_t, of_b = within[..., 0] - missing[0] + lag, within[..., 1] - missing[1]
+    changes = m * (xp.where(after, 1.0, 0.0) - xp.where(before, 1.0, 0.0))
+    total = xp.where(b_first, of_b, of_t) + xp.where(met, changes, 0.0).sum(-1)
+    sure = proved & told & (clear | ~met).all(-1) & ~(cut & met.any(-1))
+    total = xp.where(t_alone, of_t, xp.where(b_alone, of_b, total))
+    return xp.where(good & (sure | t_alone | b_alone), total, -1.0).astype(int)
 
 
 def _padded(roots: Array, missing: int, xp: Any) -> Array:
@@ -213,6 +216,22 @@ def _loop(roots: Array, gain: Array, turns: Array, radius: Array, xp: Any) -> tu
     start = angle[..., 0] - angle[..., 1] - xp.where(gain < 0, math.pi, 0.0) - 0.5 * math.pi * quarters
     inside = ((r - roots.real) * (r + roots.real) - roots.imag**2) / scale**2
     return _Loop(u, v, inside, weight, doubt, turns, start), roots, cut
+
+
+def _alone(loop: _Loop, eps: float, xp: Any) -> tuple[Array, Array]:
+    """Whether one part is larger on the whole circle by its least and the other's largest possible size.
+
+    Such loops need no crossovers, whose disks are wide where many roots coincide.
+    """
+    size = xp.abs(loop.inside)  # (r - |a|)/(r + |a|), the least of |z - a| over its largest
+    doubt = _ROUNDINGS * eps * (loop.doubt + (1.0 / (size + eps)).sum((-2, -1)))
+    least = xp.abs(loop.weight) * (size * size).prod(-1)
+    # More doubt than a tenth is a root on the circle to within rounding.
+    first, second = (
+        least[..., 0] > (1.0 + doubt) * -loop.weight[..., 1],
+        least[..., 1] > (1.0 + doubt) * loop.weight[..., 0],
+    )
+    return first & (doubt < 0.1), second & (doubt < 0.1)
 
 
 def _difference(loop: _Loop, t: Array, eps: float, xp: Any) -> tuple[Array, Array]:
