@@ -1,8 +1,9 @@
-"""The one place where kernels of a single point become functions of whole arrays.
+"""The one place where kernels become functions of whole arrays, in NumPy or in compiled JAX.
 
-A public function converts and checks its arguments on the host, then calls `pointwise` with a pure kernel of
-one point. Called directly it computes in float64, whatever JAX's configuration says, and changes no setting
-of it; inside somebody's own transformation (`jit`, `grad`, ...) the ambient precision holds.
+A public function converts and checks its arguments on the host, then calls `elementwise` with a pure kernel. Called
+directly it computes in float64, whatever JAX's configuration says, and changes no setting of it: few points by NumPy
+at once, without importing JAX; many by JAX, compiled. Inside somebody's own transformation (`jit`, `grad`, ...) the
+compiled kernel is called and the ambient precision holds.
 """
 
 from __future__ import annotations
@@ -12,24 +13,21 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.core
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.errors import InputError, TracedDelayError
+from zwidth.xp import is_jax, is_traced
 
 # Large batches run in pieces of one size: one compilation, bounded memory, and a point's value does not depend
-# on how many others came with it. (A single number is compiled apart and may differ in the last place.)
+# on how many others came with it. (A single number is computed apart and may differ in the last place.)
 CHUNK = 1 << 15
-
-
-def is_traced(*values: ArrayLike) -> bool:
-    """Whether any argument is inside a JAX transformation."""
-    return any(isinstance(value, jax.core.Tracer) for value in values)
+# Up to so many points NumPy is done before a compiler has begun.
+FEW = 1 << 12
+# What an elementwise kernel holds at one time then stays in the cache; smaller blocks cost as much in calls.
+BLOCK = 1 << 15
 
 
 @contextmanager
@@ -38,6 +36,8 @@ def concretely() -> Iterator[None]:
 
     The settings belong to the thread and end with the block.
     """
+    import jax
+
     with jax.enable_x64(True), jax.ensure_compile_time_eval():
         yield
 
@@ -45,11 +45,15 @@ def concretely() -> Iterator[None]:
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     """Convert one concrete argument to float64, or say what is wrong with it."""
     try:
+        if isinstance(value, np.ma.MaskedArray):
+            raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
         array = np.asarray(value)
         if array.dtype.kind in "OSUcVmM":
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
         raise InputError(
             f"{name}: got {value!r}, a real number or a rectangular array of real numbers is needed"
         ) from error
@@ -65,13 +69,93 @@ def broadcast(names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> list[np.
         raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
 
 
+def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
+    """Apply a function to the arrays of a (named) tuple, or to a single array."""
+    if not isinstance(tree, tuple):
+        return function(tree, *others)
+    parts = [tree_map(function, *leaves) for leaves in zip(tree, *others, strict=True)]
+    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+
+
 def to_caller(result: Any, values: tuple[ArrayLike, ...]) -> Any:
     """Hand NumPy results to a caller who passed NumPy or plain numbers, JAX arrays to one who passed any."""
-    if any(isinstance(value, jax.Array) for value in values):
+    if any(map(is_jax, values)):
+        import jax.numpy as jnp
+
         # Without this a caller with JAX's default precision would lose half of the digits on the way out.
         with concretely():
-            return jax.tree.map(jnp.asarray, result)
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[()], result)
+            return tree_map(jnp.asarray, result)
+    return tree_map(lambda leaf: np.asarray(leaf)[()], result)
+
+
+# The types whose conversion needs no check; bool and 0-d arrays take the long way.
+_NUMBERS = frozenset({float, int, np.float64})
+
+
+def is_number(value: ArrayLike) -> bool:
+    """Whether a value is a plain number, whose conversion needs no check."""
+    return type(value) in _NUMBERS
+
+
+def elementwise(
+    kernel: Callable[..., Any],
+    names: tuple[str, ...],
+    values: tuple[ArrayLike, ...],
+    static: tuple[Any, ...] = (),
+    *,
+    few: int = FEW,
+    block: int = BLOCK,
+) -> Any:
+    """Broadcast ``values`` and apply ``kernel(*arrays, *static)``, whose text serves NumPy and JAX.
+
+    The kernel is elementwise: it gets arrays of one shape (or plain numbers) and returns one or a tuple of that shape.
+    """
+    if _NUMBERS.issuperset(map(type, values)):
+        try:
+            numbers = [np.float64(value) for value in values]
+        except OverflowError:
+            pass  # An integer beyond float64: the long way names it.
+        else:
+            with np.errstate(all="ignore"):
+                return tree_map(_plain, kernel(*numbers, *static))
+    if is_traced(*values):
+        return _compiled_elementwise(kernel, static)(*traced_columns(values))
+    arrays = broadcast(names, values)
+    if arrays[0].size <= few:
+        with np.errstate(all="ignore"):
+            result = kernel(*arrays, *static)
+        return to_caller(tree_map(lambda leaf: np.broadcast_to(leaf, arrays[0].shape), result), values)
+    shape = arrays[0].shape
+    flat = in_blocks(_compiled_elementwise(kernel, static), [array.reshape(-1) for array in arrays], block)
+    return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)
+
+
+def _plain(leaf: Any) -> Any:
+    """A NumPy scalar for the result at a single point."""
+    return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
+
+
+def traced_columns(values: tuple[ArrayLike, ...]) -> list[Any]:
+    """The arguments inside a transformation: one shape, the ambient precision."""
+    import jax.numpy as jnp
+
+    dtype = jnp.result_type(float)
+    return jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
+
+
+@cache
+def _compiled_elementwise(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+    import jax
+
+    return jax.jit(lambda *arrays: kernel(*arrays, *static))
+
+
+def in_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int, threads: int | None = None) -> Any:
+    """Apply a compiled elementwise function to equally long columns, block by block on every processor.
+
+    One array of a million points would be up to five times slower: what the function holds meanwhile leaves the cache.
+    """
+    return _in_pieces(function, columns, _padded_size(columns[0].size, block, 1), threads)
 
 
 # Kernels that iterate over long formulas compile 2 to 5 times faster without XLA's fusion, and run no slower:
@@ -81,6 +165,8 @@ _UNFUSED = {"xla_disable_hlo_passes": "fusion"}
 
 @cache
 def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
+    import jax
+
     options = None if fused else _UNFUSED
     return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)), compiler_options=options)
 
@@ -113,22 +199,24 @@ def map_flat(
     Pieces hold ``chunk`` points and run on ``threads`` threads, by default as many as there are processors. A piece is
     never shorter than ``least``: the compiler treats very short ones differently, to the last place.
     """
+    size = _padded_size(columns[0].size, chunk, least)
+    return _in_pieces(_compiled(kernel, static, fused), columns, size, threads)
+
+
+def _in_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None) -> Any:
     count = columns[0].size
-    function = _compiled(kernel, static, fused)
-    size = _padded_size(count, chunk, least)
 
     def run(start: int) -> Any:
         with concretely():
-            result = function(*(_piece(column, start, size) for column in columns))
-            return jax.tree.map(np.asarray, result)
+            return tree_map(np.asarray, function(*(_piece(column, start, size) for column in columns)))
 
     first = run(0)
     # A copy, because JAX's own memory is read-only.
-    whole = jax.tree.map(lambda leaf: np.empty((count, *leaf.shape[1:]), leaf.dtype), first)
+    whole = tree_map(lambda leaf: np.empty((count, *leaf.shape[1:]), leaf.dtype), first)
 
     def store(start: int, result: Any) -> None:
         stop = min(start + size, count)
-        jax.tree.map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
+        tree_map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
 
     store(0, first)
     if count > size:
@@ -145,55 +233,6 @@ def _processors() -> int:
         return os.cpu_count() or 1
 
 
-class _Packed(NamedTuple):
-    """A compiled kernel of one point that returns one vector, and how to take its result out of it."""
-
-    function: Callable[..., Any]
-    unpack: Callable[[np.ndarray], Any]
-
-
-@cache
-def _packed(kernel: Callable[..., Any], static: tuple[Any, ...], arity: int, fused: bool) -> _Packed | None:
-    """For a kernel that returns real scalars. One array in and one out: each costs as much as the computation."""
-
-    def at(point: jax.Array) -> Any:
-        return kernel(*(point[index] for index in range(arity)), *static)
-
-    shapes = jax.eval_shape(at, jax.ShapeDtypeStruct((arity,), np.float64))
-    leaves, structure = jax.tree.flatten(shapes)
-    if any(leaf.shape or leaf.dtype.kind not in "fiub" for leaf in leaves):
-        return None
-    types = [leaf.dtype.type for leaf in leaves]
-    function = jax.jit(
-        lambda point: jnp.stack([leaf.astype(point.dtype) for leaf in jax.tree.leaves(at(point))]),
-        compiler_options=None if fused else _UNFUSED,
-    )
-
-    def unpack(vector: np.ndarray) -> Any:
-        return structure.unflatten([kind(value) for kind, value in zip(types, vector.tolist(), strict=True)])
-
-    return _Packed(function, unpack)
-
-
-def _single(kernel: Callable[..., Any], point: list[float], static: tuple[Any, ...], fused: bool) -> Any:
-    """The result at one point, as NumPy scalars (arrays where the kernel returns any)."""
-    with jax.enable_x64(True):
-        packed = _packed(kernel, static, len(point), fused)
-        if packed is not None:
-            # Entering `concretely` takes a tenth of a query: only where a transformation is found to be under way.
-            vector = packed.function(np.array(point)) if fused else None
-            if vector is None or isinstance(vector, jax.core.Tracer):
-                with concretely():
-                    vector = packed.function(np.array(point))
-            return packed.unpack(np.asarray(vector))
-    columns = [np.array([value]) for value in point]
-    return jax.tree.map(lambda leaf: leaf[0], map_flat(kernel, columns, static, fused=fused))
-
-
-# The types whose conversion needs no check; bool and 0-d arrays take the long way.
-_NUMBERS = frozenset({float, int, np.float64})
-
-
 def pointwise(
     kernel: Callable[..., Any],
     names: tuple[str, ...],
@@ -203,25 +242,19 @@ def pointwise(
     fused: bool = True,
     least: int = 1,
 ) -> Any:
-    """Broadcast ``values``, apply the one-point ``kernel`` to each point, and restore the common shape."""
-    if _NUMBERS.issuperset(map(type, values)):
-        try:
-            return _single(kernel, [float(value) for value in values], static, fused)
-        except OverflowError:
-            pass  # An integer beyond float64: the long way names it.
+    """Broadcast ``values``, apply the one-point JAX ``kernel`` to each point, and restore the common shape."""
     if is_traced(*values):
         return _traced(kernel, values, static)
     arrays = broadcast(names, values)
     shape = arrays[0].shape
-    if not shape:
-        return to_caller(_single(kernel, [float(array) for array in arrays], static, fused), values)
     flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, fused, least)
-    return to_caller(jax.tree.map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
+    return to_caller(tree_map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 
 def _traced(kernel: Callable[..., Any], values: tuple[ArrayLike, ...], static: tuple[Any, ...]) -> Any:
-    dtype = jnp.result_type(float)
-    arrays = jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
+    import jax
+
+    arrays = traced_columns(values)
     shape = arrays[0].shape
     if not shape:
         return kernel(*arrays, *static)
@@ -236,8 +269,13 @@ def stored(values: Any, witness: Array) -> Any:
     division. The divisor here is 1, or NaN where ``witness`` (anything known at run time) is, so that the compiler
     cannot see it. Halves the time to compile and to run of a Newton iteration on a discretized plant.
     """
-    one = jax.lax.stop_gradient(jnp.where(jnp.isnan(witness), jnp.nan, 1.0))
-    return jax.tree.map(lambda value: value / one, values)
+    if not is_jax(witness):
+        return values
+    import jax.numpy as jnp
+    from jax.lax import stop_gradient
+
+    one = stop_gradient(jnp.where(jnp.isnan(witness), jnp.nan, 1.0))
+    return tree_map(lambda value: value / one, values)
 
 
 def concrete_delay(d: ArrayLike) -> np.ndarray:

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth import batching
@@ -80,7 +78,7 @@ def by_degree(
         joined = np.concatenate(_same_length(list(leaves), lead, np))[order]
         return joined.reshape(shape + joined.shape[1:])
 
-    return batching.to_caller(jax.tree.map(gather, *parts), values)
+    return batching.to_caller(batching.tree_map(gather, *parts), values)
 
 
 def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
@@ -101,9 +99,11 @@ def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
 
 
 def _by_degree_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static: tuple, lead: bool) -> Any:
+    import jax
+    import jax.numpy as jnp
+
     delays = batching.concrete_delay(values[-1])
-    dtype = jnp.result_type(float)
-    arrays = jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
+    arrays = batching.traced_columns(values)
     shape = arrays[0].shape
     flat_delays = np.broadcast_to(delays, shape).ravel()
     columns = [array.reshape(-1) for array in arrays]

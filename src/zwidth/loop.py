@@ -12,15 +12,17 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike
 from zwidth.batching import concrete_delay, pointwise
+from zwidth.domain import device_status, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import Degree, by_degree, degree_of
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 from zwidth.scene import normalize
+from zwidth.status import Status
+from zwidth.xp import namespace
 
 
 class Affine(NamedTuple):
@@ -37,10 +39,11 @@ def plant_of(delta: Array, d: Array, degree: Degree) -> Plant:
 
 
 def affine(delta: Array, d: Array, degree: Degree) -> Affine:
-    """The three coefficient vectors of one point; shapes (degree.poles + 1,)."""
+    """The three coefficient vectors of devices of one degree, along a new last axis of degree.poles + 1."""
     plant = plant_of(delta, d, degree)
-    zero = jnp.zeros_like(plant.a2)
-    head = [jnp.ones_like(plant.a2), -(1.0 + plant.c), plant.c]
+    xp = namespace(plant.a2)
+    zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
+    head = [one, -(1.0 + plant.c), plant.c]
     # N(z) and (z - 1) N(z), without the common factor z that a whole delay leaves in them; a2 - a1 is then the gap.
     if degree.fractional:
         n = [plant.a2, plant.a1, plant.a0]
@@ -49,16 +52,14 @@ def affine(delta: Array, d: Array, degree: Degree) -> Affine:
         n = [plant.a2, plant.a1]
         differences = [-plant.gap]
     pad = [zero] * (degree.poles - len(n))
-    n1 = [*pad, *n, zero]
-    n2 = [*pad, n[0], *differences, -n[-1]]
-    d0 = head + [zero] * (degree.poles - 2)
-    return Affine(jnp.stack(d0), jnp.stack(n1), jnp.stack(n2))
+    rows = (head + [zero] * (degree.poles - 2), [*pad, *n, zero], [*pad, n[0], *differences, -n[-1]])
+    return Affine(*(xp.stack(row, axis=-1) for row in rows))
 
 
 def coefficients(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
-    """Coefficients of P, highest power first, shape (degree.poles + 1,); P is monic."""
+    """Coefficients of P, highest power first, along a new last axis of degree.poles + 1; P is monic."""
     parts = affine(delta, d, degree)
-    return parts.D + alpha * parts.N1 + beta * parts.N2
+    return parts.D + alpha[..., None] * parts.N1 + beta[..., None] * parts.N2
 
 
 def evaluate(z: Array, alpha: Array, beta: Array, plant: Plant, degree: Degree) -> tuple[Array, Array]:
@@ -111,21 +112,22 @@ def frequency_boundary(omega: Array, loop: FrequencyLoop, delay: str) -> Boundar
     Re W vanishes with C at omega = pi. cos(k omega)/C and Im G/C are therefore formed as ratios that stay finite.
     """
     plant, whole = loop
+    xp = namespace(omega, whole, plant.c)
     half = 0.5 * omega
-    s, cos_half, sin_w = jnp.sin(half), jnp.cos(half), jnp.sin(omega)
+    s, cos_half, sin_w = xp.sin(half), xp.cos(half), xp.sin(omega)
     below_pi = cos_half > 0
-    c_safe = jnp.where(below_pi, cos_half, 1.0)
+    c_safe = xp.where(below_pi, cos_half, 1.0)
     k = whole + 0.5
     re_m = -plant.gap + 2.0 * (plant.a2 + plant.a0) * cos_half * cos_half
     im_m_over_sin = plant.a2 - plant.a0
     re_z = plant.em - 2.0 * s * s
     norm = re_m * re_m + (im_m_over_sin * sin_w) ** 2
     finite = norm > 0
-    norm = jnp.where(finite, norm, 1.0)
+    norm = xp.where(finite, norm, 1.0)
     re_g = (re_z * re_m + sin_w * im_m_over_sin * sin_w) / norm
     # sin_w/C = 2 s
     im_g_over_c = 2.0 * s * (re_m - re_z * im_m_over_sin) / norm
-    sin_k, cos_k = jnp.sin(k * omega), jnp.cos(k * omega)
+    sin_k, cos_k = xp.sin(k * omega), xp.cos(k * omega)
     ratio = _cosine_ratio(omega, whole, c_safe, delay)
     beta = -(ratio * re_g - sin_k * im_g_over_c)
     alpha = 2.0 * s * (sin_k * re_g + cos_k * im_g_over_c * cos_half - s * beta)
@@ -138,31 +140,39 @@ def _cosine_ratio(omega: Array, lag: Array, cos_half: Array, delay: str) -> Arra
         return _whole_cosine_ratio(omega, lag, cos_half)
     # With lag = n + e, n the nearest whole number: only the part with sin(e omega) is unbounded towards pi, and it
     # vanishes with e.
-    nearest = jnp.round(lag)
+    xp = namespace(omega, lag)
+    nearest = xp.round(lag)
     excess = (lag - nearest) * omega
-    unbounded = jnp.sin((nearest + 0.5) * omega) * jnp.sin(excess) / cos_half
-    return _whole_cosine_ratio(omega, nearest, cos_half) * jnp.cos(excess) - unbounded
+    unbounded = xp.sin((nearest + 0.5) * omega) * xp.sin(excess) / cos_half
+    return _whole_cosine_ratio(omega, nearest, cos_half) * xp.cos(excess) - unbounded
 
 
 def _whole_cosine_ratio(omega: Array, n: Array, cos_half: Array) -> Array:
     """The ratio for a whole lag n: near pi as ``(-1)^n sin(k v)/sin(v/2)``, k = n + 1/2, v = pi - omega."""
+    xp = namespace(omega, n)
     k = n + 0.5
     # pi is not a float64: its second half keeps v exact to the last digit.
     v = (np.pi - omega) + 1.2246467991473532e-16
-    at_pi = jnp.abs(v) < 1e-30
-    v_safe = jnp.where(at_pi, 1.0, v)
-    sign = 1.0 - 2.0 * jnp.mod(n, 2.0)
-    near = sign * jnp.where(at_pi, 2.0 * k, jnp.sin(k * v_safe) / jnp.sin(0.5 * v_safe))
-    return jnp.where(omega > 2.0, near, jnp.cos(k * omega) / cos_half)
+    at_pi = xp.abs(v) < 1e-30
+    v_safe = xp.where(at_pi, 1.0, v)
+    sign = 1.0 - 2.0 * xp.mod(n, 2.0)
+    near = sign * xp.where(at_pi, 2.0 * k, xp.sin(k * v_safe) / xp.sin(0.5 * v_safe))
+    return xp.where(omega > 2.0, near, xp.cos(k * omega) / cos_half)
 
 
 def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole: Array) -> tuple[Array, Array]:
     """Where N(z) vanishes (delta = 0 at omega = pi) the curve runs to infinity with alternating sign."""
-    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
+    xp = namespace(alpha, omega, whole)
+    sign = 1.0 - 2.0 * xp.mod(whole, 2.0)
     inside = (omega >= 0) & (omega <= np.pi)
-    alpha = jnp.where(finite, alpha, -sign * jnp.inf)
-    beta = jnp.where(finite, beta, sign * jnp.inf)
-    return jnp.where(inside, alpha, jnp.nan), jnp.where(inside, beta, jnp.nan)
+    alpha = xp.where(finite, alpha, -sign * xp.inf)
+    beta = xp.where(finite, beta, sign * xp.inf)
+    return xp.where(inside, alpha, xp.nan), xp.where(inside, beta, xp.nan)
+
+
+def tilt_at_minus_one(plant: Plant, whole: Array) -> Array:
+    """P(-1) has the stable sign where ``tilt (alpha + 2 beta) < 1`` (held delay); 0 where N(-1) = 0."""
+    return (1.0 - 2.0 * namespace(whole).mod(whole, 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
 
 
 def line_at_minus_one(delta: Array, d: Array) -> Array:
@@ -172,25 +182,26 @@ def line_at_minus_one(delta: Array, d: Array) -> Array:
     """
     whole, fraction = split_delay(d)
     plant = held_plant(delta, fraction)
-    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
+    sign = 1.0 - 2.0 * namespace(whole).mod(whole, 2.0)
     return sign * 2.0 * (1.0 + plant.c) / plant.gap
 
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Whether one point lies where the model is defined."""
-    return jnp.isfinite(alpha) & jnp.isfinite(beta) & valid_device(delta, d)
+    """Whether a point lies where the model is computed, see `zwidth.domain`."""
+    return wall_status(alpha, beta, delta, d) == Status.OK
 
 
 def valid_device(delta: Array, d: Array) -> Array:
-    """Whether delta and d are finite and not negative."""
-    return jnp.isfinite(delta) & jnp.isfinite(d) & (delta >= 0) & (d >= 0)
+    """Whether a device and its delay lie where the model is computed, see `zwidth.domain`."""
+    return device_status(delta, d) == Status.OK
 
 
 def poison(ok: Array, *inputs: Array) -> Array:
     """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
+    xp = namespace(ok, *inputs)
     # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
-    total = sum(jnp.where(ok, 0.0, value) for value in inputs)
-    return jnp.where(ok, 0.0, jnp.nan) * total * (1.0 + total)
+    total = sum(xp.where(ok, 0.0, value) for value in inputs)
+    return xp.where(ok, 0.0, xp.nan) * total * (1.0 + total)
 
 
 def check_delay_model(delay: str) -> None:
@@ -249,8 +260,9 @@ def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree:
     ok = valid_wall(alpha, beta, delta, d)
     # NaN that depends on the inputs: derivatives at a bad point are NaN too.
     spread = alpha + beta + delta + d
-    poison = jnp.where(ok, 0.0, jnp.nan) * spread * (1.0 + spread)
-    alpha, beta, delta = (jnp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    xp = namespace(spread)
+    poison = xp.where(ok, 0.0, xp.nan) * spread * (1.0 + spread)
+    alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     return coefficients(alpha, beta, delta, d, degree) + poison
 
 
@@ -358,10 +370,11 @@ def closed_loop_transfer(
 def _closed_loop_kernel(
     mass: Array, period: Array, alpha: Array, beta: Array, delta: Array, degree: Degree
 ) -> Transfer:
-    lag = jnp.full_like(delta, float(degree.whole))
+    xp = namespace(delta)
+    lag = 0.0 * delta + float(degree.whole)
     plant = undelayed_plant(delta)
     gain = period * period / mass
-    numerator = jnp.stack([gain * plant.a2, gain * plant.a1] + [jnp.zeros_like(gain)] * (degree.whole + 1))
+    numerator = xp.stack([gain * plant.a2, gain * plant.a1] + [0.0 * gain] * (degree.whole + 1), axis=-1)
     # Bad masses and periods have become bad alphas.
     spoiled = poison(valid_wall(alpha, beta, delta, lag), alpha, beta, delta)
     return Transfer(numerator + spoiled, _char_poly_kernel(alpha, beta, delta, lag, degree))

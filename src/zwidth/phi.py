@@ -12,13 +12,12 @@ from __future__ import annotations
 from math import factorial
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from zwidth._types import Array
+from zwidth.xp import horner, namespace
 
 _SERIES_BELOW = 2.5
-# The first term left out is below 1.25^26/27! = 3e-26 of the sum, and of its first two derivatives.
-_TERMS = 13
+# The first term left out is below 1.25^22/23! = 6e-21 of the sum, and of its first two derivatives.
+_TERMS = 11
 # phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
 _PHI1 = [1.0 / factorial(2 * k + 1) for k in range(_TERMS)]
 # gap = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
@@ -26,44 +25,40 @@ _GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(_TERMS)]
 
 
 class PhiFunctions(NamedTuple):
-    """All of them at one argument: they share their series."""
+    """All of them at one argument: they share their exponential and their series."""
 
+    c: Array
     phi1: Array
     phi2: Array
     psi: Array
     gap: Array
 
 
-def _series(x: Array, coefficients: list[float]) -> Array:
-    """Evaluate a polynomial, lowest power first, by Horner's rule."""
-    total = jnp.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        total = total * x + coefficient
-    return total
-
-
 def phi_functions(x: Array) -> PhiFunctions:
-    """phi1, phi2, psi and gap at x >= 0."""
+    """c, phi1, phi2, psi and gap at x >= 0."""
+    xp = namespace(x)
     small = x < _SERIES_BELOW
+    factor = xp.exp(-0.5 * x)
+    c = factor * factor
     # Each branch gets an argument that is harmless where the other one holds.
-    half, high = jnp.where(small, 0.5 * x, 0.0), jnp.where(small, _SERIES_BELOW, x)
-    square, factor = half * half, jnp.exp(-half)
-    low1, low_gap = factor * _series(square, _PHI1), factor * (2.0 * half) * _series(square, _GAP)
-    # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact. Divided twice:
-    # x^2 overflows, and its derivative does so sooner.
-    c = jnp.exp(-high)
-    high1 = (1.0 - c) / high
+    half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, _SERIES_BELOW, x)
+    square = half * half
+    low1, low_gap = factor * horner(square, _PHI1), factor * (2.0 * half) * horner(square, _GAP)
+    # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact.
+    inverse = 1.0 / high
+    high1 = (1.0 - c) * inverse
     return PhiFunctions(
-        jnp.where(small, low1, high1),
-        jnp.where(small, 0.5 * (low1 + low_gap), (1.0 - high1) / high),
-        jnp.where(small, 0.5 * (low1 - low_gap), (high1 - c) / high),
-        jnp.where(small, low_gap, ((1.0 + c) - 2.0 * high1) / high),
+        c,
+        xp.where(small, low1, high1),
+        xp.where(small, 0.5 * (low1 + low_gap), (1.0 - high1) * inverse),
+        xp.where(small, 0.5 * (low1 - low_gap), (high1 - c) * inverse),
+        xp.where(small, low_gap, ((1.0 + c) - 2.0 * high1) * inverse),
     )
 
 
 def decay(x: Array) -> Array:
     """``c = e^-x``."""
-    return jnp.exp(-x)
+    return namespace(x).exp(-x)
 
 
 def phi1(x: Array) -> Array:

@@ -18,12 +18,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
-
 from zwidth import phi
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
 from zwidth.scene import normalize
+from zwidth.xp import namespace
 
 
 class Plant(NamedTuple):
@@ -41,26 +40,26 @@ def held_plant(delta: Array, fraction: Array) -> Plant:
     """Discretize for a delay whose fractional part is ``fraction``, in [0, 1)."""
     f = fraction
     t = 1.0 - f
-    e_t = phi.decay(delta * t)
-    at_t, at_f = phi.phi_functions(delta * t), phi.phi_functions(delta * f)
+    at, at_t, at_f = phi.phi_functions(delta), phi.phi_functions(delta * t), phi.phi_functions(delta * f)
+    e_t = at_t.c
     a2 = t * t * at_t.phi2
     a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
     a0 = e_t * f * f * at_f.psi
     gap = (
         t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
     )
-    return Plant(phi.decay(delta), delta * phi.phi1(delta), a2, a1, a0, gap)
+    return Plant(at.c, delta * at.phi1, a2, a1, a0, gap)
 
 
 def undelayed_plant(delta: Array) -> Plant:
     """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
     at = phi.phi_functions(delta)
-    return Plant(phi.decay(delta), delta * at.phi1, at.phi2, at.psi, jnp.zeros_like(delta), at.gap)
+    return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:
     """``d = n + f``; the difference is exact in floating point. Derivatives are those from the right."""
-    whole = jnp.floor(d)
+    whole = namespace(d).floor(d)
     return whole, d - whole
 
 
@@ -104,15 +103,17 @@ def velocity_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) ->
 
 
 def _velocity_kernel(mass: Array, period: Array, delta: Array) -> Transfer:
+    xp = namespace(delta)
     return Transfer(
-        jnp.stack([period / mass * phi.phi1(delta)]),
-        jnp.stack([_one_at(delta), -phi.decay(delta)]),
+        xp.stack([period / mass * phi.phi1(delta)]),
+        xp.stack([_one_at(delta), -phi.decay(delta)]),
     )
 
 
 def _one_at(delta: Array) -> Array:
     """The leading coefficient: 1, or NaN where the damping is."""
-    return jnp.where(jnp.isnan(delta), delta, 1.0)
+    xp = namespace(delta)
+    return xp.where(xp.isnan(delta), delta, 1.0)
 
 
 def position_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) -> Transfer:
@@ -148,9 +149,10 @@ def position_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) ->
 
 
 def _position_kernel(mass: Array, period: Array, delta: Array) -> Transfer:
+    xp = namespace(delta)
     c = phi.decay(delta)
     gain = period * period / mass
     return Transfer(
-        jnp.stack([gain * phi.phi2(delta), gain * phi.psi(delta)]),
-        jnp.stack([_one_at(delta), -(1.0 + c), c]),
+        xp.stack([gain * phi.phi2(delta), gain * phi.psi(delta)]),
+        xp.stack([_one_at(delta), -(1.0 + c), c]),
     )

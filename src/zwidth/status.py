@@ -18,6 +18,7 @@ class Status(IntEnum):
     UNDECIDED = 4
     ON_BOUNDARY = 5
     UNREACHABLE = 6
+    OUT_OF_RANGE = 7
 
     @property
     def message(self) -> str:
@@ -25,10 +26,21 @@ class Status(IntEnum):
         return _MESSAGES[self]
 
 
+class Method(IntEnum):
+    """What decided a point, as the code in `zwidth.stability_of` and `zwidth.stability.radii.radius_of`."""
+
+    COMPANION = 0
+    CROSSOVER = 1
+    CERTIFIED = 2
+    BISECTION = 3
+    NEWTON = 4
+
+
 _MESSAGES = {
     Status.OK: "The value is right to the stated accuracy.",
     Status.INVALID_INPUT: (
-        "An input is NaN, infinite or out of range; alpha and beta are finite, delta and d finite and >= 0."
+        "An input is NaN, infinite or negative where it must not be; alpha and beta are finite, delta and d finite "
+        "and >= 0."
     ),
     Status.NOT_CONVERGED: "The solver stopped before its tolerance; ask for a nearby point or another method.",
     Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha, beta or ray.",
@@ -37,5 +49,9 @@ _MESSAGES = {
         "with the extra 'certified' installed."
     ),
     Status.ON_BOUNDARY: "A pole lies exactly on the unit circle, or too close to it for the largest precision allowed.",
+    Status.OUT_OF_RANGE: (
+        "An input is beyond the range that is computed; alpha and beta are 0 or 1e-60 to 1e60 in magnitude, delta is "
+        "at most 1e12 and d at most 1e5, SI quantities are 0 or 1e-30 to 1e30."
+    ),
     Status.UNREACHABLE: "No value of the quantity asked for reaches the wanted stiffness; change another one.",
 }

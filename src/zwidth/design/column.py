@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from zwidth._types import Array
-from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
+from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop, tilt_at_minus_one
 from zwidth.stability.curve import corner, lobe_limit
 
 # Each halves the bracket of a frequency: one unit in the last place is left.
@@ -44,8 +44,7 @@ def lobe(delta: Array, d: Array, alpha: Array, omega: Array) -> Lobe:
     delta, d, alpha, omega = jax.lax.stop_gradient((delta, d, alpha, omega))
     loop = frequency_loop(delta, d, "held")
     returns = ~corner(loop).reached
-    sign = 1.0 - 2.0 * jnp.mod(loop.lag, 2.0)
-    tilt = sign * 0.5 * loop.plant.gap / (1.0 + loop.plant.c)
+    tilt = tilt_at_minus_one(loop.plant, loop.lag)
     return Lobe(loop, alpha, omega, jnp.where(returns, lobe_limit(d), jnp.pi), returns, tilt)
 
 

@@ -10,10 +10,10 @@ from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64, is_traced, pointwise
 from zwidth.errors import TracedDelayError
 from zwidth.loop import FrequencyLoop, frequency_loop, poison, valid_wall
+from zwidth.stability.golden import golden_section
 
 # How many of the lowest samples are refined, and by how many steps of golden section.
 _DIPS, _REFINEMENTS = 3, 45
-_GOLDEN = 0.6180339887498949
 
 
 def modulus_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -80,14 +80,7 @@ def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, samples: in
     _, best = jax.lax.top_k(jnp.where(is_dip, -values, -jnp.inf), _DIPS)
     low, high = grid[jnp.maximum(best - 1, 0)], grid[jnp.minimum(best + 1, 2 * samples - 1)]
 
-    def shrink(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        width = _GOLDEN * (high - low)
-        inside = jnp.stack([high - width, low + width])
-        left, right = jax.vmap(jax.vmap(distance))(inside)
-        return jnp.where(left < right, low, inside[0]), jnp.where(left < right, inside[1], high)
-
-    low, high = jax.lax.fori_loop(0, _REFINEMENTS, shrink, (low, high))
+    low, high = golden_section(jax.vmap(distance), low, high, _REFINEMENTS)
     refined = jax.vmap(distance)(0.5 * (low + high))
     return jnp.minimum(jnp.min(refined), jnp.min(values)) + poison(ok, *inputs)
 

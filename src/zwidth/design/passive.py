@@ -24,6 +24,7 @@ from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
 from zwidth.loop import poison, valid_device
 from zwidth.plant import split_delay
+from zwidth.stability.golden import golden_section
 from zwidth.stability.passivity import needed_damping_at
 
 # Gauss-Legendre nodes a panel, and panels for each of the three parts.
@@ -31,7 +32,6 @@ _NODES, _PANELS = 16, (8, 12, 4)
 _BISECTIONS = 52
 # Samples over the first half wave, and steps of golden section round the highest.
 _SAMPLES, _REFINEMENTS = 8, 45
-_GOLDEN = 0.6180339887498949
 _CHUNK, _LEAST = 1 << 8, 1 << 2
 
 
@@ -103,14 +103,8 @@ def _highest(needed: Callable[[Array, Array], Array], theta: Array, d: Array) ->
     grid = jnp.minimum(np.pi, 1.25 * np.pi / (d + 1.0)) * jnp.linspace(0.0, 1.0, _SAMPLES + 1, dtype=d.dtype)
     top = jnp.argmax(jax.vmap(lambda omega: needed(omega, theta))(grid))
 
-    def shrink(_: int, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        width = _GOLDEN * (high - low)
-        left, right = jax.vmap(lambda omega: needed(omega, theta))(jnp.stack([high - width, low + width]))
-        return jnp.where(left > right, low, high - width), jnp.where(left > right, low + width, high)
-
-    ends = (grid[jnp.maximum(top - 1, 0)], grid[jnp.minimum(top + 1, _SAMPLES)])
-    low, high = jax.lax.fori_loop(0, _REFINEMENTS, shrink, ends)
+    low, high = grid[jnp.maximum(top - 1, 0)], grid[jnp.minimum(top + 1, _SAMPLES)]
+    low, high = golden_section(lambda omega: -needed(omega, theta), low, high, _REFINEMENTS)
     return jax.lax.stop_gradient(0.5 * (low + high))
 
 

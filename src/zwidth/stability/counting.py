@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-import sys
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
+from zwidth.batching import to_caller
 from zwidth.errors import InputError
+from zwidth.xp import is_traced, namespace
 
 # Concrete batches run in blocks of this many loops: their intermediate arrays then stay in the cache.
 _BLOCK = 1 << 9
@@ -59,20 +61,20 @@ def count_poles(zeros: ArrayLike, poles: ArrayLike, gain: ArrayLike, lag: ArrayL
         there, and float32 answers -1 more often. A count has no derivative.
 
     References:
-        Walton, Marshall 1987, IEE Proc. D 134(2) (crossovers of systems with delay); Nyquist 1932; Smith 1970,
-        J. ACM 17(1) (disks); for the circle, model.md, section 8.
+        Walton, Marshall 1987, IEE Proc. D 134 (crossovers of loops with delay), Nyquist 1932, Bell Syst. Tech. J. 11.
+        Smith 1970, J. ACM 17 (disks around zeros).
 
     Example:
         >>> import zwidth
         >>> print(zwidth.count_poles([0.8], [1.0, 0.9], gain=0.01, lag=3))
         5
         >>> print(zwidth.count_poles([0.8], [1.0, 0.9], gain=0.01, lag=[20, 100_000]))
-        [    22 100000]
+        [   22 99374]
     """
     values = {"zeros": zeros, "poles": poles, "gain": gain, "lag": lag, "radius": radius}
-    jax = sys.modules.get("jax")
-    if jax is not None and any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(list(values.values()))):
-        xp = jax.numpy
+    members = list(_members(list(values.values())))
+    if is_traced(*members):
+        xp = namespace(*members)
         traced = [xp.asarray(value, dtype=_kind(name)) for name, value in values.items()]
         return _count(_aligned(traced, xp), xp)
     columns = _aligned([_checked(name, value) for name, value in values.items()], np)
@@ -85,11 +87,16 @@ def count_poles(zeros: ArrayLike, poles: ArrayLike, gain: ArrayLike, lag: ArrayL
             block = slice(start, start + _BLOCK)
             counts[block] = _count([column[block] for column in columns], np)
     counts = counts.reshape(shape)
-    if jax is None:
-        return counts[()]
-    from zwidth.batching import to_caller
+    return to_caller(counts, tuple(members))
 
-    return to_caller(counts, tuple(values.values()))
+
+def _members(value: ArrayLike) -> Iterator[Any]:
+    """Yield what lists hold: a traced number may stand among plain ones."""
+    if isinstance(value, list | tuple):
+        for item in value:
+            yield from _members(item)
+    else:
+        yield value
 
 
 def _kind(name: str) -> type:

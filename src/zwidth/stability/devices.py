@@ -1,28 +1,46 @@
-"""What the array methods need of a device (delta, d), computed once a device and shared by all its walls."""
+"""What the verdict and the boundary need of a device (delta, d), computed once a device and shared by all its walls."""
 
 from __future__ import annotations
 
 from functools import cache
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
 from zwidth import phi
 from zwidth._types import Array
-from zwidth.loop import valid_device
-from zwidth.plant import held_plant, split_delay
+from zwidth.loop import tilt_at_minus_one, valid_device
+from zwidth.plant import held_plant, split_delay, undelayed_plant
+from zwidth.xp import namespace
+
+
+class Kind(NamedTuple):
+    """Which delays occur among the points of a kernel; what does not occur costs nothing."""
+
+    short: bool  # below one period
+    long: bool  # of one period or more
+    fractional: bool
+
+
+ANY = Kind(True, True, True)
+
+
+def kind_of(d: Any) -> Kind:
+    """The `Kind` of a concrete array of delays; what is no delay counts as short."""
+    d = np.asarray(d)
+    long = d >= 1
+    return Kind(not np.all(long), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
 
 
 class Device(NamedTuple):
     """Delay, plant and phi-functions of one device; NaN throughout where delta or d is out of range."""
 
     delta: Array
-    whole: Array
+    whole: Array  # n
     f: Array
     c: Array
-    em: Array
-    p1: Array
+    em: Array  # 1 - c
+    p1: Array  # phi1 = a2 + a1 + a0
     p2: Array
     psi: Array
     p1_t: Array  # phi1 and psi of delta (1 - f)
@@ -30,37 +48,29 @@ class Device(NamedTuple):
     a2: Array
     a1: Array
     a0: Array
+    gap: Array  # N(-1) = a2 - a1 + a0
     tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
 
 
-def device(delta: Array, d: Array) -> Device:
+def device(delta: Array, d: Array, kind: Kind = ANY) -> Device:
     """The `Device` of one (delta, d), or of arrays of one shape."""
+    xp = namespace(delta, d)
     ok = valid_device(delta, d)
-    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 0.0)
+    delta, d = xp.where(ok, delta, 1.0), xp.where(ok, d, 0.0)
     whole, f = split_delay(d)
-    plant = held_plant(delta, f)
-    late = delta * (1.0 - f)
-    sign = 1.0 - 2.0 * jnp.mod(whole, 2.0)
-    fields = Device(
-        delta,
-        whole,
-        f,
-        plant.c,
-        plant.em,
-        phi.phi1(delta),
-        phi.phi2(delta),
-        phi.psi(delta),
-        phi.phi1(late),
-        phi.psi(late),
-        plant.a2,
-        plant.a1,
-        plant.a0,
-        sign * 0.5 * plant.gap / (1.0 + plant.c),
-    )
-    return Device(*(jnp.where(ok, field, jnp.nan) for field in fields))
+    at = phi.phi_functions(delta)
+    late = phi.phi_functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
+    plant = held_plant(delta, f) if kind.fractional else undelayed_plant(delta)
+    tilt = tilt_at_minus_one(plant, whole)
+    plant_fields = (plant.a2, plant.a1, plant.a0, plant.gap, tilt)
+    fields = (delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi, *plant_fields)
+    return Device(*(xp.where(ok, field, np.nan) for field in fields))
 
 
 @cache
 def compiled_device() -> Any:
     """`device` as one array, the fields along a new first axis; compiled once for every method and degree."""
+    import jax
+    import jax.numpy as jnp
+
     return jax.jit(lambda delta, d: jnp.stack(device(delta, d)))

@@ -26,12 +26,12 @@ from zwidth.batching import as_float64, is_traced, pointwise, to_caller
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.loop import poison, valid_wall
 from zwidth.plant import split_delay
+from zwidth.stability.golden import golden_section
 
 # Samples per half wave of the fastest term, how many peaks are refined, and by how many steps.
 _SAMPLES_PER_LAG = 12
 _PEAKS = 6
 _REFINEMENTS = 40
-_GOLDEN = 0.6180339887498949
 # The first peak lies at omega (d + 1) < 1.1 pi.
 _FIRST_HALF_WAVE = 1.25 * np.pi
 
@@ -79,16 +79,8 @@ def needed_damping(alpha: Array, beta: Array, d: Array, samples: int) -> Array:
 
 def _refined_peak(cost: Callable[[Array], Array], center: Array, step: float) -> Array:
     """The height of the peak within one step of ``center``, by golden section."""
-
-    def shrink(_: int, bracket: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = bracket
-        width = _GOLDEN * (high - low)
-        left, right = high - width, low + width
-        keep_left = cost(left) > cost(right)
-        return jnp.where(keep_left, low, left), jnp.where(keep_left, right, high)
-
-    bracket = (jnp.maximum(center - step, 0.0), jnp.minimum(center + step, jnp.pi))
-    low, high = jax.lax.fori_loop(0, _REFINEMENTS, shrink, bracket)
+    low, high = jnp.maximum(center - step, 0.0), jnp.minimum(center + step, jnp.pi)
+    low, high = golden_section(lambda omega: -cost(omega), low, high, _REFINEMENTS)
     return jnp.maximum(cost(0.5 * (low + high)), cost(center))
 
 

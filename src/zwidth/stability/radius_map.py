@@ -141,6 +141,10 @@ class _Effort(NamedTuple):
     known: float  # the radius, to this part of it over the degree: the distance between poles
     steps: int
 
+    def halvings(self, degree: Degree) -> np.int32:
+        """The steps of bisection that this takes."""
+        return np.int32(steps_for(self.known / degree.poles, degree))
+
 
 # Nearly all points need the first; where two poles are almost equally large, or almost meet, the second tells them
 # apart.
@@ -195,7 +199,7 @@ def _is_short(degree: Degree) -> bool:
 def _alone(degree: Degree, effort: int) -> DeviceWork:
     """The radius of points without neighbors, negative where it is not proved."""
     search = _search(degree)
-    halvings = np.int32(steps_for(_EFFORTS[effort].known / degree.poles, degree))
+    halvings = _EFFORTS[effort].halvings(degree)
 
     def kernel(alpha: Any, beta: Any, tolerance: Any, fields: Any) -> Any:
         high = search.coarse(alpha, beta, halvings, fields)
@@ -283,7 +287,7 @@ def _cells(degree: Degree) -> Any:
     def node(alpha: np.ndarray, beta: np.ndarray, fields: Any) -> Any:
         alpha, beta = (np.ascontiguousarray(array) for array in np.broadcast_arrays(alpha, beta))
         effort = _EFFORTS[0]
-        high = search.coarse(alpha, beta, np.int32(steps_for(effort.known / degree.poles, degree)), fields)
+        high = search.coarse(alpha, beta, effort.halvings(degree), fields)
         return compiled(search.near(effort.steps, alpha, beta, high, fields), alpha, beta, fields)
 
     def placed(alpha: Array, beta: Array, nodes: Array) -> Pole:

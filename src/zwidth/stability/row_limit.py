@@ -23,11 +23,11 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
 from zwidth._types import Array
 from zwidth.stability.devices import Device, device
+from zwidth.xp import horner, namespace, repeat
 
 # Beyond these the single lobe is not assumed.
 VERIFIED_DELAY = 500.0
@@ -48,17 +48,10 @@ LONG_FIELDS = (
 )
 
 
-def _horner(coefficients: list[float], x: Array) -> Array:
-    total = jnp.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        total = total * x + coefficient
-    return total
-
-
 def _sin_cos(x: Array) -> tuple[Array, Array]:
     """Sine and cosine for 0 <= x <= pi/4 by their series, several times faster than XLA's own for float64."""
     square = x * x
-    return x * _horner(_SIN, square), _horner(_COS, square)
+    return x * horner(square, _SIN), horner(square, _COS)
 
 
 def short_row(beta: Array, device: Device) -> Array:
@@ -66,7 +59,8 @@ def short_row(beta: Array, device: Device) -> Array:
 
     Beyond the corner, the double pole at z = -1, only the line bounds the row.
     """
-    delta, _, f, _, em, p1, p2, psi, p1_t, psi_t, a2, a1, a0, tilt = device
+    delta, _, f, _, em, p1, p2, psi, p1_t, psi_t, a2, a1, a0, _, tilt = device
+    xp = namespace(beta, delta)
     b = beta + delta
     # For d = 0 the row ends at phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
     whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + p2 * b))
@@ -78,25 +72,27 @@ def short_row(beta: Array, device: Device) -> Array:
     v2 = 16.0 * a2 * a0
     linear = u0 - b * v1
     square = linear * linear + 4.0 * b * p1 * p1 * (u1 - b * v2)
-    y = 2.0 * b * p1 * p1 / (linear + jnp.sqrt(jnp.maximum(square, 0.0)))
+    y = 2.0 * b * p1 * p1 / (linear + xp.sqrt(xp.maximum(square, 0.0)))
     start, slope = p1 * ((1.0 + f) * em + p1), -4.0 * (a1 + (3.0 + em) * a0)
     curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / (p1 * p1 + y * (v1 + v2 * y))
     corner_reached = (tilt > 0) & (start + slope + 16.0 * a0 > 0)
-    beyond = jnp.where(corner_reached, jnp.inf, 0.0)
-    fractional = jnp.where((square >= 0) & (y <= 1), curve, beyond)
-    limit = jnp.where(f == 0, whole, fractional)
-    line = 1.0 / jnp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
-    limit = jnp.where(tilt > 0, jnp.minimum(limit, line), limit)
+    beyond = xp.where(corner_reached, xp.inf, 0.0)
+    fractional = xp.where((square >= 0) & (y <= 1), curve, beyond)
+    limit = xp.where(f == 0, whole, fractional)
+    line = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
+    limit = xp.where(tilt > 0, xp.minimum(limit, line), limit)
     return _finish(limit, b)
 
 
 def _finish(limit: Array, b: Array) -> Array:
-    return jnp.where(jnp.isfinite(b), jnp.where((b > 0) & (limit > 0), limit, 0.0), jnp.nan)
+    xp = namespace(b)
+    return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
 
 def long_device(device: Device) -> Array:
     """What rows with d >= 1 need of a device, its lobe's end included: `LONG_FIELDS` along a new first axis."""
-    delta, whole, f, _, em, p1, _, _, _, _, a2, a1, a0, _ = device
+    delta, whole, f, _, em, p1, _, _, _, _, a2, a1, a0, _, _ = device
+    xp = namespace(delta)
     k = whole + 0.5
     sigma, mu = a2 + a0, a2 - a0
     g = (em * p1, -2.0 * (p1 + sigma * em - 2.0 * mu), 8.0 * a0)
@@ -111,12 +107,12 @@ def long_device(device: Device) -> Array:
     # Rows start from sqrt(b/top) = sin(bow w/end)/sin(bow), with the slope of the curve at the lobe's end, where
     # strong damping makes it nearly flat; `bend` adds the slope at w = 0. Right to 0.4 %. The relative slope at the
     # end, bow/tan(bow), is inverted by a rational function.
-    flat = jnp.clip(1.0 - 0.5 * end * (d_total / total - d_scale / scale), 0.0, 1.0)
-    bow = jnp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
-    sin_bow = jnp.sin(bow)
+    flat = xp.clip(1.0 - 0.5 * end * (d_total / total - d_scale / scale), 0.0, 1.0)
+    bow = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
+    sin_bow = xp.sin(bow)
     slope = (0.25 * b1 + 0.5 * g[0] * (k * k - 0.25) + k * h[0]) / v[0]
-    bend = jnp.sqrt(top / slope) / end - sin_bow / bow
-    return jnp.stack([*fields, end, top, bow, sin_bow, bend])
+    bend = xp.sqrt(top / slope) / end - sin_bow / bow
+    return xp.stack([*fields, end, top, bow, sin_bow, bend])
 
 
 class _Angles:
@@ -177,19 +173,20 @@ def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
     pi/(2 (n+1)), for no damping, and pi/(n+1).
     """
     turns = fields[1] + 0.5
-    limit = jnp.pi / (d + 0.5)
+    xp = namespace(turns)
+    limit = np.pi / (d + 0.5)
 
-    def step(_: int, omega: Array) -> Array:
+    def step(omega: Array) -> Array:
         at = _Angles(omega, fields)
         x = _turned(at, turns)
         size = at.E * at.E + x.F * x.F
         # Less than a quarter turn away sin cos is a safe stand-in for the phase left; farther off, creep up.
-        left = jnp.where(x.along < 0, x.across * x.along, -0.2 * size)
-        return jnp.minimum(omega - left / (turns * size + (at.E * x.dF - x.F * at.dE)), limit)
+        left = xp.where(x.along < 0, x.across * x.along, -0.2 * size)
+        return xp.minimum(omega - left / (turns * size + (at.E * x.dF - x.F * at.dE)), limit)
 
     # A loop, not a long expression: a device is solved once, and a short program compiles in a fifth of the time.
-    start = 0.5 * jnp.pi / turns * (1.0 + 0.7 * ratio / (ratio + 1.0 / turns))
-    return jax.lax.fori_loop(0, _END_STEPS, step, start)
+    start = 0.5 * np.pi / turns * (1.0 + 0.7 * ratio / (ratio + 1.0 / turns))
+    return repeat(_END_STEPS, step, start, xp)
 
 
 def long_row(beta: Array, fields: Array) -> Array:
@@ -199,14 +196,15 @@ def long_row(beta: Array, fields: Array) -> Array:
     lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
     """
     delta, end, top, bow, sin_bow, bend = fields[0], *fields[-5:]
+    xp = namespace(beta, delta)
     b = beta + delta
     inside = (b > 0) & (b < top)
-    goal = jnp.where(inside, b, 0.5 * top)
+    goal = xp.where(inside, b, 0.5 * top)
     share = goal / top
-    r = jnp.sqrt(share)
-    omega = jnp.minimum(end * (_arcsine(r * sin_bow) / bow + bend * r * (1.0 - share)), end)
+    r = xp.sqrt(share)
+    omega = xp.minimum(end * (_arcsine(r * sin_bow) / bow + bend * r * (1.0 - share)), end)
     for _ in range(_ROW_STEPS):
-        omega = jnp.clip(omega - _newton_step(goal, _Angles(omega, fields), fields), 0.0, end)
+        omega = xp.clip(omega - _newton_step(goal, _Angles(omega, fields), fields), 0.0, end)
     at = _Angles(omega, fields)
     x = _turned(at, fields[1] + 0.5)
     numerator, denominator = 2.0 * at.s * x.across, at.c * at.V
@@ -214,13 +212,14 @@ def long_row(beta: Array, fields: Array) -> Array:
     step = _newton_step(goal, at, fields)
     numerator -= step * (at.c * x.across + 2.0 * at.s * x.d_across)
     denominator -= step * (at.c * at.dV - 0.5 * at.s * at.V)
-    return _finish(jnp.where(inside, numerator / denominator, 0.0), b)
+    return _finish(xp.where(inside, numerator / denominator, 0.0), b)
 
 
 def _arcsine(x: Array) -> Array:
     """Three to four digits of arcsin x for 0 <= x <= 1, half of it by its tangent; good enough for a start."""
-    t = x / (1.0 + jnp.sqrt(jnp.maximum((1.0 - x) * (1.0 + x), 0.0)))
-    return 2.0 * t * _horner(_ARCTAN, t * t)
+    xp = namespace(x)
+    t = x / (1.0 + xp.sqrt(xp.maximum((1.0 - x) * (1.0 + x), 0.0)))
+    return 2.0 * t * horner(t * t, _ARCTAN)
 
 
 def _newton_step(goal: Array, at: _Angles, fields: list[Array] | Array) -> Array:
@@ -236,4 +235,4 @@ def _newton_step(goal: Array, at: _Angles, fields: list[Array] | Array) -> Array
 def limit_kernel(beta: Array, delta: Array, d: Array) -> Array:
     """The limit for any delay, for use inside a transformation; it means something in the verified range only."""
     here = device(delta, d)
-    return jnp.where(d < 1, short_row(beta, here), long_row(beta, long_device(here)))
+    return namespace(beta, delta, d).where(d < 1, short_row(beta, here), long_row(beta, long_device(here)))

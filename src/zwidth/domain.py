@@ -1,0 +1,73 @@
+"""Where the model is computed: one range for every function, checked here.
+
+No device lies outside; inside, no square or product of the formulas overflows or loses its digits. A value that is NaN,
+infinite or negative where it must not be is INVALID_INPUT, one beyond the ranges OUT_OF_RANGE, in that order.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zwidth._types import Array
+from zwidth.errors import InputError
+from zwidth.status import Status
+from zwidth.xp import namespace
+
+# Every SI quantity is 0 or of a magnitude in this range.
+SI_RANGE = (1e-30, 1e30)
+# alpha and beta are 0 or of a magnitude in this range.
+WALL_RANGE = (1e-60, 1e60)
+# The largest physical damping (delta) and the longest delay (d).
+LARGEST_DAMPING = 1e12
+LONGEST_DELAY = 1e5
+
+
+def within(value: Array, limits: tuple[float, float]) -> Array:
+    """Whether a value is 0 or of a magnitude within ``limits``."""
+    xp = namespace(value)
+    size = xp.abs(value)
+    return (size == 0) | ((size >= limits[0]) & (size <= limits[1]))
+
+
+def device_status(delta: Array, d: Array) -> Array:
+    """The `Status` of a device and its delay."""
+    xp = namespace(delta, d)
+    valid = xp.isfinite(delta) & xp.isfinite(d) & (delta >= 0) & (d >= 0)
+    inside = (delta <= LARGEST_DAMPING) & (d <= LONGEST_DELAY)
+    return _status(valid, inside, xp)
+
+
+def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """The `Status` of a wall on a device."""
+    xp = namespace(alpha, beta, delta, d)
+    valid = xp.isfinite(alpha) & xp.isfinite(beta) & xp.isfinite(delta) & xp.isfinite(d) & (delta >= 0) & (d >= 0)
+    inside = (delta <= LARGEST_DAMPING) & (d <= LONGEST_DELAY) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+    return _status(valid, inside, xp)
+
+
+def _status(valid: Array, inside: Array, xp: Any) -> Array:
+    status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
+    return status.astype(np.int32)
+
+
+_ALLOWED = {
+    "alpha": f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude",
+    "beta": f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude",
+    "delta": f"0 to {LARGEST_DAMPING:g}",
+    "d": f"0 to {LONGEST_DELAY:g}",
+}
+
+
+def check_scalars(**values: Any) -> None:
+    """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
+    for name, value in values.items():
+        if not isinstance(value, int | float | np.floating | np.integer) or not np.isfinite(value):
+            continue
+        if name in ("alpha", "beta"):
+            inside = bool(within(np.float64(value), WALL_RANGE))
+        else:
+            inside = value <= (LARGEST_DAMPING if name == "delta" else LONGEST_DELAY)
+        if not inside:
+            raise InputError(f"{name}: got {value!r}; it must be {_ALLOWED[name]}")

@@ -1,0 +1,72 @@
+"""One text of a formula for NumPy and for JAX: which of the two, and the few operations they spell differently.
+
+A kernel asks its arguments for their namespace, computes elementwise, iterates a fixed number of steps and chooses
+with ``xp.where``. Importing this imports no JAX.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+
+State = TypeVar("State")
+_HOST_TYPES = (float, int, np.ndarray, np.generic, bool, list, tuple, str, type(None))
+
+
+def is_jax(value: Any) -> bool:
+    """Whether a value is a JAX array, traced or not. Where JAX was never imported, none can exist."""
+    if isinstance(value, _HOST_TYPES):
+        return False
+    jax = sys.modules.get("jax")
+    return jax is not None and isinstance(value, jax.Array)
+
+
+def is_traced(*values: Any) -> bool:
+    """Whether any argument is inside a JAX transformation."""
+    jax = sys.modules.get("jax")
+    return jax is not None and any(isinstance(value, jax.core.Tracer) for value in values)
+
+
+def namespace(*values: Any) -> Any:
+    """`jax.numpy` where any argument is a JAX array, NumPy otherwise."""
+    if any(map(is_jax, values)):
+        import jax.numpy
+
+        return jax.numpy
+    return np
+
+
+def repeat(steps: int, step: Callable[[State], State], state: State, xp: Any) -> State:
+    """Apply ``step`` so many times: a loop of the compiler in JAX, whose length does not add to the time to compile."""
+    if xp is np:
+        for _ in range(steps):
+            state = step(state)
+        return state
+    from jax.lax import fori_loop
+
+    return fori_loop(0, steps, lambda _, state: step(state), state)
+
+
+def frozen(values: State, xp: Any) -> State:
+    """The same values, through which no derivative passes."""
+    if xp is np:
+        return values
+    from jax.lax import stop_gradient
+
+    return stop_gradient(values)
+
+
+def epsilon(value: Any) -> float:
+    """The rounding unit of a value's type; that of float64 for plain numbers."""
+    return float(np.finfo(getattr(value, "dtype", np.float64)).eps)
+
+
+def horner(x: Any, coefficients: list[float]) -> Any:
+    """A polynomial, lowest power first, by Horner's rule."""
+    total = coefficients[-1]
+    for coefficient in reversed(coefficients[:-1]):
+        total = total * x + coefficient
+    return total
