@@ -160,13 +160,13 @@ def test_filtered_walls():
     rng = np.random.default_rng(84)
 
     def loops():
-        for lag in [0, 1, 2, 5, 20, 60] * 100:
+        for lag in [0, 1, 2, 5, 20, 60] * 60:
             yield *haptic_loop(rng, lag), rng.choice([1.0, rng.uniform(0.8, 1.2)])
-        for lag in [200, 500] * 3:
+        for lag in [200, 500] * 2:
             yield *haptic_loop(rng, lag), rng.choice([1.0, 1 - 10 ** rng.uniform(-5, -1.5)])
 
     compared, distances = compare(loops())
-    assert compared + len(distances) == 606
+    assert compared + len(distances) == 364
     assert len(distances) <= 3
 
 
@@ -187,7 +187,7 @@ def winding_number(zeros, poles, gain, lag):
 
 def test_long_delays_against_the_winding_number():
     rng = np.random.default_rng(85)
-    for lag in (1000, 3000, 10_000, 100_000) * 3:
+    for lag in [1000, 3000, 10_000] * 3 + [100_000]:
         loop = haptic_loop(rng, lag)
         assert count_poles(*loop) == pytest.approx(winding_number(*loop), abs=1e-6)
 
