@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.counting import count_poles as count_poles
     from zwidth.stability.labels import is_stable as is_stable
     from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
@@ -110,6 +111,7 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
+    "count_poles": "zwidth.stability.counting",
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
     "stability_of": "zwidth.stability.labels",
@@ -158,6 +160,7 @@ __all__ = [
     "boundary",
     "boundary_point",
     "char_poly",
+    "count_poles",
     "denormalize",
     "fastest_damping",
     "fastest_wall",
