@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from zwidth.design.requirements import required_damping as required_damping
     from zwidth.design.requirements import required_mass as required_mass
     from zwidth.design.requirements import required_period as required_period
+    from zwidth.design.robust import Interval as Interval
     from zwidth.design.robust import RobustStiffness as RobustStiffness
     from zwidth.design.robust import RobustWall as RobustWall
     from zwidth.design.robust import robust_max_stiffness as robust_max_stiffness
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.counting import count_poles as count_poles
     from zwidth.stability.labels import is_stable as is_stable
     from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
@@ -85,6 +87,7 @@ _HOME = {
     "required_damping": "zwidth.design.requirements",
     "required_mass": "zwidth.design.requirements",
     "required_period": "zwidth.design.requirements",
+    "Interval": "zwidth.design.robust",
     "RobustStiffness": "zwidth.design.robust",
     "RobustWall": "zwidth.design.robust",
     "robust_max_stiffness": "zwidth.design.robust",
@@ -110,6 +113,7 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
+    "count_poles": "zwidth.stability.counting",
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
     "stability_of": "zwidth.stability.labels",
@@ -136,6 +140,7 @@ __all__ = [
     "Device",
     "FastestWall",
     "InputError",
+    "Interval",
     "Requirement",
     "RidgeKind",
     "RidgePoint",
@@ -158,6 +163,7 @@ __all__ = [
     "boundary",
     "boundary_point",
     "char_poly",
+    "count_poles",
     "denormalize",
     "fastest_damping",
     "fastest_wall",
