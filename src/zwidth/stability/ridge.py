@@ -125,9 +125,10 @@ def slopes_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> Ridge
     undelayed = is_undelayed(delay, kind)
     fractional = delay == "fractional_power"
     by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
-    point = _point(ridge, status)
-    found = 0.0 * point.alpha
-    return RidgeSlopes(point, alpha_change(ridge.s, plant, lag, by_delta, undelayed) + found, by_d + found)
+    mask = found(ridge)
+    return RidgeSlopes(
+        _point(ridge, status), alpha_change(ridge.s, plant, lag, by_delta, undelayed) * mask, by_d * mask
+    )
 
 
 def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
@@ -150,16 +151,16 @@ def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Arra
 
 
 def found(ridge: Ridge) -> Array:
-    """0, or NaN where the solver did not converge."""
+    """1, or NaN where the solver did not converge."""
     # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
     xp = namespace(ridge.s)
-    return xp.where(xp.abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s, 0.0, np.nan)
+    return xp.where(xp.abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s, 1.0, np.nan)
 
 
 def _point(ridge: Ridge, status: Array) -> RidgePoint:
     xp = namespace(ridge.alpha)
-    miss = found(ridge)
-    status = xp.where((status == Status.OK) & xp.isnan(miss), int(Status.NOT_CONVERGED), status)
+    mask = found(ridge)
+    status = xp.where((status == Status.OK) & xp.isnan(mask), int(Status.NOT_CONVERGED), status)
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
-    values = (ridge.alpha + miss, ridge.beta + miss, ridge.omega + miss)
+    values = (ridge.alpha * mask, ridge.beta * mask, ridge.omega * mask)
     return RidgePoint(*values, kind.astype(np.int32), status.astype(np.int32))

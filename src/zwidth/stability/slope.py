@@ -69,4 +69,4 @@ def slope_kernel(d: Array, delay: str, kind: Kind = ANY) -> Array:
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
     start = start_of(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
     ridge = differentiable_ridge(plant, lag, start, delay, kind)
-    return ridge.alpha + found(ridge)
+    return ridge.alpha * found(ridge)
