@@ -70,4 +70,6 @@ def outermost_zero(
         step = value / slope
         # Where the function is flat, a step is rounding over rounding.
         zero = zero - xp.where(xp.abs(step) <= width, step, 0.0)
-    return zero, found
+    # Rounding may lead out of the bracket where it ends in the zero.
+    least = frozen(inner, xp)
+    return xp.where(zero < least, least, zero), found

@@ -25,8 +25,6 @@ from zwidth.status import Status
 from zwidth.xp import namespace
 
 _LEAST, _MOST = 0.2, 6.0
-# A delay of this many periods is as good as continuous time, to 1e-5 of the stiffness.
-_LONG = LONGEST_DELAY
 # A hundred samples of a lobe at a time: what a block needs stays in the cache.
 _BLOCK = 1 << 8
 _FEW = 1 << 9
@@ -97,7 +95,7 @@ def _solved(
     beyond = ~(lifted.value(outer)[0] < 0.0)
     found = found & ~beyond
     value = xp.where(found, x, 0.0) * unit
-    delta, d = (leaf[0] for leaf in lifted.device(xp.where(found, x, inner[0])[None]))
+    delta, d = (leaf[0] for leaf in lifted.device(xp.where(found, x, outer[0])[None]))
     inside = within(value, SI_RANGE) & (device_status(delta, d) == Status.OK) & ~beyond
     status = xp.where(found | free, int(Status.OK), int(Status.UNREACHABLE))
     status = xp.where(given == Status.OK, xp.where(inside, status, int(Status.OUT_OF_RANGE)), given)
@@ -243,8 +241,8 @@ def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array) 
     xp = namespace(*inputs)
     longest = _period_at(_MOST, stiffness, mass, damping, 1.0)
     without_delay = _period_at(_LEAST, stiffness, mass, damping, 1.0)
-    # The delay is nowhere more periods than the model takes.
-    shortest = xp.where(delay > 0, xp.maximum(delay / _LONG, 1e-6 * without_delay), without_delay)
+    # A delay of 1e5 periods, the longest that the model takes, is as good as continuous time, to 1e-5 of K.
+    shortest = xp.where(delay > 0, xp.maximum(1.001 * delay / LONGEST_DELAY, 1e-6 * without_delay), without_delay)
     shortest = xp.minimum(shortest, longest)
     path = _Path(damping / mass, delay, mass / stiffness, a=1, b=-1, p=-2)
     return _solved(path, (shortest, longest, 0.0 * delay), 0.0 * delay + 1.0, given, inputs)
