@@ -14,7 +14,7 @@ import jax.numpy as jnp
 
 from zwidth._types import Array
 from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop, tilt_at_minus_one
-from zwidth.stability.curve import corner, lobe_limit
+from zwidth.stability.curve import corner
 
 # Each halves the bracket of a frequency: one unit in the last place is left.
 _BISECTIONS = 52
@@ -45,7 +45,7 @@ def lobe(delta: Array, d: Array, alpha: Array, omega: Array) -> Lobe:
     loop = frequency_loop(delta, d, "held")
     returns = ~corner(loop).reached
     tilt = tilt_at_minus_one(loop.plant, loop.lag)
-    return Lobe(loop, alpha, omega, jnp.where(returns, lobe_limit(d), jnp.pi), returns, tilt)
+    return Lobe(loop, alpha, omega, jnp.where(returns, jnp.minimum(jnp.pi, jnp.pi / (d + 0.5)), jnp.pi), returns, tilt)
 
 
 def column(alpha: Array, lobe: Lobe) -> Column:
