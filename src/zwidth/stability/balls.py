@@ -102,7 +102,7 @@ def plant(delta: float, f: float, bits: int) -> Plant:
         ball = flint.arb(delta)
         c, p1, phi2, psi = _phi(ball, frexp(delta)[1], bits)
         if f == 0:
-            return Plant(ball, c, ball * p1, p1, phi2, psi, *[None] * 4)
+            return Plant(ball, c, ball * p1, p1, phi2, psi)
         f_ball = flint.arb(f)
         with flint.ctx.workprec(_EXACT_BITS):
             t = 1 - f_ball
@@ -127,7 +127,7 @@ def _phi(x: flint.arb, exponent: int, bits: int) -> tuple[flint.arb, flint.arb, 
         return c, p1, (1 - p1) / x, (p1 - c) / x
 
 
-def _enclose_zero(cubic: tuple[Any, Any, Any, Any]) -> tuple[flint.arb, bool]:
+def _enclose_zero(cubic: tuple[Any, ...]) -> tuple[flint.arb, bool]:
     """`zwidth.stability.enclosed_verdict.enclose_zero`: Newton's method on the midpoints, then the signs beside it."""
     import flint
 
@@ -135,7 +135,7 @@ def _enclose_zero(cubic: tuple[Any, Any, Any, Any]) -> tuple[flint.arb, bool]:
     mids = [h.mid() for h in balls]
     rough = [np.float64(h) for h in mids]
     with np.errstate(all="ignore"):
-        guess = first_zero(*rough, *[np.float64(0.0)] * (4 - len(rough)), len(rough) == 4, np)
+        guess = first_zero(rough[0], rough[1], rough[2], rough[3] if len(rough) == 4 else 0.0, len(rough) == 4, np)
     u = flint.arb(float(guess) if 0 < guess < 2 else 1.0)
     smallest = flint.arb(2) ** (8 - flint.ctx.prec)
     slopes = [k * h for k, h in enumerate(mids)][1:]
@@ -202,10 +202,10 @@ def _rational(alpha: Any, beta: Any, f: Any) -> tuple[list[Any], Any, int]:
     a2, a1, a0 = t * t * half, (1 + 2 * t * f) * half, f * f * half
     zero, one = flint.fmpq(0), flint.fmpq(1)
     if f == 0:
-        here = Plant(zero, one, zero, one, half, half, *[None] * 4)
+        here = Plant(zero, one, zero, one, half, half)
         numerator, lead = [half, half], 1
     else:
-        here = Plant(zero, one, zero, one, a2, a1, a0, *[None] * 3)
+        here = Plant(zero, one, zero, one, a2, a1, a0)
         numerator, lead = [a0, a1, a2], 2
     cubic = [h for h in gain_cubic(alpha, beta, long_device(here)) if h is not None]
     return cubic, flint.fmpq_poly(numerator) * flint.fmpq_poly([-beta, alpha + beta]), lead
@@ -256,6 +256,7 @@ def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np
     """`decide` point by point: stable, status, bits."""
     count = columns[0].size
     stable, status, bits = np.zeros(count, bool), np.zeros(count, np.int32), np.zeros(count, np.int32)
-    for index, point in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        stable[index], status[index], bits[index] = decide(*point, max_bits)
+    alpha, beta, delta, d = (column.tolist() for column in columns)
+    for index in range(count):
+        stable[index], status[index], bits[index] = decide(alpha[index], beta[index], delta[index], d[index], max_bits)
     return stable, status, bits
