@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from zwidth.errors import StoreExistsError as StoreExistsError
     from zwidth.errors import TracedDelayError as TracedDelayError
     from zwidth.errors import ZwidthError as ZwidthError
+    from zwidth.kernel_cache import use_compilation_cache as use_compilation_cache
     from zwidth.loop import char_poly as char_poly
     from zwidth.response import StepResponse as StepResponse
     from zwidth.response import step_response as step_response
@@ -50,12 +51,13 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
-    from zwidth.stability.methods import is_stable as is_stable
-    from zwidth.stability.methods import spectral_radius as spectral_radius
-    from zwidth.stability.methods import stability_of as stability_of
+    from zwidth.stability.counting import count_poles as count_poles
+    from zwidth.stability.labels import is_stable as is_stable
+    from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
+    from zwidth.stability.radii import spectral_radius as spectral_radius
     from zwidth.stability.region import StableRegion as StableRegion
     from zwidth.stability.region import stable_region as stable_region
     from zwidth.stability.ridge import RidgeKind as RidgeKind
@@ -96,6 +98,7 @@ _HOME = {
     "StoreExistsError": "zwidth.errors",
     "TracedDelayError": "zwidth.errors",
     "ZwidthError": "zwidth.errors",
+    "use_compilation_cache": "zwidth.kernel_cache",
     "char_poly": "zwidth.loop",
     "StepResponse": "zwidth.response",
     "step_response": "zwidth.response",
@@ -108,9 +111,10 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
-    "is_stable": "zwidth.stability.methods",
-    "spectral_radius": "zwidth.stability.methods",
-    "stability_of": "zwidth.stability.methods",
+    "count_poles": "zwidth.stability.counting",
+    "is_stable": "zwidth.stability.labels",
+    "spectral_radius": "zwidth.stability.radii",
+    "stability_of": "zwidth.stability.labels",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
@@ -156,6 +160,7 @@ __all__ = [
     "boundary",
     "boundary_point",
     "char_poly",
+    "count_poles",
     "denormalize",
     "fastest_damping",
     "fastest_wall",
@@ -183,6 +188,7 @@ __all__ = [
     "stable_region",
     "step_response",
     "stiffness_slope",
+    "use_compilation_cache",
 ]
 
 

@@ -26,8 +26,8 @@ from zwidth.xp import is_jax, is_traced
 CHUNK = 1 << 15
 # Up to so many points NumPy is done before a compiler has begun.
 FEW = 1 << 12
-# The values that an elementwise kernel holds at one time then stay in the second-level cache.
-BLOCK = 1 << 13
+# What an elementwise kernel holds at one time then stays in the cache; smaller blocks cost as much in calls.
+BLOCK = 1 << 15
 
 
 @contextmanager
@@ -90,6 +90,11 @@ def to_caller(result: Any, values: tuple[ArrayLike, ...]) -> Any:
 
 # The types whose conversion needs no check; bool and 0-d arrays take the long way.
 _NUMBERS = frozenset({float, int, np.float64})
+
+
+def is_number(value: ArrayLike) -> bool:
+    """Whether a value is a plain number, whose conversion needs no check."""
+    return type(value) in _NUMBERS
 
 
 def elementwise(

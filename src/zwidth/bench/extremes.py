@@ -10,7 +10,7 @@ import numpy as np
 from zwidth.bench.problems import Walls
 from zwidth.stability.boundary import boundary
 from zwidth.stability.certified import certified_stable
-from zwidth.stability.methods import is_stable
+from zwidth.stability.labels import is_stable
 from zwidth.stability.region import lobe
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status

@@ -16,8 +16,9 @@ from zwidth.bench.problems import Walls
 from zwidth.stability import balls
 from zwidth.stability.certified import certified_stable, filtered
 from zwidth.stability.certified_filter import OPEN, STABLE
+from zwidth.stability.labels import is_stable
 from zwidth.stability.layout import lay_out
-from zwidth.stability.methods import is_stable, spectral_radius
+from zwidth.stability.radii import spectral_radius
 from zwidth.stability.ridge import RidgeMethod, alpha_max
 
 FILTER, NO_BETA, NO_DELTA = "certified, filter alone", "companion, beta = 0", "companion, delta = 0"

@@ -14,7 +14,7 @@ from zwidth.design.column import column, lobe
 from zwidth.design.lowest import Cost, lowest, without_slope
 from zwidth.design.margin import frequency_count, margin_kernel
 from zwidth.grouping import Degree, by_degree
-from zwidth.stability.methods import is_stable
+from zwidth.stability.labels import is_stable
 from zwidth.stability.poles import companion_chunk, radius_kernel
 from zwidth.stability.ridge import RidgePoint, alpha_max, ridge_kernel
 from zwidth.status import Status
@@ -136,7 +136,7 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
     chunk = max(1, (1 << 19) // samples)
     found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (samples,), chunk, least=_LEAST)
     # The margin says nothing of the side of the boundary.
-    return _answer(found, is_stable(alpha, found[0], delta, d, method="schur_cohn"), status, inputs)
+    return _answer(found, is_stable(alpha, found[0], delta, d), status, inputs)
 
 
 def _robust_kernel(

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.domain import WALL_RANGE, within
 from zwidth.stability.devices import ANY, Device, Kind, device
 from zwidth.stability.row_limit import short_row
 from zwidth.xp import horner, namespace
@@ -169,6 +170,7 @@ def stable_at(alpha: Array, beta: Array, here: Device, kind: Kind) -> Array:
     as well conditioned for strong damping as for none.
     """
     xp = namespace(alpha, here.c)
+    alpha = xp.where(within(alpha, WALL_RANGE) & within(beta, WALL_RANGE), alpha, np.nan)
     below = alpha < short_row(beta, here) if kind.short else None
     if not kind.long:
         return (alpha > 0) & below

@@ -14,7 +14,7 @@ from zwidth.errors import InputError
 from zwidth.loop import check_delay_model, frequency_loop, line_at_minus_one
 from zwidth.stability.boundary import boundary
 from zwidth.stability.curve import lobe_end
-from zwidth.stability.methods import is_stable
+from zwidth.stability.labels import is_stable
 from zwidth.stability.ridge import alpha_max
 
 
