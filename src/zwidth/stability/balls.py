@@ -68,7 +68,7 @@ def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> 
             inside = bool(found.stable)
             return Decision(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
         last = bits == max_bits
-        if delta == 0 and (last or bits == _DOUBTFUL_BITS) and _crosses_exactly(alpha, beta, d, bits):
+        if delta == 0 and (last or bits == _DOUBTFUL_BITS) and _crosses_exactly(*_exact(alpha, beta, d), bits):
             return Decision(False, Status.ON_BOUNDARY, bits)
         if last:
             return Decision(False, Status.UNDECIDED, bits)
@@ -90,8 +90,11 @@ def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Ver
 @lru_cache(maxsize=64)
 def _device(delta: float, d: float, bits: int) -> Short | Long:
     """The device in balls; whole maps share it."""
-    here = plant(delta, d - int(d), bits)
-    return short_device(here) if d < 1 else long_device(here)
+    import flint
+
+    with flint.ctx.workprec(bits):
+        here = plant(delta, d - int(d), bits)
+        return short_device(here) if d < 1 else long_device(here)
 
 
 def plant(delta: float, f: float, bits: int) -> Plant:
@@ -162,7 +165,15 @@ def _take_lag(u: flint.arb, _: Any, whole: int) -> Lag:
     return Lag(cosine, sine, lag < turn, w * (whole + 1) > turn)
 
 
-def _crosses_exactly(alpha: float, beta: float, d: float, bits: int) -> bool:
+def _exact(alpha: float, beta: float, d: float) -> tuple[Any, Any, int, Any]:
+    """alpha, beta, n and f as rational numbers."""
+    import flint
+
+    stiffness, damping, f = (flint.fmpq(*value.as_integer_ratio()) for value in (alpha, beta, d - int(d)))
+    return stiffness, damping, int(d), f
+
+
+def _crosses_exactly(alpha: Any, beta: Any, whole: int, f: Any, bits: int) -> bool:
     """Whether the poles at delta = 0 include the crossover itself, ``z = e^(j w)``: then they are on the unit circle.
 
     Called where all that precedes the phase is certain, so that the wall borders the stable ones: no pole is outside.
@@ -171,15 +182,14 @@ def _crosses_exactly(alpha: float, beta: float, d: float, bits: int) -> bool:
     """
     import flint
 
-    exact = [flint.fmpq(*value.as_integer_ratio()) for value in (alpha, beta, d - int(d))]
-    cubic, wall, lead = _rational(*exact)
+    cubic, wall, lead = _rational(alpha, beta, f)
     z = flint.fmpq_poly([0, 1])
-    coefficients = cubic if alpha else cubic[1:]
+    coefficients = cubic if alpha != 0 else cubic[1:]
     # u = -(z - 1)^2/(2 z)
     degree = len(coefficients) - 1
     g = sum((h * (-(z - 1) * (z - 1)) ** k * (2 * z) ** (degree - k) for k, h in enumerate(coefficients)), 0 * z)
-    power = int(d) + lead
-    if not _meet_modulo(g.numer(), (z - 1) * (z - 1), wall, power) or int(d) > _LONGEST_EXACT:
+    power = whole + lead
+    if not _meet_modulo(g.numer(), (z - 1) * (z - 1), wall, power) or whole > _LONGEST_EXACT:
         return False
     common = g.gcd((_power_modulo(z, power, g) * (z - 1) * (z - 1) + wall) % g)
     if common.degree() == 0:
