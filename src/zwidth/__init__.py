@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from zwidth.design.requirements import required_damping as required_damping
     from zwidth.design.requirements import required_mass as required_mass
     from zwidth.design.requirements import required_period as required_period
+    from zwidth.design.robust import Interval as Interval
     from zwidth.design.robust import RobustStiffness as RobustStiffness
     from zwidth.design.robust import RobustWall as RobustWall
     from zwidth.design.robust import robust_max_stiffness as robust_max_stiffness
@@ -86,6 +87,7 @@ _HOME = {
     "required_damping": "zwidth.design.requirements",
     "required_mass": "zwidth.design.requirements",
     "required_period": "zwidth.design.requirements",
+    "Interval": "zwidth.design.robust",
     "RobustStiffness": "zwidth.design.robust",
     "RobustWall": "zwidth.design.robust",
     "robust_max_stiffness": "zwidth.design.robust",
@@ -138,6 +140,7 @@ __all__ = [
     "Device",
     "FastestWall",
     "InputError",
+    "Interval",
     "Requirement",
     "RidgeKind",
     "RidgePoint",

@@ -27,7 +27,7 @@ CHUNK = 1 << 15
 # Up to so many points NumPy is done before a compiler has begun.
 FEW = 1 << 12
 # What an elementwise kernel holds at one time then stays in the cache; smaller blocks cost as much in calls.
-BLOCK = 1 << 15
+BLOCK = 1 << 16
 
 
 @contextmanager

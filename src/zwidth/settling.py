@@ -73,7 +73,7 @@ def modes(alpha: float, beta: float, delta: float, d: float) -> Modes | None:
     z = np.asarray(poles(alpha, beta, delta, d), dtype=complex)
     z = z[np.abs(z) > 1e-300]
     numbers = [np.float64(value) for value in (alpha, beta, delta, d)]
-    monic = coefficients(*numbers, degree)
+    monic = coefficients(numbers[0], numbers[1], numbers[2], numbers[3], degree)
     power = degree.poles - np.arange(degree.poles)
     slope = np.sum(power[:, None] * monic[:-1, None] * z ** (power[:, None] - 1.0), axis=0)
     here = phi.phi_functions(numbers[2])
@@ -99,7 +99,7 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
 
     NaN where the wall is not stable, where poles so nearly coincide that rounding hides their modes, and for d > 500.
     """
-    stable = bool(stable_kernel(*(np.float64(value) for value in (alpha, beta, delta, d))))
+    stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
     if not stable or d > _LONGEST:
         return math.nan
     with np.errstate(all="ignore"):

@@ -13,6 +13,7 @@ from zwidth.design.requirements import allowed_delay as allowed_delay
 from zwidth.design.requirements import required_damping as required_damping
 from zwidth.design.requirements import required_mass as required_mass
 from zwidth.design.requirements import required_period as required_period
+from zwidth.design.robust import Interval as Interval
 from zwidth.design.robust import RobustStiffness as RobustStiffness
 from zwidth.design.robust import RobustWall as RobustWall
 from zwidth.design.robust import robust_max_stiffness as robust_max_stiffness

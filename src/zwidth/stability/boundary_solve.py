@@ -165,5 +165,3 @@ def _polish(line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay:
     missed = jnp.abs(line.offset(wall)) / jnp.hypot(line.dalpha, line.dbeta)
     hit = missed <= 1e-9 * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
     return omega, distance, bracketed & hit & (jnp.abs(omega - start) <= 1e-6)
-
-

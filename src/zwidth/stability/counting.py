@@ -179,7 +179,7 @@ def _count(columns: list[Array], xp: Any) -> Array:
     low, high, leading, proved = _intervals(loop, eps, xp)
     met = xp.isfinite(low)
     m, clear = _turns_between(loop, low, high, eps, xp)
-    b_first, before, after, told = _larger(loop, roots, low, high, leading, eps, xp)
+    b_first, before, after, told = _larger(loop, roots, low, high, leading, m, eps, xp)
     t_alone, b_alone = _alone(loop, eps, xp)
 
     within = (loop.inside >= 0).sum(-1)
@@ -347,9 +347,9 @@ def _turns_between(loop: _Loop, low: Array, high: Array, eps: float, xp: Any) ->
 
 
 def _larger(
-    loop: _Loop, roots: Array, low: Array, high: Array, leading: Array, eps: float, xp: Any
+    loop: _Loop, roots: Array, low: Array, high: Array, leading: Array, m: Array, eps: float, xp: Any
 ) -> tuple[Array, Array, Array, Array]:
-    """Whether B is larger: at z = -r, before and after every interval; and whether all that is beyond rounding."""
+    """Whether B is larger: at z = -r, before and after every interval; and whether all of that is told that matters."""
     first = leading < 0
     n = low.shape[-1]
     gaps = xp.isfinite(low[..., 1:])
@@ -363,7 +363,8 @@ def _larger(
     value, noise = _difference(loop, points, eps, xp)
     value, split = value.real, middle.shape[-1]
     clear = xp.abs(value) > noise
-    told = (clear[..., :split] | ~gaps | (high[..., :-1] >= low[..., 1:])).all(-1)
+    # Between two intervals of the same m it does not matter.
+    told = (clear[..., :split] | ~gaps | (m[..., :-1] == m[..., 1:])).all(-1)
     # Half of what follows the gaps belongs to roots of T.
     half = split + near.shape[-1]
     told = told & (~on[..., 0, :] | (clear[..., split:half] & (value[..., split:half] < 0))).all(-1)

@@ -123,9 +123,7 @@ def _short(here: Device) -> Short:
     u0 = 4.0 * (f * f * em + f * p1 + t * (f * here.p1_t + t * here.psi_t) + a0) / p1
     u1 = -16.0 * a0 * (f + t * here.p1_t) * over
     v1, v2 = -4.0 * (a1 * (a2 + a0) + 4.0 * a2 * a0) * over, 16.0 * a2 * a0 * over
-    return Short(
-        u0, u1, ((1.0 + f) * em + p1) / p1, -4.0 * (a1 + (3.0 + em) * a0) * over, 16.0 * a0 * over, v1, v2
-    )
+    return Short(u0, u1, ((1.0 + f) * em + p1) / p1, -4.0 * (a1 + (3.0 + em) * a0) * over, 16.0 * a0 * over, v1, v2)
 
 
 def _short_end(short: Short) -> tuple[Array, Array]:

@@ -196,4 +196,4 @@ def _one_device(kind: Kind) -> Any:
 def _scattered(kind: Kind) -> Any:
     import jax
 
-    return jax.jit(lambda *columns: stable_kernel(*columns, kind))
+    return jax.jit(lambda alpha, beta, delta, d: stable_kernel(alpha, beta, delta, d, kind))

@@ -246,8 +246,10 @@ def test_more_zeros_than_poles():
 
 def test_no_gain_leaves_the_poles():
     assert count_poles([0.3, 2.0], [0.2, 0.9, 1.2, -1j], 0, 7, 0.95) == 9
-    for pole in (1.0, -1.0, 1j, 0.6 + 0.8j, np.exp(1j)):
+    for pole in (1.0, -1.0, 1j, 0.6 + 0.8j, *np.exp(1j * np.arange(1, 40))):
         assert count_poles([0.3], [0.2, pole], 0, 3) == -1
+        # The real ones are moved by 1e-40, which the count sees; of the others rounding leaves no more than 1e-16.
+        assert (count_poles([0.3], [0.2, pole], 1e-40, 3) == -1) == (np.imag(pole) != 0)
 
 
 def test_a_zero_on_the_circle_where_the_other_part_is_larger():
@@ -259,6 +261,18 @@ def test_a_zero_on_the_circle_where_the_other_part_is_larger():
         )
         around = [reference([0.3, -0.2], [root, np.conj(root)], 9.0, 2, radius)[0] for radius in (0.999, 1.0, 1.001)]
         assert count_poles([0.3, -0.2], [root, np.conj(root)], 9.0, 2, [0.999, 1.0, 1.001]).tolist() == around
+
+
+def test_parts_of_equal_size_at_both_ends():
+    # Small roots: T and B nearly as large at z = 1, -1, j and -j, where the plane is turned before counting.
+    rng = np.random.default_rng(91)
+
+    def loops():
+        for _ in range(300):
+            roots = 0.04 * rng.normal(size=(2, 3)) + 0.04j * rng.normal(size=(2, 3))
+            yield *roots, rng.choice([-1, 1]) * rng.uniform(0.95, 1.05), int(rng.integers(1, 9)), 1.0
+
+    assert compare(loops())[0] == 300
 
 
 def test_clusters():
