@@ -45,11 +45,6 @@ class Ball:
         end = self.mid - self.radius
         return end - 2.0 * _rounding(end)
 
-    def upper(self) -> Any:
-        """A float64 number above or at every number of the ball."""
-        end = self.mid + self.radius
-        return end + 2.0 * _rounding(end)
-
     def __neg__(self) -> Ball:
         return Ball(-self.mid, self.rad)
 
@@ -116,19 +111,6 @@ class Ball:
 def as_ball(value: Any) -> Ball:
     """A ball as it is, a float64 number or array as an exact one."""
     return value if isinstance(value, Ball) else Ball(value)
-
-
-def between(low: Any, high: Any) -> Ball:
-    """The ball of all numbers from ``low`` to ``high``, two float64 numbers or arrays."""
-    mid = 0.5 * low + 0.5 * high
-    xp = namespace(mid)
-    return Ball(mid, xp.maximum(high - mid, mid - low) + 2.0 * _rounding(mid))
-
-
-def hull(one: Ball, other: Ball) -> Ball:
-    """A ball that contains both."""
-    xp = namespace(one.mid, other.mid)
-    return between(xp.minimum(one.lower(), other.lower()), xp.maximum(one.upper(), other.upper()))
 
 
 def _is_zero(value: Any) -> bool:
