@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from zwidth.design.stiffness import sensitivities as sensitivities
     from zwidth.errors import ConfigError as ConfigError
     from zwidth.errors import InputError as InputError
+    from zwidth.errors import PrecisionWarning as PrecisionWarning
     from zwidth.errors import StoreExistsError as StoreExistsError
     from zwidth.errors import TracedDelayError as TracedDelayError
     from zwidth.errors import ZwidthError as ZwidthError
@@ -97,6 +98,7 @@ _HOME = {
     "sensitivities": "zwidth.design.stiffness",
     "ConfigError": "zwidth.errors",
     "InputError": "zwidth.errors",
+    "PrecisionWarning": "zwidth.errors",
     "StoreExistsError": "zwidth.errors",
     "TracedDelayError": "zwidth.errors",
     "ZwidthError": "zwidth.errors",
@@ -141,6 +143,7 @@ __all__ = [
     "FastestWall",
     "InputError",
     "Interval",
+    "PrecisionWarning",
     "Requirement",
     "RidgeKind",
     "RidgePoint",

@@ -166,7 +166,7 @@ def _ridge_kernel(alpha: Array, delta: Array, d: Array) -> RidgePoint:
 def _column_kernel(
     alpha: Array, delta: Array, d: Array, ridge_alpha: Array, ridge_omega: Array, status: Array
 ) -> tuple[Array, Array, Array]:
-    lower, upper, exists = column(alpha, lobe(delta, d, ridge_alpha, ridge_omega))
+    lower, upper, exists = column(alpha, lobe(delta, d))
     status = jnp.where((status == Status.OK) & ~exists, Status.NO_BOUNDARY, status)
     status = jnp.where(jnp.isfinite(alpha), status, Status.INVALID_INPUT)
     return lower, upper, status.astype(jnp.int32)
@@ -235,7 +235,7 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
 def _wall_kernel(
     delta: Array, ridge_alpha: Array, ridge_omega: Array, status: Array, d: Array, degree: Degree
 ) -> FastestWall:
-    device = lobe(delta, d, ridge_alpha, ridge_omega)
+    device = lobe(delta, d)
 
     def best_damping(alpha: Array) -> tuple[Array, Array]:
         stable = column(alpha, device)

@@ -129,8 +129,8 @@ def boundary_point(
 
     Returns:
         BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (0 and pi: the real ones);
-        ``status``, see `zwidth.Status`, with NaN where it is not OK: NO_BOUNDARY where the row or column holds no stable
-        wall or the ray starts at none, UNDECIDED where the outline, looked at in places along it, does not show one
+        ``status``, see `zwidth.Status`, with NaN where it is not OK: NO_BOUNDARY where a row or column holds no stable
+        wall or a ray starts at none, UNDECIDED where the outline, looked at in places along it, does not show one
         crossing ahead, or lies closer to omega = pi than its digits allow (a fractional power of almost 0).
 
     Raises:
@@ -292,7 +292,7 @@ def _ray_kernel(
 ) -> BoundaryPoint:
     xp = namespace(delta, d, alpha0, beta0, dalpha, dbeta)
     inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
-    given = _ray_status(*inputs)
+    given = line_status(*inputs)
     size = xp.maximum(xp.abs(dalpha), xp.abs(dbeta))
     size = xp.where(given == int(Status.OK), size, 1.0)
     dalpha, dbeta = dalpha / size, dbeta / size
@@ -325,7 +325,8 @@ def _ray_kernel(
     return _answer(alpha, beta, omega, given, starts, undecided, inputs)
 
 
-def _ray_status(delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array) -> Array:
+def line_status(delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array) -> Array:
+    """The `Status` of a device and a ray."""
     xp = namespace(delta, d, alpha0, beta0, dalpha, dbeta)
     given = wall_status(alpha0, beta0, delta, d)
     inside = within(dalpha, WALL_RANGE) & within(dbeta, WALL_RANGE)
@@ -370,6 +371,9 @@ def _first_crossing(ray: _Ray, place: Array, curve: Lobe, creeping: bool) -> tup
     wide_ray = _Ray(*(part[..., None] for part in ray))
     offsets = wide_ray.offset(wall(places, wide))
     begins, ends = offsets[..., 0], offsets[..., -1]
+    # Where the lobe returns, alpha is 0 to the last digit.
+    returned = ray.dalpha * (wall(curve.end, curve).b - ray.b) + ray.dbeta * ray.alpha
+    ends = xp.where(upwards & ~curve.to_corner, returned, ends)
     leaves = xp.where(upwards, ends >= 0, (begins < 0) & (ends > 0))
     passed = offsets >= 0
     inner = passed[..., 1:-1]
@@ -393,9 +397,8 @@ def _first_crossing(ray: _Ray, place: Array, curve: Lobe, creeping: bool) -> tup
 
     left, right = (xp.take_along_axis(offsets, (index - k)[..., None], -1)[..., 0] for k in (1, 0))
     part = xp.clip(left / xp.where(left == right, 1.0, left - right), 0.0, 1.0)
-    start = before + (after - before) * part
-    if curve.short is None:
-        start = xp.sqrt(before * before + (after * after - before * before) * part)
+    between = before * before + (after * after - before * before) * part
+    start = xp.where(square, xp.sqrt(between), before + (after - before) * part)
     x, _, _, last_step = repeat(_RAY_STEPS, step, (start, before, after, start), xp)
     return x, leaves, single & (last_step <= epsilon(x) ** 0.5 * x)
 

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from zwidth.stability.methods import radius_of
 
 import zwidth
 from zwidth.bench import extremes
-from zwidth.stability.methods import radius_of
 from zwidth.status import Status
 
 # (method, precision) -> the farthest relative distance from the boundary at which a label may be wrong.
