@@ -11,7 +11,6 @@
   (24u), e^-x x times; as ``x e^-x <= phi1(x)`` and ``<= 1/2``, that error is below 2u of another term of a1, and of a0
   below u of a1. Term by term a2 is within 27u, a1, sums included, within 54u, a0 within 33u (and u of a1).
   ``c = e^-(delta t) e^-(delta f)`` is within 17u, and 3 delta u for the rounding of the exponents.
-- Wide balls: c, phi1, phi2 and psi fall with x, so both ends of x bound them; sums and products of balls do the rest.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.batching import stored
-from zwidth.stability.enclosure import TINY, UNIT, Ball, hull
+from zwidth.stability.enclosure import TINY, UNIT, Ball
 from zwidth.xp import horner, namespace
 
 _LOG2_E = 1.4426950408889634
@@ -115,36 +114,3 @@ def plant(delta: Array, fraction: Array | None) -> Plant:
         _within(p1_t, 25.0),
         _within(psi_t, 26.0),
     )
-
-
-def wide_plant(delta: Ball, fraction: Ball | None) -> Plant:
-    """The devices of a whole range of delta and f, elementwise; no smaller than 0 is taken into account."""
-    if fraction is None:
-        c, phi2, psi = _wide_phi(delta)
-        p1 = phi2 + psi
-        return Plant(delta, c, _loss(delta), p1, phi2, psi)
-    f = fraction
-    t = 1.0 - f
-    x_t, x_f = delta * t, delta * f
-    (e_t, phi2_t, psi_t), (_, phi2_f, psi_f), (c, phi2, psi) = _wide_phi(x_t), _wide_phi(x_f), _wide_phi(delta)
-    p1_t, p1_f, p1 = phi2_t + psi_t, phi2_f + psi_f, phi2 + psi
-    a1 = t * t * psi_t + t * f * (e_t + p1_t) * p1_f + f * f * phi2_f
-    return Plant(delta, c, _loss(delta), p1, t * t * phi2_t, a1, e_t * (f * f * psi_f), f, p1_t, psi_t)
-
-
-def _wide_phi(x: Ball) -> tuple[Ball, Ball, Ball]:
-    xp = namespace(x.mid)
-    low, high = xp.maximum(x.lower(), 0.0), xp.maximum(x.upper(), 0.0)
-    ends = zip(phi(low), phi(high), (9.0, 21.0, 21.0), strict=True)
-    c, phi2, psi = (hull(_within(most, units), _within(least, units)) for most, least, units in ends)
-    return c, phi2, psi
-
-
-def _loss(delta: Ball) -> Ball:
-    """``1 - e^-delta = delta phi1``, which grows with delta: bounded by its ends."""
-    xp = namespace(delta.mid)
-    ends = []
-    for x in (xp.maximum(delta.lower(), 0.0), xp.maximum(delta.upper(), 0.0)):
-        _, phi2, psi = phi(x)
-        ends.append(_within(x * (phi2 + psi), 23.0))
-    return hull(*ends)

@@ -14,7 +14,8 @@ from zwidth.domain import wall_status
 from zwidth.errors import InputError
 from zwidth.stability import balls
 from zwidth.stability.certified import certified_stable
-from zwidth.stability.certified_filter import OPEN, filtered
+from zwidth.stability.certified_filter import SPECIAL, _each, filtered
+from zwidth.stability.certified_rows import OPEN, has_rows
 from zwidth.stability.enclosed_verdict import Verdict
 from zwidth.stability.layout import lay_out
 from zwidth.status import Status
@@ -175,6 +176,35 @@ def test_every_layout_gives_the_same_labels():
     np.testing.assert_array_equal(scattered.stable, as_map.stable.ravel()[few])
     assert as_map.stable.any()
     assert not as_map.stable[0].any()
+
+
+@pytest.mark.parametrize(("delta", "d"), [(0.0, 0.0), (0.3, 0.4), (5.0, 1.0), (1e4, 1.5), (0.3, 500.5)])
+def test_rows_of_a_map_are_labelled_as_point_by_point(delta, d):
+    scale = (1 + delta) / (1 + d)
+    # With negative, no and huge stiffness, negative and no damping, beta = -delta, and values out of range.
+    alpha = scale * np.append(np.linspace(-0.2, 3.0, 641), [1e59, 1e70, np.nan])
+    beta = np.append(scale * np.linspace(-1.1, 3.0, 120), [0.0, -delta, 1e70, np.nan])
+    points = lay_out((alpha, beta[:, None], delta, d)).points
+    assert has_rows(points)
+    by_row, alone = filtered(points), _each(points)
+    np.testing.assert_array_equal(by_row >= SPECIAL, alone >= SPECIAL)
+    decided = ((by_row & 3) != OPEN) & ((alone & 3) != OPEN)
+    np.testing.assert_array_equal(by_row[decided], alone[decided])
+    # Rows decide no less.
+    assert ((by_row & 3) == OPEN).sum() <= ((alone & 3) == OPEN).sum()
+
+
+def test_rows_of_several_devices_are_kept_apart():
+    alpha, beta = np.linspace(0.01, 2.0, 512), np.linspace(-0.5, 1.5, 40)[:, None]
+    delta, d = np.array([0.0, 0.1, 3.0])[:, None, None], np.array([0.0, 0.5, 1.0, 3.0])[:, None, None, None]
+    points = lay_out((alpha, beta, delta, d)).points
+    assert has_rows(points)
+    np.testing.assert_array_equal(filtered(points), _each(points))
+
+
+def test_no_search_where_alpha_shares_its_axis():
+    alpha, beta = np.linspace(0.01, 2.0, 512), np.linspace(-0.5, 1.5, 400)[:, None]
+    assert not has_rows(lay_out((alpha, beta, 0.1 + alpha, 1.0)).points)
 
 
 def test_mixed_delays_keep_their_places():
