@@ -18,7 +18,7 @@ TARGET = Path(__file__).resolve().parents[1] / "docs" / "figures" / "one_lobe.sv
 STRONG = 5.0
 DELTA, DELAYS = 1.0, (0.0, 0.5, 1.0, 2.0)
 TURNS = {0.25: r"$\theta = \pi/4$", 0.5: r"$\pi/2$", 0.75: r"$3\pi/4$"}
-POINTS = 4001
+POINTS = 1201
 
 
 class Lobe:
@@ -101,7 +101,7 @@ def _draw_coordinates(ax: Axes, lobe: Lobe) -> None:
     ax.fill(*lobe.outline(), facecolor=style.BLUE, alpha=0.09, linewidth=0.0, zorder=1)
     for share in np.arange(0.1, 0.95, 0.1):
         w = share * np.pi
-        ax.plot(*lobe.wall(w, np.linspace(0.0, np.pi - lobe.theta(w), 200)), color=style.SKY, linewidth=0.7, zorder=2)
+        ax.plot(*lobe.wall(w, np.linspace(0.0, np.pi - lobe.theta(w), 80)), color=style.SKY, linewidth=0.7, zorder=2)
     for margin in np.radians(np.arange(15.0, 180.0, 15.0)):
         w = lobe.w[lobe.theta(lobe.w) + margin < np.pi]
         ax.plot(*lobe.wall(w, margin), color=style.SKY, linewidth=0.7, linestyle=style.DASHED, zorder=2)
