@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.margins import Margins as Margins
+    from zwidth.stability.margins import margins as margins
     from zwidth.stability.methods import is_stable as is_stable
     from zwidth.stability.methods import spectral_radius as spectral_radius
     from zwidth.stability.methods import stability_of as stability_of
@@ -108,6 +110,8 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
+    "Margins": "zwidth.stability.margins",
+    "margins": "zwidth.stability.margins",
     "is_stable": "zwidth.stability.methods",
     "spectral_radius": "zwidth.stability.methods",
     "stability_of": "zwidth.stability.methods",
@@ -134,6 +138,7 @@ __all__ = [
     "Device",
     "FastestWall",
     "InputError",
+    "Margins",
     "Requirement",
     "RidgeKind",
     "RidgePoint",
@@ -162,6 +167,7 @@ __all__ = [
     "is_passive",
     "is_stable",
     "load_config",
+    "margins",
     "max_stiffness",
     "modulus_margin",
     "most_robust_damping",
