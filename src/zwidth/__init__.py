@@ -56,6 +56,11 @@ if TYPE_CHECKING:
     from zwidth.stability.counting import count_poles as count_poles
     from zwidth.stability.labels import is_stable as is_stable
     from zwidth.stability.labels import stability_of as stability_of
+    from zwidth.stability.margins import Margins as Margins
+    from zwidth.stability.margins import margins as margins
+    from zwidth.stability.methods import is_stable as is_stable
+    from zwidth.stability.methods import spectral_radius as spectral_radius
+    from zwidth.stability.methods import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
@@ -119,6 +124,11 @@ _HOME = {
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
     "stability_of": "zwidth.stability.labels",
+    "Margins": "zwidth.stability.margins",
+    "margins": "zwidth.stability.margins",
+    "is_stable": "zwidth.stability.methods",
+    "spectral_radius": "zwidth.stability.methods",
+    "stability_of": "zwidth.stability.methods",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
@@ -143,6 +153,7 @@ __all__ = [
     "FastestWall",
     "InputError",
     "Interval",
+    "Margins",
     "PrecisionWarning",
     "Requirement",
     "RidgeKind",
@@ -173,6 +184,7 @@ __all__ = [
     "is_passive",
     "is_stable",
     "load_config",
+    "margins",
     "max_stiffness",
     "modulus_margin",
     "most_robust_damping",

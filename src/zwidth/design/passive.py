@@ -1,6 +1,6 @@
 """Z-width as a number: the area of the passive walls in the (alpha, beta) plane.
 
-In the direction ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)`` the damping that a passive wall needs is decided
+In the direction ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)`` the damping that a wall needs is decided
 
     at omega = 0                       for theta < theta1,
     at one omega that rises with theta for theta1 < theta < theta2,

@@ -231,9 +231,9 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 def passive_stiffness_slope(d: float) -> tuple[float, float]:
     """The stiffest passive wall and its damping, both over delta, for one delay.
 
-    The condition is homogeneous in (alpha, beta, delta), so ``alpha_passive = slope * delta`` for every delta. For whole
-    d the damping has no effect on the peak where cos((d + 1) w) = 0: ``slope = 2 tan(pi/(4 (d + 1)))``. For a held delay
-    the direction is searched: the passive set is convex, so that it has one tip.
+    The condition is homogeneous in (alpha, beta, delta), so ``alpha_passive = slope * delta`` for every delta. For
+    whole d the damping has no effect on the peak where cos((d + 1) w) = 0: ``slope = 2 tan(pi/(4 (d + 1)))``. For a
+    held delay the direction is searched: the passive set is convex, so that it has one tip.
     """
     check_scalars(d=d)
     delay = as_float64("d", d)
