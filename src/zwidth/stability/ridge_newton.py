@@ -177,8 +177,8 @@ class Start(NamedTuple):
 # rounded coefficients of the curve, its next neighbors would fall on either side.
 _TAKE_OVER = 3.6593616274217835
 
-# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one period,
-# 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
+# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one
+# period, 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
 _SHORT = (
     (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
     (-0.1878, 3.83, -4.872, 1.835),
@@ -194,7 +194,7 @@ _FRACTIONAL_STEPS = 12
 
 
 def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
-    return horner(t, [horner(u, list(row)) if len(row) > 1 else row[0] for row in rows])
+    return horner(t, [horner(u, list(row)) for row in rows])
 
 
 def start_of(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
