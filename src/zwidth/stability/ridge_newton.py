@@ -227,13 +227,15 @@ def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tupl
     """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
     xp = namespace(curve.b, lag)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
-    s = before = xp.minimum(xp.maximum(start.s, lower), upper)
-    # Unrolled: XLA then makes one loop over the points of each step.
-    for _ in range(_HELD_STEPS):
-        before = s
+    s = xp.minimum(xp.maximum(start.s, lower), upper)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        s, _ = state
         first, second = stationarity(s, curve, lag, undelayed)
-        s = s - first * s / (second * s + start.power * first)
-        s = stored(xp.minimum(xp.maximum(s, lower), upper), start.scale)
+        new = s - first * s / (second * s + start.power * first)
+        return xp.minimum(xp.maximum(new, lower), upper), s
+
+    s, before = repeat(_HELD_STEPS, step, (s, s), xp)
     return s, s - before
 
 
