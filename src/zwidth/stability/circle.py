@@ -25,8 +25,9 @@ from zwidth.plant import held_plant, split_delay, undelayed_plant
 from zwidth.stability.crossover import ARCSINE
 from zwidth.xp import epsilon, horner, namespace
 
-# An odd multiple as near as this is one that is met.
-_NEAR = 1e-12
+# What rounding makes of a bracket, and of an odd multiple over the number of turns, in rounding units.
+_NEAR = 5e3
+_MET = 50.0
 # Steps of the bracketed Newton iteration for the zeros of the cubic.
 _CUBIC_STEPS = 6
 
@@ -72,7 +73,7 @@ class Circle(NamedTuple):
     im: Array
 
 
-class _Sides(NamedTuple):
+class Sides(NamedTuple):
     """The sizes of the factors on one circle."""
 
     r: Array
@@ -84,13 +85,13 @@ class _Sides(NamedTuple):
     down: Array
 
 
-def _sides(log_r: Array, loop: Loop) -> _Sides:
+def sides(log_r: Array, loop: Loop) -> Sides:
     xp = namespace(log_r, loop.alpha)
     r, near = xp.exp(log_r), xp.expm1(log_r)
     power = loop.turns * log_r
     up, down = xp.exp(xp.minimum(power, 0.0)), xp.exp(-xp.maximum(power, 0.0))
     front = loop.alpha * r + loop.beta * near
-    return _Sides(r, near, near + loop.em, front, loop.a2 * r + loop.h, up, down)
+    return Sides(r, near, near + loop.em, front, loop.a2 * r + loop.h, up, down)
 
 
 class _Sizes(NamedTuple):
@@ -107,7 +108,7 @@ class _Sizes(NamedTuple):
         return (t0 + t1 * x) * (c0 + c1 * x) + m0 * (w0 + w1 * x)
 
 
-def _sizes(at: _Sides, loop: Loop, fractional: bool) -> _Sizes:
+def _sizes(at: Sides, loop: Loop, fractional: bool) -> _Sizes:
     xp = namespace(at.r)
     r = at.r
     t0, t1 = at.up * at.near * (at.up * at.near), 4.0 * r * at.up * at.up
@@ -150,6 +151,8 @@ def _cubic_zeros(h0: Array, h1: Array, h2: Array, h3: Array, xp: Any) -> list[Ar
 def _between(low: Array, high: Array, first: Array, last: Array, h: tuple[Array, ...], xp: Any) -> Array:
     """The zero of a monotone piece of a cubic: each step solves for the parabola that touches it twice."""
     exists = (first < 0) != (last < 0)
+    if xp is np and not np.any(exists):
+        return low + np.nan
     falls = first > 0
     sign = xp.where(falls, -2.0, 2.0)
     x = xp.where(xp.abs(first) < xp.abs(last), low, high)
@@ -160,7 +163,9 @@ def _between(low: Array, high: Array, first: Array, last: Array, h: tuple[Array,
         before = (value > 0) == falls
         low, high = xp.where(before, x, low), xp.where(before, high, x)
         new = x - sign * value / (xp.abs(slope) + xp.sqrt(xp.maximum(slope * slope - 2.0 * value * bend, 0.0)))
-        x = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+        old, x = x, xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+        if xp is np and np.all((old == x) | ~exists):
+            break
     return xp.where(exists, x, np.nan)
 
 
@@ -192,9 +197,12 @@ class _Crossing(NamedTuple):
     re: Array  # F' of F = log(T/B) as a function of log z
     im: Array
     rate: Array  # a bound of |F'| without the cancellation of its parts
+    quotient: Array  # |T/B|^2 over r^(2 (1 + n))
+    wall_re: Array  # the derivative of log B
+    wall_im: Array
 
 
-def _crossing(x: Array, at: _Sides, loop: Loop, fractional: bool, xp: Any) -> _Crossing:
+def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Crossing:
     """``arg T - arg B`` at a crossover, continuous from w = 0, and the derivative of the logarithm of their quotient."""
     y = 1.0 - x
     r = at.r
@@ -220,12 +228,15 @@ def _crossing(x: Array, at: _Sides, loop: Loop, fractional: bool, xp: Any) -> _C
         (loop.h, body, body_im, sizes[2]),
         (-sign * loop.beta, wall, wall_im, sizes[3]),
     ]
+    quotient = sizes[0] / sizes[2] * (sizes[1] / sizes[3])
     re, slope_im, rate = loop.turns, 0.0 * x, loop.turns
     for k, (zero, part, part_im, size) in enumerate(parts):
         scaled = zero / size
         re = re + scaled * part
         slope_im = slope_im - scaled * part_im
         rate = rate + xp.abs(scaled) * xp.sqrt(size)
+    b_re = loop.turns + 2.0 + parts[0][1] / sizes[0] + loop.c * pole / sizes[1] - re
+    b_im = -im / sizes[0] - loop.c * im / sizes[1] - slope_im
     if fractional:
         late, late_size = z + loop.q, (z + loop.q) * (z + loop.q) + im * im
         # arg(1 + q/z) = arg(z + q) - w, in [-pi, 0]
@@ -233,14 +244,15 @@ def _crossing(x: Array, at: _Sides, loop: Loop, fractional: bool, xp: Any) -> _C
         theta = theta - angle(1.0 + ratio - 2.0 * ratio * x, -ratio * im / r)
         scaled = loop.q / late_size
         re, slope_im = re + scaled * late, slope_im - scaled * im
+        b_re, b_im = b_re - scaled * late, b_im + scaled * im
         rate = rate + scaled * xp.sqrt(late_size)
-    return _Crossing(theta, w, re, slope_im, rate)
+        quotient = quotient / (1.0 + ratio * ratio + 2.0 * ratio * (1.0 - 2.0 * x))
+    return _Crossing(theta, w, re, slope_im, rate, quotient, b_re, b_im)
 
 
 class _End(NamedTuple):
     """T and B where the circle meets the real axis."""
 
-    outer: Array  # T is the larger
     device: Array  # its argument over pi, continuous along the half circle
     wall: Array
     opposite: Array  # their signs differ
@@ -248,18 +260,19 @@ class _End(NamedTuple):
     slope: Array  # F' there, a real number
 
 
-def _end(factors: tuple[Array, ...], signs: tuple[Array, Array], angles: tuple[Array, Array], at: _Sides, loop: Loop) -> _End:
+def _end(
+    log_r: Array, factors: tuple[Array, ...], signs: tuple[Array, Array], angles: tuple[Array, Array], loop: Loop
+) -> _End:
     """From z - 1, z - c, a2 z + h, 1 + q/z, s z - beta and z + q, all real."""
     one, pole, body, late, wall, shifted = factors
     xp = namespace(one)
-    size = at.up * xp.abs(one) * xp.abs(pole)
-    other = at.down * xp.abs(body * late) * xp.abs(wall)
+    level = loop.turns * log_r + xp.log(xp.abs(one * pole / (body * late * wall)))
     slope = loop.turns + 1.0 / one + loop.c / pole + loop.h / body - loop.beta / wall
     slope = slope + xp.where(loop.q > 0, loop.q / shifted, 0.0)
-    return _End(size > other, *angles, signs[0] != signs[1], xp.log(size / other), slope)
+    return _End(*angles, signs[0] != signs[1], level, slope)
 
 
-def _real_ends(at: _Sides, loop: Loop) -> tuple[_End, _End]:
+def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     xp = namespace(at.r)
     r = at.r
     half = xp.where(loop.s < 0, -1.0, 1.0)
@@ -267,39 +280,39 @@ def _real_ends(at: _Sides, loop: Loop) -> tuple[_End, _End]:
     device = xp.where(at.near < 0, 1.0, 0.0) + xp.where(at.off < 0, 1.0, 0.0)
     behind = at.front < 0
     front = _end(
+        log_r,
         (at.near, at.off, at.body, 1.0 + ratio, at.front, r + loop.q),
         ((at.near < 0) != (at.off < 0), behind),
         (device, xp.where(behind, half, 0.0)),
-        at,
         loop,
     )
     body, late, wall = loop.h - loop.a2 * r, 1.0 - ratio, -(loop.alpha * r + loop.beta * (1.0 + r))
     flipped = (body < 0) != ((late < 0) != (wall < 0))
     back = _end(
+        log_r,
         (-1.0 - r, -loop.c - r, body, late, wall, loop.q - r),
         (xp.mod(loop.turns, 2.0) == 1.0, flipped),
         (
             loop.turns + 2.0,
             xp.where(body < 0, 1.0, 0.0) - xp.where(late < 0, 1.0, 0.0) + xp.where(wall < 0, half, 0.0),
         ),
-        at,
         loop,
     )
     return front, back
 
 
-def circle(log_r: Array, loop: Loop, fractional: bool) -> Circle:
+def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, high: Array = np.inf) -> Circle:
     """Count the poles inside ``|z| = e^log_r``, and tell where Newton's method expects the next one.
 
     On a crossover T and B are equally large: one Newton step for ``log(T/B) = an odd multiple of j pi`` leads to a
     pole, outwards where there are poles outside, else inwards. On the real axis the same in real numbers.
     """
     xp = namespace(log_r, loop.alpha)
-    at = _sides(log_r, loop)
+    at = sides(log_r, loop)
     sizes = _sizes(at, loop, fractional)
     zeros = _cubic_zeros(*sizes.h, xp) if fractional else _quadratic_zeros(*sizes.h[:3], xp)
-    front, back = _real_ends(at, loop)
-    outer = front.outer
+    front, back = real_ends(log_r, at, loop)
+    outer = (sizes.h[0] > 0) | ((sizes.h[0] == 0) & (sizes.h[1] < 0))
     left = xp.where(outer, front.device, front.wall)
     eps = epsilon(log_r)
     blur = 4.0 * eps * (loop.turns + 8.0)
@@ -307,7 +320,7 @@ def circle(log_r: Array, loop: Loop, fractional: bool) -> Circle:
     sure = ~((front.opposite & (xp.abs(front.level) < blur)) | (back.opposite & (xp.abs(back.level) < blur)))
     turn, crossings = 0.0 * left, []
     for x in zeros:
-        valid = (x > 0) & (x < 1.0)
+        valid = (x >= 0) & (x < 1.0)
         x = xp.where(valid, x, 0.5)
         here = _crossing(x, at, loop, fractional, xp)
         part = here.theta / (2.0 * np.pi)
@@ -323,33 +336,83 @@ def circle(log_r: Array, loop: Loop, fractional: bool) -> Circle:
     right = xp.where(outer, back.device, back.wall)
     count = right - left + 2.0 * turn
     full = count == loop.turns + 2.0
-    return Circle(count, full, sure, *_expected(log_r, full, crossings, front, back, loop, xp))
+    expected = _expected((log_r, low, high), full, crossings, (front, back), at, loop)
+    return Circle(count, full, sure, *expected)
 
 
 def _expected(
-    log_r: Array, full: Array, crossings: list, front: _End, back: _End, loop: Loop, xp: Any
+    bracket: tuple[Array, Array, Array], full: Array, crossings: list, ends: tuple[_End, _End], at: Sides, loop: Loop
 ) -> tuple[Array, Array]:
-    """The largest pole that one Newton step leads to, on the side where the radius must be; NaN where none does."""
+    """The largest pole inside the bracket that one Newton step leads to; NaN where none does."""
+    log_r, low, high = bracket
+    xp = namespace(log_r, loop.alpha)
     side = xp.where(full, -1.0, 1.0)
-    best, angle_of = -np.inf * side, 0.0 * side + np.nan
-    best = xp.where(full, -np.inf, -np.inf)
-    for end, w in ((front, 0.0), (back, np.pi)):
-        step = -end.level / end.slope
-        good = end.opposite & (step * side > -_NEAR)
-        new = xp.where(good, log_r + step, -np.inf)
-        better = new > best
-        best, angle_of = xp.where(better, new, best), xp.where(better, w, angle_of)
+    low, high = (xp.where(full, low, log_r), xp.where(full, log_r, high))
+    slack = _NEAR * epsilon(log_r) * (1.0 + xp.abs(log_r))
+    low, high = low - slack, high + slack
+    best, best_im = xp.where(loop.alpha == 0, 0.0, -np.inf), 0.0 * side
+    best = xp.where((best > low) & (best < high), best, -np.inf)
+    front, back = ends
+    # Near z = 1 the logarithm of r - 1 is what goes in a straight line.
+    shrink = at.near * xp.exp(-front.level * at.r / (front.slope * at.near))
+    slow = (at.near < 0) & (front.slope * at.near > 0)
+    candidates = [
+        (front.opposite, xp.where(slow, xp.log1p(shrink), log_r - front.level / front.slope), 0.0),
+        (back.opposite, log_r - back.level / back.slope, np.pi),
+    ]
     for here, rest, valid in crossings:
         norm = here.re * here.re + here.im * here.im
         # Of the odd multiples on both sides one lies outwards; one that is met already counts as either.
         wanted = xp.where(here.im * side > 0, 0.5, -0.5)
-        wanted = xp.where(0.5 - xp.abs(rest) < _NEAR, xp.where(rest > 0, 0.5, -0.5), wanted)
+        met = 0.5 - xp.abs(rest) < _MET * epsilon(log_r) * (loop.turns + 100.0)
+        wanted = xp.where(met, xp.where(rest > 0, 0.5, -0.5), wanted)
         gap = 2.0 * np.pi * (wanted - rest) / norm
-        new = xp.where(valid, log_r + gap * here.im, -np.inf)
-        better = new > best
-        best = xp.where(better, new, best)
-        angle_of = xp.where(better, here.w + gap * here.re, angle_of)
-    at_one = (loop.alpha == 0) & (best < 0) & (side * log_r < 0)
-    best, angle_of = xp.where(at_one, 0.0, best), xp.where(at_one, 0.0, angle_of)
-    none = best == -np.inf
-    return xp.where(none, np.nan, best), xp.clip(angle_of, 0.0, np.pi)
+        # A circle on which the sizes barely differ leads nowhere.
+        moves = met | (xp.abs(gap * here.im) > slack)
+        candidates.append((valid & moves, log_r + gap * here.im, here.w + gap * here.re))
+    for good, new, im in candidates:
+        better = good & (new > best) & (new > low) & (new < high)
+        best, best_im = xp.where(better, new, best), xp.where(better, im, best_im)
+    return xp.where(best == -np.inf, np.nan, best), xp.clip(best_im, 0.0, np.pi)
+
+
+class Near(NamedTuple):
+    """The loop at ``z = e^(re + j im)``, by logarithms; F' is the derivative of F = log(T/B) by log z."""
+
+    level: Array  # log |T/B|
+    past: Array  # arg T - arg B less the nearest odd multiple of pi
+    re: Array  # F'
+    im: Array
+    wall_re: Array  # the derivative of log B
+    wall_im: Array
+
+
+def near(re: Array, im: Array, loop: Loop, fractional: bool) -> Near:
+    """Evaluate at a point of the upper half plane, 0 <= im <= pi."""
+    xp = namespace(re, loop.alpha)
+    at = sides(re, loop)
+    sine = xp.sin(0.5 * im)
+    here = _crossing(sine * sine, at, loop, fractional, xp)
+    level = loop.turns * re + 0.5 * xp.log(here.quotient)
+    part = here.theta / (2.0 * np.pi)
+    past = 2.0 * np.pi * (part - xp.floor(part) - 0.5)
+    return Near(level, past, here.re, here.im, here.wall_re, here.wall_im)
+
+
+def ratio_step(at: Near) -> tuple[Array, Array]:
+    """Newton's step on log(T/B), for poles of long delays: all but their powers of z is nearly constant."""
+    norm = at.re * at.re + at.im * at.im
+    return -(at.level * at.re + at.past * at.im) / norm, -(at.past * at.re - at.level * at.im) / norm
+
+
+def newton_step(at: Near) -> tuple[Array, Array]:
+    """Newton's step on P itself, for poles next to a zero of T or B: ``P/P' = (1 + y)/(y F' + (1 + y) B'/B)``, y = T/B."""
+    xp = namespace(at.level)
+    size = xp.exp(at.level)
+    y_re, y_im = -size * xp.cos(at.past), -size * xp.sin(at.past)
+    sum_re = 1.0 + y_re
+    # 1 + y cancels near a pole; that loses nothing that y had.
+    slope_re = y_re * at.re - y_im * at.im + sum_re * at.wall_re - y_im * at.wall_im
+    slope_im = y_re * at.im + y_im * at.re + sum_re * at.wall_im + y_im * at.wall_re
+    norm = slope_re * slope_re + slope_im * slope_im
+    return -(sum_re * slope_re + y_im * slope_im) / norm, -(y_im * slope_re - sum_re * slope_im) / norm
