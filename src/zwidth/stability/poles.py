@@ -9,10 +9,11 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64, is_traced
-from zwidth.domain import check_scalars
+from zwidth.domain import check_scalars, wall_status
 from zwidth.errors import InputError
 from zwidth.grouping import Degree, by_degree, degree_of, few_poles
 from zwidth.loop import check_has_poles, coefficients, evaluate, plant_of, poison, valid_wall
+from zwidth.status import Method, Status
 from zwidth.xp import namespace
 
 # The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
@@ -163,3 +164,32 @@ def _count_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Deg
     # Without stiffness a pole is at 1, whatever rounding makes of it.
     count = xp.where(alpha == 0, xp.maximum(count, 1), count)
     return xp.where(xp.isnan(z[..., 0].real), -1, count)
+
+
+def radius_and_bound(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> tuple[Array, ...]:
+    """The spectral radius from the poles, a bound of its error, no certificates, a status and the method."""
+    values = (alpha, beta, delta, d)
+    radius, error, status = _of_all_poles(_bound_kernel, values)
+    return radius, error, 0 * status > 0, status, 0 * status + np.int32(Method.COMPANION)
+
+
+def _bound_kernel(
+    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool
+) -> tuple[Array, Array, Array]:
+    """A pole lies within degree |P/P'| of any z. What rounding may do to P itself comes on top."""
+    xp = namespace(alpha, beta, delta, d)
+    poles = pole_kernel(alpha, beta, delta, d, degree, spring)
+    size = xp.abs(poles)
+    largest = xp.argmax(xp.where(xp.isnan(size), 0.0, size), axis=-1)[..., None]
+    z = xp.take_along_axis(poles, largest, axis=-1)
+    radius = xp.where(alpha == 0, xp.maximum(xp.max(size, axis=-1), 1.0), xp.max(size, axis=-1))
+    plant = plant_of(delta, d, degree)
+    plant = type(plant)(*(field[..., None] for field in plant))
+    value, slope = (part[..., 0] for part in evaluate(z, alpha[..., None], beta[..., None], plant, degree))
+    wall = (xp.abs(alpha) + xp.abs(beta)) * xp.maximum(radius, 1.0) ** 3
+    rounding = 4e-16 * degree.poles * ((1.0 + radius) ** 2 * radius ** (degree.poles - 2) + wall)
+    error = degree.poles * (xp.abs(value) + rounding) / xp.abs(slope) + 4e-16 * radius
+    status = wall_status(alpha, beta, delta, d)
+    bounded = xp.isfinite(error)
+    status = xp.where((status == Status.OK) & ~bounded, np.int32(Status.NOT_CONVERGED), status)
+    return radius, xp.where(xp.isnan(radius), np.nan, xp.where(bounded, error, np.inf)), status
