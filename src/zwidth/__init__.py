@@ -50,12 +50,13 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.decay import decay_rate as decay_rate
     from zwidth.stability.labels import is_stable as is_stable
-    from zwidth.stability.radii import spectral_radius as spectral_radius
     from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
+    from zwidth.stability.radii import spectral_radius as spectral_radius
     from zwidth.stability.region import StableRegion as StableRegion
     from zwidth.stability.region import stable_region as stable_region
     from zwidth.stability.ridge import RidgeKind as RidgeKind
@@ -110,6 +111,7 @@ _HOME = {
     "boundary_point": "zwidth.stability.boundary",
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
+    "decay_rate": "zwidth.stability.decay",
     "stability_of": "zwidth.stability.labels",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
@@ -156,6 +158,7 @@ __all__ = [
     "boundary",
     "boundary_point",
     "char_poly",
+    "decay_rate",
     "denormalize",
     "fastest_damping",
     "fastest_wall",

@@ -110,8 +110,12 @@ class Complex(NamedTuple):
         while True:
             odd = (left & 1) == 1
             product = result.times(square)
-            result = Complex(*(Double(*(np.where(odd, n, o) for n, o in zip(new, old, strict=True)))
-                               for new, old in zip(product, result, strict=True)))
+            result = Complex(
+                *(
+                    Double(*(np.where(odd, n, o) for n, o in zip(new, old, strict=True)))
+                    for new, old in zip(product, result, strict=True)
+                )
+            )
             left = left >> 1
             if not np.any(left):
                 return result

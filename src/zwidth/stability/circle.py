@@ -143,9 +143,7 @@ def _cubic_zeros(h0: Array, h1: Array, h2: Array, h3: Array, xp: Any) -> list[Ar
     low, high = xp.minimum(low, high), xp.maximum(low, high)
     ends = [0.0 * h0, low, high, 0.0 * h0 + 1.0]
     values = [h0 + x * (h1 + x * (h2 + x * h3)) for x in ends]
-    return [
-        _between(ends[k], ends[k + 1], values[k], values[k + 1], (h0, h1, h2, h3), xp) for k in range(3)
-    ]
+    return [_between(ends[k], ends[k + 1], values[k], values[k + 1], (h0, h1, h2, h3), xp) for k in range(3)]
 
 
 def _between(low: Array, high: Array, first: Array, last: Array, h: tuple[Array, ...], xp: Any) -> Array:
@@ -220,7 +218,12 @@ def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Cr
     phase = xp.where((v_im < 0) & (q_im >= 0), phase + 2.0 * np.pi, phase)
     w = _turn(x, y, xp)
     theta = loop.turns * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
-    sizes = [one * one + im * im, pole * pole + im * im, body * body + body_im * body_im, wall * wall + wall_im * wall_im]
+    sizes = [
+        one * one + im * im,
+        pole * pole + im * im,
+        body * body + body_im * body_im,
+        wall * wall + wall_im * wall_im,
+    ]
     # z/(z - a) = 1 + a/(z - a)
     parts = [
         (1.0, one, im, sizes[0]),

@@ -17,7 +17,9 @@ from zwidth.status import Status
 
 # Below this a rate of float64 may have lost more than five digits.
 _SLOW = 0.1
-_STEPS = 3
+_STEPS = 8
+# An error of the radius this small beside the rate leaves no doubt which pole decays most slowly.
+_SURELY = 1e-3
 _ACCURACY = 1e-9
 
 
@@ -35,7 +37,8 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 
     Returns:
         Array of the broadcast shape, per period: positive exactly where `zwidth.is_stable` says so, 0 with a pole on
-        the unit circle, negative where the motion grows. NaN for a point out of range.
+        the unit circle, negative where the motion grows. NaN for a point out of range, and
+        where poles lie so close together that two counts cannot tell which is the slowest.
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
@@ -74,13 +77,12 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         stable = np.asarray(stable_kernel(*columns, kind_of(columns[3])))
     # The two agree but for walls within rounding of the circle: there the verdict's side is kept.
     rate = np.where(stable & (rate <= 0), np.finfo(float).tiny, np.where(~stable & (rate > 0), 0.0, rate))
-    rate = np.where(ok & np.isfinite(found.re), rate, np.nan)
+    known = (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
+    rate = np.where(ok & known, rate, np.nan)
     return to_caller(rate.reshape(shape), values)
 
 
-def refined_rate(
-    alpha: Array, beta: Array, delta: Array, d: Array, re: Array, im: Array
-) -> Array:
+def refined_rate(alpha: Array, beta: Array, delta: Array, d: Array, re: Array, im: Array) -> Array:
     """``-log |z|`` of the pole next to ``e^(re + j im)``, from residuals of twice the digits."""
     whole = np.floor(d)
     em, start, lead, bend = _plant(delta, d - whole)
@@ -104,9 +106,10 @@ def refined_rate(
         slope = slope + (lead.high + 2.0 * bend.high * zeta) * wall.rounded + m * s.high
         step = -value / slope
         # A multiple pole moves by as much as it is uncertain.
-        step = np.where(np.isfinite(step) & (np.abs(step) < 1e-3 * np.maximum(np.abs(zeta), 1e-3 / turns)), step, 0.0)
-        if k < _STEPS - 1:
-            zeta = zeta + step
+        step = np.where(np.isfinite(step) & (np.abs(step) < 0.5 * np.maximum(np.abs(zeta), 1e-3 / turns)), step, 0.0)
+        if k == _STEPS - 1 or np.all(np.abs(step) <= 4e-16 * np.abs(zeta)):
+            break
+        zeta = zeta + step
     # |z|^2 - 1 = 2 Re zeta + |zeta|^2
     re2, im2 = single(zeta.real), single(zeta.imag)
     beyond = re2.scaled(2.0).plus(re2.times(re2)).plus(im2.times(im2))
@@ -114,7 +117,9 @@ def refined_rate(
     beyond = beyond.plus(single(change))
     rate = -0.5 * np.log1p(beyond.high) - 0.5 * beyond.low / (1.0 + beyond.high)
     at_one = (alpha == 0) & (re == 0)
-    return np.where(at_one, 0.0, rate)
+    # Steps that do not settle have lost the pole: next to a double one, of walls a last place from none.
+    settled = np.abs(np.real(step / (1.0 + zeta))) <= 1e-3 * np.abs(rate)
+    return np.where(at_one, 0.0, np.where(settled, rate, np.nan))
 
 
 def _plant(delta: Array, f: Array) -> tuple[Double, Double, Double, Double]:

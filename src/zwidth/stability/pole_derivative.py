@@ -26,7 +26,9 @@ class Complex(NamedTuple):
     def over(self, other: Complex) -> Complex:
         """The quotient."""
         size = other.re * other.re + other.im * other.im
-        return Complex((self.re * other.re + self.im * other.im) / size, (self.im * other.re - self.re * other.im) / size)
+        return Complex(
+            (self.re * other.re + self.im * other.im) / size, (self.im * other.re - self.re * other.im) / size
+        )
 
 
 def _factors(z: Complex, past_one: Array, loop: Loop) -> list[Complex]:

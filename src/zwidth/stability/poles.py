@@ -95,9 +95,7 @@ def check_degree(d: ArrayLike) -> None:
         )
 
 
-def _of_all_poles(
-    kernel: Callable[..., Any], values: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]
-) -> Array:
+def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike]) -> Array:
     check_scalars(**dict(zip(("alpha", "beta", "delta", "d"), values, strict=True)))
     check_degree(values[3])
     static = (is_spring(values[1]),)

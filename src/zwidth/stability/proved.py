@@ -15,8 +15,8 @@ from zwidth.stability.circle import loop_of
 from zwidth.stability.radius import proved, radius_kernel
 from zwidth.status import Status
 
-# Counts, and whether some of them bisect: nearly all points need the first.
-_EFFORTS = ((5, False), (40, False), (90, True))
+# Counts, whether some of them bisect, and Newton steps on the pole: nearly all points need the first.
+_EFFORTS = ((5, False, 2), (40, False, 12), (90, True, 40))
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(1, 12)
 _LARGEST_ERROR = 0.1
@@ -70,7 +70,7 @@ def outermost_poles(columns: list[np.ndarray], accuracy: float) -> Poles:
         left = np.flatnonzero(~ok)
         if left.size:
             again = _search([column[left] for column in columns], accuracy, kind, effort)
-            better = again[2] | ~np.isfinite(re[left])
+            better = np.isfinite(again[0])
             re[left], im[left], ok[left] = (
                 np.where(better, new, old[left]) for new, old in zip(again, (re, im, ok), strict=True)
             )
@@ -99,11 +99,23 @@ def proved_radii(values: tuple[ArrayLike, ...], accuracy: float) -> Proved:
     columns = [array.reshape(-1) for array in arrays]
     status = np.asarray(wall_status(*columns))
     ok = status == Status.OK
-    found = outermost_poles([np.where(ok, column, fill) for column, fill in zip(columns, (0.1, 0.1, 1.0, 0.0), strict=True)], accuracy)
+    found = outermost_poles(
+        [np.where(ok, column, fill) for column, fill in zip(columns, (0.1, 0.1, 1.0, 0.0), strict=True)], accuracy
+    )
     radius = np.where(ok, np.exp(found.re), np.nan)
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
-    error = np.where(ok, np.where(np.isfinite(found.error), np.expm1(found.error) * radius + 2e-16 * radius, np.inf), np.nan)
+    error = np.where(
+        ok, np.where(np.isfinite(found.error), np.expm1(found.error) * radius + 2e-16 * radius, np.inf), np.nan
+    )
     certified = ok & (found.error <= accuracy)
     status = np.where(ok & ~certified, np.int32(Status.NOT_CONVERGED), status).astype(np.int32)
     leaves = Proved(radius, error, certified, status)
     return to_caller(Proved(*(leaf.reshape(shape) for leaf in leaves)), values)
+
+
+def certified_columns(
+    alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray, accuracy: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Radii of equally many values of each, and whether each is proved to a relative accuracy."""
+    found = proved_radii((alpha, beta, delta, d), accuracy)
+    return found.radius, found.certified

@@ -150,16 +150,19 @@ def outermost(loop: Loop, fractional: bool, steps: int, halve: bool = False) -> 
         seen = circle(at, loop, fractional, low, high)
         high = xp.where(seen.full & ~done, at, high)
         low = xp.where(seen.full | done, low, at)
-        expected = xp.isfinite(seen.re) & ~done
-        re, im = xp.where(expected, seen.re, re), xp.where(expected, seen.im, im)
+        # What has been found before counts until it is refuted.
+        kept = ~xp.isfinite(seen.re) & (guess.re > low - past) & (guess.re < high + past)
+        new_re, new_im = xp.where(kept, guess.re, seen.re), xp.where(kept, guess.im, seen.im)
+        expected = xp.isfinite(new_re) & ~done
+        re, im = xp.where(expected, new_re, re), xp.where(expected, new_im, im)
         # With more than a pair outside, the next pole is seldom the outermost.
         good = expected & (seen.count >= loop.turns)
         if halve:
             good = good & (turn < 2)
         # Climbing, one pole is left behind before the next is looked for.
-        new = seen.re + xp.where(seen.full, 0.0, past)
+        new = new_re + xp.where(seen.full, 0.0, past)
         middle = xp.where((high == bound) & (top > low) & (top < 0.99 * high), top, 0.5 * (low + high))
-        found = expected & seen.full & (xp.abs(seen.re - at) < 3.0 * past)
+        found = expected & seen.full & (xp.abs(new_re - at) < 3.0 * past)
         return xp.where(good, new, middle), low, high, re, im, done | found, xp.mod(turn + 1.0, 3.0)
 
     state = (start, low, bound, guess.re, guess.im, bound < low, 0.0 * start)
@@ -204,11 +207,19 @@ def proved(log_r: Array, tolerances: Sequence[Any], loop: Loop, fractional: bool
 
 
 def radius_kernel(
-    alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool, steps: int, halve: bool
+    alpha: Array,
+    beta: Array,
+    delta: Array,
+    d: Array,
+    tolerance: Array,
+    fractional: bool,
+    steps: int,
+    halve: bool,
+    polishing: int,
 ) -> tuple[Array, Array, Array]:
     """The outermost pole of each point by the logarithm of its modulus and its argument, and whether it is proved."""
     loop = loop_of(alpha, beta, delta, d, fractional)
-    found = polished(outermost(loop, fractional, steps, halve), loop, fractional, newton_step, 2)
+    found = polished(outermost(loop, fractional, steps, halve), loop, fractional, newton_step, polishing)
     return found.re, found.im, proved(found.re, [tolerance], loop, fractional)[0]
 
 

@@ -20,7 +20,7 @@ from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.passivity import _sample_count as sample_count
 from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.poles import companion_chunk, radius_by_companion
-from zwidth.stability.radius_map import certified_columns
+from zwidth.stability.proved import certified_columns
 from zwidth.stability.ridge import alpha_max
 from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY
 from zwidth.status import Status
