@@ -54,13 +54,11 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
     from zwidth.stability.counting import count_poles as count_poles
+    from zwidth.stability.decay import decay_rate as decay_rate
     from zwidth.stability.labels import is_stable as is_stable
     from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.margins import Margins as Margins
     from zwidth.stability.margins import margins as margins
-    from zwidth.stability.methods import is_stable as is_stable
-    from zwidth.stability.methods import spectral_radius as spectral_radius
-    from zwidth.stability.methods import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
@@ -123,12 +121,10 @@ _HOME = {
     "count_poles": "zwidth.stability.counting",
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
+    "decay_rate": "zwidth.stability.decay",
     "stability_of": "zwidth.stability.labels",
     "Margins": "zwidth.stability.margins",
     "margins": "zwidth.stability.margins",
-    "is_stable": "zwidth.stability.methods",
-    "spectral_radius": "zwidth.stability.methods",
-    "stability_of": "zwidth.stability.methods",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
@@ -178,6 +174,7 @@ __all__ = [
     "boundary_point",
     "char_poly",
     "count_poles",
+    "decay_rate",
     "denormalize",
     "fastest_damping",
     "fastest_wall",
