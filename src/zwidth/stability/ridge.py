@@ -27,7 +27,8 @@ from zwidth.xp import epsilon, is_traced, namespace
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
-_CHUNK = 1 << 13
+# What fits the second-level cache, for the general route and for this one.
+_CHUNK, _BLOCK = 1 << 13, 1 << 15
 
 
 class RidgeKind(IntEnum):
@@ -95,7 +96,7 @@ def alpha_max(
         from zwidth.stability.ridge_kkt import kkt_kernel
 
         return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
-    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, occurring(d)))
+    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, occurring(d)), block=_BLOCK)
 
 
 def occurring(d: ArrayLike) -> Kind:
