@@ -127,7 +127,8 @@ def elementwise(
     if arrays[0].size <= few:
         with np.errstate(all="ignore"):
             result = kernel(*arrays, *static)
-        return to_caller(tree_map(lambda leaf: np.broadcast_to(leaf, arrays[0].shape), result), values)
+        # A copy: a view of an argument, or of one value, could not be written to.
+        return to_caller(tree_map(lambda leaf: np.array(np.broadcast_to(leaf, arrays[0].shape)), result), values)
     shape = arrays[0].shape
     flat = in_blocks(_compiled_elementwise(kernel, static), [array.reshape(-1) for array in arrays], block)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)

@@ -10,6 +10,7 @@ factored. Pole methods use the coefficients `coefficients`, frequency methods `f
 
 from __future__ import annotations
 
+from math import factorial
 from typing import NamedTuple
 
 import numpy as np
@@ -18,11 +19,11 @@ from zwidth._types import DELAY_MODELS, Array, ArrayLike
 from zwidth.batching import concrete_delay, pointwise
 from zwidth.domain import device_status, wall_status
 from zwidth.errors import InputError, check_choice
-from zwidth.grouping import Degree, by_degree, degree_of
+from zwidth.grouping import Degree, by_degree, degree_of, few_poles
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 from zwidth.scene import normalize
 from zwidth.status import Status
-from zwidth.xp import namespace
+from zwidth.xp import horner, namespace
 
 
 class Affine(NamedTuple):
@@ -153,11 +154,21 @@ def _whole_cosine_ratio(omega: Array, n: Array, cos_half: Array) -> Array:
     k = n + 0.5
     # pi is not a float64: its second half keeps v exact to the last digit.
     v = (np.pi - omega) + 1.2246467991473532e-16
-    at_pi = xp.abs(v) < 1e-30
-    v_safe = xp.where(at_pi, 1.0, v)
     sign = 1.0 - 2.0 * xp.mod(n, 2.0)
-    near = sign * xp.where(at_pi, 2.0 * k, xp.sin(k * v_safe) / xp.sin(0.5 * v_safe))
+    near = sign * 2.0 * k * _cardinal_sine(k * v) / _cardinal_sine(0.5 * v)
     return xp.where(omega > 2.0, near, xp.cos(k * omega) / cos_half)
+
+
+_CARDINAL = [(-1.0) ** i / factorial(2 * i + 1) for i in range(11)]
+
+
+def _cardinal_sine(x: Array) -> Array:
+    """``sin(x)/x``, for small x by its series: the quotient has no digit of its derivatives there."""
+    xp = namespace(x)
+    small = xp.abs(x) < 1.5
+    safe = xp.where(small, 2.0, x)
+    inner = xp.where(small, x, 0.0)
+    return xp.where(small, horner(inner * inner, _CARDINAL), xp.sin(safe) / safe)
 
 
 def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole: Array) -> tuple[Array, Array]:
@@ -253,17 +264,15 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
         [ 1.   -1.5   1.25 -0.25]
     """
     check_has_poles(delay)
-    return by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
+    return by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
 
 
 def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
     ok = valid_wall(alpha, beta, delta, d)
-    # NaN that depends on the inputs: derivatives at a bad point are NaN too.
-    spread = alpha + beta + delta + d
-    xp = namespace(spread)
-    poison = xp.where(ok, 0.0, xp.nan) * spread * (1.0 + spread)
+    spoiled = poison(ok, alpha, beta, delta, d)[..., None]
+    xp = namespace(alpha, beta, delta, d)
     alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    return coefficients(alpha, beta, delta, d, degree) + poison
+    return coefficients(alpha, beta, delta, xp.where(ok, d, float(degree.whole)), degree) + spoiled
 
 
 def char_poly_si(

@@ -6,7 +6,7 @@ Of the loop nothing is used but its frequency response, so that this judges the 
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +14,8 @@ import optimistix
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
-from zwidth.domain import WALL_RANGE, wall_status, within
 from zwidth.loop import BoundaryCurve, FrequencyLoop, frequency_boundary, frequency_loop, poison
+from zwidth.stability.boundary import BoundaryPoint, line_status
 from zwidth.stability.bracketing import bisect
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.curve import lobe_end
@@ -25,22 +25,19 @@ from zwidth.status import Status
 
 # Cells into which the lobe is cut to bracket its crossings with a line.
 _CELLS = 256
-# What to look for on a line: its lowest crossing, the next one above that, or the first one ahead of its origin.
-_LOWEST, _ABOVE_LOWEST, _AHEAD = 0.0, 1.0, 2.0
+# What is asked travels as a number: one compilation serves rows, columns and rays.
+_CODES = {"lower": 0.0, "upper": 1.0, "row": 2.0, "ray": 3.0}
 
 
-def solved_point(names: tuple[str, ...], values: tuple[ArrayLike, ...], line: str, delay: str) -> "SolvedPoint":
+def solved_point(names: tuple[str, ...], values: tuple[ArrayLike, ...], line: str, delay: str) -> BoundaryPoint:
     """`zwidth.boundary_point` of (delta, d) and the numbers of one line, solved anew."""
-    return pointwise(_KERNELS[line], ("delta", "d", *names), values, (delay,), fused=False)
-
-
-class SolvedPoint(NamedTuple):
-    """A wall on the edge of stability, or an array of them."""
-
-    alpha: Array
-    beta: Array
-    omega: Array
-    status: Array
+    delta, d, *numbers = values
+    if line == "row":
+        numbers, names = [0.0, numbers[0], 1.0, 0.0], ("alpha0", "beta", "dalpha", "dbeta")
+    elif line != "ray":
+        numbers, names = [numbers[0], 0.0, 0.0, 1.0], ("alpha", "beta0", "dalpha", "dbeta")
+    everything = (delta, d, *numbers, _CODES[line])
+    return pointwise(_point_kernel, ("delta", "d", *names, "line"), everything, (delay,), fused=False)
 
 
 class _Line(NamedTuple):
@@ -61,30 +58,50 @@ class _Line(NamedTuple):
         return along / (self.dalpha**2 + self.dbeta**2)
 
 
-def _point_kernel(
-    delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array, search: Array, delay: str
-) -> BoundaryPoint:
-    inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
-    ok = valid_device(delta, d) & jnp.isfinite(sum(inputs)) & ((dalpha != 0) | (dbeta != 0))
-    delta, d, *direction = (jnp.where(ok, value, 1.0) for value in inputs)
+class _Inputs(NamedTuple):
+    """A device and a line."""
+
+    delta: Array
+    d: Array
+    alpha0: Array
+    beta0: Array
+    dalpha: Array
+    dbeta: Array
+
+
+def _point_kernel(*arguments: Any) -> BoundaryPoint:
+    *numbers, code, delay = arguments
+    inputs = _Inputs(*numbers)
+    given = line_status(*inputs)
+    ok = given == int(Status.OK)
+    safe = _Inputs(*(jnp.where(ok, value, 1.0) for value in inputs))
+    delta, d, *direction = safe
     line = _Line(*direction)
     loop = frequency_loop(delta, d, delay)
-    omegas = _lobe_frequencies(delta, d, loop, delay)
+    ridge = jax.lax.stop_gradient(ridge_kernel(delta, d, delay))
+    omegas = _lobe_frequencies(ridge.omega, lobe_end(loop, d, delay))
     on_curve = _curve_crossings(line, omegas, loop, delay)
-    real = _real_pole_crossings(line, loop)
-    index, exists = _choose(on_curve, real, search)
-    # For alpha <= 0 a real pole is at 1 or beyond, whatever beta.
-    exists = exists & ((line.dalpha != 0) | (line.alpha > 0))
+    real = _real_pole_crossings(line, loop, code)
+    index, exists = _choose(on_curve, real, code)
     cell = jnp.minimum(index, _CELLS - 1)
     omega, distance, converged = _polish(line, omegas[cell], omegas[cell + 1], loop, delay)
     is_real = index >= _CELLS
     omega = jnp.where(is_real, jnp.where(index == _CELLS, 0.0, jnp.pi), omega)
     distance = jnp.where(is_real, real[jnp.clip(index - _CELLS, 0, 1)], distance)
+    # A stable wall before the point, on the same line.
+    is_row, is_ray = code == _CODES["row"], code == _CODES["ray"]
+    begins = line.alpha + jnp.where(is_row, 0.5 * distance, 0.0) * line.dalpha
+    starts = stable_kernel(begins, line.beta, delta, d)
+    if delay != "held":
+        row = _curve_crossings(_Line(begins, line.beta, jnp.ones_like(d), jnp.zeros_like(d)), omegas, loop, delay)
+        on_row = (begins > 0) & jnp.any((row > 0) & jnp.isfinite(row))
+        starts = jnp.where(d == 0, starts, on_row)
+    on_column = (line.alpha > 0) & (line.alpha < ridge.alpha)
+    exists = exists & jnp.where(is_row | is_ray, starts, on_column)
     solved = is_real | converged
-    found = ok & exists & solved
-    status = jnp.where(exists, jnp.where(solved, Status.OK, Status.NOT_CONVERGED), Status.NO_BOUNDARY)
-    status = jnp.where(ok, status, Status.INVALID_INPUT)
-    spoiled = poison(found, *inputs)
+    status = jnp.where(exists, jnp.where(solved, int(Status.OK), int(Status.NOT_CONVERGED)), int(Status.NO_BOUNDARY))
+    status = jnp.where(ok, status, given)
+    spoiled = poison(status == int(Status.OK), *inputs)
     return BoundaryPoint(
         line.alpha + distance * line.dalpha + spoiled,
         line.beta + distance * line.dbeta + spoiled,
@@ -93,10 +110,8 @@ def _point_kernel(
     )
 
 
-def _lobe_frequencies(delta: Array, d: Array, loop: FrequencyLoop, delay: str) -> Array:
+def _lobe_frequencies(top: Array, end: Array) -> Array:
     """Cell edges along the lobe; the ridge is one of them, so that a column meets at most one edge a cell."""
-    top = jax.lax.stop_gradient(ridge_kernel(delta, d, delay).omega)
-    end = lobe_end(loop, d, delay)
     part = jnp.linspace(0.0, 1.0, _CELLS // 2 + 1)
     return jnp.concatenate([top * part, top + (end - top) * part[1:]])
 
@@ -111,30 +126,28 @@ def _curve_crossings(line: _Line, omegas: Array, loop: FrequencyLoop, delay: str
     return jnp.where(crosses, distance[:-1] + share * (distance[1:] - distance[:-1]), jnp.inf)
 
 
-def _real_pole_crossings(line: _Line, loop: FrequencyLoop) -> Array:
-    """The distances at which the line meets alpha = 0 (a pole at z = 1) and P(-1) = 0."""
+def _real_pole_crossings(line: _Line, loop: FrequencyLoop, code: Array) -> Array:
+    """The distances at which the line meets alpha = 0 (a pole at z = 1) and, below one period, P(-1) = 0."""
     at_one = -line.alpha / jnp.where(line.dalpha == 0, 1.0, line.dalpha)
     plant, lag = loop
-    whole = lag == jnp.floor(lag)
-    sign = 1.0 - 2.0 * jnp.mod(lag, 2.0)
-    usable = whole & (plant.gap != 0)
-    sum_at_minus_one = sign * 2.0 * (1.0 + plant.c) / jnp.where(usable, plant.gap, 1.0)
+    usable = (lag == 0) & (plant.gap > 0)
+    sum_at_minus_one = 2.0 * (1.0 + plant.c) / jnp.where(usable, plant.gap, 1.0)
     rate = line.dalpha + 2.0 * line.dbeta
     at_minus_one = (sum_at_minus_one - line.alpha - 2.0 * line.beta) / jnp.where(rate == 0, 1.0, rate)
-    exists = jnp.stack([line.dalpha != 0, usable & (rate != 0)])
+    exists = jnp.stack([(line.dalpha != 0) & (code == _CODES["ray"]), usable & (rate != 0)])
     return jnp.where(exists, jnp.stack([at_one, at_minus_one]), jnp.inf)
 
 
-def _choose(on_curve: Array, real: Array, search: Array) -> tuple[Array, Array]:
+def _choose(on_curve: Array, real: Array, code: Array) -> tuple[Array, Array]:
     """Which crossing bounds the stable part of the line: a cell, then z = 1, then z = -1; and whether there is one."""
     lowest = jnp.argmin(on_curve)
     candidates = jnp.concatenate([on_curve, real])
-    # A column is left upwards, beyond its lower end; a ray is left at the first crossing ahead.
-    start = jnp.where(search == _ABOVE_LOWEST, on_curve[lowest], 0.0)
+    # A column is left upwards, beyond its lower end; a row or a ray is left at the first crossing ahead.
+    start = jnp.where(code == _CODES["upper"], on_curve[lowest], 0.0)
     ahead = jnp.where(candidates > start, candidates, jnp.inf)
-    index = jnp.where(search == _LOWEST, lowest, jnp.argmin(ahead))
-    chosen = jnp.where(search == _LOWEST, on_curve[lowest], ahead[index])
-    return index, jnp.isfinite(chosen)
+    is_lower = code == _CODES["lower"]
+    index = jnp.where(is_lower, lowest, jnp.argmin(ahead))
+    return index, jnp.isfinite(jnp.where(is_lower, on_curve[lowest], ahead[index]))
 
 
 def _polish(line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay: str) -> tuple[Array, Array, Array]:
@@ -160,8 +173,9 @@ def _polish(line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay:
         throw=False,
     )
     omega, distance = solution.value[1], solution.value[0] * scale
-    # Of a wall softer than about 1e-30 the frequency is below what a bracket resolves.
+    # Of a very soft wall the frequency is below what a bracket resolves.
     wall = frequency_boundary(omega, loop, delay)
     missed = jnp.abs(line.offset(wall)) / jnp.hypot(line.dalpha, line.dbeta)
-    hit = missed <= 1e-9 * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
-    return omega, distance, bracketed & hit & (jnp.abs(omega - start) <= 1e-6)
+    near = float(jnp.finfo(start.dtype).eps) ** 0.5
+    hit = missed <= 0.1 * near * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
+    return omega, distance, bracketed & hit & (jnp.abs(omega - start) <= 100.0 * near)

@@ -169,7 +169,7 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
 
 def _by_crossover(points: Points) -> np.ndarray:
     if points.is_dense:
-        return boundary_map(points).stable
+        return boundary_map(points)
     shape, kind = points.shape, kind_of(points.d)
     if points.size <= FEW:
         with np.errstate(all="ignore"):

@@ -1,9 +1,8 @@
 """The stiffest stable wall of each virtual damping, in closed form: where a row of the (alpha, beta) plane ends.
 
-For a held delay d = n + f the stable walls of one (beta, delta, d) were found to be ``0 < alpha < limit``: the limit is
-the first lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1. Seen, not proved: pole
-counts on some 700,000 random walls, on both sides of the limit and far from it, with delta = 0 and 1e-6 to 1e6, n = 0
-to 60, f anywhere, down to 1e-16 beside whole numbers. `VERIFIED_DELAY` and `VERIFIED_DAMPING` state the range.
+For a held delay d = n + f the stable walls of one (beta, delta, d) are ``0 < alpha < limit``: the limit is the first
+lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md, Theorem
+3a).
 
 Notation: ``N(z) = a2 z^2 + a1 z + a0`` of `zwidth.plant`, ``em = 1 - c``, ``sigma = a2 + a0``, ``mu = a2 - a0``,
 ``y = sin(w/2)^2``, ``k = n + 1/2``, and the boundary at ``z = e^(j w)`` in the form
@@ -28,10 +27,6 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.stability.devices import Device, device
 from zwidth.xp import horner, namespace, repeat
-
-# Beyond these the single lobe is not assumed.
-VERIFIED_DELAY = 500.0
-VERIFIED_DAMPING = 1e6
 
 # From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
 # 2 leave a row with some 2e-9 of its frequency, which the step in alpha behind them squares.
@@ -238,6 +233,6 @@ def _newton_step(goal: Array, at: Angles, fields: list[Array] | Array) -> Array:
 
 
 def limit_kernel(beta: Array, delta: Array, d: Array) -> Array:
-    """The limit for any delay, for use inside a transformation; it means something in the verified range only."""
+    """The limit for any delay, for use inside a transformation."""
     here = device(delta, d)
     return namespace(beta, delta, d).where(d < 1, short_row(beta, here), long_row(beta, long_device(here)))
