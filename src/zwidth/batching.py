@@ -175,7 +175,7 @@ def _stack_level() -> int:
     frame, level = sys._getframe(1), 1
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("zwidth", "jax"):
         frame, level = frame.f_back, level + 1
-    return level - 1
+    return level
 
 
 @cache
