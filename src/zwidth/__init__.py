@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from zwidth.design.requirements import required_damping as required_damping
     from zwidth.design.requirements import required_mass as required_mass
     from zwidth.design.requirements import required_period as required_period
+    from zwidth.design.robust import Interval as Interval
     from zwidth.design.robust import RobustStiffness as RobustStiffness
     from zwidth.design.robust import RobustWall as RobustWall
     from zwidth.design.robust import robust_max_stiffness as robust_max_stiffness
@@ -35,9 +36,11 @@ if TYPE_CHECKING:
     from zwidth.design.stiffness import sensitivities as sensitivities
     from zwidth.errors import ConfigError as ConfigError
     from zwidth.errors import InputError as InputError
+    from zwidth.errors import PrecisionWarning as PrecisionWarning
     from zwidth.errors import StoreExistsError as StoreExistsError
     from zwidth.errors import TracedDelayError as TracedDelayError
     from zwidth.errors import ZwidthError as ZwidthError
+    from zwidth.kernel_cache import use_compilation_cache as use_compilation_cache
     from zwidth.loop import char_poly as char_poly
     from zwidth.response import StepResponse as StepResponse
     from zwidth.response import step_response as step_response
@@ -50,14 +53,15 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.counting import count_poles as count_poles
+    from zwidth.stability.labels import is_stable as is_stable
+    from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.margins import Margins as Margins
     from zwidth.stability.margins import margins as margins
-    from zwidth.stability.methods import is_stable as is_stable
-    from zwidth.stability.methods import spectral_radius as spectral_radius
-    from zwidth.stability.methods import stability_of as stability_of
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
+    from zwidth.stability.radii import spectral_radius as spectral_radius
     from zwidth.stability.region import StableRegion as StableRegion
     from zwidth.stability.region import stable_region as stable_region
     from zwidth.stability.ridge import RidgeKind as RidgeKind
@@ -86,6 +90,7 @@ _HOME = {
     "required_damping": "zwidth.design.requirements",
     "required_mass": "zwidth.design.requirements",
     "required_period": "zwidth.design.requirements",
+    "Interval": "zwidth.design.robust",
     "RobustStiffness": "zwidth.design.robust",
     "RobustWall": "zwidth.design.robust",
     "robust_max_stiffness": "zwidth.design.robust",
@@ -95,9 +100,11 @@ _HOME = {
     "sensitivities": "zwidth.design.stiffness",
     "ConfigError": "zwidth.errors",
     "InputError": "zwidth.errors",
+    "PrecisionWarning": "zwidth.errors",
     "StoreExistsError": "zwidth.errors",
     "TracedDelayError": "zwidth.errors",
     "ZwidthError": "zwidth.errors",
+    "use_compilation_cache": "zwidth.kernel_cache",
     "char_poly": "zwidth.loop",
     "StepResponse": "zwidth.response",
     "step_response": "zwidth.response",
@@ -110,11 +117,12 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
+    "count_poles": "zwidth.stability.counting",
+    "is_stable": "zwidth.stability.labels",
+    "spectral_radius": "zwidth.stability.radii",
+    "stability_of": "zwidth.stability.labels",
     "Margins": "zwidth.stability.margins",
     "margins": "zwidth.stability.margins",
-    "is_stable": "zwidth.stability.methods",
-    "spectral_radius": "zwidth.stability.methods",
-    "stability_of": "zwidth.stability.methods",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
@@ -138,7 +146,9 @@ __all__ = [
     "Device",
     "FastestWall",
     "InputError",
+    "Interval",
     "Margins",
+    "PrecisionWarning",
     "Requirement",
     "RidgeKind",
     "RidgePoint",
@@ -161,6 +171,7 @@ __all__ = [
     "boundary",
     "boundary_point",
     "char_poly",
+    "count_poles",
     "denormalize",
     "fastest_damping",
     "fastest_wall",
@@ -189,6 +200,7 @@ __all__ = [
     "stable_region",
     "step_response",
     "stiffness_slope",
+    "use_compilation_cache",
 ]
 
 

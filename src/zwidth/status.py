@@ -26,6 +26,16 @@ class Status(IntEnum):
         return _MESSAGES[self]
 
 
+class Method(IntEnum):
+    """What decided a point, as the code in `zwidth.stability_of` and `zwidth.stability.radii.radius_of`."""
+
+    COMPANION = 0
+    CROSSOVER = 1
+    CERTIFIED = 2
+    BISECTION = 3
+    NEWTON = 4
+
+
 _MESSAGES = {
     Status.OK: "The value is right to the stated accuracy.",
     Status.INVALID_INPUT: (

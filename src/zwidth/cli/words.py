@@ -113,6 +113,8 @@ def _distance_lines(stiffness: float, virtual_damping: float, verdict: Assessmen
 
 
 def _passivity_words(verdict: Assessment) -> str:
+    if verdict.alpha < 0:
+        return "no, and no damping makes a negative stiffness passive"
     if verdict.passive:
         return f"yes, with {with_unit(verdict.passivity_margin, 'N s/m')} of physical damping to spare"
     return f"no, for want of {with_unit(-verdict.passivity_margin, 'N s/m')} of physical damping"

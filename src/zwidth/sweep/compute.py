@@ -21,7 +21,6 @@ from zwidth.stability.passivity import margin_at_one_delay
 from zwidth.stability.poles import companion_chunk, radius_by_companion
 from zwidth.stability.radius_map import certified_columns
 from zwidth.stability.ridge import alpha_max
-from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
 from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, Family
@@ -120,17 +119,12 @@ def _settling_time(radius: np.ndarray, block: Block) -> np.ndarray:
 
 
 def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
-    """Which walls are stable: by the boundary where its shape is known, elsewhere by their poles."""
+    """Which walls are stable: those below the limit of their row."""
     stable = np.empty(shape, dtype=bool)
     limit = _limits(block)
     for plane, alpha, ends in zip(stable, block.alpha, limit, strict=True):
         np.less(alpha[:, None], ends, out=plane)
         plane[~(alpha > 0)] = False
-    known = (block.delta <= VERIFIED_DAMPING) & (block.d <= VERIFIED_DELAY)
-    if not known.all():
-        parts = {name: part[~known] for name, part in block._asdict().items() if np.size(part) and name != "rows"}
-        rest = block._replace(**parts)
-        stable[~known] = _radius(rest, (int((~known).sum()), *shape[1:])) < 1.0
     return stable
 
 

@@ -1,0 +1,199 @@
+"""Stable or not, for whole arrays of walls."""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth._types import Array, ArrayLike, DelayModel
+from zwidth.batching import BLOCK, FEW, elementwise, in_blocks, is_number, to_caller
+from zwidth.domain import check_scalars, wall_status
+from zwidth.errors import InputError, check_choice
+from zwidth.grouping import NAMES
+from zwidth.loop import check_has_poles
+from zwidth.stability.boundary_map import boundary_map
+from zwidth.stability.crossover import stable_at, stable_kernel
+from zwidth.stability.devices import ANY, Device, Kind, device, kind_of
+from zwidth.stability.layout import Points, lay_out
+from zwidth.stability.poles import unstable_poles
+from zwidth.status import Method, Status
+from zwidth.xp import is_traced
+
+StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
+STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
+
+
+class Stability(NamedTuple):
+    """Labels with their status and the `Method` that decided each point, all of the broadcast shape."""
+
+    stable: Array
+    status: Array
+    method: Array
+
+
+def is_stable(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: StabilityMethod = "auto",
+    delay: DelayModel = "held",
+) -> Array:
+    """Tell which walls are stable: every pole strictly inside the unit circle.
+
+    ``P(z) = 0`` only for ``|z| < 1``, see `zwidth.char_poly`.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast; axes along which an argument
+            does not vary cost nothing: for a map pass alpha of shape (1, N) and beta of shape (M, 1).
+        method: "crossover" asks for the phase where the loop gain is one, in closed form; "companion" computes all
+            poles; "certified" never guesses (`zwidth.stability_of` names the points it leaves open). "auto" is
+            "crossover", which on a map of one device compares alpha with the end of its row, the same closed form.
+        delay: only "held" has poles.
+
+    Returns:
+        Boolean array of the broadcast shape, maybe read-only. False for a point out of range.
+
+    Raises:
+        InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is
+            unknown.
+        TracedDelayError: d is traced with method "companion".
+
+    Numerics:
+        At a cost that does not depend on d. Float64 when called directly, the ambient precision inside `jit`. The label
+        of the closed form is right where alpha is more than some rounding errors away from the boundary; there is no
+        faster, rougher method. What a point costs: benchmarks/results/bench.md.
+
+    References:
+        docs/theory/one-crossover.md; Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> zwidth.is_stable(np.array([0.1, 0.6, 0.8]), 0.4, 0.1, 0)
+        array([ True,  True, False])
+    """
+    values = (alpha, beta, delta, d)
+    _check(method, delay, values)
+    if is_traced(*values):
+        return _traced(values, method)
+    if method in ("auto", "crossover") and all(map(is_number, values)):
+        return elementwise(stable_kernel, NAMES, values, (kind_of(d),))
+    laid = lay_out(values)
+    return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
+
+
+def stability_of(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: StabilityMethod = "auto",
+    delay: DelayModel = "held",
+) -> Stability:
+    """Tell which walls are stable, and for each point how that was decided.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0. All four broadcast.
+        method: as for `zwidth.is_stable`.
+        delay: only "held" has poles.
+
+    Returns:
+        Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
+        is not computed, and with method "certified" UNDECIDED or ON_BOUNDARY where no label is given (``stable`` is
+        False there); ``method``, the `Method` that decided. Arrays may be read-only.
+
+    Raises:
+        InputError: an argument is no real number or traced, a scalar is out of range, shapes do not broadcast, or a
+            name is unknown.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.stability_of([0.1, float("nan")], 0.4, 0.1, 1).status
+        array([0, 1], dtype=int32)
+    """
+    values = (alpha, beta, delta, d)
+    _check(method, delay, values)
+    if is_traced(*values):
+        raise InputError("stability_of: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+    laid = lay_out(values)
+    stable, used, status = _decide(laid.points, method)
+    ranged = wall_status(*laid.points)
+    status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
+    codes = (np.broadcast_to(status, laid.points.shape).astype(np.int32), np.asarray(used, np.int32))
+    return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
+
+
+def _check(method: str, delay: str, values: tuple[ArrayLike, ...]) -> None:
+    check_has_poles(delay)
+    check_choice("method", method, STABILITY_METHODS)
+    check_scalars(**dict(zip(NAMES, values, strict=True)))
+
+
+def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
+    if method == "certified":
+        raise InputError(
+            "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
+            "'auto', 'crossover' or 'companion'"
+        )
+    if method == "companion":
+        return unstable_poles(*values) == 0
+    d = values[3]
+    return elementwise(stable_kernel, NAMES, values, (ANY if is_traced(d) else kind_of(d),))
+
+
+def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
+    """Labels, what decided them, and statuses where they are not all OK."""
+    if method == "companion":
+        return np.asarray(unstable_poles(*points)) == 0, Method.COMPANION, None
+    if method == "certified":
+        # Loaded here: it needs an extra for its last resort.
+        from zwidth.stability.certified import certified_stable
+
+        proved = certified_stable(*points)
+        return proved.stable, Method.CERTIFIED, proved.status
+    return _by_crossover(points), Method.CROSSOVER, None
+
+
+def _by_crossover(points: Points) -> np.ndarray:
+    if points.is_dense:
+        return boundary_map(points)
+    shape, kind = points.shape, kind_of(points.d)
+    if points.size <= FEW:
+        with np.errstate(all="ignore"):
+            return np.broadcast_to(stable_kernel(*points, kind), shape)
+    if points.delta.size == points.d.size == 1:
+        # One device for all walls: discretized once.
+        here = np.stack(device(points.delta.reshape(1), points.d.reshape(1), kind))
+        columns = [np.broadcast_to(column, shape).reshape(-1) for column in (points.alpha, points.beta)]
+        stable = in_blocks(partial(_one_device(kind), here), columns, BLOCK)
+    else:
+        columns = [np.broadcast_to(column, shape).reshape(-1) for column in points]
+        stable = in_blocks(_scattered(kind), columns, BLOCK)
+    return stable.reshape(shape)
+
+
+@cache
+def _one_device(kind: Kind) -> Any:
+    import jax
+
+    return jax.jit(lambda here, alpha, beta: stable_at(alpha, beta, Device(*here), kind))
+
+
+@cache
+def _scattered(kind: Kind) -> Any:
+    import jax
+
+    return jax.jit(lambda alpha, beta, delta, d: stable_kernel(alpha, beta, delta, d, kind))
