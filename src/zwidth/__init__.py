@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
     from zwidth.stability.counting import count_poles as count_poles
+    from zwidth.stability.decay import decay_rate as decay_rate
     from zwidth.stability.labels import is_stable as is_stable
     from zwidth.stability.labels import stability_of as stability_of
     from zwidth.stability.margins import Margins as Margins
@@ -120,6 +121,7 @@ _HOME = {
     "count_poles": "zwidth.stability.counting",
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
+    "decay_rate": "zwidth.stability.decay",
     "stability_of": "zwidth.stability.labels",
     "Margins": "zwidth.stability.margins",
     "margins": "zwidth.stability.margins",
@@ -172,6 +174,7 @@ __all__ = [
     "boundary_point",
     "char_poly",
     "count_poles",
+    "decay_rate",
     "denormalize",
     "fastest_damping",
     "fastest_wall",

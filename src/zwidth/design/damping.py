@@ -94,7 +94,7 @@ def _fastest_kernel(
 
 def _radius_over(alpha: Array, delta: Array, d: Array, degree: Degree) -> Cost:
     """The spectral radius as a function of the virtual damping."""
-    return lambda betas: (jax.vmap(lambda beta: radius_kernel(alpha, beta, delta, d, degree))(betas), ())
+    return lambda betas: (radius_kernel(*jnp.broadcast_arrays(alpha, betas, delta, d), degree), ())
 
 
 def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> DampingChoice:
@@ -118,7 +118,7 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
 
     Numerics:
         As `fastest_damping`; the margin is right to about 1e-12. Called directly or traced, the answer is returned
-        only where the Schur-Cohn recursion finds it stable.
+        only where `zwidth.is_stable` finds it stable.
 
     References:
         Landau 1990 (modulus margin).

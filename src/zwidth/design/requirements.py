@@ -88,7 +88,7 @@ def _solved(
 ) -> Requirement:
     """Solve for x and give ``x unit`` with its status. ``free``: a function that is never 0 requires nothing at all."""
     xp = namespace(unit, *inputs)
-    lifted = _Path(*(value[None] for value in path[:3]), *path[3:])
+    lifted = path._replace(strength=path.strength[None], lag=path.lag[None], scale=path.scale[None])
     inner, outer, offset = (xp.broadcast_to(value, unit.shape)[None] for value in bracket)
     x, found = (leaf[0] for leaf in outermost_zero(lifted.value, lifted.value_and_slope, inner, outer, offset))
     # Cut off by the domain, the bracket does not end where the function is negative.

@@ -14,6 +14,7 @@ from zwidth.loop import BoundaryCurve, check_delay_model, frequency_boundary, fr
 from zwidth.stability.crossover import stable_at
 from zwidth.stability.curve import (
     Lobe,
+    RowEnd,
     bisect_place,
     column_end,
     creeps,
@@ -26,7 +27,7 @@ from zwidth.stability.curve import (
     wall,
 )
 from zwidth.stability.devices import ANY, Device, Kind, kind_of
-from zwidth.stability.row_limit import long_row_point, short_row
+from zwidth.stability.row_limit import short_row
 from zwidth.status import Status
 from zwidth.xp import epsilon, frozen, namespace, repeat
 
@@ -34,7 +35,7 @@ PointMethod: TypeAlias = Literal["auto", "optimistix"]
 _METHODS: tuple[str, ...] = ("auto", "optimistix")
 
 # Places of the lobe at which a ray is looked for, and Newton's steps from between two of them.
-_PLACES, _RAY_STEPS = 24, 6
+_PLACES, _RAY_STEPS = 24, 12
 # One Newton step through which derivatives pass makes the first ones exact, a second one the second ones.
 _EXACT_STEPS = 2
 # Closer to pi the frequency of a fractional power of less than one has too few digits.
@@ -205,25 +206,27 @@ def _row_kernel(delta: Array, d: Array, beta: Array, line: str, delay: str, kind
     curve = lobe(here, d, delay, kind)
     creeping = creeps(delay, kind)
     fixed = frozen(curve, xp)
-    x, meets, beyond = frozen(row_end(beta, fixed, creeping), xp)
+    row = frozen(row_end(beta, fixed, creeping), xp)
+    x, meets, beyond, _ = row
     smooth, at = _follow(x, curve, lambda wall: (wall.b - (beta + delta), wall.d_b), xp)
     # What `zwidth.is_stable` compares with, to the last place.
-    limit = _limit(beta, here, fixed, at.alpha, delay)
+    limit = _limit(beta, row, here, fixed, delay)
     alpha = xp.where(beyond, _on_line(curve, xp) - 2.0 * beta, _with_slope(limit, at.alpha, xp))
     omega = xp.where(beyond, np.pi, frequency(smooth, curve))
     exists = (meets | beyond) & (limit > 0)
     return _answer(alpha, beta, omega, given, exists, _too_close(x, creeping, curve), (delta, d, beta))
 
 
-def _limit(beta: Array, here: Device, curve: Lobe, alpha: Array, delay: str) -> Array:
+def _limit(beta: Array, row: RowEnd, here: Device, curve: Lobe, delay: str) -> Array:
+    """The stiffest stable alpha of a row."""
     if delay != "held":
-        return alpha
+        xp = namespace(beta)
+        return xp.where(row.beyond, _on_line(curve, xp) - 2.0 * beta, wall(row.x, curve).alpha)
     if curve.long is None:
         return short_row(beta, here)
-    long = long_row_point(beta, curve.long)[0]
     if curve.short is None:
-        return long
-    return namespace(beta).where(curve.is_short, short_row(beta, here), long)
+        return row.alpha
+    return namespace(beta).where(curve.is_short, short_row(beta, here), row.alpha)
 
 
 def _column_kernel(delta: Array, d: Array, alpha: Array, line: str, delay: str, kind: Kind) -> BoundaryPoint:
@@ -301,13 +304,11 @@ def _ray_kernel(
     creeping = creeps(delay, kind)
     ray = _Ray(alpha0, beta0 + delta, dalpha, dbeta)
     fixed, still = frozen((curve, ray), xp)
-    place, meets, beyond = frozen(row_end(beta0, fixed, creeping), xp)
-    limit = _limit(beta0, here, fixed, wall(place, fixed).alpha, delay)
-    if delay == "held":
-        starts = stable_at(alpha0, beta0, here, kind)
-    else:
-        starts = (alpha0 > 0) & (meets | beyond) & (alpha0 < xp.where(beyond, _on_line(fixed, xp) - 2.0 * beta0, limit))
-    x, on_lobe, single = frozen(_first_crossing(still, place, fixed, creeping), xp)
+    row = frozen(row_end(beta0, fixed, creeping), xp)
+    # For a held delay the verdict of `zwidth.is_stable` itself.
+    inside = (alpha0 > 0) & (row.meets | row.beyond) & (alpha0 < _limit(beta0, row, here, fixed, delay))
+    starts = stable_at(alpha0, beta0, here, kind) if delay == "held" else inside
+    x, on_lobe, single = frozen(_first_crossing(still, row, fixed, creeping), xp)
     smooth, at = _follow(x, curve, lambda wall: (ray.offset(wall), ray.offset_slope(wall)), xp)
     # Off the lobe: along the line of z = -1 or along alpha = 0, whichever comes first.
     rate = dalpha + 2.0 * dbeta
@@ -352,14 +353,15 @@ class _Ray(NamedTuple):
         return self.dalpha * wall.d_b - self.dbeta * wall.d_alpha
 
 
-def _first_crossing(ray: _Ray, place: Array, curve: Lobe, creeping: bool) -> tuple[Array, Array, Array]:
+def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tuple[Array, Array, Array]:
     """Where a ray from a stable wall leaves through the lobe, whether it does, and whether it was seen to do so once.
 
-    The row of the wall meets the lobe at ``place``. A ray upwards can only leave behind that, one downwards before it.
+    Of the row on which the wall lies, ``row`` is the end: a ray upwards can only leave behind that, one downwards
+    before it.
     """
     xp = namespace(curve.delta, ray.alpha)
     upwards = ray.dbeta >= 0
-    low, high = xp.where(upwards, place, 0.0), xp.where(upwards, curve.end, place)
+    low, high = xp.where(upwards, row.x, 0.0), xp.where(upwards, curve.end, row.x)
     # Places even in the square of omega, in which the start of the lobe is straight.
     square = _squared(curve, xp)
     first, last = xp.where(square, low * low, low), xp.where(square, high * high, high)
@@ -374,7 +376,7 @@ def _first_crossing(ray: _Ray, place: Array, curve: Lobe, creeping: bool) -> tup
     # Where the lobe returns, alpha is 0 to the last digit.
     returned = ray.dalpha * (wall(curve.end, curve).b - ray.b) + ray.dbeta * ray.alpha
     ends = xp.where(upwards & ~curve.to_corner, returned, ends)
-    leaves = xp.where(upwards, ends >= 0, (begins < 0) & (ends > 0))
+    leaves = xp.where(upwards, (ends >= 0) & ~row.beyond, (begins < 0) & (ends > 0))
     passed = offsets >= 0
     inner = passed[..., 1:-1]
     single = xp.all(inner[..., 1:] >= inner[..., :-1], axis=-1)

@@ -31,7 +31,7 @@ _CUBIC_STEPS, _COLUMN_STEPS = 4, 3
 # Halvings of a logarithm that spans 32 decades: what is left is rounding.
 _HALVINGS = 60
 _SMALLEST = 1e-32
-_END = LONG_FIELDS.index("end")
+_END, _TOP = LONG_FIELDS.index("end"), LONG_FIELDS.index("top")
 
 
 class Short(NamedTuple):
@@ -204,14 +204,19 @@ def _crept(lobe: Lobe) -> Array:
     return (lobe.long[1] > 0.5) & (lobe.long[1] < 1.5)
 
 
-def row_end(beta: Array, lobe: Lobe, creeping: bool = False) -> tuple[Array, Array, Array]:
-    """The place where a row meets the lobe, whether it does, and whether it passes beyond the corner.
+class RowEnd(NamedTuple):
+    """Where a row ends: on the lobe, or beyond the corner on the line of z = -1, or nowhere."""
 
-    Where it does not, the nearer end of the lobe stands for it.
-    """
+    x: Array  # where it does not meet the lobe, the nearer end of it
+    meets: Array
+    beyond: Array
+    alpha: Array  # for n >= 1 what `zwidth.stability.row_limit.long_row` gives
+
+
+def row_end(beta: Array, lobe: Lobe, creeping: bool = False) -> RowEnd:
+    """The end of a row: the one zero of ``b - beta - delta``, a quadratic in y for n = 0."""
     xp = namespace(beta, lobe.delta)
     b = beta + lobe.delta
-    none = b != b
     if lobe.short is not None:
         u0, u1, *_, v1, v2 = lobe.short
         linear = u0 - b * v1
@@ -221,20 +226,17 @@ def row_end(beta: Array, lobe: Lobe, creeping: bool = False) -> tuple[Array, Arr
         y = xp.where(meets, y, xp.where(b > 0, lobe.end, 0.0))
         beyond = (b > 0) & ~meets & lobe.to_corner
         if lobe.long is None:
-            return y, meets, beyond
-    top = wall(lobe.end, lobe).b
-    on_lobe = (b > 0) & (b < top)
-    x = xp.where(on_lobe, long_row_point(beta, lobe.long)[1], xp.where(b > 0, lobe.end, 0.0))
+            return RowEnd(y, meets, beyond, b)
+    alpha, omega = long_row_point(beta, lobe.long)
+    on_lobe = (b > 0) & (b < (wall(lobe.end, lobe).b if creeping else lobe.long[_TOP]))
     if creeping:
         crept = bisect_place(lambda x: wall(x, lobe).b < b, _SMALLEST * lobe.end, lobe.end, xp)
-        x = xp.where(_crept(lobe) & on_lobe, crept, x)
+        omega = xp.where(_crept(lobe), crept, omega)
+    x = xp.where(on_lobe, omega, xp.where(b > 0, lobe.end, 0.0))
     if lobe.short is None:
-        return x, on_lobe, none
-    return (
-        xp.where(lobe.is_short, y, x),
-        xp.where(lobe.is_short, meets, on_lobe),
-        lobe.is_short & beyond,
-    )
+        return RowEnd(x, on_lobe, b != b, alpha)
+    is_short = lobe.is_short
+    return RowEnd(xp.where(is_short, y, x), xp.where(is_short, meets, on_lobe), is_short & beyond, alpha)
 
 
 def peak(lobe: Lobe, creeping: bool = False) -> Peak:

@@ -177,8 +177,8 @@ class Start(NamedTuple):
 # rounded coefficients of the curve, its next neighbors would fall on either side.
 _TAKE_OVER = 3.6593616274217835
 
-# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one period,
-# 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
+# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one
+# period, 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
 _SHORT = (
     (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
     (-0.1878, 3.83, -4.872, 1.835),
@@ -194,7 +194,7 @@ _FRACTIONAL_STEPS = 12
 
 
 def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
-    return horner(t, [horner(u, list(row)) if len(row) > 1 else row[0] for row in rows])
+    return horner(t, [horner(u, list(row)) for row in rows])
 
 
 def start_of(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
@@ -227,13 +227,15 @@ def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tupl
     """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
     xp = namespace(curve.b, lag)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
-    s = before = xp.minimum(xp.maximum(start.s, lower), upper)
-    # Unrolled: XLA then makes one loop over the points of each step.
-    for _ in range(_HELD_STEPS):
-        before = s
+    s = xp.minimum(xp.maximum(start.s, lower), upper)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        s, _ = state
         first, second = stationarity(s, curve, lag, undelayed)
-        s = s - first * s / (second * s + start.power * first)
-        s = stored(xp.minimum(xp.maximum(s, lower), upper), start.scale)
+        new = s - first * s / (second * s + start.power * first)
+        return xp.minimum(xp.maximum(new, lower), upper), s
+
+    s, before = repeat(_HELD_STEPS, step, (s, s), xp)
     return s, s - before
 
 

@@ -37,7 +37,7 @@ def _chi(x: Array, gap: Array) -> Array:
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
-    """The derivatives of `zwidth.plant.held_plant` in delta and in the fraction; those of any fraction at whole delays."""
+    """The derivatives of `zwidth.plant.held_plant` in delta and in the fraction."""
     f, t = fraction, 1.0 - fraction
     c, e_t = phi.decay(delta), phi.decay(delta * t)
     at_t, at_f = phi.phi_functions(delta * t), phi.phi_functions(delta * f)
@@ -103,8 +103,8 @@ def _jax_plant() -> Any:
 
     @function.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
-        slopes = plant_slopes(*primals)
-        change = (sum(slope * side for slope, side in zip(field, tangents, strict=True)) for field in zip(*slopes))
+        (by_delta, by_f), (d_delta, d_f) = plant_slopes(*primals), tangents
+        change = (a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True))
         return function(*primals), Plant(*change)
 
     return function
@@ -134,7 +134,7 @@ def _jax_ridge() -> Any:
         _, first = jax.jvp(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along)
         _, second = stationarity(ridge.s, curve, lag, undelayed)
         s = jnp.where(corner, 0.0, -first / jnp.where(corner, 1.0, second))
-        _, (_, beta) = jax.jvp(lambda *point: wall(*point, undelayed), (ridge.s, curve, lag), (s, *along))
+        _, (_, beta) = jax.jvp(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along))
         root = jnp.sqrt(jnp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
         moved = Ridge(alpha, beta, 2.0 * s / root, s, jnp.zeros_like(s))
         return ridge, moved

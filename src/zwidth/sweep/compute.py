@@ -19,7 +19,7 @@ from zwidth.grouping import degree_of, groups
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.passivity import margin_at_one_delay
 from zwidth.stability.poles import companion_chunk, radius_by_companion
-from zwidth.stability.radius_map import certified_columns
+from zwidth.stability.proved import certified_columns
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
