@@ -77,7 +77,7 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
         return needed_damping(alpha, xp.sin(theta), safe_d[..., None] + 0.0 * theta)
 
     edges = (-end, first, last, end)
-    parts = [_integral(needed, *edges[i : i + 2], nodes) for i, nodes in enumerate(_NODES)]
+    parts = [_integral(needed, edges[i], edges[i + 1], nodes) for i, nodes in enumerate(_NODES)]
     return 0.5 * delta * delta * unit * (parts[0] + parts[1] + parts[2]) + poison(ok, delta, d)
 
 

@@ -2,7 +2,7 @@
 
 ``|L|`` falls strictly with the frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. So
 once a distance r has been seen, no lower one lies where ``|L| > 1 + r`` or ``|L| < 1 - r``. Within a turn of the phase
-to either side of the gain crossover L is real and negative, at a distance of ``||L| - 1|``: what lies beyond is farther.
+to either side of the gain crossover L is real and negative, at a distance of ``||L| - 1|``: what is beyond is farther.
 The turns that remain are two, however long the delay.
 """
 
