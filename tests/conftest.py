@@ -38,6 +38,11 @@ settings.register_profile(
 settings.load_profile("zwidth")
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Most tests inside transformations keep JAX's default precision on purpose."""
+    config.addinivalue_line("filterwarnings", "ignore::zwidth.errors.PrecisionWarning")
+
+
 @pytest.fixture
 def x64():
     """Enable float64 in JAX for one test, as a user who traces the library's functions would."""

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from zwidth.design.stiffness import sensitivities as sensitivities
     from zwidth.errors import ConfigError as ConfigError
     from zwidth.errors import InputError as InputError
+    from zwidth.errors import PrecisionWarning as PrecisionWarning
     from zwidth.errors import StoreExistsError as StoreExistsError
     from zwidth.errors import TracedDelayError as TracedDelayError
     from zwidth.errors import ZwidthError as ZwidthError
@@ -53,8 +54,11 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
     from zwidth.stability.counting import count_poles as count_poles
+    from zwidth.stability.decay import decay_rate as decay_rate
     from zwidth.stability.labels import is_stable as is_stable
     from zwidth.stability.labels import stability_of as stability_of
+    from zwidth.stability.margins import Margins as Margins
+    from zwidth.stability.margins import margins as margins
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
@@ -97,6 +101,7 @@ _HOME = {
     "sensitivities": "zwidth.design.stiffness",
     "ConfigError": "zwidth.errors",
     "InputError": "zwidth.errors",
+    "PrecisionWarning": "zwidth.errors",
     "StoreExistsError": "zwidth.errors",
     "TracedDelayError": "zwidth.errors",
     "ZwidthError": "zwidth.errors",
@@ -116,7 +121,10 @@ _HOME = {
     "count_poles": "zwidth.stability.counting",
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
+    "decay_rate": "zwidth.stability.decay",
     "stability_of": "zwidth.stability.labels",
+    "Margins": "zwidth.stability.margins",
+    "margins": "zwidth.stability.margins",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
@@ -141,6 +149,8 @@ __all__ = [
     "FastestWall",
     "InputError",
     "Interval",
+    "Margins",
+    "PrecisionWarning",
     "Requirement",
     "RidgeKind",
     "RidgePoint",
@@ -164,12 +174,14 @@ __all__ = [
     "boundary_point",
     "char_poly",
     "count_poles",
+    "decay_rate",
     "denormalize",
     "fastest_damping",
     "fastest_wall",
     "is_passive",
     "is_stable",
     "load_config",
+    "margins",
     "max_stiffness",
     "modulus_margin",
     "most_robust_damping",

@@ -53,12 +53,14 @@ def by_degree(
     fused: bool = True,
     least: int = 1,
     threads: int | None = None,
+    few: Callable[[Degree], int] | None = None,
 ) -> Any:
     """Apply ``kernel(alpha, beta, delta, d, degree, *static)`` to points whose delays may differ.
 
     Other arguments may take the place of these if ``names`` says so; the last one is the delay. Results that are
     vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN
-    behind (for poles). ``fused``, ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
+    behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any shape, and takes up to
+    so many points of a degree without JAX. ``fused``, ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
     """
     if batching.is_traced(*values):
         return _by_degree_traced(kernel, names, values, static, lead)
@@ -67,10 +69,14 @@ def by_degree(
     parts, places = [], []
     for degree, index in groups(columns[-1]):
         picked = [column[index] for column in columns]
-        parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), fused, least, threads))
+        if few is not None and index.size <= few(degree):
+            with np.errstate(all="ignore"):
+                parts.append(kernel(*picked, degree, *static))
+        else:
+            parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), fused, least, threads))
         places.append(index)
     if not parts:
-        parts, places = [batching.map_flat(kernel, columns, (Degree(0, False), *static))], [np.arange(0)]
+        parts, places = [_of_nothing(kernel, columns, static, few)], [np.arange(0)]
     order = np.argsort(np.concatenate(places), kind="stable")
     shape = arrays[0].shape
 
@@ -79,6 +85,18 @@ def by_degree(
         return joined.reshape(shape + joined.shape[1:])
 
     return batching.to_caller(batching.tree_map(gather, *parts), values)
+
+
+def _of_nothing(kernel: Callable[..., Any], columns: list[np.ndarray], static: tuple, few: Any) -> Any:
+    """Results of no point, of the shapes that the shortest delay gives."""
+    if few is not None:
+        return kernel(*columns, Degree(0, False), *static)
+    return batching.map_flat(kernel, columns, (Degree(0, False), *static))
+
+
+def few_poles(degree: Degree) -> int:
+    """Up to how many points of a degree NumPy has done before a compiler has begun."""
+    return max(1, batching.FEW * 64 // max(64, degree.poles**2))
 
 
 def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:

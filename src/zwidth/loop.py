@@ -19,7 +19,7 @@ from zwidth._types import DELAY_MODELS, Array, ArrayLike
 from zwidth.batching import concrete_delay, pointwise
 from zwidth.domain import device_status, wall_status
 from zwidth.errors import InputError, check_choice
-from zwidth.grouping import Degree, by_degree, degree_of
+from zwidth.grouping import Degree, by_degree, degree_of, few_poles
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 from zwidth.scene import normalize
 from zwidth.status import Status
@@ -264,17 +264,15 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
         [ 1.   -1.5   1.25 -0.25]
     """
     check_has_poles(delay)
-    return by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
+    return by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
 
 
 def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
     ok = valid_wall(alpha, beta, delta, d)
-    # NaN that depends on the inputs: derivatives at a bad point are NaN too.
-    spread = alpha + beta + delta + d
-    xp = namespace(spread)
-    poison = xp.where(ok, 0.0, xp.nan) * spread * (1.0 + spread)
+    spoiled = poison(ok, alpha, beta, delta, d)[..., None]
+    xp = namespace(alpha, beta, delta, d)
     alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    return coefficients(alpha, beta, delta, d, degree) + poison
+    return coefficients(alpha, beta, delta, xp.where(ok, d, float(degree.whole)), degree) + spoiled
 
 
 def char_poly_si(

@@ -12,7 +12,7 @@ from zwidth._types import Array, ArrayLike
 from zwidth.batching import is_traced, pointwise, to_caller
 from zwidth.design.column import column, lobe
 from zwidth.design.lowest import Cost, lowest, without_slope
-from zwidth.design.margin import frequency_count, margin_kernel
+from zwidth.design.margin import margin_kernel
 from zwidth.grouping import Degree, by_degree
 from zwidth.stability.labels import is_stable
 from zwidth.stability.poles import companion_chunk, radius_kernel
@@ -94,7 +94,7 @@ def _fastest_kernel(
 
 def _radius_over(alpha: Array, delta: Array, d: Array, degree: Degree) -> Cost:
     """The spectral radius as a function of the virtual damping."""
-    return lambda betas: (jax.vmap(lambda beta: radius_kernel(alpha, beta, delta, d, degree))(betas), ())
+    return lambda betas: (radius_kernel(*jnp.broadcast_arrays(alpha, betas, delta, d), degree), ())
 
 
 def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> DampingChoice:
@@ -118,7 +118,7 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
 
     Numerics:
         As `fastest_damping`; the margin is right to about 1e-12. Called directly or traced, the answer is returned
-        only where the Schur-Cohn recursion finds it stable.
+        only where `zwidth.is_stable` finds it stable.
 
     References:
         Landau 1990 (modulus margin).
@@ -130,20 +130,16 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
         np.True_
     """
     inputs = (alpha, delta, d)
-    samples = frequency_count(d)
     lower, upper, status = _columns(*inputs)
     names = ("alpha", "lower", "upper", "delta", "d")
-    chunk = max(1, (1 << 19) // samples)
-    found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (samples,), chunk, least=_LEAST)
+    found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (), _CHUNK, least=_LEAST)
     # The margin says nothing of the side of the boundary.
     return _answer(found, is_stable(alpha, found[0], delta, d), status, inputs)
 
 
-def _robust_kernel(
-    alpha: Array, lower: Array, upper: Array, delta: Array, d: Array, samples: int
-) -> tuple[Array, Array]:
+def _robust_kernel(alpha: Array, lower: Array, upper: Array, delta: Array, d: Array) -> tuple[Array, Array]:
     def cost(betas: Array) -> tuple[Array, tuple[()]]:
-        return -jax.vmap(lambda beta: margin_kernel(alpha, beta, delta, d, samples))(betas), ()
+        return -margin_kernel(*jnp.broadcast_arrays(alpha, betas, delta, d)), ()
 
     beta, achieved, _ = lowest(cost, lower, upper, **_COLUMN)
     return beta, -achieved

@@ -166,7 +166,7 @@ def _phi_forms(x: Form) -> tuple[Form, Form, Form]:
 
 
 def plant(delta: Form, f: Form) -> Plant:
-    """The devices of boxes, as `zwidth.stability.enclosed_plant.wide_plant`."""
+    """The devices of boxes, as `zwidth.stability.enclosed_plant.plant`."""
     t = 1.0 - f
     x_t, x_f = delta * t, delta * f
     (e_t, phi2_t, psi_t), (_, phi2_f, psi_f), (c, phi2, psi) = _phi_forms(x_t), _phi_forms(x_f), _phi_forms(delta)

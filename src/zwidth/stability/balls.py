@@ -68,7 +68,7 @@ def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> 
             inside = bool(found.stable)
             return Decision(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
         last = bits == max_bits
-        if delta == 0 and (last or bits == _DOUBTFUL_BITS) and _crosses_exactly(alpha, beta, d, bits):
+        if delta == 0 and (last or bits == _DOUBTFUL_BITS) and _crosses_exactly(*_exact(alpha, beta, d), bits):
             return Decision(False, Status.ON_BOUNDARY, bits)
         if last:
             return Decision(False, Status.UNDECIDED, bits)
@@ -90,8 +90,11 @@ def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Ver
 @lru_cache(maxsize=64)
 def _device(delta: float, d: float, bits: int) -> Short | Long:
     """The device in balls; whole maps share it."""
-    here = plant(delta, d - int(d), bits)
-    return short_device(here) if d < 1 else long_device(here)
+    import flint
+
+    with flint.ctx.workprec(bits):
+        here = plant(delta, d - int(d), bits)
+        return short_device(here) if d < 1 else long_device(here)
 
 
 def plant(delta: float, f: float, bits: int) -> Plant:
@@ -102,7 +105,7 @@ def plant(delta: float, f: float, bits: int) -> Plant:
         ball = flint.arb(delta)
         c, p1, phi2, psi = _phi(ball, frexp(delta)[1], bits)
         if f == 0:
-            return Plant(ball, c, ball * p1, p1, phi2, psi, *[None] * 4)
+            return Plant(ball, c, ball * p1, p1, phi2, psi)
         f_ball = flint.arb(f)
         with flint.ctx.workprec(_EXACT_BITS):
             t = 1 - f_ball
@@ -127,7 +130,7 @@ def _phi(x: flint.arb, exponent: int, bits: int) -> tuple[flint.arb, flint.arb, 
         return c, p1, (1 - p1) / x, (p1 - c) / x
 
 
-def _enclose_zero(cubic: tuple[Any, Any, Any, Any]) -> tuple[flint.arb, bool]:
+def _enclose_zero(cubic: tuple[Any, ...]) -> tuple[flint.arb, bool]:
     """`zwidth.stability.enclosed_verdict.enclose_zero`: Newton's method on the midpoints, then the signs beside it."""
     import flint
 
@@ -135,7 +138,7 @@ def _enclose_zero(cubic: tuple[Any, Any, Any, Any]) -> tuple[flint.arb, bool]:
     mids = [h.mid() for h in balls]
     rough = [np.float64(h) for h in mids]
     with np.errstate(all="ignore"):
-        guess = first_zero(*rough, *[np.float64(0.0)] * (4 - len(rough)), len(rough) == 4, np)
+        guess = first_zero(rough[0], rough[1], rough[2], rough[3] if len(rough) == 4 else 0.0, len(rough) == 4, np)
     u = flint.arb(float(guess) if 0 < guess < 2 else 1.0)
     smallest = flint.arb(2) ** (8 - flint.ctx.prec)
     slopes = [k * h for k, h in enumerate(mids)][1:]
@@ -162,7 +165,15 @@ def _take_lag(u: flint.arb, _: Any, whole: int) -> Lag:
     return Lag(cosine, sine, lag < turn, w * (whole + 1) > turn)
 
 
-def _crosses_exactly(alpha: float, beta: float, d: float, bits: int) -> bool:
+def _exact(alpha: float, beta: float, d: float) -> tuple[Any, Any, int, Any]:
+    """alpha, beta, n and f as rational numbers."""
+    import flint
+
+    stiffness, damping, f = (flint.fmpq(*value.as_integer_ratio()) for value in (alpha, beta, d - int(d)))
+    return stiffness, damping, int(d), f
+
+
+def _crosses_exactly(alpha: Any, beta: Any, whole: int, f: Any, bits: int) -> bool:
     """Whether the poles at delta = 0 include the crossover itself, ``z = e^(j w)``: then they are on the unit circle.
 
     Called where all that precedes the phase is certain, so that the wall borders the stable ones: no pole is outside.
@@ -171,15 +182,14 @@ def _crosses_exactly(alpha: float, beta: float, d: float, bits: int) -> bool:
     """
     import flint
 
-    exact = [flint.fmpq(*value.as_integer_ratio()) for value in (alpha, beta, d - int(d))]
-    cubic, wall, lead = _rational(*exact)
+    cubic, wall, lead = _rational(alpha, beta, f)
     z = flint.fmpq_poly([0, 1])
-    coefficients = cubic if alpha else cubic[1:]
+    coefficients = cubic if alpha != 0 else cubic[1:]
     # u = -(z - 1)^2/(2 z)
     degree = len(coefficients) - 1
     g = sum((h * (-(z - 1) * (z - 1)) ** k * (2 * z) ** (degree - k) for k, h in enumerate(coefficients)), 0 * z)
-    power = int(d) + lead
-    if not _meet_modulo(g.numer(), (z - 1) * (z - 1), wall, power) or int(d) > _LONGEST_EXACT:
+    power = whole + lead
+    if not _meet_modulo(g.numer(), (z - 1) * (z - 1), wall, power) or whole > _LONGEST_EXACT:
         return False
     common = g.gcd((_power_modulo(z, power, g) * (z - 1) * (z - 1) + wall) % g)
     if common.degree() == 0:
@@ -202,10 +212,10 @@ def _rational(alpha: Any, beta: Any, f: Any) -> tuple[list[Any], Any, int]:
     a2, a1, a0 = t * t * half, (1 + 2 * t * f) * half, f * f * half
     zero, one = flint.fmpq(0), flint.fmpq(1)
     if f == 0:
-        here = Plant(zero, one, zero, one, half, half, *[None] * 4)
+        here = Plant(zero, one, zero, one, half, half)
         numerator, lead = [half, half], 1
     else:
-        here = Plant(zero, one, zero, one, a2, a1, a0, *[None] * 3)
+        here = Plant(zero, one, zero, one, a2, a1, a0)
         numerator, lead = [a0, a1, a2], 2
     cubic = [h for h in gain_cubic(alpha, beta, long_device(here)) if h is not None]
     return cubic, flint.fmpq_poly(numerator) * flint.fmpq_poly([-beta, alpha + beta]), lead
@@ -256,6 +266,7 @@ def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np
     """`decide` point by point: stable, status, bits."""
     count = columns[0].size
     stable, status, bits = np.zeros(count, bool), np.zeros(count, np.int32), np.zeros(count, np.int32)
-    for index, point in enumerate(zip(*(column.tolist() for column in columns), strict=True)):
-        stable[index], status[index], bits[index] = decide(*point, max_bits)
+    alpha, beta, delta, d = (column.tolist() for column in columns)
+    for index in range(count):
+        stable[index], status[index], bits[index] = decide(alpha[index], beta[index], delta[index], d[index], max_bits)
     return stable, status, bits

@@ -10,7 +10,8 @@ from zwidth._types import ArrayLike
 from zwidth.domain import wall_status
 from zwidth.errors import InputError
 from zwidth.stability import balls
-from zwidth.stability.certified_filter import OPEN, STABLE, UNSTABLE, filtered
+from zwidth.stability.certified_filter import filtered
+from zwidth.stability.certified_rows import OPEN, STABLE, UNSTABLE
 from zwidth.stability.layout import Points, lay_out
 from zwidth.status import Status
 

@@ -10,6 +10,7 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import BLOCK, FEW, in_blocks
 from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
+from zwidth.stability.certified_rows import OPEN, UNSTABLE, by_rows, has_rows
 from zwidth.stability.devices import Kind, kind_of
 from zwidth.stability.enclosed_plant import plant
 from zwidth.stability.enclosed_verdict import (
@@ -27,18 +28,24 @@ from zwidth.stability.enclosure import Ball
 from zwidth.stability.layout import Points
 from zwidth.xp import namespace
 
-# The verdict's code, and what is added where alpha or beta is 0 or a value is out of range: XLA takes numbers below
-# 2^-1022 for zero, and at alpha = 0 the verdict is not on the pole at z = 1.
-UNSTABLE, STABLE, OPEN, SPECIAL = 0, 1, 2, 4
+# Added to the code where alpha or beta is 0 or a value is out of range: XLA takes numbers below 2^-1022 for zero, and
+# at alpha = 0 the verdict is not on the pole at z = 1.
+SPECIAL = 4
 
 
 def filtered(points: Points) -> np.ndarray:
     """The code of every point, of the broadcast shape."""
+    return by_rows(points, _each) if has_rows(points) else _each(points)
+
+
+def _each(points: Points) -> np.ndarray:
+    """The same, point by point."""
     shape, kind = points.shape, kind_of(points.d)
     if points.size <= FEW:
+        # NumPy is several times faster with scalars than with arrays without axes.
+        alpha, beta, delta, d = (array[()] for array in points)
         with np.errstate(all="ignore"):
-            fields = device_fields(points.delta, points.d, kind)
-            return np.broadcast_to(wall_codes(points.alpha, points.beta, fields, kind), shape).copy()
+            return np.broadcast_to(wall_codes(alpha, beta, device_fields(delta, d, kind), kind), shape).copy()
     if points.delta.size == points.d.size == 1:
         with np.errstate(all="ignore"):
             fields = device_fields(points.delta.reshape(()), points.d.reshape(()), kind)

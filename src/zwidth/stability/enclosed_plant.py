@@ -2,16 +2,15 @@
 
 ``u = 2^-53``. No library's exp is trusted.
 
-- ``c = e^-x``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 15 terms below 3u:
+- ``c = e^-x``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 14 terms below 3u:
   together below 8u. Beyond x = 700 it is off by 1e-304 at most.
-- For x < 2.5 ``A = sum x^k/(k+2)!`` has positive terms only: 8u, hence ``psi = c A`` 17u and
-  ``phi2 = c (1 + (x - 1) A)`` 20u, because ``|x - 1| A <= 1 + (x - 1) A``. For x >= 2.5, where c <= 0.083, the
-  quotients lose little: phi1 4u, phi2 6u, psi 11u. ``phi1 = phi2 + psi`` is within 21u, ``em = delta phi1`` within 22u.
+- For x < 1.5 ``A = sum x^k/(k+2)!`` has positive terms only: 8u, hence ``psi = c A`` 17u and
+  ``phi2 = c (1 + (x - 1) A)`` 20u, because ``|x - 1| A <= 1 + (x - 1) A``. For x >= 1.5, where c <= 0.224, the
+  quotients lose little: phi1 6u, phi2 9u, psi 19u. ``phi1 = phi2 + psi`` is within 21u, ``em = delta phi1`` within 22u.
 - Held fraction: t = 1 - f is off by u, and x = delta t by 2u. phi1 and phi2 amplify that at most once and psi twice
   (24u), e^-x x times; as ``x e^-x <= phi1(x)`` and ``<= 1/2``, that error is below 2u of another term of a1, and of a0
   below u of a1. Term by term a2 is within 27u, a1, sums included, within 54u, a0 within 33u (and u of a1).
   ``c = e^-(delta t) e^-(delta f)`` is within 17u, and 3 delta u for the rounding of the exponents.
-- Wide balls: c, phi1, phi2 and psi fall with x, so both ends of x bound them; sums and products of balls do the rest.
 """
 
 from __future__ import annotations
@@ -22,16 +21,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.stability.enclosure import TINY, UNIT, Ball, hull
+from zwidth.batching import stored
+from zwidth.stability.enclosure import TINY, UNIT, Ball
 from zwidth.xp import horner, namespace
 
 _LOG2_E = 1.4426950408889634
 # The first part has 32 significant bits: its products with whole numbers below 2^21 are exact.
 _LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
-_EXP_TERMS = [(-1.0) ** k / factorial(k) for k in range(15)]
-_SERIES_BELOW = 2.5
-# The first term left out is below 1e-19 of the sum.
-_A_TERMS = [1.0 / factorial(k + 2) for k in range(26)]
+_EXP_TERMS = [(-1.0) ** k / factorial(k) for k in range(14)]
+_SERIES_BELOW = 1.5
+# The first term left out is below 5e-17 of the sum.
+_A_TERMS = [1.0 / factorial(k + 2) for k in range(19)]
 _EXP_LIMIT = 700.0
 
 
@@ -44,10 +44,10 @@ class Plant(NamedTuple):
     p1: Any  # phi1 = a2 + a1 + a0
     a2: Any
     a1: Any
-    a0: Any  # None for a whole delay, like all below
-    f: Any
-    p1_t: Any  # phi1 and psi of delta (1 - f)
-    psi_t: Any
+    a0: Any = None  # None for a whole delay, like all below
+    f: Any = None
+    p1_t: Any = None  # phi1 and psi of delta (1 - f)
+    psi_t: Any = None
 
 
 def _two_to_minus(k: Array, xp: Any) -> Array:
@@ -90,7 +90,7 @@ def plant(delta: Array, fraction: Array | None) -> Plant:
         c, phi2, psi = phi(delta)
         p1 = phi2 + psi
         a2, a1 = _within(phi2, 21.0), _within(psi, 21.0)
-        return Plant(Ball(delta), _within(c, 9.0), _within(delta * p1, 23.0), _within(p1, 22.0), a2, a1, *[None] * 4)
+        return Plant(Ball(delta), _within(c, 9.0), _within(delta * p1, 23.0), _within(p1, 22.0), a2, a1)
     f = fraction
     t = 1.0 - f
     e_t, phi2_t, psi_t = phi(delta * t)
@@ -99,7 +99,9 @@ def plant(delta: Array, fraction: Array | None) -> Plant:
     a2 = t * t * phi2_t
     a1 = t * t * psi_t + t * f * (e_t * p1_f) + f * f * phi2_f + t * f * (p1_t * p1_f)
     a0 = e_t * (f * f * psi_f)
-    p1, c = a2 + a1 + a0, e_t * e_f
+    # Several loops of the compiler use them.
+    a2, a1, a0, c, p1_t, psi_t = stored((a2, a1, a0, e_t * e_f, p1_t, psi_t), delta)
+    p1 = a2 + a1 + a0
     return Plant(
         Ball(delta),
         Ball(c, (18.0 + 3.0 * delta) * UNIT * c + TINY),
@@ -112,36 +114,3 @@ def plant(delta: Array, fraction: Array | None) -> Plant:
         _within(p1_t, 25.0),
         _within(psi_t, 26.0),
     )
-
-
-def wide_plant(delta: Ball, fraction: Ball | None) -> Plant:
-    """The devices of a whole range of delta and f, elementwise; no smaller than 0 is taken into account."""
-    if fraction is None:
-        c, phi2, psi = _wide_phi(delta)
-        p1 = phi2 + psi
-        return Plant(delta, c, _loss(delta), p1, phi2, psi, *[None] * 4)
-    f = fraction
-    t = 1.0 - f
-    x_t, x_f = delta * t, delta * f
-    (e_t, phi2_t, psi_t), (_, phi2_f, psi_f), (c, phi2, psi) = _wide_phi(x_t), _wide_phi(x_f), _wide_phi(delta)
-    p1_t, p1_f, p1 = phi2_t + psi_t, phi2_f + psi_f, phi2 + psi
-    a1 = t * t * psi_t + t * f * (e_t + p1_t) * p1_f + f * f * phi2_f
-    return Plant(delta, c, _loss(delta), p1, t * t * phi2_t, a1, e_t * (f * f * psi_f), f, p1_t, psi_t)
-
-
-def _wide_phi(x: Ball) -> tuple[Ball, Ball, Ball]:
-    xp = namespace(x.mid)
-    low, high = xp.maximum(x.lower(), 0.0), xp.maximum(x.upper(), 0.0)
-    ends = zip(phi(low), phi(high), (9.0, 21.0, 21.0), strict=True)
-    c, phi2, psi = (hull(_within(most, units), _within(least, units)) for most, least, units in ends)
-    return c, phi2, psi
-
-
-def _loss(delta: Ball) -> Ball:
-    """``1 - e^-delta = delta phi1``, which grows with delta: bounded by its ends."""
-    xp = namespace(delta.mid)
-    ends = []
-    for x in (xp.maximum(delta.lower(), 0.0), xp.maximum(delta.upper(), 0.0)):
-        _, phi2, psi = phi(x)
-        ends.append(_within(x * (phi2 + psi), 23.0))
-    return hull(*ends)

@@ -45,11 +45,6 @@ class Ball:
         end = self.mid - self.radius
         return end - 2.0 * _rounding(end)
 
-    def upper(self) -> Any:
-        """A float64 number above or at every number of the ball."""
-        end = self.mid + self.radius
-        return end + 2.0 * _rounding(end)
-
     def __neg__(self) -> Ball:
         return Ball(-self.mid, self.rad)
 
@@ -57,9 +52,15 @@ class Ball:
         return Ball(abs(self.mid), self.rad)
 
     def __add__(self, other: Any) -> Ball:
-        other = as_ball(other)
+        if not isinstance(other, Ball):
+            other = Ball(other)
         mid = self.mid + other.mid
-        return Ball(mid, _total(self.rad, other.rad, _rounding(mid)))
+        rad = UNIT * abs(mid) + TINY
+        if self.rad is not None:
+            rad = self.rad + rad
+        if other.rad is not None:
+            rad = other.rad + rad
+        return Ball(mid, rad)
 
     __radd__ = __add__
 
@@ -70,15 +71,19 @@ class Ball:
         return (-self) + other
 
     def __mul__(self, other: Any) -> Ball:
-        if isinstance(other, int | float) and abs(frexp(other)[0]) == 0.5:
-            # A power of two only moves the exponent.
-            rad = None if self.rad is None else self.rad * abs(other)
-            return Ball(self.mid * other, rad if abs(other) >= 1.0 else _total(rad, TINY))
-        other = as_ball(other)
+        if not isinstance(other, Ball):
+            if isinstance(other, int | float) and abs(frexp(other)[0]) == 0.5:
+                # A power of two only moves the exponent.
+                rad = None if self.rad is None else self.rad * abs(other)
+                return Ball(self.mid * other, rad if abs(other) >= 1.0 else _total(rad, TINY))
+            other = Ball(other)
         mid = self.mid * other.mid
-        left = None if other.rad is None else (abs(self.mid) + (0.0 if self.rad is None else self.rad)) * other.rad
-        right = None if self.rad is None else abs(other.mid) * self.rad
-        return Ball(mid, _total(left, right, _rounding(mid)))
+        rad = UNIT * abs(mid) + TINY
+        if self.rad is not None:
+            rad = abs(other.mid) * self.rad + rad
+        if other.rad is not None:
+            rad = (abs(self.mid) if self.rad is None else abs(self.mid) + self.rad) * other.rad + rad
+        return Ball(mid, rad)
 
     __rmul__ = __mul__
 
@@ -116,19 +121,6 @@ class Ball:
 def as_ball(value: Any) -> Ball:
     """A ball as it is, a float64 number or array as an exact one."""
     return value if isinstance(value, Ball) else Ball(value)
-
-
-def between(low: Any, high: Any) -> Ball:
-    """The ball of all numbers from ``low`` to ``high``, two float64 numbers or arrays."""
-    mid = 0.5 * low + 0.5 * high
-    xp = namespace(mid)
-    return Ball(mid, xp.maximum(high - mid, mid - low) + 2.0 * _rounding(mid))
-
-
-def hull(one: Ball, other: Ball) -> Ball:
-    """A ball that contains both."""
-    xp = namespace(one.mid, other.mid)
-    return between(xp.minimum(one.lower(), other.lower()), xp.maximum(one.upper(), other.upper()))
 
 
 def _is_zero(value: Any) -> bool:

@@ -6,26 +6,23 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth import accuracy as costs
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import is_traced, to_caller
+from zwidth.batching import elementwise, is_traced
+from zwidth.domain import check_scalars
 from zwidth.errors import InputError, check_choice
+from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
-from zwidth.stability import traced
-from zwidth.stability.layout import Points, lay_out, point_ok
-from zwidth.stability.radius_map import COMPANION_POLES, Radii, bisected, by_companion, by_newton
+from zwidth.stability.poles import radius_and_bound, radius_by_companion
+from zwidth.stability.proved import Proved, proved_radii
+from zwidth.stability.radius import traced_kernel
 from zwidth.status import Method, Status
 
-RadiusMethod: TypeAlias = Literal["auto", "companion", "bisection", "newton"]
+RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)
 
-# "auto" takes companion eigenvalues, with all digits, for so few points of delays up to this.
-_FEW_POINTS = 1 << 12
-_FEW_PERIODS = 32.0
 _DEFAULT_ACCURACY = 1e-9
-# Closer in, the rounding errors of its own test would spoil Newton's certificate.
-_LEAST_CERTIFIED = 1e-10
-_LEAST_BISECTED = 1e-14
+# Closer in, the rounding of two counts would meet.
+_LEAST_ACCURACY = 1e-12
 
 
 class Radius(NamedTuple):
@@ -57,30 +54,29 @@ def spectral_radius(
         alpha: normalized stiffness K T^2/m.
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast; for a map pass alpha of shape
-            (1, N) and beta of shape (M, 1).
-        method: "newton" follows the largest pole across a map (scattered points start from a coarse bisection) and
-            proves each value; "bisection" halves an interval by the Schur-Cohn test; "companion" computes all poles.
-            "auto" is "companion" for fewer than 4096 points of d <= 32, else "newton"; where an accuracy is given, the
-            cheapest that was measured to keep it, see `zwidth.accuracy.choose`.
-        accuracy: relative error asked for; 1e-9 by default. At least 1e-10 for "newton", 1e-14 for "bisection".
+        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast.
+        method: "newton" (and "auto") finds the outermost pole and proves each value by two counts of the poles inside
+            a circle, at a cost that does not grow with d; "companion" computes all poles.
+        accuracy: relative error to prove, 1e-9 by default, at least 1e-12. Newton's method ends with nearly all digits
+            whatever is asked for, so nothing becomes faster by asking for less; "companion" takes any.
         delay: only "held" has poles.
 
     Returns:
-        Array of the broadcast shape, maybe read-only. NaN for a point out of range.
+        Array of the broadcast shape. NaN for a point out of range.
 
     Raises:
-        InputError: an argument is no real number, shapes do not broadcast, a name is unknown, or the accuracy is out
-            of the method's reach.
-        TracedDelayError: d is traced.
+        InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, a name is unknown,
+            or the accuracy is out of reach.
+        TracedDelayError: d is traced with method "companion".
 
     Numerics:
-        Float64 when called directly, the ambient precision inside `jit` (methods "companion" and "bisection"; "auto"
-        is "companion"). Error bounds and certificates come from `radius_of`. Near a double pole the radius itself is
-        uncertain by about 1e-8, and bisection by 1e-5.
+        Float64 when called directly, few points without JAX; the ambient precision inside `jit`, where d may be traced.
+        Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple one.
+        Error bounds and certificates come from `radius_of`: next to a k-fold pole the radius is known to about
+        1e-16^(1/k). Where the loop is stable by less than 1e-16 the value rounds to 1: `decay_rate` does not.
 
     References:
-        Hulin, Preusche, Hirzinger 2006, eq. (17); Schur 1918; Cohn 1922.
+        Hulin, Preusche, Hirzinger 2006, eq. (17).
 
     Example:
         >>> import zwidth
@@ -89,12 +85,25 @@ def spectral_radius(
     """
     values = (alpha, beta, delta, d)
     wanted = _check_radius(method, accuracy, delay)
+    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
+    if method == "companion":
+        return radius_by_companion(*values)
     if is_traced(*values):
-        return traced.radius(values, method, wanted)
-    laid = lay_out(values)
-    radii, _ = _radii(laid.points, method, wanted, asked=accuracy is not None)
-    found = radii.radius if np.all(ok := point_ok(laid.points)) else np.where(ok, radii.radius, np.nan)
-    return to_caller(laid.spread(found), values)
+        return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
+    return proved_radii(values, wanted).radius
+
+
+def _exp(value: Array) -> Array:
+    import jax.numpy as jnp
+
+    return jnp.exp(value)
+
+
+def _has_fraction(d: ArrayLike) -> bool:
+    if is_traced(d):
+        return True
+    delays = np.asarray(d, np.float64)
+    return bool(np.any(delays != np.floor(delays)))
 
 
 def radius_of(
@@ -119,38 +128,34 @@ def radius_of(
         delay: only "held" has poles.
 
     Returns:
-        Radius: ``radius``; ``error``, absolute: where ``certified``, a pole was shown to lie within the error of
-        ``radius`` and all poles inside ``radius + error``, in float64 arithmetic and with rounding errors that could
-        not have decided either. Elsewhere it bounds the last interval (bisection), or the distance from the largest
-        computed pole to a true one (companion). ``status``: INVALID_INPUT with NaN for a point out of range,
-        NOT_CONVERGED where no bound was found; ``method``, a `Method`: points that Newton's method leaves open are
-        COMPANION or BISECTION. Arrays may be read-only.
+        Radius: ``radius``; ``error``, absolute: where ``certified``, all poles were counted inside ``radius + error``
+        and not all inside ``radius - error``, in float64 arithmetic and with rounding errors that could not have
+        decided either, and the error is within what was asked for. ``status``: INVALID_INPUT or OUT_OF_RANGE with NaN;
+        NOT_CONVERGED where the error is larger than asked for (next to multiple poles; it is then the least one that
+        two counts do prove) or infinite where there is none. With "companion" the error bounds the distance from the
+        largest computed pole to a true one, and nothing is certified. ``method``: a `Method`.
 
     Raises:
-        InputError: an argument is no real number or traced, shapes do not broadcast, a name is unknown, or the
-            accuracy is out of the method's reach.
+        InputError: an argument is no real number or traced, a scalar is out of range, shapes do not broadcast, a name
+            is unknown, or the accuracy is out of reach.
 
     References:
-        Hulin, Preusche, Hirzinger 2006, eq. (17); Schur 1918; Cohn 1922.
+        Hulin, Preusche, Hirzinger 2006, eq. (17).
 
     Example:
         >>> from zwidth.stability.radii import radius_of
-        >>> found = radius_of(0.5, 0.5, 0.1, 1, method="newton")
+        >>> found = radius_of(0.5, 0.5, 0.1, 1)
         >>> bool(found.certified), f"{found.radius:.6f}"
         (True, '1.207346')
     """
     values = (alpha, beta, delta, d)
     wanted = _check_radius(method, accuracy, delay)
     _refuse_traced(values, "radius_of", "spectral_radius")
-    laid = lay_out(values)
-    radii, used = _radii(laid.points, method, wanted, asked=accuracy is not None)
-    ok = np.broadcast_to(point_ok(laid.points), laid.points.shape)
-    bounded = np.isfinite(radii.error)
-    status = np.where(ok, np.where(bounded, Status.OK, Status.NOT_CONVERGED), Status.INVALID_INPUT)
-    found = np.where(ok, radii.radius, np.nan)
-    error = np.where(ok, np.where(bounded, radii.error, np.inf), np.nan)
-    everything = (found, error, radii.certified & ok, status.astype(np.int32), np.asarray(used, np.int32))
-    return to_caller(Radius(*map(laid.spread, everything)), values)
+    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
+    if method == "companion":
+        return Radius(*radius_and_bound(*values))
+    found: Proved = proved_radii(values, wanted)
+    return Radius(found.radius, found.error, found.certified, found.status, 0 * found.status + np.int32(Method.NEWTON))
 
 
 def _check_radius(method: str, accuracy: float | None, delay: str) -> float:
@@ -158,37 +163,15 @@ def _check_radius(method: str, accuracy: float | None, delay: str) -> float:
     check_choice("method", method, RADIUS_METHODS)
     if accuracy is None:
         return _DEFAULT_ACCURACY
-    least = {"newton": _LEAST_CERTIFIED, "bisection": _LEAST_BISECTED}.get(method, 0.0)
-    if not (np.ndim(accuracy) == 0 and np.isfinite(accuracy) and least <= accuracy < 1 and accuracy > 0):
+    least = 0.0 if method == "companion" else _LEAST_ACCURACY
+    number: Any = accuracy
+    good = isinstance(number, int | float | np.floating) and np.isfinite(number) and 0 < number < 1 and number >= least
+    if not good:
         raise InputError(
             f"accuracy: got {accuracy!r}; a relative error of at least {least:g} and below 1 is needed for "
             f"method={method!r}; 'companion' takes any"
         )
-    return float(accuracy)
-
-
-def _radii(points: Points, method: str, accuracy: float, asked: bool) -> tuple[Radii, Any]:
-    """Results, and the `Method` of each point (or one for all)."""
-    if method == "auto" and asked:
-        method = "companion" if accuracy < _LEAST_CERTIFIED else _cheapest("spectral_radius", points, accuracy).method
-    elif method == "auto":
-        few = points.size < _FEW_POINTS and not np.any(points.d > _FEW_PERIODS)
-        method = "companion" if few else "newton"
-    if method == "companion":
-        return by_companion(points), Method.COMPANION
-    if method == "bisection":
-        return bisected(points, accuracy), Method.BISECTION
-    found = by_newton(points, accuracy)
-    whole = np.floor(points.d)
-    otherwise = np.where(whole + 3 + (points.d != whole) <= COMPANION_POLES, Method.COMPANION, Method.BISECTION)
-    return found, np.where(found.certified, Method.NEWTON, otherwise)
-
-
-def _cheapest(quantity: costs.Quantity, points: Points, accuracy: float) -> costs.Choice:
-    good = points.d[np.isfinite(points.d)]
-    longest = float(np.max(good, initial=0.0))
-    layout: costs.Layout = "map" if points.is_dense else "scattered"
-    return costs.choose(quantity, d=longest, points=points.size, layout=layout, accuracy=accuracy)
+    return float(number)
 
 
 def _refuse_traced(values: tuple[ArrayLike, ...], name: str, instead: str) -> None:

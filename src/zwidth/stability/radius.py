@@ -1,242 +1,241 @@
-"""The spectral radius of one point: by bisection, and by Newton's method on one pole with a certificate.
+"""The spectral radius of single points: the outermost pole by Newton's method, proved by two counts.
 
-All zeros of P lie inside the circle of radius r exactly where P(r z) passes the Schur-Cohn test. Bisection on r uses
-nothing else. A few steps of it already tell the largest pole: at the end of the recursion a quadratic is left over
-whose zeros, times r, are near the poles that reach the circle first. Newton's method on P in its product form then
-gives the pole itself, and one last test a little outside it proves that no other pole is larger.
-
-What an accepted point proves, in float64 arithmetic, is ``|z|(1 - tol) <= radius <= |z|(1 + tol)``: a pole lies within
-``degree |P/P'|`` of each Newton iterate, and all lie inside ``|z|(1 + tol)``. Points at which rounding errors could
-have decided that test (near double poles) are not accepted.
+All poles lie inside ``|z| = r (1 + tol)`` and not all inside ``r (1 - tol)``: then the radius is r up to that
+tolerance, whatever led to it. Where rounding could have decided a count (next to multiple poles) nothing is claimed.
+Every count also tells where the next pole is expected (`zwidth.stability.circle`), so a few of them find the radius;
+an expectation that contradicts earlier counts is replaced by halving the interval that they leave.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import comb, log
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
 from zwidth._types import Array
-from zwidth.grouping import Degree
-from zwidth.stability.devices import Device
-from zwidth.stability.recursion import Ends, Signed, Verdict, bits, reduce_to
-from zwidth.stability.schur_cohn import polynomial
+from zwidth.loop import poison, valid_wall
+from zwidth.stability.circle import Loop, Near, angle, circle, loop_of, near, newton_step, ratio_step, real_ends, sides
+from zwidth.stability.pole_derivative import followed
+from zwidth.xp import epsilon, frozen, namespace
 
-# Multiples of the accuracy at which bisection looks for a circle that is surely free of poles.
-_LADDER = (1.0, 1e1, 1e2, 1e3, 1e4, 1e5, 1e6)
-
-
-class Circle(NamedTuple):
-    """The verdict on the circle of one radius, and the quadratic left over at the end of the recursion."""
-
-    inside: Array  # every pole is inside
-    sure: Array  # ... and rounding errors cannot have decided that
-    quadratic: tuple[Array, Array, Array]
+_LEVEL_STEPS = 6
+# How far beyond a pole the next circle lies, as a power of the rounding unit: 1e-10 in float64.
+_BEYOND = 0.64
+_GUESS_STEPS = 3
+# Squares of steps, over the distance between poles: longer ones lead astray, shorter ones have settled.
+_LONGEST_STEP = 4.0
+_SETTLED = 1e-4
 
 
-def circle(alpha: Array, beta: Array, inverse: Array, device: Device, degree: Degree, margin: bool = True) -> Circle:
-    """Test the circle of radius ``1/inverse``; without ``margin``, in any precision, ``sure`` means nothing."""
-    p = polynomial(alpha, beta, device, degree)
-    power = inverse
-    top = [p.top[0]]
-    for value in p.top[1:]:
-        top.append(None if value is None else Signed(value.sign, value.number * power))
-        power = power * inverse
-    power = jax.lax.integer_pow(inverse, p.degree - len(p.low) + 1)
-    low: list[Signed | None] = []
-    for value in reversed(p.low):
-        low.insert(0, None if value is None else Signed(value.sign, value.number * power))
-        power = power * inverse
-    one = jnp.ones_like(alpha * beta * inverse)
-    top[0] = Signed(1, one)
-    verdict = Verdict(margin=margin)
-    q2, q1, q0 = reduce_to(Ends(top, low, p.degree), verdict, 2).values
-    verdict.note(q2 * q2 - q0 * q0, q2)
-    both = q2 + q0
-    verdict.note_ratio(both - jnp.abs(q1), both)
-    inside = verdict.positive & (both > jnp.abs(q1))
-    return Circle(inside, inside & ~verdict.small_margin if margin else inside, (q2, q1, q0))
-
-
-def bracket(alpha: Array, beta: Array, device: Device, degree: Degree) -> tuple[Array, Array]:
-    """Bounds of the radius within a factor of 2 degree: ``max (|p_(n-i)|/C(n,i))^(1/i)``, ``2 max |p_(n-i)|^(1/i)``."""
-    p = polynomial(alpha, beta, device, degree).joined()
-    n = p.degree
-    met = len(p.top) > n
-    named = list(enumerate(p.top)) if met else [*enumerate(p.top), *((n - i, v) for i, v in enumerate(p.low))]
-    low, high = jnp.zeros_like(alpha * beta), jnp.zeros_like(alpha * beta)
-    for i, value in named:
-        if i == 0 or value is None:
-            continue
-        size = jnp.log(jnp.abs(value.number))
-        high = jnp.maximum(high, jnp.exp(size / i))
-        # As a logarithm: the number of combinations overflows at high degree.
-        low = jnp.maximum(low, jnp.exp((size - log(comb(n, i))) / i))
-    return low, 2.0 * high
-
-
-def bisect(
-    alpha: Array, beta: Array, low: Array, high: Array, steps: Array | int, device: Device, degree: Degree
-) -> tuple[Array, Array]:
-    """Halve the logarithm of a bracket so many times; its upper end always passes the test.
-
-    The lower end is the upper one times a width that shrinks the same way everywhere: with one number to decide about,
-    not two, XLA runs the test once a step.
-    """
-
-    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
-        inverse, half = state
-        middle = inverse * half
-        inside = circle(alpha, beta, middle, device, degree, margin=False).inside
-        return jnp.where(inside, middle, inverse), jnp.sqrt(half)
-
-    inverse, half = jax.lax.fori_loop(0, steps, step, (1.0 / high, jnp.sqrt(high / low)))
-    high = 1.0 / inverse
-    return high / (half * half), high
-
-
-@dataclass(frozen=True)
-class Pole:
-    """A complex number by its parts: XLA's real arithmetic is faster than its complex one."""
+class Found(NamedTuple):
+    """The outermost pole ``e^(re + j im)``, 0 <= im <= pi."""
 
     re: Array
     im: Array
 
-    def __mul__(self, other: Pole) -> Pole:
-        return Pole(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
 
-    def times(self, factor: Array | float) -> Pole:
-        return Pole(self.re * factor, self.im * factor)
-
-    def plus(self, other: Pole) -> Pole:
-        return Pole(self.re + other.re, self.im + other.im)
-
-    def shifted(self, real: Array | float) -> Pole:
-        return Pole(self.re + real, self.im)
-
-    @property
-    def square(self) -> Array:
-        return self.re * self.re + self.im * self.im
+def largest(loop: Loop) -> Array:
+    """The logarithm of a radius that no pole exceeds: beyond it T is the larger part."""
+    xp = namespace(loop.alpha)
+    size = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
+    root = xp.sqrt(size)
+    # |T| >= r^(1+n) (r - 1)^2, |B| <= size r^2
+    short = xp.log1p(xp.where(loop.turns > 1, root, root + size))
+    steep = xp.maximum(np.log(2.0), xp.log(4.0 * size) / loop.turns)
+    return 1e-9 + xp.where(loop.turns > 1, xp.minimum(short, steep), short)
 
 
-def _power(z: Pole, exponent: int) -> Pole | None:
-    """z^exponent by repeated squaring; None for exponent 0."""
-    result = None
-    while exponent:
-        if exponent & 1:
-            result = z if result is None else result * z
-        exponent >>= 1
-        if exponent:
-            z = z * z
-    return result
+def smallest(loop: Loop, fractional: bool) -> Array:
+    """The logarithm of a radius that some pole reaches: ``max (|p_(N-i)|/C(N, i))^(1/i)`` of the coefficients."""
+    xp = namespace(loop.alpha)
+    c, s, beta = loop.c, loop.s, loop.beta
+    a1, a0 = loop.h + loop.a2 * loop.q, loop.h * loop.q
+    tiny = 1e-300
+    if fractional:
+        poles = loop.turns + 3.0
+        first = xp.abs(loop.a2 * s - (1.0 + c)) / 4.0
+        second = xp.sqrt(xp.abs(c + a1 * s - loop.a2 * beta) / 6.0)
+        third = xp.cbrt(xp.abs(a0 * s - a1 * beta) / 4.0)
+        last = xp.sqrt(xp.sqrt(xp.abs(a0 * beta)))
+        undelayed = xp.maximum(xp.maximum(first, second), xp.maximum(third, last))
+    else:
+        poles = loop.turns + 2.0
+        first = xp.abs(loop.a2 * s - (1.0 + c)) / 3.0
+        second = xp.sqrt(xp.abs(c + a1 * s - loop.a2 * beta) / 3.0)
+        undelayed = xp.maximum(xp.maximum(first, second), xp.cbrt(xp.abs(a1 * beta)))
+    return xp.log(xp.maximum(xp.where(loop.turns > 1, (1.0 + c) / poles, undelayed), tiny)) - 1e-9
 
 
-class Local(NamedTuple):
-    """P, P' and N at one z; dP/dalpha = z N, dP/dbeta = (z - 1) N."""
-
-    value: Pole
-    slope: Pole
-    n: Pole
+def beyond(value: Array) -> float:
+    """How far beyond a pole the next circle lies, in a value's precision."""
+    return epsilon(value) ** _BEYOND
 
 
-def evaluate(z: Pole, alpha: Array, beta: Array, device: Device, degree: Degree) -> Local:
-    """The product form ``z^k (z - 1)(z - c) + N(z) ((alpha + beta) z - beta)``."""
-    c, a2, a1, a0 = device.c, device.a2, device.a1, device.a0
-    power = degree.whole + (2 if degree.fractional else 1)
-    lag = _power(z, power - 1)
-    near = z.shifted(-1.0)
-    quadratic = near * z.shifted(-c)
-    n, dn = z.times(a2).shifted(a1), Pole(a2, jnp.zeros_like(a2))
-    if degree.fractional:
-        n, dn = (n * z).shifted(a0), z.times(2.0 * a2).shifted(a1)
-    total = alpha + beta
-    wall = z.times(total).shifted(-beta)
-    inner = quadratic.times(float(power)).plus(z * z.times(2.0).shifted(-(1.0 + c)))
-    head, slope = z * quadratic, inner
-    if lag is not None:
-        head, slope = head * lag, inner * lag
-    rest = Pole(dn.re * wall.re, dn.re * wall.im) if not degree.fractional else dn * wall
-    return Local(head.plus(n * wall), slope.plus(rest).plus(n.times(total)), n)
+def until(steps: int, step: Callable[[Any], Any], done: Callable[[Any], Array], state: Any, xp: Any) -> Any:
+    """Apply ``step`` up to so many times, or until every point is done."""
+    if xp is np:
+        for _ in range(steps):
+            state = step(state)
+            if np.all(done(state)):
+                break
+        return state
+    from jax.lax import while_loop
+
+    return while_loop(
+        lambda carry: (carry[0] < steps) & ~done(carry[1]).all(),
+        lambda carry: (carry[0] + 1, step(carry[1])),
+        (0, state),
+    )[1]
 
 
-def _reciprocal(x: Array) -> Array:
-    """``1/x`` for x > 0, to 1e-10: a quotient used twice would break XLA's fusion."""
-    y = jax.lax.bitcast_convert_type(0x7FDE623822FC16E6 - bits(x), jnp.float64)
-    for _ in range(3):
-        y = y * (2.0 - x * y)
-    return y
+def level(high: Array, loop: Loop) -> Array:
+    """Where T and B are equally large on the real axis, the top of the curve on which the poles lie."""
+    xp = namespace(high)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        at, _ = state
+        front, _ = real_ends(at, sides(at, loop), loop)
+        new = at - front.level / front.slope
+        new = xp.where(xp.isfinite(new), xp.clip(new, 0.1 * at, high), at)
+        return new, xp.abs(new - at)
+
+    return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, high), xp)[0]
 
 
-def _inverse_root(x: Array) -> Array:
-    """``1/sqrt(x)`` for x > 0, to rounding."""
-    y = jax.lax.bitcast_convert_type(0x5FE6EB50C7B537A9 - (bits(x) >> 1), jnp.float64)
-    for _ in range(4):
-        y = y * (1.5 - 0.5 * x * y * y)
-    return y
+def slow_pole(loop: Loop) -> Found:
+    """The larger pole near 1, of P to second order in z - 1."""
+    xp = namespace(loop.alpha)
+    alpha, s, turns = loop.alpha, loop.s, loop.turns
+    m0, m1 = (loop.a2 + loop.h) * (1.0 + loop.q), loop.a2 - loop.h * loop.q
+    constant = m0 * alpha
+    linear = loop.em + m0 * s + (m1 - turns * m0) * alpha
+    lead = 1.0 + (m1 - turns * m0) * s + (0.5 * turns * (turns + 1.0) * m0 - turns * m1) * alpha
+    lead = xp.where(lead > 0.1, lead, 1.0)
+    inside = linear * linear - 4.0 * lead * constant
+    root = xp.sqrt(xp.abs(inside))
+    sum_ = linear + xp.where(linear < 0, -root, root)
+    real = xp.where(linear < 0, -0.5 * sum_ / lead, -2.0 * constant / sum_)
+    pair = inside < 0
+    re, im = xp.where(pair, -0.5 * linear / lead, real), xp.where(pair, 0.5 * root / lead, 0.0)
+    re = xp.maximum(re, -0.5)
+    return Found(0.5 * xp.log1p(re * (2.0 + re) + im * im), angle(1.0 + re, im))
 
 
-def over(left: Pole, right: Pole) -> Pole:
-    """The quotient, to ten digits."""
-    scaled = _reciprocal(right.square)
-    return Pole((left.re * right.re + left.im * right.im) * scaled, (left.im * right.re - left.re * right.im) * scaled)
+def guesses(loop: Loop, high: Array, fractional: bool) -> tuple[Found, Array]:
+    """The pole that is the outermost of most loops, NaN where it was not found, and the level of the real axis."""
+    xp = namespace(high)
+    top = level(high, loop)
+    slow = polished(slow_pole(loop), loop, fractional, newton_step, _GUESS_STEPS)
+    pair = polished(Found(top, np.pi / (loop.turns + 1.0)), loop, fractional, ratio_step, _GUESS_STEPS)
+    later = (pair.re > slow.re) | xp.isnan(slow.re)
+    return Found(xp.where(later, pair.re, slow.re), xp.where(later, pair.im, slow.im)), top
 
 
-def newton(z: Pole, steps: int, alpha: Array, beta: Array, device: Device, degree: Degree) -> tuple[Pole, Pole]:
-    """So many steps from z; the result, and the last step.
+def outermost(loop: Loop, fractional: bool, steps: int, halve: bool = False) -> Found:
+    """Look for the outermost pole in so many counts; with ``halve`` every third one bisects."""
+    xp = namespace(loop.alpha)
+    bound, low = largest(loop), smallest(loop, fractional)
+    # A wall without stiffness has a pole at 1.
+    low = xp.where(loop.alpha == 0, xp.maximum(low, 0.0), low)
+    guess, top = guesses(loop, bound, fractional)
+    past = beyond(low)
+    known = (guess.re > low) & (guess.re < bound)
+    # Where the delay is short other poles may lead by far.
+    unknown = xp.where(loop.turns > 1, top, 0.5 * (low + top))
+    start = xp.where(known, guess.re + past, xp.maximum(low, unknown))
 
-    XLA makes one loop over the points out of all steps, and of what comes before and behind, where a single array
-    comes out at the end; with two it would compute every step again for each step that follows.
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        at, low, high, re, im, done, turn = state
+        seen = circle(at, loop, fractional, low, high)
+        high = xp.where(seen.full & ~done, at, high)
+        low = xp.where(seen.full | done, low, at)
+        # What has been found before counts until it is refuted.
+        kept = ~xp.isfinite(seen.re) & (guess.re > low - past) & (guess.re < high + past)
+        new_re, new_im = xp.where(kept, guess.re, seen.re), xp.where(kept, guess.im, seen.im)
+        expected = xp.isfinite(new_re) & ~done
+        re, im = xp.where(expected, new_re, re), xp.where(expected, new_im, im)
+        # With more than a pair outside, the next pole is seldom the outermost.
+        good = expected & (seen.count >= loop.turns)
+        if halve:
+            good = good & (turn < 2)
+        # Climbing, one pole is left behind before the next is looked for.
+        new = new_re + xp.where(seen.full, 0.0, past)
+        middle = xp.where((high == bound) & (top > low) & (top < 0.99 * high), top, 0.5 * (low + high))
+        found = expected & seen.full & (xp.abs(new_re - at) < 3.0 * past)
+        return xp.where(good, new, middle), low, high, re, im, done | found, xp.mod(turn + 1.0, 3.0)
+
+    state = (start, low, bound, guess.re, guess.im, bound < low, 0.0 * start)
+    state = until(steps, step, lambda state: state[5], state, xp)
+    return Found(state[3], state[4])
+
+
+def polished(
+    found: Found, loop: Loop, fractional: bool, stepper: Callable[[Near], tuple[Array, Array]], steps: int
+) -> Found:
+    """Newton steps on a pole, NaN where they do not settle; the pole at 1 of a wall without stiffness stays there."""
+    xp = namespace(found.re)
+
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        re, im, _ = state
+        by_re, by_im = stepper(near(re, im, loop, fractional))
+        size = (by_re * by_re + by_im * by_im) * loop.turns * loop.turns
+        good = (size < _LONGEST_STEP) & ((loop.alpha != 0) | (re != 0))
+        re, im = xp.where(good, re + by_re, re), xp.where(good, im + by_im, im)
+        # Past the real axis the conjugate is meant.
+        im = xp.abs(im)
+        return re, xp.where(im > np.pi, 2.0 * np.pi - im, im), size
+
+    start = (found.re, found.im, 0.0 * found.re)
+    re, im, size = until(steps, step, lambda state: state[2] < 1e-24, start, xp)
+    settled = (size < _SETTLED) | ((loop.alpha == 0) & (re == 0))
+    return Found(xp.where(settled, re, np.nan), im)
+
+
+def proved(log_r: Array, tolerances: Sequence[Any], loop: Loop, fractional: bool) -> list[Array]:
+    """Whether the radius is ``e^log_r`` within each relative tolerance, in float64 arithmetic."""
+    xp = namespace(log_r)
+    offsets = [sign * tolerance + 0.0 * log_r for tolerance in tolerances for sign in (1.0, -1.0)]
+    if np.ndim(log_r) == 0 and xp is np:
+        seen = [circle(log_r + offset, loop, fractional) for offset in offsets]
+        full, sure = [at.full for at in seen], [at.sure for at in seen]
+    else:
+        # One text for all circles.
+        at = circle(log_r + xp.stack(offsets), loop, fractional)
+        full, sure = at.full, at.sure
+    return [full[k] & sure[k] & ~full[k + 1] & sure[k + 1] for k in range(0, len(offsets), 2)]
+
+
+def radius_kernel(
+    alpha: Array,
+    beta: Array,
+    delta: Array,
+    d: Array,
+    tolerance: Array,
+    fractional: bool,
+    steps: int,
+    halve: bool,
+    polishing: int,
+) -> tuple[Array, Array, Array]:
+    """The outermost pole of each point by the logarithm of its modulus and its argument, and whether it is proved."""
+    loop = loop_of(alpha, beta, delta, d, fractional)
+    found = polished(outermost(loop, fractional, steps, halve), loop, fractional, newton_step, polishing)
+    return found.re, found.im, proved(found.re, [tolerance], loop, fractional)[0]
+
+
+def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:
+    """The logarithm of the radius with its derivatives, inside somebody's transformation.
+
+    NaN where it was not found; derivatives are those of the outermost pole, NaN where that is a multiple one.
     """
-    by = z
-    for _ in range(steps):
-        at = evaluate(z, alpha, beta, device, degree)
-        by = over(at.value, at.slope)
-        z = Pole(z.re - by.re, z.im - by.im)
-    return z, by
-
-
-def accept(
-    z: Pole, step: Pole, tolerance: Array | float, alpha: Array, beta: Array, device: Device, degree: Degree
-) -> Array:
-    """The certificate: a pole is near z, and every pole is inside ``|z|(1 + tolerance)``.
-
-    |z| where that is proved, ``-|z|`` where it is not: one array for two results, see `newton`.
-    """
-    square = z.square
-    inverse = _inverse_root(square)
-    outside = circle(alpha, beta, inverse * (1.0 - tolerance), device, degree)
-    allowed = tolerance / (degree.poles + 1)
-    near = step.square < allowed * allowed * square
-    # Of a real pole no root need be taken: the one at z = 1 of a wall without stiffness stays exactly there.
-    radius = jnp.where(z.im == 0, jnp.abs(z.re), square * inverse)
-    return jnp.where(outside.sure & near, radius, -radius)
-
-
-def start(alpha: Array, beta: Array, high: Array, device: Device, degree: Degree) -> Pole:
-    """The largest zero of the quadratic left over on a circle just outside the largest pole, times its radius."""
-    q2, q1, q0 = circle(alpha, beta, _reciprocal(high), device, degree, margin=False).quadratic
-    scale = _reciprocal(q2)
-    half = -0.5 * q1 * scale
-    discriminant = half * half - q0 * scale
-    size = jnp.abs(discriminant)
-    root = size * _inverse_root(size)
-    real = discriminant >= 0
-    re = jnp.where(real, half + jnp.where(half < 0, -root, root), half)
-    return Pole(re * high, jnp.where(real, 0.0, root) * high)
-
-
-def sure_error(alpha: Array, beta: Array, radius: Array, accuracy: Array, device: Device, degree: Degree) -> Array:
-    """The least of accuracy, 10 accuracy, ... at which a circle outside the radius surely holds every pole; or NaN.
-
-    Close to a double pole, at a distance e, the test amplifies rounding errors by 1/e^3: it is unsure up to about 1e-5
-    on both sides of it.
-    """
-    error = jnp.full_like(radius, jnp.nan)
-    for factor in reversed(_LADDER):
-        tolerance = factor * accuracy
-        sure = circle(alpha, beta, (1.0 - tolerance) / radius, device, degree).sure
-        error = jnp.where(sure, tolerance * radius, error)
-    return error
+    xp = namespace(alpha, beta, delta, d)
+    still = loop_of(*frozen((alpha, beta, delta, d), xp), fractional)
+    found = polished(outermost(still, fractional, 60), still, fractional, newton_step, 3)
+    eps = epsilon(found.re)
+    known, simple = proved(found.re, [eps**0.25, eps**0.58], still, fractional)
+    moved = followed(found.re, found.im, loop_of(alpha, beta, delta, d, fractional), still, fractional)
+    change = xp.where(simple, moved, np.nan)
+    # The value itself is not changed by what its derivatives are worth.
+    value = frozen(xp.where(simple, found.re + moved, found.re), xp) + (change - frozen(change, xp))
+    value = xp.where(simple, value, frozen(found.re, xp) + 0.0 * change)
+    return xp.where(known, value, np.nan) + poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

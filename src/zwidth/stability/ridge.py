@@ -14,7 +14,7 @@ from zwidth.errors import check_choice
 from zwidth.loop import check_delay_model
 from zwidth.plant import Plant, split_delay, undelayed_plant
 from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.stability.ridge_newton import Ridge, start_of
+from zwidth.stability.ridge_newton import Ridge, is_undelayed, start_of
 from zwidth.stability.ridge_slopes import (
     alpha_by_lag,
     alpha_change,
@@ -122,12 +122,13 @@ def slopes_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> Ridge
     """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
     ridge, status, plant, lag, (delta, f) = _solved(delta, d, delay, kind)
     by_delta, by_f = plant_slopes(delta, f)
-    D = lag + 1.0
+    undelayed = is_undelayed(delay, kind)
     fractional = delay == "fractional_power"
-    by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, D, by_f)
-    point = _point(ridge, status)
-    found = 0.0 * point.alpha
-    return RidgeSlopes(point, alpha_change(ridge.s, plant, D, by_delta) + found, by_d + found)
+    by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
+    mask = found(ridge)
+    return RidgeSlopes(
+        _point(ridge, status), alpha_change(ridge.s, plant, lag, by_delta, undelayed) * mask, by_d * mask
+    )
 
 
 def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
@@ -139,27 +140,27 @@ def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Arra
     delta, d = delta * mask, d * mask
     whole, f = split_delay(d)
     if not kind.fractional:
-        # Both models are one.
-        delay = "held" if xp is np else delay
+        # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
+        delay = "held"
     if delay == "fractional_power":
         whole, f = d, 0.0 * d
-    start = start_of(delta, d, f)
+    start = start_of(delta, d, f, kind)
     plant = differentiable_plant(delta, f) if kind.fractional and delay == "held" else undelayed_plant(delta)
-    ridge = differentiable_ridge(plant, whole, start, delay, not kind.long and delay == "held")
-    if delay == "fractional_power":
-        # The corner is left like -d^(2/3) as soon as d > 0: all three fall with infinite slope.
-        corner = ridge.s >= 1.0
-        fall = xp.where(corner, xp.sqrt(xp.where(corner, d, 1.0)), 0.0)
-        ridge = ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - fall, omega=ridge.omega - fall)
+    ridge = differentiable_ridge(plant, whole, start, delay, kind)
     return ridge, status, plant, whole, (delta, f)
+
+
+def found(ridge: Ridge) -> Array:
+    """1, or NaN where the solver did not converge."""
+    # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
+    xp = namespace(ridge.s)
+    return xp.where(xp.abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s, 1.0, np.nan)
 
 
 def _point(ridge: Ridge, status: Array) -> RidgePoint:
     xp = namespace(ridge.alpha)
-    # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
-    converged = xp.abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
-    found = xp.where(converged, 1.0, np.nan)
-    status = xp.where((status == Status.OK) & ~converged, int(Status.NOT_CONVERGED), status)
+    mask = found(ridge)
+    status = xp.where((status == Status.OK) & xp.isnan(mask), int(Status.NOT_CONVERGED), status)
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
-    values = (ridge.alpha * found, ridge.beta * found, ridge.omega * found)
+    values = (ridge.alpha * mask, ridge.beta * mask, ridge.omega * mask)
     return RidgePoint(*values, kind.astype(np.int32), status.astype(np.int32))

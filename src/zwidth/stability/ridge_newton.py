@@ -2,7 +2,7 @@
 
 The curve z = e^(j omega) and its slope are written in ``y = s^2``, ``s = sin(omega/2)``. There the maximum stays a
 regular one at omega = pi, where every derivative in omega vanishes by symmetry, and the corner is the end point s = 1.
-With D = n + 1 (held) or D = d + 1 (fractional power), q = 1 - y, M = N(z)/z and a prime for d/dy:
+With D = lag + 1, lag = n (held) or d (fractional power), q = 1 - y, M = N(z)/z and a prime for d/dy:
 
     (z - c) conj M = g1 + j g2 sin omega     quadratic and linear in y
     |M|^2 = rho = m^2 + k^2 4 y q            m = Re M = N(1) - 2 b y, b = a2 + a0, k = a2 - a0
@@ -31,6 +31,7 @@ from zwidth._types import Array
 from zwidth.batching import stored
 from zwidth.plant import Plant
 from zwidth.stability.crossover import ARCSINE
+from zwidth.stability.devices import ANY, Kind
 from zwidth.xp import epsilon, frozen, horner, namespace, repeat
 
 # Taylor series; on [0, pi/2] the first term left out is below 1e-17.
@@ -72,9 +73,9 @@ class Wave(NamedTuple):
     tau2: Array
 
 
-def wave(s: Array, D: Array, undelayed: bool) -> Wave:
+def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
     """The oscillating factors at one s, finite with their derivatives up to the corner. ``undelayed``: all D are 1."""
-    xp = namespace(s, D)
+    xp = namespace(s, lag)
     y, q = s * s, (1.0 - s) * (1.0 + s)
     cos_w = q - y
     # At the corner D = 1, and what the root enters is 0.
@@ -86,73 +87,81 @@ def wave(s: Array, D: Array, undelayed: bool) -> Wave:
     per_sin = 0.5 / (s * root)
     if undelayed:
         return Wave(y, q, half, per_sin, 1.0, cos_w, 0.0, 0.0)
-    # D omega as omega + (D - 1) omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
-    x = (D - 1.0) * half
+    # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
+    D, x = lag + 1.0, lag * half
     square = x * x
     sine, cosine = x * horner(square, _SIN), horner(square, _COS)
-    ratio, cosine = 2.0 * sine * cosine * per_sin, (cosine - sine) * (cosine + sine)
-    tau, kappa = cosine + cos_w * ratio, cos_w * cosine - 4.0 * y * q * ratio
+    ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
+    sin2 = 4.0 * y * q
+    tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio
     # For D = 1 kappa is cos omega and the next two are exactly 0.
     square = 4.0 * per_sin * per_sin
-    tau1 = 0.5 * (D * kappa - tau * cos_w) * square
-    return Wave(y, q, half, per_sin, tau, kappa, tau1, -(1.5 * cos_w * tau1 + (D * D - 1.0) * tau) * square)
+    # D kappa - tau cos omega
+    tau1 = 0.5 * (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * square
+    return Wave(y, q, half, per_sin, tau, kappa, tau1, -(1.5 * cos_w * tau1 + lag * (D + 1.0) * tau) * square)
 
 
-class Look(NamedTuple):
-    """The curve and its stationarity at one s."""
+class Sides(NamedTuple):
+    """What wall and stationarity share."""
 
-    first: Array  # T
-    second: Array  # dT/ds
-    alpha: Array
-    beta: Array
-    beta_slope: Array  # d beta/ds where T = 0
-    bend: Array  # d^2 alpha/ds^2 over dT/ds
+    g1: Array
+    g2: Array
+    m: Array
+    rho: Array
 
 
-def look(s: Array, curve: Curve, D: Array, undelayed: bool = False) -> Look:
-    """Evaluate everything at one s."""
-    xp = namespace(s, curve.b)
-    y, q, _, _, tau, kappa, tau1, tau2 = wave(s, D, undelayed)
-    cos_w, sin2, twice = q - y, 4.0 * y * q, 2.0 * D
-    g1 = curve.g1[0] + y * (curve.g1[1] + y * curve.g1[2])
-    g2 = curve.g2[0] + y * curve.g2[1]
-    dg1, dg2 = curve.g1[1] + 2.0 * y * curve.g1[2], curve.g2[1]
+def sides(at: Wave, curve: Curve) -> Sides:
+    """(z - c) conj M and M at one s."""
+    xp = namespace(at.y, curve.b)
+    g1 = curve.g1[0] + at.y * (curve.g1[1] + at.y * curve.g1[2])
+    g2 = curve.g2[0] + at.y * curve.g2[1]
     # Free of cancellation at both ends.
-    m = xp.where(y < 0.5, curve.at_one - 2.0 * curve.b * y, 2.0 * curve.b * q - curve.gap)
-    k2 = curve.k * curve.k
-    rho = m * m + k2 * sin2
+    m = xp.where(at.y < 0.5, curve.at_one - 2.0 * curve.b * at.y, 2.0 * curve.b * at.q - curve.gap)
+    return Sides(g1, g2, m, m * m + curve.k * curve.k * (4.0 * at.y * at.q))
+
+
+def wall(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
+    """(alpha, beta) of the curve at one s."""
+    at = wave(s, lag, undelayed)
+    g1, g2, _, rho = sides(at, curve)
+    per_rho = 1.0 / rho
+    alpha = 4.0 * at.y * (at.tau * g1 + at.kappa * g2) * per_rho
+    return alpha, -(at.kappa * g1 - 4.0 * at.y * at.q * at.tau * g2) * per_rho - 0.5 * alpha
+
+
+def stationarity(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
+    """T and dT/ds, see the head of this file."""
+    at = wave(s, lag, undelayed)
+    y, q, tau, kappa, tau1, tau2 = at.y, at.q, at.tau, at.kappa, at.tau1, at.tau2
+    g1, g2, m, rho = sides(at, curve)
+    cos_w, k2, twice = q - y, curve.k * curve.k, 2.0 * (lag + 1.0)
+    dg1, dg2 = curve.g1[1] + 2.0 * y * curve.g1[2], curve.g2[1]
     drho, ddrho = 4.0 * (k2 * cos_w - curve.b * m), 8.0 * (curve.b * curve.b - k2)
     value = tau * g1 + kappa * g2
     slope = tau1 * g1 + tau * (dg1 - twice * g2) + kappa * dg2
     bend = tau2 * g1 + tau1 * (2.0 * dg1 - twice * g2) + 2.0 * tau * (curve.g1[2] - twice * dg2)
     weighted = y * value
     first = rho * (value + y * slope) - weighted * drho
-    second = 2.0 * s * (rho * (2.0 * slope + y * bend) - weighted * ddrho)
-    across = kappa * g1 - sin2 * tau * g2
-    d_across = kappa * dg1 - twice * tau * g1 - 4.0 * cos_w * tau * g2 - sin2 * (tau1 * g2 + tau * dg2)
-    per_rho = 1.0 / rho
-    alpha, share = 4.0 * weighted * per_rho, across * per_rho
-    beta_slope = 2.0 * s * (share * drho - d_across) * per_rho
-    return Look(first, second, alpha, -share - 0.5 * alpha, beta_slope, 8.0 * s * per_rho * per_rho)
+    return first, 2.0 * s * (rho * (2.0 * slope + y * bend) - weighted * ddrho)
 
 
-def _corner(curve: Curve, D: Array, known: Array) -> tuple[Array, Array, Array]:
-    """Whether the ridge is the double pole at z = -1, and the wall there.
+def _corner(curve: Curve, lag: Array, known: Array) -> tuple[Array, ...]:
+    """Whether the ridge is the double pole at z = -1, and what `Ridge` holds there.
 
     It is where the lobe reaches y = 1 with alpha > 0, still rising. The curve gets there on the first lobe only if
     D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0. ``known`` is `Start.corner`, which decides where it can.
     """
-    xp = namespace(curve.b, D)
+    xp = namespace(curve.b, lag)
     g1 = sum(curve.g1[1:], curve.g1[0])
     g2 = curve.g2[0] + curve.g2[1]
     value, slope = g1 - g2, curve.g1[1] + 2.0 * curve.g1[2] - 2.0 * g2 - curve.g2[1]
     rho, drho = curve.gap**2, 4.0 * (curve.b * curve.gap - curve.k**2)
     rising = rho * (value + slope) - value * drho >= 0.0
-    judged = (D <= 1.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0) & rising
+    judged = (lag <= 0.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0) & rising
     corner = xp.where(known == 0.0, judged, known > 0.0)
     rho = xp.where(corner, rho, 1.0)
     alpha = 4.0 * value / rho
-    return corner, alpha, g1 / rho - 0.5 * alpha
+    return corner, alpha, g1 / rho - 0.5 * alpha, np.pi, 1.0, 0.0
 
 
 class Start(NamedTuple):
@@ -168,32 +177,40 @@ class Start(NamedTuple):
 # rounded coefficients of the curve, its next neighbors would fall on either side.
 _TAKE_OVER = 3.6593616274217835
 
-# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 1.8 % below one period,
-# 1.1 % beyond. Two steps then leave 3e-8, whose square is below rounding; the third evaluation is also the answer's.
-_SHORT = ((0.2324, 1.157, -1.403, 0.5543), (2.309, -4.469, 2.646), (-1.215, 1.85), (0.006701,))
+# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one
+# period, 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
+_SHORT = (
+    (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
+    (-0.1878, 3.83, -4.872, 1.835),
+    (1.511, -6.996, 5.233),
+    (0.2643, 1.186),
+    (-0.4501,),
+)
 _LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
 # Below one period T bends more; so much that the power matters.
 _POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
-_HELD_STEPS = 2
+_HELD_STEPS = 3
 _FRACTIONAL_STEPS = 12
 
 
 def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
-    return horner(t, [horner(u, list(row)) if len(row) > 1 else row[0] for row in rows])
+    return horner(t, [horner(u, list(row)) for row in rows])
 
 
-def start_of(delta: Array, d: Array, fraction: Array, strength: Array | None = None) -> Start:
+def start_of(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
     """Where to begin for one (delta, d); ``strength`` 1 stands for delta -> infinity."""
     xp = namespace(delta, d)
     delta, d, f = frozen((delta, d, fraction), xp)
     r = delta * (d + 1.0)
     u, t = 1.0 / (d + 1.0), r / (r + 3.0) if strength is None else strength
-    short = d < 1.0
-    long = _polynomial(t, u, _LONG) + 0.4702 * f * (1.0 - f) * u * u * t
-    s = xp.where(short, _polynomial(t, u, _SHORT), long) * u
-    power = xp.where(short, _polynomial(t, u, _POWER), 0.0)
-    corner = xp.where(d == 0.0, xp.where(delta > _TAKE_OVER, 1.0, -1.0), 0.0)
-    return Start(u, s, power, corner)
+    s = power = corner = zero = 0.0 * u
+    if kind.long:
+        s = _polynomial(t, u, _LONG) + 0.4702 * f * (1.0 - f) * u * u * t
+    if kind.short:
+        short, low, bent = d < 1.0, _polynomial(t, u, _SHORT), _polynomial(t, u, _POWER)
+        s, power = (xp.where(short, low, s), xp.where(short, bent, zero)) if kind.long else (low, bent)
+        corner = xp.where(d == 0.0, xp.where(delta > _TAKE_OVER, 1.0, -1.0), zero)
+    return Start(u, s * u, power, corner)
 
 
 class Ridge(NamedTuple):
@@ -206,47 +223,47 @@ class Ridge(NamedTuple):
     last: Array
 
 
-def _solve_held(curve: Curve, D: Array, start: Start, undelayed: bool) -> tuple[Array, Array, Look]:
-    """Newton's method clipped to a bracket that holds every ridge: s, the step that is left, and the curve there."""
-    xp = namespace(curve.b, D)
+def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
+    """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
+    xp = namespace(curve.b, lag)
     lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
     s = xp.minimum(xp.maximum(start.s, lower), upper)
 
-    def step(s: Array) -> tuple[Array, Look]:
-        at = look(s, curve, D, undelayed)
-        new = s - at.first * s / (at.second * s + start.power * at.first)
-        return xp.minimum(xp.maximum(new, lower), upper) - s, at
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        s, _ = state
+        first, second = stationarity(s, curve, lag, undelayed)
+        new = s - first * s / (second * s + start.power * first)
+        return xp.minimum(xp.maximum(new, lower), upper), s
 
-    for _ in range(_HELD_STEPS):
-        s = stored(s + step(s)[0], start.scale)
-    return s, *step(s)
+    s, before = repeat(_HELD_STEPS, step, (s, s), xp)
+    return s, s - before
 
 
-def _solve_fractional(curve: Curve, D: Array, start: Start) -> tuple[Array, Array, Look]:
+def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Array]:
     """The same with a shrinking bracket.
 
     For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2): there the step is
     Newton's for ``T q^(3/2)`` as a function of ``q^(5/2)``.
     """
-    xp = namespace(curve.b, D)
-    d = D - 1.0
+    xp = namespace(curve.b, lag)
+    d = lag
     # d = 0 may end at pi itself, where 1/sin omega is infinite.
     rest = xp.maximum(0.3 * xp.minimum(d, 0.05) ** (2.0 / 3.0), epsilon(d))
     lower, upper = 0.5 * start.scale, xp.minimum(xp.sqrt(1.0 - rest), 1.05 * start.scale)
 
     def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         s, lower, upper = state
-        at = look(s, curve, D)
-        rising = at.first > 0.0
+        value, slope = stationarity(s, curve, lag)
+        rising = value > 0.0
         lower, upper = xp.where(rising, s, lower), xp.where(rising, upper, s)
         q = (1.0 - s) * (1.0 + s)
         near = (q < 0.5) & (d > 0.0)
         # dq = -2 s ds
-        scaled = 3.0 * s * at.first - q * at.second
-        ratio = 1.0 - 5.0 * s * at.first / scaled
-        usable = xp.where(near, (scaled > 0.0) & (ratio > 0.0), at.second < 0.0)
+        scaled = 3.0 * s * value - q * slope
+        ratio = 1.0 - 5.0 * s * value / scaled
+        usable = xp.where(near, (scaled > 0.0) & (ratio > 0.0), slope < 0.0)
         power = xp.where(near & usable, ratio, 1.0) ** 0.4
-        candidate = xp.where(near, xp.sqrt(1.0 - q * power), s - at.first / at.second)
+        candidate = xp.where(near, xp.sqrt(1.0 - q * power), s - value / slope)
         candidate = xp.minimum(xp.maximum(candidate, lower), upper)
         # Off the bracket, towards pi, q is bisected geometrically: it may be small.
         inner = xp.sqrt(1.0 - xp.sqrt((1.0 - lower * lower) * (1.0 - upper * upper)))
@@ -254,27 +271,29 @@ def _solve_fractional(curve: Curve, D: Array, start: Start) -> tuple[Array, Arra
 
     first = xp.minimum(xp.maximum(start.s, lower), upper)
     state = repeat(_FRACTIONAL_STEPS - 1, step, (first, lower, upper), xp)
-    return state[0], step(state)[0] - state[0], look(state[0], curve, D)
+    s = step(state)[0]
+    return s, s - state[0]
 
 
-def solve(plant: Plant, lag: Array, start: Start, delay: str, undelayed: bool) -> Ridge:
+def is_undelayed(delay: str, kind: Kind) -> bool:
+    """Whether every D is 1."""
+    return delay == "held" and not kind.long
+
+
+def solve(plant: Plant, lag: Array, start: Start, delay: str, kind: Kind) -> Ridge:
     """The ridge of one plant behind ``lag`` periods (whole in the held model)."""
     xp = namespace(plant.a2, lag)
-    curve, D = curve_of(stored(plant, start.scale)), lag + 1.0
+    undelayed = is_undelayed(delay, kind)
+    curve = curve_of(stored(plant, start.scale))
     if delay == "fractional_power":
-        s, last, at = _solve_fractional(curve, D, start)
+        s, last = _solve_fractional(curve, lag, start)
     else:
-        s, last, at = _solve_held(curve, D, start, undelayed)
-    # What the last step still changes: alpha to second order, beta to first.
-    gain = 0.5 * at.bend * at.first * last
-    alpha, beta = at.alpha + gain, at.beta - 0.5 * gain + at.beta_slope * last
+        s, last = _solve_held(curve, lag, start, undelayed)
     # Just before the take-over a smooth optimum may round to the corner's place.
-    s = xp.minimum(s + last, 1.0 - 0.5 * epsilon(s))
-    corner, corner_alpha, corner_beta = _corner(curve, D, start.corner)
-    return Ridge(
-        xp.where(corner, corner_alpha, alpha),
-        xp.where(corner, corner_beta, beta),
-        xp.where(corner, np.pi, 2.0 * wave(s, D, True).half),
-        xp.where(corner, 1.0, s),
-        xp.where(corner, 0.0, last),
-    )
+    s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))
+    alpha, beta = wall(s, curve, lag, undelayed)
+    ridge = Ridge(alpha, beta, 2.0 * wave(s, lag, True).half, s, last)
+    if not kind.short:
+        return ridge
+    corner, *there = _corner(curve, lag, start.corner)
+    return Ridge(*(xp.where(corner, end, value) for end, value in zip(there, ridge, strict=True)))

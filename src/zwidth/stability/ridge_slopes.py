@@ -20,7 +20,8 @@ import numpy as np
 from zwidth import phi
 from zwidth._types import Array
 from zwidth.plant import Plant, held_plant
-from zwidth.stability.ridge_newton import Ridge, Start, curve_of, look, solve, wave
+from zwidth.stability.devices import Kind
+from zwidth.stability.ridge_newton import Ridge, Start, curve_of, is_undelayed, sides, solve, stationarity, wall, wave
 from zwidth.xp import horner, namespace
 
 # -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `zwidth.phi`
@@ -36,7 +37,7 @@ def _chi(x: Array, gap: Array) -> Array:
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
-    """The derivatives of `zwidth.plant.held_plant` in delta and in the fraction; those of any fraction at whole delays."""
+    """The derivatives of `zwidth.plant.held_plant` in delta and in the fraction."""
     f, t = fraction, 1.0 - fraction
     c, e_t = phi.decay(delta), phi.decay(delta * t)
     at_t, at_f = phi.phi_functions(delta * t), phi.phi_functions(delta * f)
@@ -51,19 +52,15 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
 
 
-def alpha_change(s: Array, plant: Plant, D: Array, change: Plant) -> Array:
-    """How alpha moves at a fixed s (1 at a corner) when the plant does; D is fixed."""
+def alpha_change(s: Array, plant: Plant, lag: Array, change: Plant, undelayed: bool = False) -> Array:
+    """How alpha moves at a fixed s (1 at a corner) when the plant does."""
     xp = namespace(s, plant.a2)
     curve = curve_of(plant)
-    y, q, _, _, tau, kappa, _, _ = wave(s, D, False)
-    g1 = curve.g1[0] + y * (curve.g1[1] + y * curve.g1[2])
-    g2 = curve.g2[0] + y * curve.g2[1]
-    b, sin2 = change.a2 + change.a0, 4.0 * y * q
-    low = y < 0.5
-    m = xp.where(low, curve.at_one - 2.0 * curve.b * y, 2.0 * curve.b * q - curve.gap)
-    dm = xp.where(low, b * (1.0 - 2.0 * y) + change.a1, 2.0 * b * q - change.gap)
-    k, dk = curve.k, change.a2 - change.a0
-    rho = m * m + k * k * sin2
+    at = wave(s, lag, undelayed)
+    g1, g2, m, rho = sides(at, curve)
+    y, q, tau, kappa = at.y, at.q, at.tau, at.kappa
+    b, k, dk, sin2 = change.a2 + change.a0, curve.k, change.a2 - change.a0, 4.0 * y * q
+    dm = xp.where(y < 0.5, b * (1.0 - 2.0 * y) + change.a1, 2.0 * b * q - change.gap)
     # dM conj M = h1 + j h2 sin omega
     h1, h2 = dm * m + dk * k * sin2, dk * m - dm * k
     turned = tau * (g1 * h1 - g2 * h2 * sin2) + kappa * (g1 * h2 + g2 * h1)
@@ -73,9 +70,9 @@ def alpha_change(s: Array, plant: Plant, D: Array, change: Plant) -> Array:
 def alpha_by_lag(ridge: Ridge, lag: Array) -> Array:
     """How alpha moves with the exponent D; -inf at a corner, which the fractional power leaves like -d^(2/3)."""
     xp = namespace(ridge.s, lag)
-    at = wave(ridge.s, lag + 1.0, True)
+    at = wave(ridge.s, lag, True)
     slope = -8.0 * at.y * at.half * at.per_sin * (ridge.beta + 0.5 * ridge.alpha)
-    return xp.where(ridge.s < 1.0, slope, -np.inf)
+    return xp.where(ridge.s >= 1.0, -np.inf, slope)
 
 
 def differentiable_plant(delta: Array, fraction: Array) -> Plant:
@@ -83,11 +80,19 @@ def differentiable_plant(delta: Array, fraction: Array) -> Plant:
     return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
 
 
-def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay: str, undelayed: bool) -> Ridge:
+def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay: str, kind: Kind) -> Ridge:
     """`zwidth.stability.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
     if namespace(plant.a2, lag) is np:
-        return solve(plant, lag, start, delay, undelayed)
-    return _jax_ridge()(plant, lag, start, delay, undelayed)
+        return solve(plant, lag, start, delay, kind)
+    import jax.numpy as jnp
+
+    ridge = _jax_ridge()(plant, lag, start, delay, kind)
+    if delay == "held":
+        return ridge
+    # The corner is left like -d^(2/3) as soon as d > 0: all three fall with infinite slope.
+    corner = ridge.s >= 1.0
+    fall = jnp.where(corner, jnp.sqrt(jnp.where(corner, lag, 1.0)), 0.0)
+    return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - fall, omega=ridge.omega - fall)
 
 
 @cache
@@ -98,8 +103,8 @@ def _jax_plant() -> Any:
 
     @function.defjvp
     def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
-        slopes = plant_slopes(*primals)
-        change = (sum(slope * side for slope, side in zip(field, tangents, strict=True)) for field in zip(*slopes))
+        (by_delta, by_f), (d_delta, d_f) = plant_slopes(*primals), tangents
+        change = (a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True))
         return function(*primals), Plant(*change)
 
     return function
@@ -113,31 +118,25 @@ def _jax_ridge() -> Any:
     function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
 
     @function.defjvp
-    def rule(delay: str, undelayed: bool, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
+    def rule(delay: str, kind: Kind, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # The rule calls the function itself and is made of differentiable formulas: hence right to any order.
         plant, lag, start = primals
         change, lag_change = tangents[:2]
-        ridge = function(plant, lag, start, delay, undelayed)
-        smooth = ridge.s < 1.0
-        D = lag + 1.0
-        alpha = alpha_change(ridge.s, plant, D, change)
+        ridge = function(plant, lag, start, delay, kind)
+        corner = ridge.s >= 1.0
+        undelayed = is_undelayed(delay, kind)
+        alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
         if delay == "fractional_power":
-            alpha += jnp.where(smooth, alpha_by_lag(ridge, lag), 0.0) * lag_change
-            D_change = lag_change
-        else:
-            # Whole periods do not move.
-            D_change = jnp.zeros_like(lag)
-        along = (change, D_change)
-
-        def curve_at(name: str, s: Array) -> Any:
-            return lambda plant, D: getattr(look(s, curve_of(plant), D), name)
-
-        at = look(ridge.s, curve_of(plant), D)
-        _, first = jax.jvp(curve_at("first", ridge.s), (plant, D), along)
-        s = jnp.where(smooth, -first / jnp.where(smooth, at.second, 1.0), 0.0)
-        _, beta = jax.jvp(curve_at("beta", ridge.s), (plant, D), along)
-        root = jnp.sqrt(jnp.where(smooth, (1.0 - ridge.s) * (1.0 + ridge.s), 1.0))
-        moved = Ridge(alpha, beta + at.beta_slope * s, 2.0 * s / root, s, jnp.zeros_like(s))
+            alpha += jnp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
+        curve, curve_change = jax.jvp(curve_of, (plant,), (change,))
+        along = (curve_change, lag_change if delay == "fractional_power" else jnp.zeros_like(lag))
+        # Whole periods do not move.
+        _, first = jax.jvp(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along)
+        _, second = stationarity(ridge.s, curve, lag, undelayed)
+        s = jnp.where(corner, 0.0, -first / jnp.where(corner, 1.0, second))
+        _, (_, beta) = jax.jvp(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along))
+        root = jnp.sqrt(jnp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
+        moved = Ridge(alpha, beta, 2.0 * s / root, s, jnp.zeros_like(s))
         return ridge, moved
 
     return function

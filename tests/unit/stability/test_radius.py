@@ -6,12 +6,12 @@ import jax
 import numpy as np
 import pytest
 from mpmath import mp
+from zwidth.stability.methods import Method, radius_of
 
 import oracles
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
-from zwidth.stability.methods import Method, radius_of
 from zwidth.status import Status
 
 LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
