@@ -18,7 +18,6 @@ from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.proved import outermost_poles
 from zwidth.stability.ridge import RidgeKind, alpha_max
 
-
 _POLE_ACCURACY = 1e-9
 
 
