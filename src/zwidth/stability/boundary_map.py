@@ -79,7 +79,8 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0)
 def _solved_here(long: bool, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
     """The same by NumPy, each device computed once."""
     with np.errstate(all="ignore"):
-        here = device(*np.broadcast_arrays(delta, d), kind_of(d))
+        delta, d = np.broadcast_arrays(delta, d)
+        here = device(delta, d, kind_of(d))
         return long_row(beta, long_device(here)) if long else short_row(beta, here)
 
 

@@ -216,29 +216,39 @@ class RowEnd(NamedTuple):
 
 
 def row_end(beta: Array, lobe: Lobe, creeping: bool = False) -> RowEnd:
-    """The end of a row: the one zero of ``b - beta - delta``, a quadratic in y for n = 0."""
+    """The end of a row: the one zero of ``b - beta - delta``."""
+    if lobe.long is None:
+        return _short_end_of_row(beta, lobe)
+    long = _long_end_of_row(beta, lobe, creeping)
+    if lobe.is_short is None:
+        return long
+    short, xp = _short_end_of_row(beta, lobe), namespace(beta, lobe.delta)
+    return RowEnd(*(xp.where(lobe.is_short, mine, other) for mine, other in zip(short, long, strict=True)))
+
+
+def _short_end_of_row(beta: Array, lobe: Lobe) -> RowEnd:
+    """A quadratic in y."""
+    xp = namespace(beta, lobe.delta)
+    assert lobe.short is not None
+    u0, u1, *_, v1, v2 = lobe.short
+    b = beta + lobe.delta
+    linear = u0 - b * v1
+    square = linear * linear + 4.0 * b * (u1 - b * v2)
+    y = 2.0 * b / (linear + xp.sqrt(xp.maximum(square, 0.0)))
+    meets = (b > 0) & (square >= 0) & (y <= lobe.end)
+    y = xp.where(meets, y, xp.where(b > 0, lobe.end, 0.0))
+    return RowEnd(y, meets, (b > 0) & ~meets & lobe.to_corner, b)
+
+
+def _long_end_of_row(beta: Array, lobe: Lobe, creeping: bool) -> RowEnd:
     xp = namespace(beta, lobe.delta)
     b = beta + lobe.delta
-    if lobe.short is not None:
-        u0, u1, *_, v1, v2 = lobe.short
-        linear = u0 - b * v1
-        square = linear * linear + 4.0 * b * (u1 - b * v2)
-        y = 2.0 * b / (linear + xp.sqrt(xp.maximum(square, 0.0)))
-        meets = (b > 0) & (square >= 0) & (y <= lobe.end)
-        y = xp.where(meets, y, xp.where(b > 0, lobe.end, 0.0))
-        beyond = (b > 0) & ~meets & lobe.to_corner
-        if lobe.long is None:
-            return RowEnd(y, meets, beyond, b)
     alpha, omega = long_row_point(beta, lobe.long)
-    on_lobe = (b > 0) & (b < (wall(lobe.end, lobe).b if creeping else lobe.long[_TOP]))
+    meets = (b > 0) & (b < (wall(lobe.end, lobe).b if creeping else lobe.long[_TOP]))
     if creeping:
         crept = bisect_place(lambda x: wall(x, lobe).b < b, _SMALLEST * lobe.end, lobe.end, xp)
         omega = xp.where(_crept(lobe), crept, omega)
-    x = xp.where(on_lobe, omega, xp.where(b > 0, lobe.end, 0.0))
-    if lobe.short is None:
-        return RowEnd(x, on_lobe, b != b, alpha)
-    is_short = lobe.is_short
-    return RowEnd(xp.where(is_short, y, x), xp.where(is_short, meets, on_lobe), is_short & beyond, alpha)
+    return RowEnd(xp.where(meets, omega, xp.where(b > 0, lobe.end, 0.0)), meets, b != b, alpha)
 
 
 def peak(lobe: Lobe, creeping: bool = False) -> Peak:

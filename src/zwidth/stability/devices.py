@@ -29,7 +29,7 @@ def kind_of(d: Any) -> Kind:
     """The `Kind` of a concrete array of delays; what is no delay counts as short."""
     d = np.asarray(d)
     long = d >= 1
-    return Kind(not np.all(long), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
+    return Kind(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
 
 
 class Device(NamedTuple):

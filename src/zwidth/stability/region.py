@@ -84,9 +84,9 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
 
     Returns:
         StableRegion: ``alpha``, ``beta``, ``omega`` (0 and pi on the straight parts), ``piece`` (see `Piece`);
-        ``verified`` tells that the verdict of `zwidth.is_stable` changes at every vertex, from stable a millionth of its
-        distance from the middle inside to unstable as far outside (the two at alpha = 0: along a soft column). It is False for a fractional power, which has no
-        poles. ``area`` in units of alpha times beta, of the polygon.
+        ``verified`` tells that the verdict of `zwidth.is_stable` changes at every vertex, from stable a millionth of
+        its distance from the middle inside to unstable as far outside (the two at alpha = 0: along a soft column). It
+        is False for a fractional power, which has no poles. ``area`` in units of alpha times beta, of the polygon.
 
     Raises:
         InputError: an argument is no single number in range, or ``delay`` is unknown.

@@ -178,6 +178,24 @@ def test_derivatives(delay, x64):
                     assert oracles.relative_error(got[row, column, part], exact, size) <= tol.BOUNDARY_SLOPE.float64
 
 
+def test_derivatives_in_omega_beside_pi(x64):
+    # Both parts are even about pi: the slope is the second derivative times the distance.
+    slope = jax.jit(jax.jacfwd(lambda omega, delta, d: jnp.stack(zwidth.boundary(omega, delta, d)), 0))
+    for delta, d in ((0.5, 0.0), (0.0, 0.5), (0.3, 0.5), (0.7, 1.0), (0.2, 4.0), (2.0, 37.25)):
+        with mp.workdps(80):
+            h = mpf(10) ** -12
+            ahead, level = (oracles.boundary(mp.pi - k * h, delta, d) for k in (2, mpf(10) ** -12))
+            bend = [2 * (a - b) / (2 * h) ** 2 for a, b in zip(ahead, level, strict=True)]
+        for distance in (0.0, 1e-12, 1e-9, 1e-7, 1e-6):
+            omega = math.pi - distance
+            # pi itself is no float64.
+            left = mpf(math.pi - omega) + mpf("1.2246467991473532e-16")
+            for got, second in zip(slope(omega, delta, d), bend, strict=True):
+                # Rounding of the terms that cancel; beyond, the fourth derivative.
+                allowed = 4 * tol.EPS64 + (2e-10 + (d + 1) ** 2 * float(left) ** 2) * float(left)
+                assert abs(mpf(float(got)) + second * left) <= allowed * abs(second), (delta, d)
+
+
 def test_points_out_of_range_are_nan_with_all_derivatives(x64):
     assert np.isnan(zwidth.boundary(*np.array(BAD).T)).all()
     for part in along("held")(np.array(BAD), DIRECTIONS):
