@@ -26,7 +26,7 @@ from zwidth.xp import namespace
 
 _LEAST, _MOST = 0.2, 6.0
 # A hundred samples of a lobe at a time: what a block needs stays in the cache.
-_BLOCK = 1 << 8
+_BLOCK = 1 << 6
 _FEW = 1 << 9
 
 
