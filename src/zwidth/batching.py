@@ -45,10 +45,16 @@ def concretely() -> Iterator[None]:
         yield
 
 
+def _is_masked(value: ArrayLike) -> bool:
+    """Whether a value is a masked array; the module that defines them is loaded by those who make some."""
+    masked = sys.modules.get("numpy.ma")
+    return masked is not None and isinstance(value, masked.MaskedArray)
+
+
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     """Convert one concrete argument to float64, or say what is wrong with it."""
     try:
-        if isinstance(value, np.ma.MaskedArray):
+        if _is_masked(value):
             raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
         array = np.asarray(value)
         if array.dtype.kind in "OSUcVmM":
@@ -169,7 +175,7 @@ def _stack_level() -> int:
     frame, level = sys._getframe(1), 1
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("zwidth", "jax"):
         frame, level = frame.f_back, level + 1
-    return level - 1
+    return level
 
 
 @cache

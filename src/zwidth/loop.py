@@ -16,10 +16,10 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike
-from zwidth.batching import concrete_delay, pointwise
+from zwidth.batching import concrete_delay
 from zwidth.domain import device_status, wall_status
 from zwidth.errors import InputError, check_choice
-from zwidth.grouping import Degree, by_degree, degree_of, few_poles
+from zwidth.grouping import Degree, by_degree, few_poles
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 from zwidth.scene import normalize
 from zwidth.status import Status
@@ -372,18 +372,18 @@ def closed_loop_transfer(
     alpha, beta, delta, _ = normalize(
         mass=mass, damping=damping, period=period, stiffness=stiffness, virtual_damping=virtual_damping
     )
-    names = ("mass", "period", "alpha", "beta", "delta")
-    return pointwise(_closed_loop_kernel, names, (mass, period, alpha, beta, delta), (degree_of(float(delay)),))
+    names = ("mass", "period", "alpha", "beta", "delta", "d")
+    values = (mass, period, alpha, beta, delta, float(delay))
+    return by_degree(_closed_loop_kernel, values, names=names, few=few_poles)
 
 
 def _closed_loop_kernel(
-    mass: Array, period: Array, alpha: Array, beta: Array, delta: Array, degree: Degree
+    mass: Array, period: Array, alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree
 ) -> Transfer:
     xp = namespace(delta)
-    lag = 0.0 * delta + float(degree.whole)
     plant = undelayed_plant(delta)
     gain = period * period / mass
     numerator = xp.stack([gain * plant.a2, gain * plant.a1] + [0.0 * gain] * (degree.whole + 1), axis=-1)
     # Bad masses and periods have become bad alphas.
-    spoiled = poison(valid_wall(alpha, beta, delta, lag), alpha, beta, delta)
-    return Transfer(numerator + spoiled, _char_poly_kernel(alpha, beta, delta, lag, degree))
+    spoiled = poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta)[..., None]
+    return Transfer(numerator + spoiled, _char_poly_kernel(alpha, beta, delta, d, degree))

@@ -1,5 +1,7 @@
 """Batching: shapes, types, pieces, and a caller's own transformations, with kernels whose answers are known."""
 
+import threading
+import warnings
 from typing import NamedTuple
 
 import jax
@@ -7,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from zwidth import batching
 from zwidth.batching import FEW, as_float64, broadcast, concrete_delay, elementwise, is_traced, map_flat, pointwise
-from zwidth.errors import InputError, TracedDelayError
+from zwidth.errors import InputError, PrecisionWarning, TracedDelayError
 from zwidth.xp import namespace
 
 
@@ -165,3 +168,17 @@ def test_plain_numbers_inside_somebody_elses_transformation_are_computed_at_once
     assert isinstance(seen[0], np.ndarray | np.float64)
     np.testing.assert_array_equal(seen[0], pointwise(fragile, ("x",), (x,), fused=fused))
     assert not jax.config.jax_enable_x64
+
+
+def test_float32_inside_a_transformation_is_said_once(monkeypatch):
+    monkeypatch.setattr(batching, "_warned", threading.Event())
+    with jax.enable_x64(True), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(lambda x: pointwise(fragile, ("x",), (x,)))(1.0)
+    with pytest.warns(PrecisionWarning, match="call jax.config.update.'jax_enable_x64', True. first") as caught:
+        jax.grad(lambda x: elementwise(jnp.square, ("x",), (x,)))(1.0)
+    # The line named is the caller's.
+    assert caught[0].filename == __file__
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        jax.jit(lambda x: pointwise(fragile, ("x",), (x,)))(2.0)

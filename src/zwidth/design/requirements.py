@@ -128,7 +128,8 @@ def required_damping(
         delay: t_d in s, >= 0. All four broadcast.
 
     Returns:
-        Requirement: ``value`` in N s/m; ``status``. NaN where an entry is out of range.
+        Requirement: ``value`` in N s/m; ``status``. NaN where an entry is out of range, or the answer would be
+        (OUT_OF_RANGE: SI quantities are 0 or 1e-30 to 1e30, delta at most 1e12, d at most 1e5).
 
     Raises:
         InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
@@ -187,7 +188,8 @@ def required_period(
         delay_periods: d = t_d/T, >= 0. Everything broadcasts.
 
     Returns:
-        Requirement: ``value`` in s; ``status``, UNREACHABLE with NaN where no rate is enough.
+        Requirement: ``value`` in s; ``status``, UNREACHABLE with NaN where no rate is enough; OUT_OF_RANGE as for
+        `required_damping`.
 
     Raises:
         InputError: not exactly one delay is given, a scalar is out of range, an argument is no real number, or
@@ -261,7 +263,8 @@ def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike =
         period: T in s, > 0. All four broadcast.
 
     Returns:
-        Requirement: ``value`` in s; ``status``, UNREACHABLE with NaN where even the best delay is not enough.
+        Requirement: ``value`` in s; ``status``, UNREACHABLE with NaN where even the best delay is not enough;
+        OUT_OF_RANGE as for `required_damping`.
 
     Raises:
         InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
@@ -313,7 +316,8 @@ def required_mass(
         delay: t_d in s, >= 0. All four broadcast.
 
     Returns:
-        Requirement: ``value`` in kg; ``status``. NaN where an entry is out of range.
+        Requirement: ``value`` in kg; ``status``. NaN where an entry is out of range, or the answer would be, see
+        `required_damping`.
 
     Raises:
         InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.

@@ -21,8 +21,8 @@ from zwidth._types import Array
 from zwidth.batching import tree_map
 from zwidth.loop import FrequencyLoop, frequency_boundary
 from zwidth.stability.devices import Device, Kind, device
-from zwidth.stability.row_limit import LONG_FIELDS, Angles, long_device, long_row_point, offset, turned
-from zwidth.xp import epsilon, namespace, repeat
+from zwidth.stability.row_limit import LONG_FIELDS, Angles, long_device, long_fields, long_row_point, offset, turned
+from zwidth.xp import epsilon, frozen, namespace, repeat
 
 # Where the fit of the peak puts it to 4 %, the secant method needs so many steps for 1e-9 of x, 1e-17 of alpha.
 _PEAK_STEPS, _PEAK_STEPS_SHORT = 5, 9
@@ -100,13 +100,15 @@ def lobe(here: Device, d: Array, delay: str, kind: Kind) -> Lobe:
     to_corner = here.delta < 0
     if kind.short:
         short = _short(here)
-        root, to_corner = _short_end(short)
+        root, to_corner = _short_end(frozen(short, xp))
         ends.append(root)
     if has_long:
-        long = list(long_device(here))
+        # The end and what follows it only start solvers: no derivative passes through them.
+        fields = list(long_device(frozen(here, xp)))
+        long = fields if xp is np else [*long_fields(here), *fields[_END:]]
         if creeping:
             limit = np.pi / xp.maximum(1.0, d + 0.5)
-            crept = bisect_place(lambda x: _long_wall(x, long).alpha > 0, _SMALLEST * limit, limit, xp)
+            crept = bisect_place(lambda x: _long_wall(x, fields).alpha > 0, _SMALLEST * limit, limit, xp)
             long[_END] = xp.where(d < 1, crept, long[_END])
         ends.append(long[_END])
     if len(ends) < 2:

@@ -118,7 +118,7 @@ def refined_rate(alpha: Array, beta: Array, delta: Array, d: Array, re: Array, i
     rate = -0.5 * np.log1p(beyond.high) - 0.5 * beyond.low / (1.0 + beyond.high)
     at_one = (alpha == 0) & (re == 0)
     # Steps that do not settle have lost the pole: next to a double one, of walls a last place from none.
-    settled = np.abs(np.real(step / (1.0 + zeta))) <= 1e-3 * np.abs(rate)
+    settled = np.abs(step) <= 4e-15 * np.abs(zeta)
     return np.where(at_one, 0.0, np.where(settled, rate, np.nan))
 
 

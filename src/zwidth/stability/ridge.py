@@ -27,7 +27,8 @@ from zwidth.xp import epsilon, is_traced, namespace
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
-_CHUNK = 1 << 13
+# What fits the second-level cache, for the general route and for this one.
+_CHUNK, _BLOCK = 1 << 13, 1 << 15
 
 
 class RidgeKind(IntEnum):
@@ -55,8 +56,8 @@ def alpha_max(
     ``alpha_max(delta, d) = sup {alpha : some beta is stable}``; in SI units ``K_max = alpha_max m/T^2``.
 
     Args:
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not. Both broadcast.
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, whole or not. Both broadcast.
         delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
         method: "newton" solves the stationarity of the paper's loop in closed form, "kkt" the general conditions with
             optimistix; "auto" is "newton".
@@ -67,12 +68,15 @@ def alpha_max(
         pole at z = -1); ``status``, see `zwidth.Status`. NaN where the status is not 0.
 
     Raises:
-        InputError: an argument is no real number, shapes do not broadcast, or ``delay`` is unknown.
+        InputError: an argument is no real number, a single number is beyond the range above, shapes do not broadcast,
+            or ``delay`` is unknown.
 
     Numerics:
         alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable: `jit`, `vmap`,
         `grad`, `jvp` and second derivatives, in delta and d; NaN where the status is not 0. Float64 when called
-        directly; the ambient precision inside somebody's own `jit`.
+        directly. Inside a transformation, `jax.grad` included, JAX's own precision holds: float32 unless
+        ``jax.config.update("jax_enable_x64", True)`` was called, which a `zwidth.PrecisionWarning` says once. Few
+        points are computed by NumPy, without importing JAX.
 
         alpha's first derivatives are continuous, also where the corner takes over (d = 0: delta = 3.65936162742...)
         and at whole d > 0; its second derivatives and the first ones of beta and omega jump there. At a whole d they
@@ -95,7 +99,7 @@ def alpha_max(
         from zwidth.stability.ridge_kkt import kkt_kernel
 
         return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
-    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, occurring(d)))
+    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, occurring(d)), block=_BLOCK)
 
 
 def occurring(d: ArrayLike) -> Kind:

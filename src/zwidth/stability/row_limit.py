@@ -84,10 +84,9 @@ def _finish(limit: Array, b: Array) -> Array:
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
 
-def long_device(device: Device) -> Array:
-    """What rows with d >= 1 need of a device, its lobe's end included: `LONG_FIELDS` along a new first axis."""
+def long_fields(device: Device) -> list[Array]:
+    """The curve alone: the first of `LONG_FIELDS`, up to the lobe's end."""
     delta, whole, f, _, em, p1, _, _, _, _, a2, a1, a0, _, _ = device
-    xp = namespace(delta)
     k = whole + 0.5
     sigma, mu = a2 + a0, a2 - a0
     g = (em * p1, -2.0 * (p1 + sigma * em - 2.0 * mu), 8.0 * a0)
@@ -95,7 +94,15 @@ def long_device(device: Device) -> Array:
     v = (p1 * p1, -4.0 * (a1 * sigma + 4.0 * a2 * a0), 16.0 * a2 * a0)
     b1 = 2.0 * p1 - 4.0 * mu + 2.0 * delta * (sigma * (sigma - a1) - 8.0 * a2 * a0)
     b2 = -8.0 * a0 * (1.0 - 2.0 * delta * a2)
-    fields = [delta, k, *g, *h, *v, b1, b2]
+    return [delta, k, *g, *h, *v, b1, b2]
+
+
+def long_device(device: Device) -> Array:
+    """What rows with d >= 1 need of a device, its lobe's end included: `LONG_FIELDS` along a new first axis."""
+    fields = long_fields(device)
+    delta, k, g0, _, _, h0, _, v0, _, _, b1, _ = fields
+    em, p1, whole, f = device.em, device.p1, device.whole, device.f
+    xp = namespace(delta)
     end = _lobe_end(fields, em / (p1 + f * em), whole + f)
     total, d_total, scale, d_scale = offset(Angles(end, fields), fields)
     top = total / scale
@@ -105,7 +112,7 @@ def long_device(device: Device) -> Array:
     flat = xp.clip(1.0 - 0.5 * end * (d_total / total - d_scale / scale), 0.0, 1.0)
     bow = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
     sin_bow = xp.sin(bow)
-    slope = (0.25 * b1 + 0.5 * g[0] * (k * k - 0.25) + k * h[0]) / v[0]
+    slope = (0.25 * b1 + 0.5 * g0 * (k * k - 0.25) + k * h0) / v0
     bend = xp.sqrt(top / slope) / end - sin_bow / bow
     return xp.stack([*fields, end, top, bow, sin_bow, bend])
 

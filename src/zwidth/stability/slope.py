@@ -29,15 +29,15 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
     g is the largest one for which some h keeps every zero inside the unit circle.
 
     Args:
-        d: delay in periods, >= 0, whole or not; any shape.
+        d: delay in periods, 0 to 1e5, whole or not; any shape.
         delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
 
     Returns:
-        Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN where d is NaN, negative
-        or infinite.
+        Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN where d is NaN, negative,
+        infinite or too long.
 
     Raises:
-        InputError: d is no real number, or ``delay`` is unknown.
+        InputError: d is no real number, a single one is longer than 1e5, or ``delay`` is unknown.
 
     Numerics:
         About 1e-15 relative. Traceable, with derivatives of every order in d. The held slope is

@@ -3,7 +3,9 @@
 import jax
 import numpy as np
 import pytest
+from mpmath import mp, mpf
 
+import oracles
 import zwidth
 from zwidth.design import passive_area, stable_area
 from zwidth.stability.poles import unstable_poles
@@ -23,6 +25,27 @@ def test_the_area_is_that_of_the_outline():
 def test_the_undamped_area_without_delay_has_a_closed_form():
     # alpha = 2 beta (2 - beta)/(2 + beta) from beta = 0 to 2: 2 (4 beta - beta^2/2 - 8 ln(2 + beta)) between them.
     assert stable_area(np.array([0.0]), 0.0)[0] == pytest.approx(2.0 * (6.0 - 8.0 * np.log(2.0)), rel=1e-13)
+
+
+@pytest.mark.parametrize("delta, d", [*POINTS, (0.01, 0.97), (1e4, 2.3), (1e-3, 30.0)])
+def test_the_area_by_quadrature_in_mpmath(delta, d):
+    with mp.workdps(40 + oracles.digits_for(delta)):
+        region = zwidth.stable_region(delta, d, points=8)
+        # The last point of the curve, in front of the line to alpha = 0.
+        rises = region.piece[-1] == zwidth.stability.region.Piece.MINUS_ONE
+        end, corner, h = mp.pi, mpf(0), mpf(10) ** -20
+        if rises:
+            corner = oracles.boundary(mp.pi - mpf(10) ** -18, delta, d)[0] ** 2 / 4
+        else:
+            near = mpf(float(region.omega[-1]))
+            end = mp.findroot(lambda w: oracles.boundary(w, delta, d)[0], (near, near * (1 - mpf(10) ** -9)))
+
+        def height(omega):
+            before, after = (oracles.boundary(omega * (1 + sign * h), delta, d)[1] for sign in (-1, 1))
+            return oracles.boundary(omega, delta, d)[0] * (after - before) / (2 * h * omega)
+
+        exact = mp.quad(height, mp.linspace(end * mpf(10) ** -12, end * (1 - mpf(10) ** -15), 4), maxdegree=5) + corner
+        assert oracles.relative_error(stable_area(delta, d), exact) < 1e-12
 
 
 @pytest.mark.parametrize("delta, d", [(3.0, 0.0), (0.5, 1.0)])

@@ -1,4 +1,4 @@
-"""First-order enclosures of boxes contain what they stand for: every operation and the whole verdict, at random points."""
+"""First-order enclosures of boxes contain what they stand for: operations and the whole verdict, at random points."""
 
 import numpy as np
 import pytest

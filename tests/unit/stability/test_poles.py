@@ -11,6 +11,7 @@ from mpmath import mp
 import oracles
 import tolerances as tol
 import zwidth
+from zwidth.errors import InputError
 from zwidth.stability.poles import companion, radius_by_companion, unstable_poles
 
 LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
@@ -132,6 +133,30 @@ def test_a_nearly_whole_delay_adds_a_pole_at_zero():
 def test_the_companion_matrix_has_the_polynomial_as_its_own():
     monic = np.array([1.0, -2.0, 0.5, 0.25, -0.125])
     np.testing.assert_allclose(np.poly(np.asarray(companion(jnp.asarray(monic)))), monic, atol=1e-6)
+
+
+@pytest.mark.parametrize("d", [2046, 10_000, 1e5])
+def test_thousands_of_poles_say_what_they_would_take(d):
+    if d == 2046:
+        from zwidth.stability.poles import check_degree
+
+        check_degree(d)
+        return
+    with pytest.raises(InputError, match=r"poles would take about .* MB and .* s a point"):
+        zwidth.poles(0.1, 0.1, 0.1, d)
+
+
+def test_without_stiffness_nothing_is_stable():
+    rng = np.random.default_rng(3)
+    beta, delta, d = rng.uniform(-1, 1, 3000), 10.0 ** rng.uniform(-3, 2, 3000), rng.choice([0.0, 1.0, 2.0, 0.5], 3000)
+    assert (np.asarray(radius_by_companion(0.0, beta, delta, d)) >= 1.0).all()
+    assert (np.asarray(unstable_poles(0.0, beta, delta, d)) >= 1).all()
+
+
+def test_a_scalar_beyond_the_domain_is_refused():
+    with pytest.raises(InputError, match="alpha"):
+        zwidth.spectral_radius(1e300, 0, 0, 1, method="companion")
+    assert np.isnan(zwidth.spectral_radius([1e300], 0.0, 0.0, 1, method="companion")).all()
 
 
 def test_derivatives_of_a_pole(x64):

@@ -1,43 +1,44 @@
 """Spectral radius by every method: error bounds and certificates held against references and mpmath's roots."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
 from mpmath import mp
-from zwidth.stability.methods import Method, radius_of
 
 import oracles
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
-from zwidth.status import Status
+from zwidth.stability.radii import radius_of
+from zwidth.status import Method, Status
 
 LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
-METHODS = [("newton", 1e-9), ("bisection", 1e-9), ("companion", None)]
+METHODS = [("newton", 1e-9), ("newton", 1e-12), ("companion", None)]
 
 
 @pytest.fixture(scope="module")
 def labels():
-    """The points of two degrees: every degree is compiled for every method."""
     with np.load(LABELS) as file:
-        some = np.isin(file["d"], [0.0, 1.5])
-        return {name: file[name][some] for name in file.files}
+        return {name: file[name] for name in file.files}
 
 
 @pytest.mark.parametrize("method, accuracy", METHODS)
 def test_scattered_points_keep_their_bounds(labels, method, accuracy):
     found = radius_of(*(labels[name] for name in ("alpha", "beta", "delta", "d")), method=method, accuracy=accuracy)
+    if accuracy == 1e-12:
+        labels = {name: values[labels["d"] <= 4] for name, values in labels.items()}
+        found = radius_of(*(labels[name] for name in ("alpha", "beta", "delta", "d")), method=method, accuracy=accuracy)
     assert (found.status == Status.OK).all()
     error = np.abs(found.radius - labels["rho"])
     assert (error <= found.error).all()
-    # An honest bound that says nothing would be of no use; bisection adds that of its test to that of the interval.
-    assert np.quantile(found.error / labels["rho"], 0.8) <= 2.1e-9
     if method == "newton":
-        assert found.certified.mean() > 0.85
-        assert (found.error <= 1.1e-9 * labels["rho"])[found.certified].all()
-        assert (found.method[found.certified] == Method.NEWTON).all()
+        assert found.certified.all()
+        assert (found.error <= 1.1 * accuracy * labels["rho"]).all()
+        assert (found.method == Method.NEWTON).all()
     else:
         assert not found.certified.any()
 
@@ -57,7 +58,7 @@ def test_maps_keep_their_bounds(d, transposed):
     axes = (alpha[:, None], beta) if transposed else (alpha, beta[:, None])
     found = radius_of(*axes, 0.1, d, method="newton")
     assert found.radius.shape == np.broadcast_shapes(*(axis.shape for axis in axes))
-    assert found.certified.mean() > 0.97
+    assert found.certified.mean() > 0.999
     peer = zwidth.spectral_radius(*axes, 0.1, d, method="companion")
     # Near a double pole the companion matrix keeps half of the digits.
     assert (np.abs(found.radius - peer) <= found.error + tol.POLE.float64 * peer)[found.certified].all()
@@ -80,7 +81,7 @@ def test_mixed_delays_single_points_and_none():
         float(exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-9
     )
     assert radius_of([], 0.5, 0.1, 1.5, method="newton").radius.shape == (0,)
-    mixed = radius_of(0.5, 0.5, 0.1, [0.0, 1.5, 4.0], method="bisection")
+    mixed = radius_of(0.5, 0.5, 0.1, [0.0, 1.5, 4.0])
     expected = [float(exact_radius(0.5, 0.5, 0.1, d)) for d in (0.0, 1.5, 4.0)]
     np.testing.assert_allclose(mixed.radius, expected, rtol=1e-9)
 
@@ -96,28 +97,24 @@ def test_bad_points_leave_the_others_alone(method, accuracy):
     np.testing.assert_array_equal(found.radius[[0, 4]], alone.radius)
 
 
-def test_bisection_takes_the_accuracy_it_is_asked_for():
-    exact = float(exact_radius(0.5, 0.5, 0.1, 1.5))
-    rough, fine = (radius_of(0.5, 0.5, 0.1, 1.5, method="bisection", accuracy=value) for value in (1e-2, 1e-12))
-    assert 1e-9 < abs(rough.radius - exact) <= rough.error < 0.1
-    assert abs(fine.radius - exact) <= fine.error < 1e-10
-
-
 def test_double_poles_are_not_certified():
     # The corner of the undamped loop is not reached at d = 1: take the ridge of a heavily damped device.
     top = zwidth.alpha_max(5.0, 0.0)
     assert top.kind == 1
     found = radius_of(top.alpha, top.beta, 5.0, 0.0, method="newton")
     assert not found.certified
-    assert found.radius == pytest.approx(1.0, abs=tol.DOUBLE_POLE.float64)
+    assert found.status == Status.NOT_CONVERGED
+    assert 1e-9 < found.error < 1e-3
+    assert abs(found.radius - exact_radius(float(top.alpha), float(top.beta), 5.0, 0.0)) <= found.error
 
 
 @pytest.mark.parametrize(
     "arguments, message",
     [
         ({"method": "guess"}, "method"),
-        ({"method": "newton", "accuracy": 1e-12}, "1e-10"),
-        ({"method": "bisection", "accuracy": 1e-15}, "1e-14"),
+        ({"method": "newton", "accuracy": 1e-13}, "1e-12"),
+        ({"method": "bisection"}, "method"),
+        ({"accuracy": "x"}, "accuracy"),
         ({"accuracy": 0.0}, "accuracy"),
         ({"accuracy": float("nan")}, "accuracy"),
         ({"delay": "fractional_power"}, "held"),
@@ -128,12 +125,79 @@ def test_what_cannot_be_asked_is_refused(arguments, message):
         zwidth.spectral_radius(0.1, 0.1, 0.1, 1, **arguments)
 
 
-@pytest.mark.parametrize("method", ["companion", "bisection"])
+@pytest.mark.parametrize("method", ["auto", "newton", "companion"])
 def test_inside_a_transformation(method, x64):
     got = jax.jit(lambda alpha: zwidth.spectral_radius(alpha, 0.5, 0.1, 1.5, method=method))(0.5)
     assert got == pytest.approx(float(exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-8)
-    with pytest.raises(InputError, match="newton"):
-        jax.jit(lambda alpha: zwidth.spectral_radius(alpha, 0.5, 0.1, 1.5, method="newton"))(0.5)
+
+
+def test_the_delay_may_be_traced(x64):
+    got = jax.jit(lambda d: zwidth.spectral_radius(0.5, 0.5, 0.1, d))(np.array([0.0, 1.5, 30.0]))
+    np.testing.assert_allclose(got, zwidth.spectral_radius(0.5, 0.5, 0.1, [0.0, 1.5, 30.0]), rtol=1e-11)
+
+
+def test_single_precision_keeps_its_digits():
+    got = jax.jit(lambda alpha: zwidth.spectral_radius(alpha, 0.5, 0.1, 1.0))(0.5)
+    assert got.dtype == np.float32
+    assert got == pytest.approx(zwidth.spectral_radius(0.5, 0.5, 0.1, 1.0), rel=1e-5)
+
+
+def exact_pole_derivative(alpha, beta, delta, d, h=mp.mpf(10) ** -20):
+    """d rho/d alpha by a central difference in 60 digits."""
+    with mp.workdps(60):
+        up, down = (
+            max(abs(z) for z in oracles.roots(oracles.polynomial(mp.mpf(alpha) + sign * h, beta, delta, d)))
+            for sign in (1, -1)
+        )
+        return float((up - down) / (2 * h))
+
+
+def test_derivatives_are_those_of_the_outermost_pole(x64):
+    slope = jax.jit(jax.grad(lambda alpha, d: zwidth.spectral_radius(alpha, 0.4, 0.1, d)))
+    for d in (0.0, 4.0, 1.5):
+        assert slope(0.2, d) == pytest.approx(exact_pole_derivative(0.2, 0.4, 0.1, d), rel=1e-9)
+    assert slope(0.2, 0.0) == pytest.approx(0.92824, abs=1e-5)
+    assert slope(0.2, 4.0) == pytest.approx(0.53533, abs=1e-5)
+
+
+def test_at_a_double_pole_there_is_no_derivative(x64):
+    # d = 0, delta = 0: z^2 (z - 1)^2 /z ... the two largest poles meet on the real axis where beta makes them.
+    top = zwidth.alpha_max(5.0, 0.0)
+    slope = jax.jit(jax.grad(lambda alpha: zwidth.spectral_radius(alpha, float(top.beta), 5.0, 0)))(float(top.alpha))
+    assert np.isnan(slope)
+
+
+def test_nothing_is_compiled_and_no_delay_takes_long():
+    code = (
+        "import sys, time, zwidth, numpy\n"
+        "zwidth.spectral_radius(.1, .1, .5, 3)\n"
+        "start = time.perf_counter()\n"
+        "for d in (62, 63, 64, 501, 1e4, 1e5, 1.5): zwidth.spectral_radius(.01, .01, .5, d)\n"
+        "assert time.perf_counter() - start < 1, time.perf_counter() - start\n"
+        "assert 'jax' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_triple_poles_keep_their_bounds():
+    # (z - r)^3 = z^3 - 3 r z^2 + 3 r^2 z - r^3 is P at d = 0, delta = 0 for alpha, beta of its three coefficients only
+    # if 2 r^2 ... : the wall of `fastest_wall`, where three poles meet, and its neighbors.
+    rng = np.random.default_rng(5)
+    alpha, beta = 0.0718 + 1e-3 * rng.standard_normal(60), 0.41 + 1e-3 * rng.standard_normal(60)
+    found = radius_of(alpha, beta, 0.0, 0.0)
+    for k in range(60):
+        assert abs(found.radius[k] - exact_radius(alpha[k], beta[k], 0.0, 0.0)) <= found.error[k]
+
+
+def test_radii_of_the_adversarial_walls_keep_their_bounds():
+    with np.load(LABELS.parent / "adversarial.npz") as file:
+        walls = [file[name] for name in ("alpha", "beta", "delta", "d")]
+        exact = 1.0 + file["margin"]
+    found = radius_of(*walls)
+    judged = np.isfinite(found.error) & np.isfinite(exact)
+    assert judged.mean() > 0.85
+    # The reference itself is rounded to 1 + margin.
+    assert (np.abs(found.radius - exact) <= found.error + 2e-16 * exact)[judged].all()
 
 
 def test_a_wall_without_stiffness_keeps_its_pole_at_one_exactly():

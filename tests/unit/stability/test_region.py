@@ -11,7 +11,7 @@ import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
 from zwidth.stability.poles import unstable_poles
-from zwidth.stability.region import Piece, _sides_are_right, lobe, stable_region
+from zwidth.stability.region import Piece, _edge_is_right, lobe, stable_region
 
 # Lobe, lobe cut by the line at z = -1, held and whole, weakly and strongly damped.
 DEVICES = [(0.0, 0), (0.5, 1), (2.4, 0), (6.0, 0), (50.0, 0.125), (3.0, 0.6), (0.1, 4), (1e3, 1.3)]
@@ -81,8 +81,7 @@ def test_the_cut_is_the_line_of_a_pole_at_minus_one(regions, device):
     with mp.workdps(oracles.DIGITS):
         for k in on_line:
             terms = oracles.polynomial(region.alpha[k], region.beta[k], *device)
-            # The meeting of line and curve is interpolated between two vertices.
-            assert abs(oracles.evaluate(terms, -1)) <= 1e-6 * sum(abs(term) for term in terms)
+            assert abs(oracles.evaluate(terms, -1)) <= 1e-13 * sum(abs(term) for term in terms)
 
 
 def test_without_strong_damping_there_is_no_line(regions):
@@ -90,12 +89,21 @@ def test_without_strong_damping_there_is_no_line(regions):
         assert (regions[device].piece == Piece.COMPLEX_PAIR).all()
 
 
-@pytest.mark.parametrize("scale", [0.9, 1.1])
+@pytest.mark.parametrize("scale", [0.9, 1.1, 1 - 1e-5, 1 + 1e-5])
 def test_a_wrong_outline_is_not_verified(regions, scale):
     region = regions[0.5, 1]
-    assert _sides_are_right(region.alpha, region.beta, 0.5, 1)
+    assert _edge_is_right(region.alpha, region.beta, 0.5, 1)
+    assert not _edge_is_right(scale * region.alpha, region.beta, 0.5, 1)
     center = region.beta.mean()
-    assert not _sides_are_right(scale * region.alpha, center + scale * (region.beta - center), 0.5, 1)
+    assert not _edge_is_right(region.alpha, center + scale * (region.beta - center), 0.5, 1)
+
+
+@pytest.mark.parametrize("points", [8, 9, 13, 32])
+@pytest.mark.parametrize("device", [*DEVICES, (1e6, 0), (0.0, 100), (3.0, 0), (0.3, 0.999)])
+def test_few_points_are_verified_too(device, points):
+    region = stable_region(*device, points=points)
+    assert region.verified
+    assert region.alpha.max() <= zwidth.alpha_max(*device).alpha * (1 + 1e-12)
 
 
 def test_a_fractional_power_is_never_verified():
