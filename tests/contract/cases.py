@@ -64,8 +64,9 @@ CASES = [
     Case("spectral_radius", zwidth.spectral_radius, {**WALL, **ONE_DELAY}, BAD_WALL),
     Case("decay_rate", zwidth.decay_rate, {**WALL, **ONE_DELAY}, BAD_WALL),
     of_walls(zwidth.is_stable, "is_stable"),
-    of_walls(zwidth.is_passive, "is_passive"),
-    of_walls(zwidth.passivity_margin, "passivity_margin"),
+    Case("is_passive", zwidth.is_passive, {**WALL, **ONE_DELAY}, BAD_WALL),
+    Case("passivity_margin", zwidth.passivity_margin, {**WALL, **ONE_DELAY}, BAD_WALL),
+    Case("margins", zwidth.margins, {**WALL, **ONE_DELAY}, BAD_WALL, heavy=True),
     Case(
         "boundary",
         zwidth.boundary,

@@ -108,14 +108,17 @@ def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -
     cos_w, square = 1.0 - u, u * (2.0 - u)
     # For n = 0 all is a polynomial in u, up to w = pi.
     undelayed = k == 1
-    square_safe = xp.where(undelayed, 1.0, square) if kind.short else square
-    cosine, sine = _wave(xp.minimum(u, 1.0), k, xp)
-    tau = sine / xp.sqrt(square_safe)
-    if kind.short:
-        cosine, tau = xp.where(undelayed, cos_w, cosine), xp.where(undelayed, 1.0, tau)
-    tau1 = (k * cosine - tau * cos_w) / square_safe
-    if kind.short:
-        tau1 = xp.where(undelayed, 0.0, tau1)
+    if kind.long:
+        square_safe = xp.where(undelayed, 1.0, square) if kind.short else square
+        cosine, sine = _wave(xp.minimum(u, 1.0), k, xp)
+        tau = sine / xp.sqrt(square_safe)
+        if kind.short:
+            cosine, tau = xp.where(undelayed, cos_w, cosine), xp.where(undelayed, 1.0, tau)
+        tau1 = (k * cosine - tau * cos_w) / square_safe
+        if kind.short:
+            tau1 = xp.where(undelayed, 0.0, tau1)
+    else:
+        cosine, tau, tau1 = cos_w, 1.0, 0.0
     inner = (k * cosine - tau) / u
     spring, spring1 = tau * (2.0 - u) - cosine, inner + k * tau
     spring2 = (-k * k * tau - tau1 - inner) / u + k * tau1

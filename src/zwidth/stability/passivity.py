@@ -182,7 +182,7 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
     values = (alpha, beta, delta, d)
     if is_traced(*values):
         return elementwise(_margin_kernel, NAMES, values, (ANY,))
-    if max(map(np.size, values)) > FEW or len({np.shape(value) for value in values}) > 1:
+    if not all(isinstance(value, int | float | np.number) for value in values):
         found = _on_maps(values)
         if found is not None:
             return found
