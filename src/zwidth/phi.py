@@ -32,10 +32,11 @@ class PhiFunctions(NamedTuple):
     phi2: Array
     psi: Array
     gap: Array
+    excess: Array  # phi1^2 - c
 
 
 def phi_functions(x: Array) -> PhiFunctions:
-    """c, phi1, phi2, psi and gap at x >= 0."""
+    """c, phi1, phi2, psi, gap and excess at x >= 0."""
     xp = namespace(x)
     small = x < _SERIES_BELOW
     factor = xp.exp(-0.5 * x)
@@ -43,7 +44,9 @@ def phi_functions(x: Array) -> PhiFunctions:
     # Each branch gets an argument that is harmless where the other one holds.
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, _SERIES_BELOW, x)
     square = half * half
-    low1, low_gap = factor * horner(square, _PHI1), factor * (2.0 * half) * horner(square, _GAP)
+    # phi1 = factor (1 + rise)
+    rise = square * horner(square, _PHI1[1:])
+    low1, low_gap = factor * (1.0 + rise), factor * (2.0 * half) * horner(square, _GAP)
     # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact.
     inverse = 1.0 / high
     high1 = (1.0 - c) * inverse
@@ -53,6 +56,7 @@ def phi_functions(x: Array) -> PhiFunctions:
         xp.where(small, 0.5 * (low1 + low_gap), (1.0 - high1) * inverse),
         xp.where(small, 0.5 * (low1 - low_gap), (high1 - c) * inverse),
         xp.where(small, low_gap, ((1.0 + c) - 2.0 * high1) * inverse),
+        xp.where(small, c * rise * (2.0 + rise), high1 * high1 - c),
     )
 
 

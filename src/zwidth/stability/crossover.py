@@ -50,6 +50,7 @@ class Crossover(NamedTuple):
 
     u: Array  # 1 - cos w
     y: Array  # 1 + cos w
+    lean: Array  # alpha - 2 u
     exists: Array
 
 
@@ -67,12 +68,12 @@ def gain_crossover(alpha: Array, beta: Array, here: Device, kind: Kind) -> Cross
     spread, square, turned = 2.0 * beta * (alpha + beta), alpha * alpha, alpha + 2.0 * beta
     h0 = p1 * p1 * square
     h1 = 2.0 * (p1 * p1 * ((beta - delta) * (beta + delta) + alpha * beta) - m1 * square)
-    h2 = corner * square - 2.0 * m1 * spread - 4.0 * c
-    h3 = corner * spread
+    rest = corner * square - 2.0 * m1 * spread
+    h2, h3 = rest - 4.0 * c, corner * spread
     # At z = -1 the device and its delay must be the larger part.
     one, other = 2.0 * (1.0 + c), gap * turned
     exists = xp.abs(other) < one
-    far = False
+    far, first = False, (h1, rest, h3)
     if kind.short:
         far = h0 + (h1 + h2 + h3) > 0
         g1 = 2.0 * (mu * mu - gap * sigma)
@@ -82,7 +83,20 @@ def gain_crossover(alpha: Array, beta: Array, here: Device, kind: Kind) -> Cross
         h2 = xp.where(far, 4.0 * c - corner * tall + g1 * spread, h2)
     near = first_zero(h0, h1, h2, h3, kind.fractional, xp)
     u, y = xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near)
-    return Crossover(u, y, exists & (near > 0) & (near <= 1.0))
+    return Crossover(u, y, _lean(alpha, u, first, here, xp), exists & (near > 0) & (near <= 1.0))
+
+
+def _lean(alpha: Array, u: Array, first: tuple[Array, Array, Array], here: Device, xp: Any) -> Array:
+    """``alpha - 2 u``, which vanishes beside both for slow, nearly undamped loops, by the equation that u solves.
+
+    ``phi1^2 (alpha^2 - 4 u^2) = -(h1 u + (h2 + 4 c) u^2 + h3 u^3) - 4 u^2 (phi1^2 - c)``, wherever its terms are smaller
+    than those of the difference itself.
+    """
+    terms = [first[0] * u, first[1] * (u * u), first[2] * (u * u * u), 4.0 * here.excess * (u * u)]
+    total, scale = alpha + 2.0 * u, here.p1 * here.p1
+    size = sum(xp.abs(term) for term in terms)
+    scaled = scale * total
+    return xp.where(size < scaled * total, -sum(terms) / xp.where(scaled > 0, scaled, 1.0), alpha - 2.0 * u)
 
 
 def first_zero(h0: Array, h1: Array, h2: Array, h3: Array, fractional: bool, xp: Any) -> Array:
@@ -105,14 +119,15 @@ def first_zero(h0: Array, h1: Array, h2: Array, h3: Array, fractional: bool, xp:
 
 def loop_vector(alpha: Array, beta: Array, crossover: Crossover, here: Device) -> tuple[Array, Array]:
     """Real and imaginary part of V, free of cancellation at both ends and where beta is near ``-delta``."""
-    c, em, a2, a0, p1, gap = here.c, here.em, here.a2, here.a0, here.p1, here.gap
-    u, y, _ = crossover
+    delta, c, em, a2, a0, p1, gap = here.delta, here.c, here.em, here.a2, here.a0, here.p1, here.gap
+    u, y, lean, _ = crossover
     xp = namespace(u)
     s, near = xp.sqrt(u * y), u < 1.0
     re = s * (alpha + beta * (2.0 * u - em))
     im = xp.where(
         near,
-        alpha * (em - u) + beta * u * ((2.0 + em) - 2.0 * u),
+        # alpha (em - u) + beta u (2 + em - 2 u), with em + beta = (beta + delta) - delta^2 phi2
+        em * lean + u * (2.0 * ((beta + delta) - delta * delta * here.p2) + beta * (em - 2.0 * u) - alpha),
         y * (alpha + beta * (5.0 + c - 2.0 * y)) - (1.0 + c) * (alpha + 2.0 * beta),
     )
     sigma = a2 + a0
@@ -122,7 +137,7 @@ def loop_vector(alpha: Array, beta: Array, crossover: Crossover, here: Device) -
 
 def lag_vector(crossover: Crossover, whole: Array) -> tuple[Array, Array]:
     """Cosine and sine of ``(n + 1/2) w``, which the verdict needs up to pi only."""
-    u, y, _ = crossover
+    u, y = crossover.u, crossover.y
     xp = namespace(u, whole)
     cos_half, sin_half = xp.sqrt(0.5 * xp.maximum(y, 0.0)), xp.sqrt(0.5 * u)
     # Half of the angle, so that its sine keeps its digits for slow loops; behind a quarter turn only n = 0 matters.

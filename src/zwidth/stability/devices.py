@@ -49,6 +49,7 @@ class Device(NamedTuple):
     a1: Array
     a0: Array
     gap: Array  # N(-1) = a2 - a1 + a0
+    excess: Array  # phi1^2 - c
     tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
 
 
@@ -62,7 +63,7 @@ def device(delta: Array, d: Array, kind: Kind = ANY) -> Device:
     late = phi.phi_functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
     plant = held_plant(delta, f) if kind.fractional else undelayed_plant(delta)
     tilt = tilt_at_minus_one(plant, whole)
-    plant_fields = (plant.a2, plant.a1, plant.a0, plant.gap, tilt)
+    plant_fields = (plant.a2, plant.a1, plant.a0, plant.gap, at.excess, tilt)
     fields = (delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi, *plant_fields)
     return Device(*(xp.where(ok, field, np.nan) for field in fields))
 

@@ -54,7 +54,7 @@ def short_row(beta: Array, device: Device) -> Array:
 
     Beyond the corner, the double pole at z = -1, only the line bounds the row.
     """
-    delta, _, f, _, em, p1, p2, psi, p1_t, psi_t, a2, a1, a0, _, tilt = device
+    delta, _, f, _, em, p1, p2, psi, p1_t, psi_t, a2, a1, a0, _, _, tilt = device
     xp = namespace(beta, delta)
     b = beta + delta
     # For d = 0 the row ends at phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
@@ -86,7 +86,7 @@ def _finish(limit: Array, b: Array) -> Array:
 
 def long_fields(device: Device) -> list[Array]:
     """The curve alone: the first of `LONG_FIELDS`, up to the lobe's end."""
-    delta, whole, f, _, em, p1, _, _, _, _, a2, a1, a0, _, _ = device
+    delta, whole, f, _, em, p1, _, _, _, _, a2, a1, a0, _, _, _ = device
     k = whole + 0.5
     sigma, mu = a2 + a0, a2 - a0
     g = (em * p1, -2.0 * (p1 + sigma * em - 2.0 * mu), 8.0 * a0)
