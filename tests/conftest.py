@@ -5,6 +5,7 @@ JAX keeps its default precision: the library's float64 must not depend on anyone
 
 import os
 import signal
+from pathlib import Path
 
 # A shell that starts something in the background has it ignore Ctrl-C, and so would every program that tests start.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -12,6 +13,10 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # Set before anything imports matplotlib, and inherited by the programs that tests start.
 os.environ["MPLBACKEND"] = "Agg"
+# Most of the time would go into compiling: the processes that run tests share what one of them has compiled.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
 import pytest
@@ -31,6 +36,11 @@ settings.register_profile(
     print_blob=True,
 )
 settings.load_profile("zwidth")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Most tests inside transformations keep JAX's default precision on purpose."""
+    config.addinivalue_line("filterwarnings", "ignore::zwidth.errors.PrecisionWarning")
 
 
 @pytest.fixture

@@ -44,7 +44,7 @@ def project_files():
     if listing.returncode == 0:
         paths = [ROOT / name for name in listing.stdout.split("\0") if name]
     else:
-        hidden = {".venv", ".git", "__pycache__", "runs"}
+        hidden = {".venv", ".venv-oldest", ".venv-newest", ".git", "__pycache__", "runs"}
         paths = [path for path in ROOT.rglob("*") if not hidden & set(path.relative_to(ROOT).parts)]
     return [path for path in paths if path.is_file()]
 

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from zwidth.design.requirements import required_damping as required_damping
     from zwidth.design.requirements import required_mass as required_mass
     from zwidth.design.requirements import required_period as required_period
+    from zwidth.design.robust import Interval as Interval
     from zwidth.design.robust import RobustStiffness as RobustStiffness
     from zwidth.design.robust import RobustWall as RobustWall
     from zwidth.design.robust import robust_max_stiffness as robust_max_stiffness
@@ -35,9 +36,11 @@ if TYPE_CHECKING:
     from zwidth.design.stiffness import sensitivities as sensitivities
     from zwidth.errors import ConfigError as ConfigError
     from zwidth.errors import InputError as InputError
+    from zwidth.errors import PrecisionWarning as PrecisionWarning
     from zwidth.errors import StoreExistsError as StoreExistsError
     from zwidth.errors import TracedDelayError as TracedDelayError
     from zwidth.errors import ZwidthError as ZwidthError
+    from zwidth.kernel_cache import use_compilation_cache as use_compilation_cache
     from zwidth.loop import char_poly as char_poly
     from zwidth.response import StepResponse as StepResponse
     from zwidth.response import step_response as step_response
@@ -50,9 +53,12 @@ if TYPE_CHECKING:
     from zwidth.stability.boundary import BoundaryPoint as BoundaryPoint
     from zwidth.stability.boundary import boundary as boundary
     from zwidth.stability.boundary import boundary_point as boundary_point
+    from zwidth.stability.counting import count_poles as count_poles
     from zwidth.stability.decay import decay_rate as decay_rate
     from zwidth.stability.labels import is_stable as is_stable
     from zwidth.stability.labels import stability_of as stability_of
+    from zwidth.stability.margins import Margins as Margins
+    from zwidth.stability.margins import margins as margins
     from zwidth.stability.passivity import is_passive as is_passive
     from zwidth.stability.passivity import passivity_margin as passivity_margin
     from zwidth.stability.poles import poles as poles
@@ -85,6 +91,7 @@ _HOME = {
     "required_damping": "zwidth.design.requirements",
     "required_mass": "zwidth.design.requirements",
     "required_period": "zwidth.design.requirements",
+    "Interval": "zwidth.design.robust",
     "RobustStiffness": "zwidth.design.robust",
     "RobustWall": "zwidth.design.robust",
     "robust_max_stiffness": "zwidth.design.robust",
@@ -94,9 +101,11 @@ _HOME = {
     "sensitivities": "zwidth.design.stiffness",
     "ConfigError": "zwidth.errors",
     "InputError": "zwidth.errors",
+    "PrecisionWarning": "zwidth.errors",
     "StoreExistsError": "zwidth.errors",
     "TracedDelayError": "zwidth.errors",
     "ZwidthError": "zwidth.errors",
+    "use_compilation_cache": "zwidth.kernel_cache",
     "char_poly": "zwidth.loop",
     "StepResponse": "zwidth.response",
     "step_response": "zwidth.response",
@@ -109,10 +118,13 @@ _HOME = {
     "BoundaryPoint": "zwidth.stability.boundary",
     "boundary": "zwidth.stability.boundary",
     "boundary_point": "zwidth.stability.boundary",
+    "count_poles": "zwidth.stability.counting",
     "is_stable": "zwidth.stability.labels",
     "spectral_radius": "zwidth.stability.radii",
     "decay_rate": "zwidth.stability.decay",
     "stability_of": "zwidth.stability.labels",
+    "Margins": "zwidth.stability.margins",
+    "margins": "zwidth.stability.margins",
     "is_passive": "zwidth.stability.passivity",
     "passivity_margin": "zwidth.stability.passivity",
     "poles": "zwidth.stability.poles",
@@ -136,6 +148,9 @@ __all__ = [
     "Device",
     "FastestWall",
     "InputError",
+    "Interval",
+    "Margins",
+    "PrecisionWarning",
     "Requirement",
     "RidgeKind",
     "RidgePoint",
@@ -158,6 +173,7 @@ __all__ = [
     "boundary",
     "boundary_point",
     "char_poly",
+    "count_poles",
     "decay_rate",
     "denormalize",
     "fastest_damping",
@@ -165,6 +181,7 @@ __all__ = [
     "is_passive",
     "is_stable",
     "load_config",
+    "margins",
     "max_stiffness",
     "modulus_margin",
     "most_robust_damping",
@@ -186,6 +203,7 @@ __all__ = [
     "stable_region",
     "step_response",
     "stiffness_slope",
+    "use_compilation_cache",
 ]
 
 

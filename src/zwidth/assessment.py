@@ -11,9 +11,15 @@ import numpy as np
 from zwidth.errors import InputError
 from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
+from zwidth.stability.decay import decay_rate
+from zwidth.stability.labels import is_stable
+from zwidth.stability.margins import margins
 from zwidth.stability.passivity import passivity_margin
-from zwidth.stability.poles import poles
+from zwidth.stability.proved import outermost_poles
 from zwidth.stability.ridge import RidgeKind, alpha_max
+
+
+_POLE_ACCURACY = 1e-9
 
 
 @dataclass(frozen=True)
@@ -22,8 +28,9 @@ class Assessment:
 
     Attributes:
         alpha, beta, delta, d: the normalized wall, device and delay.
-        stable: whether every pole lies strictly inside the unit circle.
-        spectral_radius: the largest pole magnitude.
+        stable: whether every pole lies strictly inside the unit circle; everything else agrees with it.
+        spectral_radius: the largest pole magnitude, 1 to rounding where the decay is very slow.
+        decay_rate: of the slowest motion, in 1/s, with relative accuracy; negative for a growing one.
         stiffness_limit: the stiffest stable K at this B, in N/m.
         virtual_damping_lower, virtual_damping_upper: the ends of the stable B at this K, in N s/m.
         passive: whether the wall is passive at this delay.
@@ -33,6 +40,11 @@ class Assessment:
         ridge_kind: "smooth" or "corner".
         time_constant: of the slowest pole, in s; negative for a growing one, infinite on the circle.
         frequency: at which the slowest pole oscillates, in Hz; 0 for one that does not.
+        gain_margin: the factor by which K and B together may grow; below 1 the one to which they must fall.
+        phase_margin: in degrees; positive exactly for a stable wall.
+        delay_margin: how much more delay the wall bears, in s.
+        modulus_margin: the least distance of the open loop from -1.
+        gain_crossover, phase_crossover: where the first two are taken, in Hz.
     """
 
     alpha: float
@@ -41,6 +53,7 @@ class Assessment:
     d: float
     stable: bool
     spectral_radius: float
+    decay_rate: float
     stiffness_limit: float
     virtual_damping_lower: float
     virtual_damping_upper: float
@@ -53,6 +66,12 @@ class Assessment:
     ridge_kind: str
     time_constant: float
     frequency: float
+    gain_margin: float
+    phase_margin: float
+    delay_margin: float
+    modulus_margin: float
+    gain_crossover: float
+    phase_crossover: float
 
     def as_dict(self) -> dict[str, Any]:
         """The fields as plain JSON values, None in place of NaN and infinities."""
@@ -70,7 +89,7 @@ def assess(scene: Scene) -> Assessment:
 
     Returns:
         Assessment: stability, distances to the boundary in K and in B, passivity, the stiffest stable wall of the
-        device, and the slowest pole.
+        device, the slowest pole, and the margins of control engineering.
 
     Raises:
         InputError: the scene's delay model is "fractional_power".
@@ -93,8 +112,9 @@ def assess(scene: Scene) -> Assessment:
     period = scene.timing.period
     spring = scene.device.mass / period**2
     damper = scene.device.mass / period
-    slowest = _slowest_pole(alpha, beta, delta, d)
-    radius = abs(slowest)
+    hertz = 1.0 / (2.0 * math.pi * period)
+    rate = float(decay_rate(alpha, beta, delta, d))
+    stands = margins(alpha, beta, delta, d)
     ridge = alpha_max(delta, d)
     row = boundary_point(delta, d, beta=beta)
     lower, upper = _column(alpha, delta, d)
@@ -104,8 +124,9 @@ def assess(scene: Scene) -> Assessment:
         beta=beta,
         delta=delta,
         d=d,
-        stable=bool(radius < 1.0),
-        spectral_radius=radius,
+        stable=bool(is_stable(alpha, beta, delta, d)),
+        spectral_radius=math.exp(-rate),
+        decay_rate=rate / period,
         stiffness_limit=float(row.alpha) * spring,
         virtual_damping_lower=lower * damper,
         virtual_damping_upper=upper * damper,
@@ -116,14 +137,22 @@ def assess(scene: Scene) -> Assessment:
         stiffness_max=float(ridge.alpha) * spring,
         virtual_damping_at_max=float(ridge.beta) * damper,
         ridge_kind=RidgeKind(int(ridge.kind)).name.lower(),
-        time_constant=_time_constant(radius, period),
-        frequency=float(abs(np.angle(slowest)) / (2 * np.pi * period)),
+        time_constant=math.inf if rate == 0 else period / rate,
+        frequency=_slowest_turn(alpha, beta, delta, d) * hertz,
+        gain_margin=float(stands.gain_margin),
+        phase_margin=float(stands.phase_margin),
+        delay_margin=float(stands.delay_margin) * period,
+        modulus_margin=float(stands.modulus_margin),
+        gain_crossover=float(stands.gain_crossover) * hertz,
+        phase_crossover=float(stands.phase_crossover) * hertz,
     )
 
 
-def _slowest_pole(alpha: float, beta: float, delta: float, d: float) -> complex:
-    every = np.asarray(poles(alpha, beta, delta, d))
-    return complex(every[np.argmax(np.abs(every))])
+def _slowest_turn(alpha: float, beta: float, delta: float, d: float) -> float:
+    """By which angle the slowest pole turns a period."""
+    with np.errstate(all="ignore"):
+        found = outermost_poles([np.array([value]) for value in (alpha, beta, delta, d)], _POLE_ACCURACY)
+    return abs(float(found.im[0]))
 
 
 def _column(alpha: float, delta: float, d: float) -> tuple[float, float]:
@@ -132,11 +161,3 @@ def _column(alpha: float, delta: float, d: float) -> tuple[float, float]:
         return math.nan, math.nan
     ends = [boundary_point(delta, d, alpha=alpha, side=side) for side in ("lower", "upper")]
     return float(ends[0].beta), float(ends[1].beta)
-
-
-def _time_constant(radius: float, period: float) -> float:
-    """The time in which the pole's share decays to 1/e."""
-    if radius == 0:
-        return 0.0
-    rate = -math.log(radius)
-    return math.inf if rate == 0 else period / rate

@@ -9,6 +9,9 @@ compiled kernel is called and the ambient precision holds.
 from __future__ import annotations
 
 import os
+import sys
+import threading
+import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -18,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.errors import InputError, TracedDelayError
+from zwidth.errors import InputError, PrecisionWarning, TracedDelayError
 from zwidth.xp import is_jax, is_traced
 
 # Large batches run in pieces of one size: one compilation, bounded memory, and a point's value does not depend
@@ -27,7 +30,7 @@ CHUNK = 1 << 15
 # Up to so many points NumPy is done before a compiler has begun.
 FEW = 1 << 12
 # What an elementwise kernel holds at one time then stays in the cache; smaller blocks cost as much in calls.
-BLOCK = 1 << 15
+BLOCK = 1 << 16
 
 
 @contextmanager
@@ -124,7 +127,8 @@ def elementwise(
     if arrays[0].size <= few:
         with np.errstate(all="ignore"):
             result = kernel(*arrays, *static)
-        return to_caller(tree_map(lambda leaf: np.broadcast_to(leaf, arrays[0].shape), result), values)
+        # A copy: a view of an argument, or of one value, could not be written to.
+        return to_caller(tree_map(lambda leaf: np.array(np.broadcast_to(leaf, arrays[0].shape)), result), values)
     shape = arrays[0].shape
     flat = in_blocks(_compiled_elementwise(kernel, static), [array.reshape(-1) for array in arrays], block)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)
@@ -140,7 +144,32 @@ def traced_columns(values: tuple[ArrayLike, ...]) -> list[Any]:
     import jax.numpy as jnp
 
     dtype = jnp.result_type(float)
+    if dtype == np.float32:
+        _warn_of_float32()
     return jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
+
+
+_warned = threading.Event()
+
+
+def _warn_of_float32() -> None:
+    """Say once a process that half of the digits are missing: an optimizer would stop there and not tell."""
+    if not _warned.is_set():
+        _warned.set()
+        warnings.warn(
+            "computing in float32 inside a JAX transformation; call jax.config.update('jax_enable_x64', True) first "
+            "for float64",
+            PrecisionWarning,
+            stacklevel=_stack_level(),
+        )
+
+
+def _stack_level() -> int:
+    """How far up the first caller outside of zwidth and JAX is: the warning then names a line of the user's."""
+    frame, level = sys._getframe(1), 1
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("zwidth", "jax"):
+        frame, level = frame.f_back, level + 1
+    return level - 1
 
 
 @cache

@@ -34,6 +34,10 @@ class ResourceError(ZwidthError):
     """Work that does not fit into the memory or onto the disk there is."""
 
 
+class PrecisionWarning(UserWarning):
+    """A transformation of JAX in which zwidth computes in float32, because JAX's default precision holds there."""
+
+
 class TracedDelayError(ZwidthError, TypeError):
     """A traced delay where the number of poles, hence an array shape, depends on its value."""
 

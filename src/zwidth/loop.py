@@ -10,6 +10,7 @@ factored. Pole methods use the coefficients `coefficients`, frequency methods `f
 
 from __future__ import annotations
 
+from math import factorial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from zwidth.grouping import Degree, by_degree, few_poles
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 from zwidth.scene import normalize
 from zwidth.status import Status
-from zwidth.xp import namespace
+from zwidth.xp import horner, namespace
 
 
 class Affine(NamedTuple):
@@ -153,11 +154,21 @@ def _whole_cosine_ratio(omega: Array, n: Array, cos_half: Array) -> Array:
     k = n + 0.5
     # pi is not a float64: its second half keeps v exact to the last digit.
     v = (np.pi - omega) + 1.2246467991473532e-16
-    at_pi = xp.abs(v) < 1e-30
-    v_safe = xp.where(at_pi, 1.0, v)
     sign = 1.0 - 2.0 * xp.mod(n, 2.0)
-    near = sign * xp.where(at_pi, 2.0 * k, xp.sin(k * v_safe) / xp.sin(0.5 * v_safe))
+    near = sign * 2.0 * k * _cardinal_sine(k * v) / _cardinal_sine(0.5 * v)
     return xp.where(omega > 2.0, near, xp.cos(k * omega) / cos_half)
+
+
+_CARDINAL = [(-1.0) ** i / factorial(2 * i + 1) for i in range(11)]
+
+
+def _cardinal_sine(x: Array) -> Array:
+    """``sin(x)/x``, for small x by its series: the quotient has no digit of its derivatives there."""
+    xp = namespace(x)
+    small = xp.abs(x) < 1.5
+    safe = xp.where(small, 2.0, x)
+    inner = xp.where(small, x, 0.0)
+    return xp.where(small, horner(inner * inner, _CARDINAL), xp.sin(safe) / safe)
 
 
 def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole: Array) -> tuple[Array, Array]:

@@ -16,8 +16,8 @@ from zwidth._types import Array
 from zwidth.xp import horner, namespace
 
 _SERIES_BELOW = 2.5
-# The first term left out is below 1.25^26/27! = 3e-26 of the sum, and of its first two derivatives.
-_TERMS = 13
+# The first term left out is below 1.25^22/23! = 6e-21 of the sum, and of its first two derivatives.
+_TERMS = 11
 # phi1 = e^(-x/2) sum_k (x/2)^(2k) / (2k + 1)!
 _PHI1 = [1.0 / factorial(2 * k + 1) for k in range(_TERMS)]
 # gap = e^(-x/2) x sum_k (k + 1) (x/2)^(2k) / (2k + 3)!
@@ -25,8 +25,9 @@ _GAP = [(k + 1.0) / factorial(2 * k + 3) for k in range(_TERMS)]
 
 
 class PhiFunctions(NamedTuple):
-    """All of them at one argument: they share their series."""
+    """All of them at one argument: they share their exponential and their series."""
 
+    c: Array
     phi1: Array
     phi2: Array
     psi: Array
@@ -34,22 +35,24 @@ class PhiFunctions(NamedTuple):
 
 
 def phi_functions(x: Array) -> PhiFunctions:
-    """phi1, phi2, psi and gap at x >= 0."""
+    """c, phi1, phi2, psi and gap at x >= 0."""
     xp = namespace(x)
     small = x < _SERIES_BELOW
+    factor = xp.exp(-0.5 * x)
+    c = factor * factor
     # Each branch gets an argument that is harmless where the other one holds.
     half, high = xp.where(small, 0.5 * x, 0.0), xp.where(small, _SERIES_BELOW, x)
-    square, factor = half * half, xp.exp(-half)
+    square = half * half
     low1, low_gap = factor * horner(square, _PHI1), factor * (2.0 * half) * horner(square, _GAP)
-    # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact. Divided twice:
-    # x^2 overflows, and its derivative does so sooner.
-    c = xp.exp(-high)
-    high1 = (1.0 - c) / high
+    # Above the switch 1 - c loses nothing, and unlike expm1 has a derivative that is relatively exact.
+    inverse = 1.0 / high
+    high1 = (1.0 - c) * inverse
     return PhiFunctions(
+        c,
         xp.where(small, low1, high1),
-        xp.where(small, 0.5 * (low1 + low_gap), (1.0 - high1) / high),
-        xp.where(small, 0.5 * (low1 - low_gap), (high1 - c) / high),
-        xp.where(small, low_gap, ((1.0 + c) - 2.0 * high1) / high),
+        xp.where(small, 0.5 * (low1 + low_gap), (1.0 - high1) * inverse),
+        xp.where(small, 0.5 * (low1 - low_gap), (high1 - c) * inverse),
+        xp.where(small, low_gap, ((1.0 + c) - 2.0 * high1) * inverse),
     )
 
 

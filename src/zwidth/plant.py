@@ -40,21 +40,21 @@ def held_plant(delta: Array, fraction: Array) -> Plant:
     """Discretize for a delay whose fractional part is ``fraction``, in [0, 1)."""
     f = fraction
     t = 1.0 - f
-    e_t = phi.decay(delta * t)
-    at_t, at_f = phi.phi_functions(delta * t), phi.phi_functions(delta * f)
+    at, at_t, at_f = phi.phi_functions(delta), phi.phi_functions(delta * t), phi.phi_functions(delta * f)
+    e_t = at_t.c
     a2 = t * t * at_t.phi2
     a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
     a0 = e_t * f * f * at_f.psi
     gap = (
         t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
     )
-    return Plant(phi.decay(delta), delta * phi.phi1(delta), a2, a1, a0, gap)
+    return Plant(at.c, delta * at.phi1, a2, a1, a0, gap)
 
 
 def undelayed_plant(delta: Array) -> Plant:
     """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
     at = phi.phi_functions(delta)
-    return Plant(phi.decay(delta), delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
+    return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:

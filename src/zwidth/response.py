@@ -9,21 +9,18 @@ Between two instants at which a force changes, the damped mass has the exact sol
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth import phi
 from zwidth._types import Array
-from zwidth.batching import as_float64, concretely
+from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.grouping import degree_of
 from zwidth.scene import Scene
-
-# The band round the final value that counts as settled, as in control textbooks.
-SETTLING_BAND = 0.02
+from zwidth.settling import advance, settling_time
 
 
 class StepResponse(NamedTuple):
@@ -37,34 +34,52 @@ class StepResponse(NamedTuple):
     settling_time: float
 
 
-def _advance(x: Array, v: Array, force: Array, t: Array, delta: Array) -> tuple[Array, Array]:
-    """The exact state after time t under a constant force."""
-    p1, p2 = phi.phi1(delta * t), phi.phi2(delta * t)
-    return x + t * p1 * v + t * t * p2 * force, phi.decay(delta * t) * v + t * p1 * force
+class _Samples(NamedTuple):
+    """State at the start of every period, and the wall's force before and behind the instant at which it changes."""
+
+    x: np.ndarray
+    v: np.ndarray
+    older: np.ndarray
+    newer: np.ndarray
 
 
-def _simulate(wall: Array, fractions: Array, f: Array, lag: int, periods: int) -> tuple[Array, Array, Array]:
-    """Run the loop; rows are periods, columns the instants ``fractions`` of each, from 0 on."""
-    alpha, beta, delta, applied = wall
+def _run(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> _Samples:
+    """Run the loop from rest, sample by sample.
 
-    def period(state, _):
-        x, v, previous, queue = state
-        # The force of this sample enters the queue; what leaves it is lag + 1 samples old, then lag samples old.
-        computed = -(alpha * x + beta * (x - previous))
-        queue = jnp.concatenate([queue[1:], computed[None]])
-        older, newer = queue[0], queue[1]
-        x_bend, v_bend = _advance(x, v, applied + older, f, delta)
-        before = fractions < f
-        span = jnp.where(before, fractions, fractions - f)
-        force = jnp.where(before, older, newer)
-        xs, vs = _advance(jnp.where(before, x, x_bend), jnp.where(before, v, v_bend), applied + force, span, delta)
-        x_next, v_next = _advance(x_bend, v_bend, applied + newer, 1.0 - f, delta)
-        return (x_next, v_next, x, queue), (xs, vs, force)
+    In plain floats: a period takes a microsecond or two, less than importing a compiler for most runs.
+    """
+    lag = degree_of(d).whole
+    f = d - lag
+    # x and v after each part of a period are linear in x, v and the force: three numbers a part.
+    parts = []
+    for t in (f, 1.0 - f):
+        at = phi.phi_functions(np.float64(delta * t))
+        parts.append((float(t * at.phi1), float(t * t * at.phi2), math.exp(-delta * t)))
+    (xv0, xf0, c0), (xv1, xf1, c1) = parts
+    # The velocity gains t phi1 F, the factor that the velocity has in the position.
+    x = v = previous = 0.0
+    forces = [0.0] * (periods + lag + 2)
+    rows = []
+    for k in range(periods):
+        forces[k + lag + 1] = -(alpha * x + beta * (x - previous))
+        older, newer = forces[k], forces[k + 1]
+        rows.append((x, v, older, newer))
+        previous = x
+        first, second = applied + older, applied + newer
+        x, v = x + xv0 * v + xf0 * first, c0 * v + xv0 * first
+        x, v = x + xv1 * v + xf1 * second, c1 * v + xv1 * second
+    return _Samples(*np.array(rows).T)
 
-    zero = jnp.zeros_like(alpha)
-    start = (zero, zero, zero, jnp.zeros(lag + 2, dtype=alpha.dtype))
-    _, history = jax.lax.scan(period, start, length=periods)
-    return history
+
+def _between(samples: _Samples, fractions: np.ndarray, delta: float, f: float, applied: float) -> tuple[Array, ...]:
+    """Position, velocity and force at the instants ``fractions`` of every period; rows are periods."""
+    x, v, older, newer = (column[:, None] for column in samples)
+    x_bend, v_bend = advance(x, v, applied + older, np.float64(f), delta)
+    before = fractions < f
+    span = np.where(before, fractions, fractions - f)
+    force = np.where(before, older, newer)
+    x, v = advance(np.where(before, x, x_bend), np.where(before, v, v_bend), applied + force, span, delta)
+    return x, v, force
 
 
 def step_response(
@@ -94,13 +109,15 @@ def step_response(
     Returns:
         StepResponse: ``time`` in periods; ``position``; ``velocity`` in position a period; ``wall_force``, what the
         wall applies then; all (periods * substeps,). ``final_position`` is force/alpha, NaN for alpha = 0.
-        ``settling_time`` is the last instant outside 2 % of it, NaN where the response does not settle in time.
+        ``settling_time`` in periods is the last instant of all outside 2 % of it, however long was simulated: it comes
+        from the poles, see `zwidth.settling`. NaN where the wall is not stable, and beyond d = 500.
 
     Raises:
         InputError: an argument is no single finite number, or out of range.
 
     Numerics:
-        Exact between force changes up to rounding; float64. An unstable response that outgrows it ends as inf or NaN.
+        Exact between force changes up to rounding; float64, by NumPy. An unstable response that outgrows it ends as
+        inf or NaN.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VIII, Fig. 11, eqs. (2), (6).
@@ -122,26 +139,15 @@ def step_response(
         if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
             raise InputError(f"{name}: got {count!r}; a whole number of at least 1 is needed")
     alpha, beta, delta, d, force = (float(number) for number in numbers.values())
-    lag = degree_of(d).whole
     fractions = np.arange(substeps) / substeps
-    with concretely():
-        history = _simulate_jit(np.array([alpha, beta, delta, force]), fractions, d - lag, lag, int(periods))
-    position, velocity, wall_force = (np.asarray(part).ravel() for part in history)
+    with np.errstate(all="ignore"):
+        samples = _run(alpha, beta, delta, d, force, int(periods))
+        history = _between(samples, fractions, delta, d - math.floor(d), force)
+    position, velocity, wall_force = (np.broadcast_to(part, (periods, substeps)).ravel() for part in history)
     time = (np.arange(periods)[:, None] + fractions).ravel()
-    final = force / alpha if alpha != 0 else np.nan
-    return StepResponse(time, position, velocity, wall_force, final, settling_time(time, position, final))
-
-
-_simulate_jit = jax.jit(_simulate, static_argnums=(3, 4))
-
-
-def settling_time(time: np.ndarray, position: np.ndarray, final: float, band: float = SETTLING_BAND) -> float:
-    """The last instant outside the band round the final value; NaN where the last one of all is outside."""
-    outside = ~(np.abs(position - final) <= band * abs(final))
-    if not np.isfinite(final) or outside[-1]:
-        return float("nan")
-    last = np.flatnonzero(outside)
-    return float(time[last[-1]]) if last.size else 0.0
+    final = force / alpha if alpha != 0 else math.nan
+    settled = settling_time(alpha, beta, delta, d) if force != 0 else 0.0
+    return StepResponse(time, position, velocity, wall_force, final, settled)
 
 
 def scene_step_response(scene: Scene, *, duration: float, substeps: int = 10, force: float = 1.0) -> StepResponse:

@@ -14,7 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike, DelayModel
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, within
 from zwidth.errors import InputError, check_choice
+from zwidth.status import Status
+from zwidth.xp import frozen, is_jax, is_traced, namespace
 
 
 class Normalized(NamedTuple):
@@ -37,58 +40,60 @@ class Physical(NamedTuple):
     virtual_damping: Array
 
 
-# field -> (unit, lowest value, whether the lowest value itself is excluded)
-_RANGES: dict[str, tuple[str, float, bool]] = {
-    "mass": ("kg", 0.0, True),
-    "damping": ("N s/m", 0.0, False),
-    "period": ("s", 0.0, True),
-    "delay": ("s", 0.0, False),
-    "stiffness": ("N/m", -math.inf, False),
-    "virtual_damping": ("N s/m", -math.inf, False),
-    "delta": ("", 0.0, False),
-    "d": ("", 0.0, False),
-    "alpha": ("", -math.inf, False),
-    "beta": ("", -math.inf, False),
+# field -> (unit, lowest value, whether the lowest value itself is excluded, magnitudes allowed beside 0)
+_RANGES: dict[str, tuple[str, float, bool, tuple[float, float]]] = {
+    "mass": ("kg", 0.0, True, SI_RANGE),
+    "damping": ("N s/m", 0.0, False, SI_RANGE),
+    "period": ("s", 0.0, True, SI_RANGE),
+    "delay": ("s", 0.0, False, SI_RANGE),
+    "stiffness": ("N/m", -math.inf, False, SI_RANGE),
+    "virtual_damping": ("N s/m", -math.inf, False, SI_RANGE),
+    "wanted_stiffness": ("N/m", 0.0, True, SI_RANGE),
+    "delta": ("", 0.0, False, (0.0, LARGEST_DAMPING)),
+    "d": ("", 0.0, False, (0.0, LONGEST_DELAY)),
+    "alpha": ("", -math.inf, False, WALL_RANGE),
+    "beta": ("", -math.inf, False, WALL_RANGE),
 }
 
 
 def _checked(name: str, value: ArrayLike) -> ArrayLike:
     """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
+    if is_traced(value):
+        return value
     try:
-        number = np.asarray(value) if not _is_traced(value) else None
+        number = np.asarray(value)
     except ValueError as error:
         raise InputError(f"{name}: got {value!r}, a rectangular array of real numbers is needed") from error
-    if number is None:
-        return value
     if number.dtype.kind not in "biuf":
         raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed")
-    if number.ndim == 0 and not _in_range(name, number, np):
-        unit, lowest, excluded = _RANGES[name]
-        bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
-        raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
-    return number.astype(np.float64, copy=False)
+    number = number.astype(np.float64, copy=False)
+    if number.ndim == 0:
+        unit, lowest, excluded, (least, most) = _RANGES[name]
+        if not _valid(name, number):
+            bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
+            raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
+        if not within(number, (least, most)):
+            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"at most {most:g}"
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}{f' (in {unit})' if unit else ''}")
+    return number
 
 
-def _in_range(name: str, value: Array, xp: Any) -> Array:
-    _, lowest, excluded = _RANGES[name]
-    return xp.isfinite(value) & ((value > lowest) if excluded else (value >= lowest))
+def _valid(name: str, value: Array) -> Array:
+    _, lowest, excluded, _ = _RANGES[name]
+    return namespace(value).isfinite(value) & ((value > lowest) if excluded else (value >= lowest))
 
 
-def _is_jax(value: ArrayLike) -> bool:
-    """Whether a value is a JAX array, traced or not; found out without importing JAX for plain numbers."""
-    if isinstance(value, int | float | str | np.ndarray | np.generic | list | tuple):
-        return False
-    import jax
-
-    return isinstance(value, jax.Array)
+def _in_range(name: str, value: Array) -> Array:
+    return _valid(name, value) & within(value, _RANGES[name][3])
 
 
-def _is_traced(value: ArrayLike) -> bool:
-    if not _is_jax(value):
-        return False
-    from zwidth.batching import is_traced
-
-    return is_traced(value)
+def quantity_status(**values: Array) -> Array:
+    """The `Status` of quantities named as in `normalize`: INVALID_INPUT before OUT_OF_RANGE, elementwise."""
+    xp = namespace(*values.values())
+    valid = inside = True
+    for name, value in values.items():
+        valid, inside = valid & _valid(name, value), inside & within(value, _RANGES[name][3])
+    return xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
 
 
 def _converted(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
@@ -99,53 +104,49 @@ def _converted(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -
     except ValueError as error:
         shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in checked.items())
         raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
-    if any(map(_is_jax, values.values())):
-        import jax.numpy as jnp
+    if any(map(is_jax, values.values())):
+        from zwidth.batching import elementwise
 
-        from zwidth.batching import pointwise
-
-        return pointwise(_formula_at, tuple(values), tuple(values.values()), (formula, tuple(values), jnp))
-    result = _formula_at(*checked.values(), formula, tuple(values), np)
+        return elementwise(_formula_at, tuple(values), tuple(values.values()), (formula, tuple(values)))
+    with np.errstate(all="ignore"):
+        result = _formula_at(*checked.values(), formula, tuple(values))
     return tuple(part[()] for part in result)
 
 
 def _formula_at(*arguments: Any) -> tuple[Array, ...]:
-    """``formula`` with NaN for what is out of range; the last three arguments are the formula, the names, and NumPy."""
-    *values, formula, names, xp = arguments
+    """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
+    *values, formula, names = arguments
+    xp = namespace(*values)
     # Multiplied, not chosen: the derivatives of what is out of range are then NaN as well.
     pairs = zip(names, values, strict=True)
-    good = (value * xp.where(_in_range(name, value, xp), 1.0, np.nan) for name, value in pairs)
-    return formula(*good, xp)
+    good = (value * xp.where(_in_range(name, value), 1.0, np.nan) for name, value in pairs)
+    return formula(*good)
 
 
-def _periods(delay: Array, period: Array, xp: Any) -> Array:
+def in_periods(delay: Array, period: Array) -> Array:
     """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number.
 
     1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
     """
+    xp = namespace(delay, period)
     quotient = delay / period
     whole = xp.round(quotient)
     near = xp.abs(quotient - whole) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(whole, 1.0)
-    excess = xp.where(near & (whole > 0), quotient - whole, 0.0)
-    if xp is not np:
-        from jax.lax import stop_gradient
-
-        # Rounding is flat; the quotient it corrects is not.
-        excess = stop_gradient(excess)
-    return quotient - excess
+    # Rounding is flat; the quotient it corrects is not.
+    return quotient - frozen(xp.where(near & (whole > 0), quotient - whole, 0.0), xp)
 
 
-def _to_normalized(mass, damping, period, delay, stiffness, virtual_damping, xp) -> tuple[Array, ...]:
+def _to_normalized(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
     """Eqs. (14), (16)."""
     return (
         stiffness * period * period / mass,
         virtual_damping * period / mass,
         damping * period / mass,
-        _periods(delay, period, xp),
+        in_periods(delay, period),
     )
 
 
-def _to_physical(mass, period, alpha, beta, delta, d, xp) -> tuple[Array, ...]:
+def _to_physical(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
     """Eqs. (14), (16) solved for the SI quantities, in the order of `Physical`."""
     rate = mass / period
     return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
@@ -171,7 +172,7 @@ def normalize(
         delay: t_d, from the sample to the moment its force acts, in s, >= 0.
         stiffness: K of the virtual wall in N/m.
         virtual_damping: B of the virtual wall in N s/m.
-            All broadcast against each other.
+            All broadcast against each other; each is 0 or 1e-30 to 1e30 in magnitude.
 
     Returns:
         ``alpha``, ``beta``, ``delta``, ``d``. ``d`` is taken as whole where the quotient is whole but for rounding.
@@ -217,10 +218,10 @@ def denormalize(
     Args:
         mass: m in kg, > 0.
         period: T in s, > 0.
-        alpha: normalized stiffness.
-        beta: normalized virtual damping.
-        delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0.
+        alpha: normalized stiffness, 0 or 1e-60 to 1e60 in magnitude.
+        beta: normalized virtual damping, 0 or 1e-60 to 1e60 in magnitude.
+        delta: normalized physical damping, 0 to 1e12.
+        d: delay in periods, 0 to 1e5.
 
     Returns:
         ``mass``, ``damping``, ``period``, ``delay``, ``stiffness``, ``virtual_damping`` in SI units.

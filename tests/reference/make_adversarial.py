@@ -234,15 +234,20 @@ def labelled(count: int, seed: int) -> dict[str, np.ndarray]:
 
 def check(points: dict[str, np.ndarray]) -> int:
     """Hold the certified method to the labels; how many it gets wrong or leaves undecided."""
+    from zwidth.domain import wall_status
     from zwidth.stability.certified import certified_stable
     from zwidth.status import Status
 
     start = time.perf_counter()
-    result = certified_stable(*(points[name] for name in ("alpha", "beta", "delta", "d")))
+    walls = [points[name] for name in ("alpha", "beta", "delta", "d")]
+    result = certified_stable(*walls)
     seconds = time.perf_counter() - start
     expected = np.where(points["label"] == ON_BOUNDARY, Status.ON_BOUNDARY, Status.OK)
     undecided = result.status == Status.UNDECIDED
-    wrong = ~undecided & ((result.stable != (points["label"] == STABLE)) | (result.status != expected))
+    # Beyond the domain there is no label.
+    outside = wall_status(*walls) != Status.OK
+    expected = np.where(outside, Status.OUT_OF_RANGE, expected)
+    wrong = ~undecided & ((result.stable != (~outside & (points["label"] == STABLE))) | (result.status != expected))
     for index in np.flatnonzero(wrong | undecided)[:20]:
         print([points[name][index] for name in points], [values[index] for values in result])
     by_filter = np.mean(result.bits == 0)

@@ -3,13 +3,13 @@
 import json
 
 import pytest
+from zwidth.stability.methods import Method, stability_of
 
 import zwidth
 from zwidth import accuracy
 from zwidth.accuracy import Cost, choose
 from zwidth.bench import suite
 from zwidth.errors import InputError
-from zwidth.stability.methods import Method, stability_of
 
 
 def cost(method, error, rate=1e6, first=1.0, d=1.0, dtype="float64", layout="map"):

@@ -1,16 +1,24 @@
 """Batching: shapes, types, pieces, and a caller's own transformations, with kernels whose answers are known."""
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zwidth.batching import as_float64, broadcast, concrete_delay, is_traced, map_flat, pointwise
+from zwidth.batching import FEW, as_float64, broadcast, concrete_delay, elementwise, is_traced, map_flat, pointwise
 from zwidth.errors import InputError, TracedDelayError
+from zwidth.xp import namespace
+
+
+class Weighted(NamedTuple):
+    total: object
+    pair: object
 
 
 def weighted(x, y, factor=1.0):
-    return {"sum": x + factor * y, "pair": jnp.stack([x, y])}
+    return Weighted(x + factor * y, jnp.stack([x, y]))
 
 
 def fragile(x):
@@ -23,9 +31,9 @@ NAMES = ("x", "y")
 def test_arguments_broadcast_and_vectors_come_last():
     x, y = np.arange(3.0)[:, None], np.arange(4.0)
     got = pointwise(weighted, NAMES, (x, y), (10.0,))
-    np.testing.assert_array_equal(got["sum"], x + 10 * y)
-    assert got["pair"].shape == (3, 4, 2)
-    np.testing.assert_array_equal(got["pair"][..., 1], np.broadcast_to(y, (3, 4)))
+    np.testing.assert_array_equal(got.total, x + 10 * y)
+    assert got.pair.shape == (3, 4, 2)
+    np.testing.assert_array_equal(got.pair[..., 1], np.broadcast_to(y, (3, 4)))
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 25])
@@ -37,9 +45,9 @@ def test_pieces_join_to_the_whole(count, chunk):
 
 def test_nothing_in_nothing_out():
     got = pointwise(weighted, NAMES, (np.ones((0, 3)), 1.0))
-    assert got["sum"].shape == (0, 3)
-    assert got["pair"].shape == (0, 3, 2)
-    assert got["sum"].dtype == np.float64
+    assert got.total.shape == (0, 3)
+    assert got.pair.shape == (0, 3, 2)
+    assert got.total.dtype == np.float64
 
 
 def test_a_bad_point_leaves_its_neighbors_alone():
@@ -81,8 +89,43 @@ def test_inside_a_transformation_the_ambient_precision_holds():
 
 def test_traced_arguments_broadcast_too():
     got = jax.jit(lambda x: pointwise(weighted, NAMES, (x, np.arange(4.0))))(jnp.ones((3, 1)))
-    assert got["sum"].shape == (3, 4)
-    assert got["pair"].shape == (3, 4, 2)
+    assert got.total.shape == (3, 4)
+    assert got.pair.shape == (3, 4, 2)
+
+
+def rooted(x, y, factor):
+    xp = namespace(x, y)
+    return Weighted(xp.where(x < 0, xp.nan, xp.sqrt(xp.abs(x))), factor * x * y)
+
+
+def test_one_kernel_is_numpy_for_few_points_and_compiled_for_many():
+    y = np.linspace(0.5, 2.0, FEW + 1)
+    x = y - 1.0
+    many, few = (elementwise(rooted, NAMES, (x[:count], y[:count]), (3.0,)) for count in (FEW + 1, FEW))
+    assert many.total.shape == (FEW + 1,)
+    np.testing.assert_allclose(few.total, many.total[:FEW], rtol=1e-15)
+    np.testing.assert_allclose(few.pair, 3.0 * (x * y)[:FEW], rtol=1e-15)
+    assert np.isnan(many.total[0])
+
+
+def test_an_elementwise_kernel_follows_its_caller_too():
+    number = elementwise(rooted, NAMES, (2.0, 1), (3.0,))
+    assert isinstance(number.total, np.float64)
+    assert number.pair == 6.0
+    spread = elementwise(rooted, NAMES, (np.ones((3, 1)), np.ones(4)), (3.0,))
+    assert spread.total.shape == spread.pair.shape == (3, 4)
+    from_jax = elementwise(rooted, NAMES, (jnp.ones(2), 1.0), (3.0,))
+    assert isinstance(from_jax.total, jax.Array)
+    assert from_jax.total.dtype == np.float64
+    with jax.enable_x64(True):
+        assert float(jax.grad(lambda x: elementwise(rooted, NAMES, (x, 1.0), (3.0,)).pair)(2.0)) == 3.0
+    with pytest.raises(InputError, match="shapes do not broadcast"):
+        elementwise(rooted, NAMES, (np.ones(2), np.ones(3)), (3.0,))
+
+
+def test_a_mask_is_not_ignored():
+    with pytest.raises(InputError, match="x: got a masked array"):
+        as_float64("x", np.ma.masked_array([1.0, 2.0], mask=[True, False]))
 
 
 @pytest.mark.parametrize("value", ["1", None, 1j, ["1"], [1, [2]], {}, np.array(["a"]), object()])

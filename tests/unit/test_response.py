@@ -9,7 +9,7 @@ import tolerances as tol
 import zwidth
 from peers import models
 from zwidth.errors import InputError
-from zwidth.response import scene_step_response, settling_time, step_response
+from zwidth.response import scene_step_response, step_response
 
 STABLE = [
     (0.108, 0.425, 0.0, 1.0),
@@ -128,20 +128,6 @@ def test_without_a_spring_there_is_no_final_position():
         # force/(damping + virtual damping) is the final speed
         assert got.velocity[-1] == pytest.approx(1.0, rel=1e-6)
     assert step_response(np.float64(5e-324), 0.5, 0.5, 1).final_position == np.inf
-
-
-@pytest.mark.parametrize(
-    "positions, expected",
-    [
-        ([0.0, 0.5, 0.99, 1.0], 1.0),
-        ([1.0, 1.0, 1.0, 1.01], 0.0),
-        ([0.0, 0.5, 1.0, 1.03], np.nan),
-        ([1.0, 1.0, np.nan, 1.0], 2.0),
-        ([1.0, 1.0, 1.0, np.inf], np.nan),
-    ],
-)
-def test_settling_time_is_the_last_instant_outside(positions, expected):
-    np.testing.assert_equal(settling_time(np.arange(4.0), np.array(positions), 1.0), expected)
 
 
 def test_a_scene_responds_in_si_units():

@@ -15,9 +15,9 @@ from zwidth.bench.baselines import available
 from zwidth.bench.problems import Walls
 from zwidth.stability import balls
 from zwidth.stability.certified import certified_stable, filtered
-from zwidth.stability.certified_filter import OPEN, STABLE
-from zwidth.stability.layout import lay_out
+from zwidth.stability.certified_rows import OPEN, STABLE
 from zwidth.stability.labels import is_stable
+from zwidth.stability.layout import lay_out
 from zwidth.stability.radii import spectral_radius
 from zwidth.stability.ridge import RidgeMethod, alpha_max
 
@@ -167,7 +167,7 @@ def _filter_alone(d: float, sizes: Sizes) -> Row:
     """What of "certified" runs at every point, and how much of a map it leaves to signs and balls."""
     truth = problems.near_boundary(d, sizes.checked)
     code = filtered(lay_out(truth.walls).points)
-    wrong = (code != OPEN) & ((code == STABLE) != truth.stable)
+    wrong = (code < OPEN) & ((code == STABLE) != truth.stable)
     error = float(np.max(truth.distance, initial=0.0, where=wrong)), int(wrong.sum()), int(wrong.size)
     walls = problems.grid(d, _fewer(sizes.map_points, d))
     points = lay_out(walls).points

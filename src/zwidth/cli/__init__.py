@@ -12,7 +12,7 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.errors import ZwidthError
-from zwidth.sweep.compiled import use_compilation_cache
+from zwidth.kernel_cache import use_compilation_cache
 
 _EXIT_FAILED, _EXIT_INPUT = 1, 2
 

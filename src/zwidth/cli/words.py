@@ -84,6 +84,7 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
             f"(alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)})",
         ),
         row("slowest pole", _pole_words(verdict)),
+        *_margin_lines(verdict),
     ]
     return lines
 
@@ -112,7 +113,21 @@ def _distance_lines(stiffness: float, virtual_damping: float, verdict: Assessmen
     return [row("to the boundary in K", in_k), row("to the boundary in B", in_b)]
 
 
+def _margin_lines(verdict: Assessment) -> list[str]:
+    """The margins of control engineering, where the wall has a stiffness."""
+    if verdict.alpha <= 0:
+        return []
+    parts = [f"gain {plain(verdict.gain_margin)}"]
+    if isfinite(verdict.phase_margin):
+        at = with_unit(verdict.gain_crossover, "Hz", 3)
+        parts.append(f"phase {plain(verdict.phase_margin)} degrees at {at}")
+    parts += [f"delay {with_unit(verdict.delay_margin, 's')}", f"modulus {plain(verdict.modulus_margin)}"]
+    return [row("margins", ", ".join(parts))]
+
+
 def _passivity_words(verdict: Assessment) -> str:
+    if verdict.alpha < 0:
+        return "no, and no damping makes a negative stiffness passive"
     if verdict.passive:
         return f"yes, with {with_unit(verdict.passivity_margin, 'N s/m')} of physical damping to spare"
     return f"no, for want of {with_unit(-verdict.passivity_margin, 'N s/m')} of physical damping"

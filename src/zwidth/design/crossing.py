@@ -1,4 +1,4 @@
-"""The outermost zero of a function of one unknown, for kernels of one point.
+"""The outermost zero of functions of one unknown, elementwise, in NumPy and in JAX.
 
 Outermost means: beyond it the function stays negative, whatever it does before. The number of steps is fixed, so
 that no point of a batch waits for another.
@@ -8,64 +8,68 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
 from zwidth._types import Array
+from zwidth.xp import epsilon, frozen, namespace, repeat
 
 # Each round cuts the bracket into this many cells; the first one has equal ratios, the others equal widths.
 _CELLS = 160
-_ROUNDS = 9
-# A logarithm of a ratio of stiffnesses this close to 0 is 0 but for rounding.
-_ZERO = 1e-14
+_ROUNDS = 4
 
 Function = Callable[[Array], Array]
+Sloped = Callable[[Array], tuple[Array, Array]]
 
 
-def outermost_zero(function: Function, inner: Array, outer: Array, offset: Array) -> tuple[Array, Array]:
-    """The last zero between ``inner`` and ``outer``, and whether there is one; implicitly differentiable.
+def outermost_cell(function: Function, inner: Array, outer: Array, offset: Array) -> tuple[Array, Array, Array]:
+    """A narrow bracket of the last zero between ``inner`` and ``outer``, and whether there is one.
 
-    ``inner + offset`` and ``outer + offset`` are positive, and ``function(outer)`` is negative. Cutting into many
-    cells at once, without derivatives, has the function compiled in one place only: Newton's method would add two.
+    All have one shape with a leading axis of 1; ``function`` takes points along that axis. ``inner + offset`` and
+    ``outer + offset`` are positive, and ``function(outer)`` is negative. A dip below zero narrower than a cell of the
+    first round is not seen; a peak above it is, where the highest of the samples stands beside it.
     """
-    inner, outer, offset = jax.lax.stop_gradient((inner, outer, offset))
+    xp = namespace(inner)
+    inner, outer, offset = frozen((inner, outer, offset), xp)
+    part = xp.arange(_CELLS + 1).astype(inner.dtype).reshape((-1,) + (1,) * (inner.ndim - 1)) / _CELLS
+    # A logarithm of a ratio this close to 0 is 0 but for rounding.
+    least = -45.0 * epsilon(inner)
 
-    def search(residual: Function, _: tuple[Array, Array]) -> tuple[Array, Array]:
-        return _cut(residual, inner, outer, offset)
-
-    # The flag rides along as a second unknown, whose equation is trivial.
-    def equations(unknowns: tuple[Array, Array]) -> tuple[Array, Array]:
-        return function(unknowns[0]), unknowns[1]
-
-    def solve(residual: Callable[..., tuple[Array, Array]], start: tuple[Array, Array]) -> tuple[Array, Array]:
-        return search(lambda x: residual((x, start[1]))[0], start)
-
-    def tangent(linear: Callable[..., tuple[Array, Array]], right: tuple[Array, Array]) -> tuple[Array, Array]:
-        slope, _ = linear((jnp.ones_like(right[0]), jnp.zeros_like(right[1])))
-        return right[0] / slope, right[1]
-
-    zero, found = jax.lax.custom_root(equations, (inner, jnp.zeros_like(inner)), solve, tangent)
-    return zero, jax.lax.stop_gradient(found) > 0
-
-
-def _cut(function: Function, inner: Array, outer: Array, offset: Array) -> tuple[Array, Array]:
-    """Shrink the bracket to the last cell whose inner end is not negative, or else round the highest sample."""
-    part = jnp.arange(_CELLS + 1, dtype=inner.dtype) / _CELLS
-
-    def one_round(index: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+    def cut(state: tuple[Array, Array, Array], share: Array) -> tuple[Array, Array, Array]:
         inner, outer, found = state
-        width = outer - inner
-        ratio = jnp.log((outer + offset) / (inner + offset))
-        share = jnp.expm1(part * ratio) * (inner + offset) / width
-        share = jnp.where((index == 0) & (width != 0), jnp.where(part < 1.0, share, 1.0), part)
-        points = inner + share * width
-        values = jax.vmap(function)(points)
-        last = jnp.max(jnp.where(values >= -_ZERO, jnp.arange(_CELLS + 1), -1))
-        top = jnp.argmax(values)
+        points = inner + share * (outer - inner)
+        values = frozen(function(points), xp)
+        place = xp.arange(_CELLS + 1).reshape(part.shape)
+        last = xp.max(xp.where(values >= least, place, -1), axis=0, keepdims=True)
+        top = xp.argmax(xp.where(xp.isnan(values), -np.inf, values), axis=0)[None]
         crossed = last >= 0
-        low = jnp.where(crossed, last, jnp.maximum(top - 1, 0))
-        high = jnp.minimum(jnp.where(crossed, last, top) + 1, _CELLS)
-        return points[low], points[high], jnp.where(crossed, 1.0, found)
+        low = xp.where(crossed, last, xp.maximum(top - 1, 0))
+        high = xp.minimum(xp.where(crossed, last, top) + 1, _CELLS)
+        ends = (xp.take_along_axis(points, index, axis=0) for index in (low, high))
+        return (*ends, found | crossed)
 
-    inner, outer, found = jax.lax.fori_loop(0, _ROUNDS, one_round, (inner, outer, jnp.zeros_like(inner)))
-    return inner, found
+    width = outer - inner
+    spread = xp.expm1(part * xp.log((outer + offset) / (inner + offset))) * (inner + offset)
+    share = xp.where((width != 0) & (part < 1.0), spread / xp.where(width != 0, width, 1.0), part)
+    state = cut((inner, outer, inner != inner), share)
+    return repeat(_ROUNDS - 1, lambda state: cut(state, part), state, xp)
+
+
+def outermost_zero(
+    function: Function, sloped: Sloped, inner: Array, outer: Array, offset: Array
+) -> tuple[Array, Array]:
+    """The last zero and whether there is one; ``sloped`` returns value and slope and is differentiable.
+
+    Two steps of Newton's method end the search. Derivatives pass through them alone: started at the zero, they move
+    with its parameters as it does, up to the third order.
+    """
+    xp = namespace(inner)
+    low, high, found = outermost_cell(function, inner, outer, offset)
+    zero, width = low, high - low
+    for _ in range(2):
+        value, slope = sloped(zero)
+        step = value / slope
+        # Where the function is flat, a step is rounding over rounding.
+        zero = zero - xp.where(xp.abs(step) <= width, step, 0.0)
+    # Rounding may lead out of the bracket where it ends in the zero.
+    least = frozen(inner, xp)
+    return xp.where(zero < least, least, zero), found

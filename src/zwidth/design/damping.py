@@ -12,7 +12,7 @@ from zwidth._types import Array, ArrayLike
 from zwidth.batching import is_traced, pointwise, to_caller
 from zwidth.design.column import column, lobe
 from zwidth.design.lowest import Cost, lowest, without_slope
-from zwidth.design.margin import frequency_count, margin_kernel
+from zwidth.design.margin import margin_kernel
 from zwidth.grouping import Degree, by_degree
 from zwidth.stability.labels import is_stable
 from zwidth.stability.poles import companion_chunk, radius_kernel
@@ -130,20 +130,16 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
         np.True_
     """
     inputs = (alpha, delta, d)
-    samples = frequency_count(d)
     lower, upper, status = _columns(*inputs)
     names = ("alpha", "lower", "upper", "delta", "d")
-    chunk = max(1, (1 << 19) // samples)
-    found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (samples,), chunk, least=_LEAST)
+    found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (), _CHUNK, least=_LEAST)
     # The margin says nothing of the side of the boundary.
     return _answer(found, is_stable(alpha, found[0], delta, d), status, inputs)
 
 
-def _robust_kernel(
-    alpha: Array, lower: Array, upper: Array, delta: Array, d: Array, samples: int
-) -> tuple[Array, Array]:
+def _robust_kernel(alpha: Array, lower: Array, upper: Array, delta: Array, d: Array) -> tuple[Array, Array]:
     def cost(betas: Array) -> tuple[Array, tuple[()]]:
-        return -jax.vmap(lambda beta: margin_kernel(alpha, beta, delta, d, samples))(betas), ()
+        return -margin_kernel(*jnp.broadcast_arrays(alpha, betas, delta, d)), ()
 
     beta, achieved, _ = lowest(cost, lower, upper, **_COLUMN)
     return beta, -achieved
@@ -166,7 +162,7 @@ def _ridge_kernel(alpha: Array, delta: Array, d: Array) -> RidgePoint:
 def _column_kernel(
     alpha: Array, delta: Array, d: Array, ridge_alpha: Array, ridge_omega: Array, status: Array
 ) -> tuple[Array, Array, Array]:
-    lower, upper, exists = column(alpha, lobe(delta, d, ridge_alpha, ridge_omega))
+    lower, upper, exists = column(alpha, lobe(delta, d))
     status = jnp.where((status == Status.OK) & ~exists, Status.NO_BOUNDARY, status)
     status = jnp.where(jnp.isfinite(alpha), status, Status.INVALID_INPUT)
     return lower, upper, status.astype(jnp.int32)
@@ -235,7 +231,7 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
 def _wall_kernel(
     delta: Array, ridge_alpha: Array, ridge_omega: Array, status: Array, d: Array, degree: Degree
 ) -> FastestWall:
-    device = lobe(delta, d, ridge_alpha, ridge_omega)
+    device = lobe(delta, d)
 
     def best_damping(alpha: Array) -> tuple[Array, Array]:
         stable = column(alpha, device)

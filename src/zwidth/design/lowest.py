@@ -7,12 +7,10 @@ fixed, so that no point of a batch waits for another.
 from __future__ import annotations
 
 from collections.abc import Callable
-from itertools import product
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from zwidth._types import Array
 
@@ -91,63 +89,6 @@ def _dips_of(count: int, grid: Array, values: Array, rest: Any) -> _Dips:
     _, best = jax.lax.top_k(jnp.where(is_dip, -values, -jnp.inf), count)
     ends = grid[jnp.maximum(best - 1, 0)], grid[jnp.minimum(best + 1, grid.shape[0] - 1)]
     return _Dips(ends[0], grid[best], ends[1], values[best], jax.tree.map(lambda leaf: leaf[best], rest))
-
-
-def lowest_in_cube(
-    cost: Callable[[Array], Array], *, axes: int, grid: int, starts: int, rounds: int, dtype: Any
-) -> Array:
-    """Minimize over the unit cube: a grid, then a pattern search from each of its lowest points.
-
-    The pattern is a center and its neighbors on a cube: where one of them is lower the center moves there, else the
-    pattern shrinks by half. A neighbor outside is moved onto the face, so that a vertex is met exactly; and the center
-    stays where the cost, a logarithm, falls by rounding only.
-    """
-    rounding = 8.0 * float(jnp.finfo(dtype).eps)
-    offsets = jnp.asarray(list(product((-1.0, 0.0, 1.0), repeat=axes)), dtype)
-    nodes = np.array(list(product(np.linspace(0.0, 1.0, grid), repeat=axes)))
-    # The grid takes the first rounds of the loop, so that the cost is compiled in one place only.
-    each = starts * offsets.shape[0]
-    sampling = -(-len(nodes) // each)
-    points = jnp.asarray(np.concatenate([nodes, np.repeat(nodes[-1:], sampling * each - len(nodes), axis=0)]), dtype)
-    is_node = jnp.arange(points.shape[0]) < len(nodes)
-
-    def start_of(values: Array) -> tuple[Array, Array, Array]:
-        # NaN, the whole box being out of range, is as good as any value.
-        _, first = jax.lax.top_k(jnp.where(is_node, -values, -jnp.inf), starts)
-        return points[first], values[first], jnp.full(starts, 0.5 / (grid - 1), dtype)
-
-    def moved(pattern: tuple[Array, Array, Array], trial: Array, reached: Array) -> tuple[Array, Array, Array]:
-        center, value, width = pattern
-        best = jnp.argmin(reached, axis=1)[:, None]
-        lower = jnp.take_along_axis(reached, best, axis=1)[:, 0]
-        better = lower < value - rounding
-        neighbor = jnp.take_along_axis(trial, best[:, :, None], axis=1)[:, 0]
-        return (
-            jnp.where(better[:, None], neighbor, center),
-            jnp.where(better, lower, value),
-            jnp.where(better, width, 0.5 * width),
-        )
-
-    def step(index: Array, state: tuple[Array, tuple[Array, Array, Array]]) -> tuple[Array, Any]:
-        known, pattern = state
-        center, _, width = pattern
-        neighbors = jnp.clip(center[:, None] + width[:, None, None] * offsets[None], 0.0, 1.0)
-        place = jnp.minimum(index, sampling - 1) * each
-        nodes_here = jax.lax.dynamic_slice(points, (place, 0), (each, axes)).reshape(neighbors.shape)
-        trial = jnp.where(index < sampling, nodes_here, neighbors)
-        reached = jax.vmap(cost)(trial.reshape(-1, axes))
-        filled = jax.lax.dynamic_update_slice(known, reached, (place,))
-        known = jnp.where(index < sampling, filled, known)
-        pattern = jax.lax.cond(
-            index == sampling - 1,
-            lambda: start_of(known),
-            lambda: moved(pattern, trial, reached.reshape(starts, -1)),
-        )
-        return known, pattern
-
-    known = jnp.zeros(points.shape[0], dtype)
-    _, (center, value, _) = jax.lax.fori_loop(0, sampling + rounds, step, (known, start_of(known)))
-    return center[jnp.argmin(value)]
 
 
 @jax.custom_jvp

@@ -8,28 +8,26 @@ were found over delta from 0 to 1e5 and d from 0 to 1e6, with room to spare:
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import pointwise
-from zwidth.design.crossing import Function, outermost_zero
-from zwidth.design.stiffness import check_stiffness
+from zwidth.batching import elementwise
+from zwidth.design.crossing import outermost_zero
+from zwidth.design.stiffness import check_stiffness, checked_device
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, within
 from zwidth.errors import InputError
 from zwidth.loop import poison
-from zwidth.scene import denormalize, normalize
-from zwidth.stability.ridge import ridge_kernel
+from zwidth.scene import denormalize, in_periods, normalize, quantity_status
+from zwidth.stability.ridge import ridge_kernel, slopes_kernel
 from zwidth.status import Status
+from zwidth.xp import namespace
 
 _LEAST, _MOST = 0.2, 6.0
-# A delay of this many periods is as good as continuous time, to 1e-6 of the stiffness; a device with this delta is
-# as good as massless.
-_LIMIT = 1e6
-_CHUNK = 1 << 11
-# Smaller batches are filled up: compiling for one more size takes far longer than solving for this many devices.
-_LEAST_BATCH = 1 << 6
+# A hundred samples of a lobe at a time: what a block needs stays in the cache.
+_BLOCK = 1 << 8
+_FEW = 1 << 9
 
 
 class Requirement(NamedTuple):
@@ -39,41 +37,80 @@ class Requirement(NamedTuple):
     status: Array
 
 
-def _alpha(delta: Array, d: Array) -> Array:
-    return ridge_kernel(delta, d, "held").alpha
+class _Path(NamedTuple):
+    """How the wanted quantity x enters: ``delta = strength x^a``, ``d = lag x^b``, ``K_max/K = alpha_max scale x^p``.
+
+    ``outwards`` is the sign with which ``log(K_max/K)`` turns negative towards large x.
+    """
+
+    strength: Array
+    lag: Array
+    scale: Array
+    a: int = 0
+    b: int = 0
+    p: int = 0
+    outwards: float = 1.0
+
+    def device(self, x: Array) -> tuple[Array, Array]:
+        """(delta, d) at x."""
+        xp = namespace(x, self.scale)
+        delta, d = xp.broadcast_arrays(_times_power(self.strength, x, self.a), _times_power(self.lag, x, self.b))
+        return delta, d
+
+    def value(self, x: Array) -> Array:
+        """The logarithm of K_max/K, signed."""
+        alpha = ridge_kernel(*self.device(x), "held").alpha
+        return self._signed_log(alpha, x)
+
+    def value_and_slope(self, x: Array) -> tuple[Array, Array]:
+        """The same with its derivative in x."""
+        delta, d = self.device(x)
+        point, by_delta, by_d = slopes_kernel(delta, d, "held")
+        slope = by_delta * _power_slope(self.strength, x, self.a) + by_d * _power_slope(self.lag, x, self.b)
+        slope = slope / point.alpha + (self.p / x if self.p else 0.0)
+        return self._signed_log(point.alpha, x), self.outwards * slope
+
+    def _signed_log(self, alpha: Array, x: Array) -> Array:
+        xp = namespace(alpha)
+        return self.outwards * xp.log(_times_power(alpha * self.scale, x, self.p))
 
 
-def _requirement(
-    function: Function, bracket: tuple[Array, Array, Array], ok: Array, inputs: tuple[Array, ...], free: bool = False
+def _times_power(factor: Array, x: Array, exponent: int) -> Array:
+    return factor if exponent == 0 else factor * x**exponent if exponent > 0 else factor / x**-exponent
+
+
+def _power_slope(factor: Array, x: Array, exponent: int) -> Array:
+    return 0.0 * x if exponent == 0 else factor + 0.0 * x if exponent == 1 else -factor / (x * x)
+
+
+def _solved(
+    path: _Path, bracket: tuple[Array, Array, Array], unit: Array, given: Array, inputs: tuple, free: bool = False
 ) -> Requirement:
-    """Solve and attach the status. ``free``: where the function never reaches 0, nothing at all is required."""
-    value, found = outermost_zero(function, *bracket)
-    answered = ok & (found | free)
-    value = jnp.where(ok & found, value, 0.0)
-    status = jnp.where(ok, jnp.where(answered, Status.OK, Status.UNREACHABLE), Status.INVALID_INPUT)
-    return Requirement(value + poison(answered, *inputs), status.astype(jnp.int32))
+    """Solve for x and give ``x unit`` with its status. ``free``: a function that is never 0 requires nothing at all."""
+    xp = namespace(unit, *inputs)
+    lifted = path._replace(strength=path.strength[None], lag=path.lag[None], scale=path.scale[None])
+    inner, outer, offset = (xp.broadcast_to(value, unit.shape)[None] for value in bracket)
+    x, found = (leaf[0] for leaf in outermost_zero(lifted.value, lifted.value_and_slope, inner, outer, offset))
+    # Cut off by the domain, the bracket does not end where the function is negative.
+    beyond = ~(lifted.value(outer)[0] < 0.0)
+    found = found & ~beyond
+    value = xp.where(found, x, 0.0) * unit
+    delta, d = (leaf[0] for leaf in lifted.device(xp.where(found, x, outer[0])[None]))
+    inside = within(value, SI_RANGE) & (device_status(delta, d) == Status.OK) & ~beyond
+    status = xp.where(found | free, int(Status.OK), int(Status.UNREACHABLE))
+    status = xp.where(given == Status.OK, xp.where(inside, status, int(Status.OUT_OF_RANGE)), given)
+    return Requirement(value + poison(status == Status.OK, *inputs), status.astype(np.int32))
 
 
-def _pointwise(kernel: Callable[..., Any], names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Requirement:
-    return pointwise(kernel, names, values, chunk=_CHUNK, fused=False, least=_LEAST_BATCH)
+def _safe(*inputs: Array, **quantities: Array) -> tuple[Array, ...]:
+    """The status of the inputs, then the inputs with harmless numbers in place of bad ones."""
+    given = quantity_status(**quantities)
+    xp = namespace(*inputs)
+    return given, *(xp.where(given == Status.OK, value, 1.0) for value in inputs)
 
 
-def _positive(*values: Array) -> Array:
-    ok = jnp.isfinite(values[0]) & (values[0] > 0)
-    for value in values[1:]:
-        ok = ok & jnp.isfinite(value) & (value > 0)
-    return ok
-
-
-def _not_negative(*values: Array) -> Array:
-    ok = jnp.isfinite(values[0]) & (values[0] >= 0)
-    for value in values[1:]:
-        ok = ok & jnp.isfinite(value) & (value >= 0)
-    return ok
-
-
-def _safe(ok: Array, *values: Array) -> tuple[Array, ...]:
-    return tuple(jnp.where(ok, value, 1.0) for value in values)
+def _answer(kernel: Any, names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Requirement:
+    return elementwise(kernel, names, values, few=_FEW, block=_BLOCK)
 
 
 def required_damping(
@@ -109,24 +146,22 @@ def required_damping(
         10.24 N s/m
     """
     check_stiffness(stiffness)
-    d = normalize(mass=mass, period=period, delay=delay).d
-    return _pointwise(_damping_kernel, ("stiffness", "mass", "period", "d"), (stiffness, mass, period, d))
+    checked_device(mass=mass, period=period, delay=delay)
+    return _answer(_damping_kernel, ("stiffness", "mass", "period", "delay"), (stiffness, mass, period, delay))
 
 
-def _damping_kernel(stiffness: Array, mass: Array, period: Array, d: Array) -> Requirement:
-    inputs = (stiffness, mass, period, d)
-    ok = _positive(stiffness, mass, period) & _not_negative(d)
-    stiffness, mass, period, d = _safe(ok, *inputs)
-    rate = mass / period
+def _damping_kernel(stiffness: Array, mass: Array, period: Array, delay: Array) -> Requirement:
+    inputs = (stiffness, mass, period, delay)
+    given, stiffness, mass, period, delay = _safe(
+        *inputs, wanted_stiffness=stiffness, mass=mass, period=period, delay=delay
+    )
+    xp = namespace(*inputs)
+    rate, d = mass / period, in_periods(delay, period)
     wanted = stiffness * period / rate
-    enough = wanted * (d + 1.0) / _LEAST
-
-    def shortfall(damping: Array) -> Array:
-        return -jnp.log(_alpha(damping / rate, d) / wanted)
-
-    # Outwards is towards more damping; the offset lets the samples start at 0.
-    bracket = (jnp.zeros_like(d), enough * rate, jnp.minimum(1e-3, 1e-3 * enough) * rate)
-    return _requirement(shortfall, bracket, ok, inputs, free=True)
+    # In delta; outwards is towards more damping, and the offset lets the samples start at 0.
+    enough = xp.minimum(wanted * (d + 1.0) / _LEAST, LARGEST_DAMPING)
+    path = _Path(xp.ones_like(d), d, 1.0 / wanted, a=1, outwards=-1.0)
+    return _solved(path, (0.0 * d, enough, xp.minimum(1e-3, 1e-3 * enough)), rate, given, inputs, free=True)
 
 
 def required_period(
@@ -180,40 +215,37 @@ def required_period(
     else:
         denormalize(mass=1.0, period=1.0, d=delay_periods)
     kernel = _period_kernel if delay_periods is None else _period_in_periods_kernel
-    return _pointwise(kernel, ("stiffness", "mass", "damping", given[0]), (stiffness, mass, damping, fixed))
+    return _answer(kernel, ("stiffness", "mass", "damping", given[0]), (stiffness, mass, damping, fixed))
 
 
 def _period_at(bound: float, stiffness: Array, mass: Array, damping: Array, D: Array) -> Array:
     """The T at which ``bound (1/D^2 + delta/D) m/T^2 = K``."""
     linear, constant = bound * damping / D, bound * mass / (D * D)
-    return (linear + jnp.sqrt(linear * linear + 4.0 * stiffness * constant)) / (2.0 * stiffness)
+    xp = namespace(linear, constant, stiffness)
+    return (linear + xp.sqrt(linear * linear + 4.0 * stiffness * constant)) / (2.0 * stiffness)
 
 
 def _period_in_periods_kernel(stiffness: Array, mass: Array, damping: Array, d: Array) -> Requirement:
     inputs = (stiffness, mass, damping, d)
-    ok = _positive(stiffness, mass) & _not_negative(damping, d)
-    stiffness, mass, damping, d = _safe(ok, *inputs)
-
-    def surplus(period: Array) -> Array:
-        return jnp.log(_alpha(damping * period / mass, d) * (mass / stiffness) / period / period)
-
-    ends = (_period_at(bound, stiffness, mass, damping, d + 1.0) for bound in (_LEAST, _MOST))
-    return _requirement(surplus, (*ends, jnp.zeros_like(d)), ok, inputs)
+    given, stiffness, mass, damping, d = _safe(*inputs, wanted_stiffness=stiffness, mass=mass, damping=damping, d=d)
+    shortest, longest = (_period_at(bound, stiffness, mass, damping, d + 1.0) for bound in (_LEAST, _MOST))
+    path = _Path(damping / mass, d, mass / stiffness, a=1, p=-2)
+    return _solved(path, (shortest, longest, 0.0 * d), 0.0 * d + 1.0, given, inputs)
 
 
 def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array) -> Requirement:
     inputs = (stiffness, mass, damping, delay)
-    ok = _positive(stiffness, mass) & _not_negative(damping, delay)
-    stiffness, mass, damping, delay = _safe(ok, *inputs)
-
-    def surplus(period: Array) -> Array:
-        return jnp.log(_alpha(damping * period / mass, delay / period) * (mass / stiffness) / period / period)
-
-    one = jnp.ones_like(delay)
-    longest = _period_at(_MOST, stiffness, mass, damping, one)
-    without_delay = _period_at(_LEAST, stiffness, mass, damping, one)
-    shortest = jnp.where(delay > 0, jnp.minimum(delay / _LIMIT, 0.1 * without_delay), without_delay)
-    return _requirement(surplus, (shortest, longest, jnp.zeros_like(delay)), ok, inputs)
+    given, stiffness, mass, damping, delay = _safe(
+        *inputs, wanted_stiffness=stiffness, mass=mass, damping=damping, delay=delay
+    )
+    xp = namespace(*inputs)
+    longest = _period_at(_MOST, stiffness, mass, damping, 1.0)
+    without_delay = _period_at(_LEAST, stiffness, mass, damping, 1.0)
+    # A delay of 1e5 periods, the longest that the model takes, is as good as continuous time, to 1e-5 of K.
+    shortest = xp.where(delay > 0, xp.maximum(1.001 * delay / LONGEST_DELAY, 1e-6 * without_delay), without_delay)
+    shortest = xp.minimum(shortest, longest)
+    path = _Path(damping / mass, delay, mass / stiffness, a=1, b=-1, p=-2)
+    return _solved(path, (shortest, longest, 0.0 * delay), 0.0 * delay + 1.0, given, inputs)
 
 
 def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike) -> Requirement:
@@ -246,24 +278,23 @@ def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike =
         0.993 ms
     """
     check_stiffness(stiffness)
-    normalize(mass=mass, damping=damping, period=period)
-    return _pointwise(_delay_kernel, ("stiffness", "mass", "damping", "period"), (stiffness, mass, damping, period))
+    checked_device(mass=mass, damping=damping, period=period)
+    return _answer(_delay_kernel, ("stiffness", "mass", "damping", "period"), (stiffness, mass, damping, period))
 
 
 def _delay_kernel(stiffness: Array, mass: Array, damping: Array, period: Array) -> Requirement:
     inputs = (stiffness, mass, damping, period)
-    ok = _positive(stiffness, mass, period) & _not_negative(damping)
-    stiffness, mass, damping, period = _safe(ok, *inputs)
+    given, stiffness, mass, damping, period = _safe(
+        *inputs, wanted_stiffness=stiffness, mass=mass, damping=damping, period=period
+    )
+    xp = namespace(*inputs)
     delta, wanted = damping * period / mass, stiffness * (period / mass) * period
-
-    def surplus(delay: Array) -> Array:
-        return jnp.log(_alpha(delta, delay / period) / wanted)
-
     # alpha_max < 6 (1/D^2 + delta/D) at D = d + 1
     linear = _MOST * delta
-    longest = (linear + jnp.sqrt(linear * linear + 4.0 * wanted * _MOST)) / (2.0 * wanted)
-    longest = jnp.maximum(longest, 1.5) - 1.0
-    return _requirement(surplus, (jnp.zeros_like(delta), longest * period, period), ok, inputs)
+    longest = (linear + xp.sqrt(linear * linear + 4.0 * wanted * _MOST)) / (2.0 * wanted)
+    longest = xp.minimum(xp.maximum(longest, 1.5) - 1.0, LONGEST_DELAY)
+    path = _Path(delta, 0.0 * delta + 1.0, 1.0 / wanted, b=1)
+    return _solved(path, (0.0 * delta, longest, 0.0 * delta + 1.0), period, given, inputs)
 
 
 def required_mass(
@@ -300,21 +331,22 @@ def required_mass(
         0.1010 kg
     """
     check_stiffness(stiffness)
-    d = normalize(mass=1.0, damping=damping, period=period, delay=delay).d
-    return _pointwise(_mass_kernel, ("stiffness", "damping", "period", "d"), (stiffness, damping, period, d))
+    checked_device(mass=1.0, damping=damping, period=period, delay=delay)
+    return _answer(_mass_kernel, ("stiffness", "damping", "period", "delay"), (stiffness, damping, period, delay))
 
 
-def _mass_kernel(stiffness: Array, damping: Array, period: Array, d: Array) -> Requirement:
-    inputs = (stiffness, damping, period, d)
-    ok = _positive(stiffness, period) & _not_negative(damping, d)
-    stiffness, damping, period, d = _safe(ok, *inputs)
-
-    def shortfall(mass: Array) -> Array:
-        return -jnp.log(_alpha(damping * period / mass, d) * (mass / stiffness) / period / period)
-
+def _mass_kernel(stiffness: Array, damping: Array, period: Array, delay: Array) -> Requirement:
+    inputs = (stiffness, damping, period, delay)
+    given, stiffness, damping, period, delay = _safe(
+        *inputs, wanted_stiffness=stiffness, damping=damping, period=period, delay=delay
+    )
+    xp = namespace(*inputs)
+    d = in_periods(delay, period)
     D = d + 1.0
     heaviest = stiffness * (period * D) ** 2 / _LEAST
-    # The undamped device answers above the second bound.
-    lightest = jnp.where(damping > 0, damping * period / _LIMIT, heaviest * _LEAST / _MOST)
-    bracket = (jnp.minimum(lightest, 0.01 * heaviest), heaviest, jnp.zeros_like(d))
-    return _requirement(shortfall, bracket, ok, inputs, free=True)
+    # The undamped device answers above the second bound; the lightest one has the largest delta.
+    lightest = xp.where(damping > 0, damping * period / LARGEST_DAMPING, heaviest * _LEAST / _MOST)
+    # No device so light that the damping drowns its mass is needed to see where K_max rises.
+    lightest = xp.minimum(xp.maximum(lightest, 1e-12 * heaviest), 0.01 * heaviest)
+    path = _Path(damping * period, d, 1.0 / (stiffness * period * period), a=-1, p=1, outwards=-1.0)
+    return _solved(path, (lightest, heaviest, 0.0 * d), 0.0 * d + 1.0, given, inputs, free=True)

@@ -1,221 +1,375 @@
-"""The stiffest wall that every device of a family can render, when mass, damping, period and delay are uncertain."""
+"""The stiffest wall that every device of a family can render, proved: mass, damping, period and delay uncertain.
+
+A device found by search bounds the answer from above. From below it is proved: the box of devices is cut until the
+verdict of `zwidth.stability.affine` holds for every device of every part at once.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from itertools import product
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import is_traced, pointwise
-from zwidth.design.column import column, lobe
-from zwidth.design.lowest import lowest_in_cube, without_slope
+from zwidth.batching import as_float64
 from zwidth.design.stiffness import max_stiffness
+from zwidth.domain import SI_RANGE, within
 from zwidth.errors import InputError
-from zwidth.loop import poison
 from zwidth.scene import normalize
-from zwidth.stability.ridge import ridge_kernel
+from zwidth.stability.affine import quantities, stable_everywhere
+from zwidth.stability.boundary import boundary_point
+from zwidth.stability.labels import is_stable
+from zwidth.status import Status
+from zwidth.xp import is_traced
 
-Interval: TypeAlias = tuple[ArrayLike, ArrayLike] | ArrayLike
 _NAMES = ("mass", "damping", "period", "delay")
-_ENDS = tuple(f"{name}[{end}]" for name in _NAMES for end in (0, 1))
-# Samples along every uncertain quantity but the damping, how many of the worst devices a local search starts from, and
-# its rounds.
-_GRID, _STARTS, _ROUNDS = 7, 4, 64
-_BISECTIONS = 40
-_CHUNK = 1 << 6
+# How far the proved bound may lie below what a device was found to limit it to.
+_TOLERANCE = 1e-6
+# Where that cannot be proved, looser ones are tried.
+_LOOSER = (1e-4, 1e-2, 0.1)
+# Parts of a box that are looked at before giving up, and at one time.
+_MOST_PARTS, _AT_ONCE = 1 << 18, 1 << 11
+# Rounds of proof and counterexample.
+_ROUNDS = 40
+_BISECTIONS = 60
+_SEARCH_ROUNDS = 60
+# Shares this close to 0 or 1 are taken for it.
+_AT_END = 1e-12
+
+
+class Interval(NamedTuple):
+    """An uncertain quantity: all values from ``low`` to ``high``, numbers or arrays that broadcast."""
+
+    low: ArrayLike
+    high: ArrayLike
+
+
+Uncertain: TypeAlias = Interval | ArrayLike
 
 
 class RobustStiffness(NamedTuple):
-    """The worst device of a box: its K_max in N/m, the device, and whether it is a vertex of the box."""
+    """What every device of a box can render, the worst device found, and a `zwidth.Status`."""
 
     stiffness: Array
+    attained: Array
     mass: Array
     damping: Array
     period: Array
     delay: Array
     is_vertex: Array
+    status: Array
 
 
-class _Box(NamedTuple):
-    """The lowest and the highest mass, damping, period and delay of one family, and whether they are in range."""
+class RobustWall(NamedTuple):
+    """One wall for a whole family of devices, in N/m and N s/m, the limit of such walls, and a `zwidth.Status`."""
 
-    low: Array
-    high: Array
-    ok: Array
-
-    def device(self, unit: Array) -> Array:
-        """The device at coordinates from 0 to 1 along every quantity; exactly the ends of the intervals there.
-
-        Even in the logarithm of mass and period, which may span decades. Of the coordinates no derivative is passed on.
-        """
-        low, high, unit = (jax.lax.stop_gradient(value) for value in (self.low, self.high, unit))
-        ratio = (high / jnp.where(low > 0, low, 1.0)) ** unit
-        inside = jnp.where(np.array([True, False, True, False]), low * ratio, low + (high - low) * unit)
-        inside = jnp.clip(inside, low, high)
-        at_low = (unit <= 0.0) | (low == high)
-        return jnp.where(at_low, self.low, jnp.where(unit >= 1.0, self.high, inside))
-
-
-def _box(ends: tuple[Array, ...]) -> _Box:
-    low, high = jnp.stack(ends[0::2]), jnp.stack(ends[1::2])
-    above = jnp.where(np.array([True, False, True, False]), low > 0, low >= 0)
-    ok = jnp.all(above & (low <= high) & jnp.isfinite(high))
-    return _Box(jnp.where(ok, low, 1.0), jnp.where(ok, high, 1.0), ok)
-
-
-def _ends(mass: Interval, damping: Interval, period: Interval, delay: Interval) -> tuple[ArrayLike, ...]:
-    """The ends of the four intervals, checked."""
-    ends: list[ArrayLike] = []
-    for name, interval in zip(_NAMES, (mass, damping, period, delay), strict=True):
-        whole = not isinstance(interval, tuple | list) and np.ndim(interval) == 0
-        pair = (interval, interval) if whole else interval
-        if len(pair) != 2:
-            raise InputError(f"{name}: got {interval!r}; give (low, high), or one number if it is known")
-        low, high = pair
-        for end in (low, high):
-            if not is_traced(end):
-                normalize(**({"mass": 1.0, "period": 1.0} | {name: end}))
-        if not is_traced(low, high) and np.ndim(low) == np.ndim(high) == 0 and np.asarray(low) > np.asarray(high):
-            raise InputError(f"{name}: got {interval!r}; the first number must not be greater than the second")
-        ends += [low, high]
-    return tuple(ends)
+    stiffness: Array
+    virtual_damping: Array
+    limit: Array
+    status: Array
 
 
 def robust_max_stiffness(
-    *, mass: Interval, damping: Interval = 0.0, period: Interval, delay: Interval = 0.0
+    *, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain, delay: Uncertain = 0.0
 ) -> RobustStiffness:
-    """Find the smallest K_max of all devices in a box: each of them can render any wall below it.
+    """Find the smallest K_max of all devices in a box: each of them can render any wall up to it.
 
     ``min over the box of K_max(m, b, T, t_d)``; the virtual damping may differ from device to device. For one wall
     (K, B) that suits all of them see `robust_wall`, which is never stiffer.
 
     Args:
-        mass: (low, high) of m in kg, > 0, or one number; likewise the others.
-        damping: of b in N s/m, >= 0.
-        period: of T in s, > 0.
-        delay: of t_d in s, >= 0. Every end may be an array: all eight broadcast, a box for each entry.
+        mass: m in kg, > 0: an `Interval`, or what is known exactly; likewise the others.
+        damping: b in N s/m, >= 0.
+        period: T in s, > 0.
+        delay: t_d in s, >= 0, held. All broadcast, the ends of intervals too: a box for each entry.
 
     Returns:
-        RobustStiffness of the broadcast shape: ``stiffness`` in N/m; ``mass``, ``damping``, ``period``, ``delay`` of
-        the device that attains it; ``is_vertex``, whether that is a corner of the box. K_max rises with the damping, so
-        ``damping`` is always its lower end; with the mass and the delay it may have an extremum inside. A box out of
-        range among arrays gives NaN.
+        RobustStiffness of the broadcast shape: ``stiffness`` in N/m, proved for every device of the box; ``attained``,
+        K_max of the worst device found, whose ``mass``, ``damping``, ``period`` and ``delay`` follow, and ``is_vertex``
+        whether it is a corner of the box. ``status``: OK where ``stiffness`` is within 1e-6 of ``attained``, UNDECIDED
+        where only less could be proved, INVALID_INPUT or OUT_OF_RANGE with NaN for a box among arrays.
 
     Raises:
-        InputError: an interval is not (low, high), two numbers are out of range or order, an argument is no real
-            number, or shapes do not broadcast.
+        InputError: an argument is a tuple or a list of two ends, a number out of range, no real number, or traced; ends
+            are out of order; or shapes do not broadcast.
 
     Numerics:
-        A grid of 343 devices, then pattern searches from the worst four of them: K_max to about 1e-14, an inner device
-        to about 1e-7 of the box. Not a proof: a dip between grid points deeper than any other would be missed.
-        Traceable; derivatives of ``stiffness`` are those of K_max at the worst device in the ends on which it lies.
+        Branch and bound: the box is cut until affine arithmetic proves a wall for each part. Some hundred parts and a
+        tenth of a second for a box of 10 to 30 %, some ten thousand and a second where delays cross whole periods at
+        strong damping.
 
     References:
-        Hulin, Preusche, Hirzinger 2006, section VII.
+        Hulin, Preusche, Hirzinger 2006, section VII; Comba, Stolfi 1993; docs/theory/one-lobe.md (rows and columns).
 
     Example:
-        >>> from zwidth.design import robust_max_stiffness
-        >>> worst = robust_max_stiffness(mass=(0.08, 0.12), damping=(5, 15), period=1e-3, delay=(0.5e-3, 1e-3))
-        >>> print(worst.is_vertex, worst.damping, worst.delay)
-        True 5.0 0.001
+        >>> from zwidth.design import Interval, robust_max_stiffness
+        >>> worst = robust_max_stiffness(mass=Interval(0.08, 0.12), damping=10, period=1e-3, delay=1e-3)
+        >>> print(worst.is_vertex, worst.mass, f"{worst.stiffness:.0f} N/m")
+        True 0.08 16975 N/m
     """
-    ends = _ends(mass, damping, period, delay)
-    return pointwise(_worst_kernel, _ENDS, ends, chunk=_CHUNK)
+    return RobustStiffness(*_each_box(_worst, RobustStiffness._fields, (mass, damping, period, delay)))
 
 
-def _worst_kernel(*ends: Array) -> RobustStiffness:
-    box = _box(ends)
-
-    def stiffness(unit: Array) -> Array:
-        """The logarithm of K_max, which rises with the damping: the lower end is therefore taken."""
-        mass, damping, period, delay = box.device(jnp.stack([unit[0], jnp.zeros_like(unit[0]), unit[1], unit[2]]))
-        return jnp.log(max_stiffness(mass=mass, damping=damping, period=period, delay=delay))
-
-    unit = lowest_in_cube(stiffness, axes=3, grid=_GRID, starts=_STARTS, rounds=_ROUNDS, dtype=ends[0].dtype)
-    device = box.device(jnp.stack([unit[0], jnp.zeros_like(unit[0]), unit[1], unit[2]]))
-    mass, damping, period, delay = device
-    reached = max_stiffness(mass=mass, damping=damping, period=period, delay=delay)
-    bad = poison(box.ok, *ends)
-    is_vertex = box.ok & jnp.all((device == box.low) | (device == box.high))
-    return RobustStiffness(reached + bad, mass + bad, damping + bad, period + bad, delay + bad, is_vertex)
-
-
-class RobustWall(NamedTuple):
-    """One wall for a whole family of devices: K in N/m and B in N s/m."""
-
-    stiffness: Array
-    virtual_damping: Array
-
-
-def robust_wall(
-    *, mass: Interval, damping: Interval = 0.0, period: Interval, delay: Interval = 0.0, samples: int = 3
-) -> RobustWall:
-    """Find the stiffest single wall (K, B) that is stable on every sampled device of a box.
-
-    The largest K for which the stable intervals of B of all devices have a point in common.
+def robust_wall(*, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain, delay: Uncertain = 0.0) -> RobustWall:
+    """Find the stiffest single wall (K, B) that is stable on every device of a box.
 
     Args:
-        mass: (low, high) of m in kg, > 0, or one number; likewise the others.
-        damping: of b in N s/m, >= 0.
-        period: of T in s, > 0.
-        delay: of t_d in s, >= 0. Every end may be an array: all eight broadcast, a box for each entry.
-        samples: devices along every uncertain quantity, at least 2: the vertices, and what lies between.
+        mass: m in kg, > 0: an `Interval`, or what is known exactly; likewise the others.
+        damping: b in N s/m, >= 0.
+        period: T in s, > 0.
+        delay: t_d in s, >= 0, held. All broadcast, the ends of intervals too: a box for each entry.
 
     Returns:
-        RobustWall of the broadcast shape: ``stiffness`` in N/m, the limit, which itself is no longer stable, and the
-        ``virtual_damping`` in N s/m left there. Both are NaN where no wall suits all devices, or out of range.
+        RobustWall of the broadcast shape: ``stiffness`` in N/m and ``virtual_damping`` in N s/m, proved stable on every
+        device of the box; ``limit``, a stiffness that no wall can reach on all devices. ``status``: OK where
+        ``stiffness`` is within 1e-6 of ``limit``, UNDECIDED where only less could be proved (NaN if nothing could),
+        INVALID_INPUT or OUT_OF_RANGE with NaN for a box among arrays.
 
     Raises:
-        InputError: an interval is not (low, high), two numbers are out of range or order, an argument is no real
-            number, shapes do not broadcast, or ``samples`` is less than 2.
+        InputError: as for `robust_max_stiffness`.
 
     Numerics:
-        Bisection over K, to 1e-12 of the largest K_max, assuming that a wall can always be made softer and that the
-        stable dampings of a stiffness are one interval, as pole counts showed. It holds for the sampled devices; for
-        those between them it is evidence, not proof. Traceable, with NaN for derivatives: which devices limit the wall
-        changes from box to box.
+        The wall that suits some devices best, proved for all by branch and bound as in `robust_max_stiffness`; a part
+        that cannot be proved shows a device that the wall does not suit, which then joins the others.
 
     References:
-        Hulin, Preusche, Hirzinger 2006, sections V, VII.
+        Hulin, Preusche, Hirzinger 2006, sections V, VII; Comba, Stolfi 1993.
 
     Example:
-        >>> from zwidth.design import robust_wall
-        >>> wall = robust_wall(mass=0.1, damping=10, period=1e-3, delay=1e-3)
-        >>> print(f"{wall.stiffness:.0f} N/m")
-        19865 N/m
+        >>> from zwidth.design import Interval, robust_wall
+        >>> wall = robust_wall(mass=Interval(0.08, 0.12), damping=10, period=1e-3, delay=Interval(0, 1e-3))
+        >>> print(f"{wall.stiffness:.0f} N/m, {wall.virtual_damping:.1f} N s/m")
+        16975 N/m, 34.6 N s/m
     """
-    ends = _ends(mass, damping, period, delay)
-    if not (isinstance(samples, int) and samples >= 2):
-        raise InputError(f"samples: got {samples!r}; a whole number of at least 2 is needed")
-    return pointwise(_wall_kernel, _ENDS, ends, (samples,), chunk=_CHUNK)
+    return RobustWall(*_each_box(_wall, RobustWall._fields, (mass, damping, period, delay)))
 
 
-def _wall_kernel(*arguments: Any) -> RobustWall:
-    *ends, samples = arguments
-    box = _box(tuple(ends))
-    axis = np.linspace(0.0, 1.0, samples)
-    grid = jnp.asarray(list(product(axis, repeat=4)), box.low.dtype)
-    mass, damping, period, delay = jax.lax.stop_gradient(jax.vmap(box.device)(grid)).T
-    _, _, delta, d = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    ridge = jax.vmap(lambda delta, d: ridge_kernel(delta, d, "held"))(delta, d)
-    lobes = jax.vmap(lobe)(delta, d, ridge.alpha, ridge.omega)
-    rate = mass / period
+def _each_box(
+    answer: Callable[[np.ndarray, np.ndarray], tuple], names: tuple[str, ...], given: tuple[Uncertain, ...]
+) -> list[np.ndarray]:
+    """Check the intervals, and answer box by box."""
+    ends = []
+    for name, value in zip(_NAMES, given, strict=True):
+        if isinstance(value, tuple | list) and not isinstance(value, Interval):
+            raise InputError(
+                f"{name}: got {value!r}; write Interval(low, high) for an uncertain quantity, or a NumPy array for "
+                "several known ones"
+            )
+        pair = value if isinstance(value, Interval) else Interval(value, value)
+        if is_traced(*pair):
+            raise InputError(f"{name}: got a traced value; a proof is made on the host, outside JAX transformations")
+        for end in pair:
+            normalize(**({"mass": 1.0, "period": 1.0} | {name: end}))
+        low, high = (as_float64(name, end) for end in pair)
+        if low.ndim == high.ndim == 0 and low > high:
+            raise InputError(f"{name}: got {value!r}; the first number must not be greater than the second")
+        ends += [low, high]
+    try:
+        columns = np.broadcast_arrays(*ends)
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {np.shape(end)}" for name, end in zip(np.repeat(_NAMES, 2), ends, strict=True))
+        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+    shape = columns[0].shape
+    rows = np.stack([column.ravel() for column in columns], axis=-1)
+    results = []
+    with np.errstate(all="ignore"):
+        for row in rows:
+            low, high = row[0::2], row[1::2]
+            status = _box_status(low, high)
+            results.append(answer(low, high) if status == Status.OK else (*[np.nan] * (len(names) - 1), status))
+    found = zip(*results, strict=True) if results else [()] * len(names)
+    # A box that is not computed is no vertex.
+    types = {"is_vertex": lambda values: np.equal(values, True), "status": lambda values: np.array(values, np.int32)}
+    arrays = (types.get(name, np.array)(values) for name, values in zip(names, found, strict=True))
+    return [np.asarray(array).reshape(shape)[()] for array in arrays]
 
-    def halve(_: int, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        low, high, left = state
+
+def _box_status(low: np.ndarray, high: np.ndarray) -> Status:
+    positive = np.array([True, False, True, False])
+    valid = np.isfinite(low) & np.isfinite(high) & (low <= high) & np.where(positive, low > 0, low >= 0)
+    if not valid.all():
+        return Status.INVALID_INPUT
+    return Status.OK if within(np.concatenate([low, high]), SI_RANGE).all() else Status.OUT_OF_RANGE
+
+
+def _normalized(devices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """N/m a unit of alpha, delta and d of devices, rows of (m, b, T, t_d)."""
+    mass, damping, period, delay = devices.T
+    return mass / period / period, damping * period / mass, delay / period
+
+
+def _stiffest(devices: np.ndarray) -> np.ndarray:
+    mass, damping, period, delay = devices.T
+    return np.asarray(max_stiffness(mass=mass, damping=damping, period=period, delay=delay))
+
+
+def _stable_dampings(stiffness: float, devices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The ends of the stable B at one K; NaN where none is stable."""
+    spring, delta, d = _normalized(devices)
+    alpha, damper = stiffness / spring, spring * devices[:, 2]
+    lower, upper = (boundary_point(delta, d, alpha=alpha, side=side).beta for side in ("lower", "upper"))
+    return np.asarray(lower) * damper, np.asarray(upper) * damper
+
+
+def _lowest(
+    cost: Callable[[np.ndarray], np.ndarray], starts: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """The best device that a pattern search finds in a box, from the best of ``starts``, rows of shares from 0 to 1.
+
+    A pattern is a center and its neighbors, a step away along any of the uncertain quantities; it moves to the lowest
+    of them, and where none is lower the step is halved.
+    """
+    free = np.flatnonzero(high > low)
+    moves = np.zeros((3**free.size, low.size))
+    moves[:, free] = np.array(list(product((-1.0, 0.0, 1.0), repeat=free.size)))
+
+    def values(shares: np.ndarray) -> np.ndarray:
+        found = cost(_devices(shares, low, high))
+        return np.where(np.isnan(found), np.inf, found)
+
+    known = values(starts)
+    best, value, step = starts[int(np.argmin(known))], float(np.min(known)), 0.25
+    for _ in range(_SEARCH_ROUNDS if free.size else 0):
+        trials = np.clip(best + step * moves, 0.0, 1.0)
+        reached = values(trials)
+        if reached.min() < value:
+            best, value = trials[int(np.argmin(reached))], float(reached.min())
+        else:
+            step *= 0.5
+    # Rounding may have kept it from an end of an interval.
+    ends = np.where(best < _AT_END, 0.0, np.where(best > 1.0 - _AT_END, 1.0, best))
+    return ends if values(ends[None])[0] <= value * (1.0 + _AT_END) else best
+
+
+def _devices(shares: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Devices of a box, exactly its ends where a share is 0 or 1."""
+    inside = np.clip(low + shares * (high - low), low, high)
+    return np.where(shares == 0.0, low, np.where(shares == 1.0, high, inside))
+
+
+def _shares(devices: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    width = high - low
+    return np.where(width > 0, (devices - low) / np.where(width > 0, width, 1.0), 0.0)
+
+
+def _grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
+    """So many shares of each uncertain quantity, combined: the vertices, and what lies between."""
+    axes = [np.linspace(0.0, 1.0, count) if b > a else np.zeros(1) for a, b in zip(low, high, strict=True)]
+    return np.array(list(product(*axes)))
+
+
+class _Proof(NamedTuple):
+    """Whether a statement holds for a whole box; otherwise the centers of parts for which it could not be proved."""
+
+    holds: bool
+    open: np.ndarray
+
+
+def _prove(stiffness: float, damping: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray) -> _Proof:
+    """Prove that (K, ``damping`` of the part's central device) is stable on every device of every part of a box.
+
+    It ends as soon as the wall is not stable on the center of a part: no cutting would help.
+    """
+    waiting = [(low[None], high[None])]
+    looked_at = 0
+    while waiting:
+        lows, highs = waiting.pop()
+        looked_at += len(lows)
+        centers = 0.5 * (lows + highs)
+        wall = damping(centers)
+        spring, delta, d = _normalized(centers)
+        fails = ~np.asarray(is_stable(stiffness / spring, wall / spring / centers[:, 2], delta, d))
+        if fails.any() or looked_at > _MOST_PARTS:
+            return _Proof(False, centers[fails])
+        mass, friction, period, delay = quantities(lows, highs)
+        ratio = period / mass
+        proved = stable_everywhere(period * ratio * stiffness, ratio * wall, friction * ratio, delay / period)
+        lows, highs = _halved(lows[~proved], highs[~proved])
+        waiting += [(lows[i : i + _AT_ONCE], highs[i : i + _AT_ONCE]) for i in range(0, len(lows), _AT_ONCE)]
+    return _Proof(True, np.empty((0, 4)))
+
+
+def _halved(lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Cut each part in two, across the quantity whose width matters most."""
+    mass, damping, period, delay = (0.5 * (lows + highs)).T
+    width = (highs - lows).T
+    delta = damping * period / mass
+    weights = (width[0] / mass, width[1] * period / mass / (0.3 + delta), 2 * width[2] / period)
+    along = np.argmax(np.stack([*weights, width[3] / (delay + 0.5 * period)]), axis=0)
+    rows, middle = np.arange(len(lows)), 0.5 * (lows + highs)
+    upper, lower = lows.copy(), highs.copy()
+    upper[rows, along], lower[rows, along] = middle[rows, along], middle[rows, along]
+    return np.concatenate([lows, upper]), np.concatenate([lower, highs])
+
+
+def _worst(low: np.ndarray, high: np.ndarray) -> tuple:
+    """`robust_max_stiffness` of one box."""
+    share = _lowest(_stiffest, _grid(low, high, 5), low, high)
+    proved, status = np.nan, Status.UNDECIDED
+    for tolerance in (_TOLERANCE, *_LOOSER):
+        for _ in range(_ROUNDS):
+            target = float(_stiffest(_devices(share[None], low, high))[0]) * (1.0 - tolerance)
+            proof = _prove(target, lambda centers, k=target: _middle(*_stable_dampings(k, centers)), low, high)
+            if proof.holds:
+                proved, status = target, Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED
+            if proof.holds or not len(proof.open):
+                break
+            starts = np.concatenate([share[None], _shares(proof.open, low, high)])
+            share = _lowest(_stiffest, starts, low, high)
+        if proved > 0:
+            break
+    worst = _devices(share, low, high)
+    is_vertex = bool(np.all((worst == low) | (worst == high)))
+    return proved, float(_stiffest(worst[None])[0]), *worst, is_vertex, status
+
+
+def _middle(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    return 0.5 * (lower + upper)
+
+
+def _best_wall(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
+    """The limit of the walls that suit a few devices, and the middle of the dampings that are left at a stiffness."""
+
+    def common(stiffness: float) -> tuple[float, float]:
+        lower, upper = _stable_dampings(stiffness, devices)
+        return float(np.max(lower)), float(np.min(upper))
+
+    low, high = 0.0, float(np.min(_stiffest(devices)))
+    for _ in range(_BISECTIONS):
         trial = 0.5 * (low + high)
-        columns = jax.vmap(column)(trial / rate * period, lobes)
-        lower, upper = jnp.max(columns.lower * rate), jnp.min(columns.upper * rate)
-        common = jnp.all(columns.exists) & (lower < upper)
-        left = jnp.where(common, 0.5 * (lower + upper), left)
-        return jnp.where(common, trial, low), jnp.where(common, high, trial), left
+        lower, upper = common(trial)
+        low, high = (trial, high) if lower < upper else (low, trial)
 
-    highest = jnp.min(ridge.alpha * rate / period)
-    start = (jnp.zeros_like(highest), highest, jnp.full_like(highest, jnp.nan))
-    stiffness, _, virtual_damping = jax.lax.fori_loop(0, _BISECTIONS, halve, start)
-    bad = jnp.where(box.ok & jnp.isfinite(virtual_damping), 0.0, jnp.nan).astype(stiffness.dtype)
-    return without_slope(RobustWall(stiffness + bad, virtual_damping + bad), tuple(ends))
+    def middle(stiffness: float) -> float:
+        lower, upper = common(stiffness)
+        return 0.5 * (lower + upper)
+
+    return high, middle
+
+
+def _wall(low: np.ndarray, high: np.ndarray) -> tuple:
+    """`robust_wall` of one box."""
+    devices = _devices(_grid(low, high, 2), low, high)
+    limit, middle = _best_wall(devices)
+    for tolerance in (_TOLERANCE, *_LOOSER):
+        for _ in range(_ROUNDS):
+            stiffness = limit * (1.0 - tolerance)
+            damping = middle(stiffness)
+            proof = _prove(stiffness, lambda centers, b=damping: np.full(len(centers), b), low, high)
+            if proof.holds:
+                status = Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED
+                return stiffness, damping, limit, status
+            if not len(proof.open):
+                break
+
+            def row_end(candidates: np.ndarray, damping: float = damping) -> np.ndarray:
+                spring, delta, d = _normalized(candidates)
+                ends = boundary_point(delta, d, beta=damping / spring / candidates[:, 2])
+                return np.where(ends.status == Status.OK, np.asarray(ends.alpha) * spring, 0.0)
+
+            found = _lowest(row_end, _shares(proof.open, low, high), low, high)
+            devices = np.concatenate([devices, _devices(found, low, high)[None]])
+            limit, middle = _best_wall(devices)
+    return np.nan, np.nan, limit, Status.UNDECIDED

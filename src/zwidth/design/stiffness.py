@@ -5,24 +5,28 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import is_traced, pointwise
+from zwidth.batching import elementwise
+from zwidth.domain import check_scalars
 from zwidth.errors import InputError
 from zwidth.loop import check_delay_model
 from zwidth.quantities import with_unit
-from zwidth.scene import normalize
-from zwidth.stability.ridge import ridge_kernel
+from zwidth.scene import Normalized, normalize, quantity_status
+from zwidth.stability.devices import Kind
+from zwidth.stability.ridge import occurring, ridge_kernel, slopes_kernel
 from zwidth.status import Status
+from zwidth.xp import is_traced, namespace
 
-_NAMES = ("mass", "period", "delta", "d")
-# Small enough for the second-level cache, as for `zwidth.alpha_max`.
-_CHUNK = 1 << 13
-# Smaller batches are filled up, so that they share a compilation.
-_LEAST = 1 << 6
+_NAMES = ("mass", "damping", "period", "delta", "d")
+
+
+def checked_device(**quantities: ArrayLike) -> Normalized:
+    """The normalized device; raises `InputError` also where a scalar delta or d is beyond the range of the model."""
+    device = normalize(**quantities)
+    check_scalars(delta=device.delta, d=device.d)
+    return device
 
 
 def check_stiffness(stiffness: ArrayLike) -> None:
@@ -65,13 +69,13 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         >>> print(f"{max_stiffness(mass=0.1, damping=10, period=1e-3, delay=1e-3):.0f} N/m")
         19865 N/m
     """
-    device = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    return pointwise(_max_stiffness_kernel, _NAMES, (mass, period, device.delta, device.d), chunk=_CHUNK, least=_LEAST)
+    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
+    values = (mass, period, device.delta, device.d)
+    return elementwise(_max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (occurring(device.d),))
 
 
-def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array) -> Array:
-    # Divided twice: the square of a period may underflow.
-    return ridge_kernel(delta, d, "held").alpha * (mass / period) / period
+def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: Kind) -> Array:
+    return ridge_kernel(delta, d, "held", kind).alpha * (mass / period) / period
 
 
 class Sensitivities(NamedTuple):
@@ -129,30 +133,26 @@ def sensitivities(
         572 N/m per N s/m
     """
     check_delay_model(delay_model)
-    device = normalize(mass=mass, damping=damping, period=period, delay=delay)
-    return pointwise(
-        _sensitivities_kernel,
-        _NAMES,
-        (mass, period, device.delta, device.d),
-        (delay_model,),
-        chunk=_CHUNK,
-        least=_LEAST,
-    )
+    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
+    values = (mass, damping, period, device.delta, device.d)
+    return elementwise(_sensitivities_kernel, _NAMES, values, (delay_model, occurring(device.d)))
 
 
-def _sensitivities_kernel(mass: Array, period: Array, delta: Array, d: Array, delay_model: str) -> Sensitivities:
-    def alpha_and_status(delta: Array, d: Array) -> tuple[Array, Array]:
-        point = ridge_kernel(delta, d, delay_model)
-        return point.alpha, point.status
-
-    (alpha, status), (by_delta, by_d) = jax.value_and_grad(alpha_and_status, (0, 1), has_aux=True)(delta, d)
-    rate = 1.0 / period
+def _sensitivities_kernel(
+    mass: Array, damping: Array, period: Array, delta: Array, d: Array, delay_model: str, kind: Kind
+) -> Sensitivities:
+    xp = namespace(mass, delta, d)
+    point, by_delta, by_d = slopes_kernel(delta, d, delay_model, kind)
+    # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
+    given = quantity_status(mass=mass, damping=damping, period=period)
+    status = xp.where(given == Status.OK, point.status, given).astype(np.int32)
+    alpha, rate = point.alpha, 1.0 / period
     return Sensitivities(
         alpha * mass * rate * rate,
         (alpha - delta * by_delta) * rate * rate,
         by_delta * rate,
         # No delay needs no product, which an infinite slope would make NaN.
-        (delta * by_delta - jnp.where(d > 0.0, d * by_d, 0.0) - 2.0 * alpha) * mass * rate**3,
+        (delta * by_delta - xp.where(d > 0.0, d * by_d, 0.0) - 2.0 * alpha) * mass * rate**3,
         by_d * mass * rate**3,
         status,
     )

@@ -154,6 +154,11 @@ class Response:
     final_position: float
     settling_time: float
 
+    @property
+    def settles_in_view(self) -> bool:
+        """Whether it has settled, for good, at the end of the time shown."""
+        return bool(self.settling_time <= self.time[-1])
+
 
 @dataclass(frozen=True)
 class StepData:

@@ -96,7 +96,7 @@ def _draw_response(ax: Axes, data: RecommendationData) -> None:
     clock, unit = style.si_unit(float(response.time[-1]), "s")
     ax.set_xlim(0.0, float(response.time[-1] + response.time[1]) * clock)
     ax.set_xlabel(f"time  $t$  in {unit}")
-    if np.isfinite(response.settling_time):
+    if response.settles_in_view:
         settled = response.settling_time * clock
         dot = Line2D([], [], linestyle="", marker="o", markersize=4.5, color=ax.lines[0].get_color())
         ax.legend([dot], [f"{SETTLED} after {settled:.3g} {unit}"], loc="upper right", handletextpad=0.2)

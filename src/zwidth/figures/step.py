@@ -53,7 +53,7 @@ def draw_positions(ax: Axes, data: StepData) -> None:
         ax.plot(response.time * clock, response.position * factor, **look, label=_text(response), zorder=3)
         if np.isfinite(response.final_position):
             ax.axhline(response.final_position * factor, color=look["color"], linewidth=0.5, zorder=2)
-        if np.isfinite(response.settling_time):
+        if response.settles_in_view:
             at = np.interp(response.settling_time, response.time, response.position)
             ax.plot(response.settling_time * clock, at * factor, "o", color=look["color"], markersize=4.5, zorder=4)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
@@ -87,13 +87,13 @@ def _legend_handles(ax: Axes, data: StepData) -> list[Line2D]:
     """The responses, and what the dots mean."""
     handles, _ = ax.get_legend_handles_labels()
     lines = [handle for handle in handles if isinstance(handle, Line2D)]
-    if any(np.isfinite(response.settling_time) for response in data.responses):
+    if any(response.settles_in_view for response in data.responses):
         lines.append(Line2D([], [], linestyle="", marker="o", markersize=4.5, color=style.GRAY, label=SETTLED))
     return lines
 
 
 def _text(response: Response) -> str:
-    settles = "" if np.isfinite(response.settling_time) else ", not settled"
+    settles = "" if response.settles_in_view else ", not settled"
     return rf"{response.label}  ($\alpha = {response.alpha:.3g}$, $\beta = {response.beta:.3g}$){settles}"
 
 

@@ -1,13 +1,11 @@
 """Ball arithmetic for the points that the floating-point filter of the certified method leaves open.
 
-Every number is an interval (a "ball" of python-flint) that contains the exact one, starting from inputs that are
-taken as exact; the precision doubles until the Schur-Cohn recursion is certain of every comparison, or of one that
-fails. Loaded only when needed: python-flint is an optional dependency.
+The text is that of `zwidth.stability.enclosed_verdict`; its numbers are balls of python-flint around inputs taken as
+exact, and the precision doubles until a verdict is certain. Loaded only when needed: python-flint is optional.
 
-What no precision decides is a pole exactly on the unit circle. At alpha = 0 one is at z = 1, and P/(z - 1) decides.
-For delta = 0 the coefficients are rational numbers, and ``gcd(P, P*)``, P* with the coefficients reversed, holds
-exactly the zeros z of P for which 1/z is another one, those on the circle among them. For delta > 0 and alpha > 0 no
-such point is known: c is then transcendental, while alpha, beta, delta and d are rational.
+What no precision decides is a pair of poles exactly on the unit circle. For delta > 0 and alpha > 0 no such point is
+known: c is then transcendental, while alpha, beta, delta and d are rational. For delta = 0 everything is algebraic, and
+whether the crossover is a zero of P is decided by their greatest common divisor, see `_crosses_exactly`.
 """
 
 from __future__ import annotations
@@ -20,7 +18,21 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from zwidth.stability.crossover import first_zero
+from zwidth.stability.enclosed_plant import Plant
+from zwidth.stability.enclosed_verdict import (
+    Lag,
+    Long,
+    Short,
+    Verdict,
+    gain_cubic,
+    long_device,
+    long_verdict,
+    short_device,
+    short_verdict,
+)
 from zwidth.status import Status
+from zwidth.xp import horner
 
 if TYPE_CHECKING:
     import flint
@@ -28,9 +40,13 @@ if TYPE_CHECKING:
 FIRST_BITS = 128
 # Enough for the exact product of a float64 and 1 - f; what its rounding lost, the phi-functions would multiply.
 _EXACT_BITS = 1200
+# Points that this many bits leave open are looked at exactly where delta = 0, up to this many whole periods.
+_DOUBTFUL_BITS = 512
+_LONGEST_EXACT = 512
+_PRIME = 2**61 - 1
 
 
-class Verdict(NamedTuple):
+class Decision(NamedTuple):
     """What is known of one point."""
 
     stable: bool
@@ -43,32 +59,191 @@ def available() -> bool:
     return find_spec("flint") is not None
 
 
-def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> Verdict:
-    """Decide one valid point, taken as exact, with alpha > 0, or alpha = 0 and beta > delta."""
-    edge = alpha == 0
-    # A stage of the recursion costs up to a bit.
-    bits = min(FIRST_BITS << (int(d) // FIRST_BITS).bit_length(), max_bits)
+def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> Decision:
+    """Decide one point of the domain, taken as exact: alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
+    edge, bits = alpha == 0, min(FIRST_BITS, max_bits)
     while True:
-        inside = _all_inside(alpha, beta, delta, d, bits)
-        if inside is not None:
-            return Verdict(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
-        if bits == max_bits:
-            break
+        found = verdict(alpha, beta, delta, d, bits)
+        if found.stable or found.unstable:
+            inside = bool(found.stable)
+            return Decision(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
+        last = bits == max_bits
+        if delta == 0 and (last or bits == _DOUBTFUL_BITS) and _crosses_exactly(*_exact(alpha, beta, d), bits):
+            return Decision(False, Status.ON_BOUNDARY, bits)
+        if last:
+            return Decision(False, Status.UNDECIDED, bits)
         bits = min(2 * bits, max_bits)
-    if delta == 0:
-        return _decide_rational(alpha, beta, d, max_bits)
-    return Verdict(False, Status.UNDECIDED, max_bits)
 
 
-def _all_inside(alpha: float, beta: float, delta: float, d: float, bits: int) -> bool | None:
-    """Whether every pole lies inside, the one at z = 1 for alpha = 0 aside; None if the precision does not tell."""
+def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Verdict:
+    """What is certain at one precision."""
     import flint
 
     with flint.ctx.workprec(bits):
-        plant, whole = _device(delta, d, bits), int(d)
-        if alpha == 0:
-            return _sparse_schur_cohn(_edge_coefficients(flint.arb(beta), plant, whole))
-        return _sparse_schur_cohn(_coefficients(flint.arb(alpha), flint.arb(beta), plant, whole))
+        device = _device(delta, d, bits)
+        stiffness, damping = flint.arb(alpha), flint.arb(beta)
+        if isinstance(device, Short):
+            return short_verdict(stiffness, damping, device)
+        return long_verdict(stiffness, damping, int(d), device, _enclose_zero, _take_lag)
+
+
+@lru_cache(maxsize=64)
+def _device(delta: float, d: float, bits: int) -> Short | Long:
+    """The device in balls; whole maps share it."""
+    import flint
+
+    with flint.ctx.workprec(bits):
+        here = plant(delta, d - int(d), bits)
+        return short_device(here) if d < 1 else long_device(here)
+
+
+def plant(delta: float, f: float, bits: int) -> Plant:
+    """The device of exact delta and f."""
+    import flint
+
+    with flint.ctx.workprec(bits):
+        ball = flint.arb(delta)
+        c, p1, phi2, psi = _phi(ball, frexp(delta)[1], bits)
+        if f == 0:
+            return Plant(ball, c, ball * p1, p1, phi2, psi)
+        f_ball = flint.arb(f)
+        with flint.ctx.workprec(_EXACT_BITS):
+            t = 1 - f_ball
+            x_t, x_f = ball * t, ball * f_ball
+        # Of a product's exponent, the sum of the factors' is off by one at most.
+        e_t, p1_t, phi2_t, psi_t = _phi(x_t, frexp(delta)[1] + frexp(1 - f)[1] - 1, bits)
+        _, p1_f, phi2_f, psi_f = _phi(x_f, frexp(delta)[1] + frexp(f)[1] - 1, bits)
+        a2, a0 = t * t * phi2_t, e_t * f_ball * f_ball * psi_f
+        a1 = t * t * psi_t + t * f_ball * (e_t + p1_t) * p1_f + f_ball * f_ball * phi2_f
+        return Plant(ball, c, ball * p1, p1, a2, a1, a0, f_ball, p1_t, psi_t)
+
+
+def _phi(x: flint.arb, exponent: int, bits: int) -> tuple[flint.arb, flint.arb, flint.arb, flint.arb]:
+    """c, phi1, phi2 and psi of x >= 2^(exponent - 1), or of 0, with as many bits more as the quotients cancel."""
+    import flint
+
+    if x == 0:
+        return flint.arb(1), flint.arb(1), flint.arb(0.5), flint.arb(0.5)
+    with flint.ctx.workprec(bits + 16 + max(0, -2 * exponent)):
+        c = (-x).exp()
+        p1 = -(-x).expm1() / x
+        return c, p1, (1 - p1) / x, (p1 - c) / x
+
+
+def _enclose_zero(cubic: tuple[Any, ...]) -> tuple[flint.arb, bool]:
+    """`zwidth.stability.enclosed_verdict.enclose_zero`: Newton's method on the midpoints, then the signs beside it."""
+    import flint
+
+    balls = [h for h in cubic if h is not None]
+    mids = [h.mid() for h in balls]
+    rough = [np.float64(h) for h in mids]
+    with np.errstate(all="ignore"):
+        guess = first_zero(rough[0], rough[1], rough[2], rough[3] if len(rough) == 4 else 0.0, len(rough) == 4, np)
+    u = flint.arb(float(guess) if 0 < guess < 2 else 1.0)
+    smallest = flint.arb(2) ** (8 - flint.ctx.prec)
+    slopes = [k * h for k, h in enumerate(mids)][1:]
+    for _ in range(64):
+        step = (horner(u, mids) / horner(u, slopes)).mid()
+        u = (u - step).mid()
+        if not (u > 0 and u < 2):
+            return u, False
+        if abs(step) < u * smallest * 16:
+            break
+    error, slope = abs(horner(u, balls)), abs(horner(u, slopes))
+    reach = (error * 3 / slope + u * smallest).upper()
+    low, high = u - reach, u + reach
+    found = low > 0 and high < 2 and horner(low, balls) > 0 and horner(high, balls) < 0
+    return flint.arb(u, reach), bool(found)
+
+
+def _take_lag(u: flint.arb, _: Any, whole: int) -> Lag:
+    import flint
+
+    w = (u / 2).sqrt().asin() * 2
+    lag, turn = w * (whole + 0.5), flint.arb.pi()
+    sine, cosine = lag.sin_cos()
+    return Lag(cosine, sine, lag < turn, w * (whole + 1) > turn)
+
+
+def _exact(alpha: float, beta: float, d: float) -> tuple[Any, Any, int, Any]:
+    """alpha, beta, n and f as rational numbers."""
+    import flint
+
+    stiffness, damping, f = (flint.fmpq(*value.as_integer_ratio()) for value in (alpha, beta, d - int(d)))
+    return stiffness, damping, int(d), f
+
+
+def _crosses_exactly(alpha: Any, beta: Any, whole: int, f: Any, bits: int) -> bool:
+    """Whether the poles at delta = 0 include the crossover itself, ``z = e^(j w)``: then they are on the unit circle.
+
+    Called where all that precedes the phase is certain, so that the wall borders the stable ones: no pole is outside.
+    With rational alpha, beta and f, ``H(u)`` times a power of z is a polynomial G(z) of degree 6 at most, a simple
+    zero of which is e^(j w). It is a zero of P too exactly if it is one of gcd(P mod G, G).
+    """
+    import flint
+
+    cubic, wall, lead = _rational(alpha, beta, f)
+    z = flint.fmpq_poly([0, 1])
+    coefficients = cubic if alpha != 0 else cubic[1:]
+    # u = -(z - 1)^2/(2 z)
+    degree = len(coefficients) - 1
+    g = sum((h * (-(z - 1) * (z - 1)) ** k * (2 * z) ** (degree - k) for k, h in enumerate(coefficients)), 0 * z)
+    power = whole + lead
+    if not _meet_modulo(g.numer(), (z - 1) * (z - 1), wall, power) or whole > _LONGEST_EXACT:
+        return False
+    common = g.gcd((_power_modulo(z, power, g) * (z - 1) * (z - 1) + wall) % g)
+    if common.degree() == 0:
+        return False
+    with flint.ctx.workprec(bits):
+        u, found = _enclose_zero(tuple(flint.arb(h) for h in cubic))
+        if not found:
+            return False
+        at = flint.acb(1 - u, (u * (2 - u)).sqrt())
+        # G = common * rest vanishes there; where rest does not, common does.
+        rest = flint.acb_poly(flint.fmpq_poly(g / common))
+        return not rest(at).contains(0)
+
+
+def _rational(alpha: Any, beta: Any, f: Any) -> tuple[list[Any], Any, int]:
+    """At delta = 0: H by powers of u, the wall's part of P, and the power of z in ``z^(n + lead) (z - 1)^2``."""
+    import flint
+
+    half, t = flint.fmpq(1, 2), 1 - f
+    a2, a1, a0 = t * t * half, (1 + 2 * t * f) * half, f * f * half
+    zero, one = flint.fmpq(0), flint.fmpq(1)
+    if f == 0:
+        here = Plant(zero, one, zero, one, half, half)
+        numerator, lead = [half, half], 1
+    else:
+        here = Plant(zero, one, zero, one, a2, a1, a0)
+        numerator, lead = [a0, a1, a2], 2
+    cubic = [h for h in gain_cubic(alpha, beta, long_device(here)) if h is not None]
+    return cubic, flint.fmpq_poly(numerator) * flint.fmpq_poly([-beta, alpha + beta]), lead
+
+
+def _meet_modulo(g: Any, factor: Any, wall: Any, power: int) -> bool:
+    """Whether G and ``z^power factor + wall`` have a common zero modulo a prime: if not, they have none at all."""
+    import flint
+
+    def reduced(p: Any) -> Any:
+        scale = flint.nmod(int(p.denom()), _PRIME)
+        return flint.nmod_poly([flint.nmod(int(value), _PRIME) / scale for value in p.numer().coeffs()], _PRIME)
+
+    small = flint.nmod_poly([int(value) % _PRIME for value in g.coeffs()], _PRIME)
+    if small.degree() != g.degree():
+        return True
+    z = flint.nmod_poly([0, 1], _PRIME)
+    return small.gcd((_power_modulo(z, power, small) * reduced(factor) + reduced(wall)) % small).degree() > 0
+
+
+def _power_modulo(z: Any, power: int, modulus: Any) -> Any:
+    """``z^power`` by repeated squaring."""
+    result = z**0
+    for digit in bin(power)[2:]:
+        result = result * result % modulus
+        if digit == "1":
+            result = result * z % modulus
+    return result
 
 
 def polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> list[Any]:
@@ -76,161 +251,15 @@ def polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> 
     import flint
 
     with flint.ctx.workprec(bits):
-        return _coefficients(flint.arb(alpha), flint.arb(beta), _device(delta, d, bits), int(d)).dense()
-
-
-class _BallDevice(NamedTuple):
-    c: Any
-    numerator: tuple[Any, ...]  # lowest power first; two terms for a whole delay
-
-
-@lru_cache(maxsize=64)
-def _device(delta: float, d: float, bits: int) -> _BallDevice:
-    """The device in balls; whole maps share it."""
-    import flint
-
-    f = d - int(d)
-    if f == 0:
-        c, phi2, psi = _phi(flint.arb(delta), frexp(delta)[1], bits)
-        return _BallDevice(c, (psi, phi2))
-    ball, f_ball = flint.arb(delta), flint.arb(f)
-    with flint.ctx.workprec(_EXACT_BITS):
-        t = 1 - f_ball
-        x_t, x_f = ball * t, ball * f_ball
-    # Of a product's exponent, the sum of the factors' is off by one at most.
-    e_t, phi2_t, psi_t = _phi(x_t, frexp(delta)[1] + frexp(1 - f)[1] - 1, bits)
-    _, phi2_f, psi_f = _phi(x_f, frexp(delta)[1] + frexp(f)[1] - 1, bits)
-    with flint.ctx.workprec(bits):
-        phi1_t, phi1_f = phi2_t + psi_t, phi2_f + psi_f
-        a2 = t * t * phi2_t
-        a1 = t * t * psi_t + t * f_ball * (e_t + phi1_t) * phi1_f + f_ball * f_ball * phi2_f
-        a0 = e_t * f_ball * f_ball * psi_f
-        return _BallDevice((-ball).exp(), (a0, a1, a2))
-
-
-def _phi(x: flint.arb, exponent: int, bits: int) -> tuple[flint.arb, flint.arb, flint.arb]:
-    """c, phi2 and psi of x >= 2^(exponent - 1), or of 0, with as many bits more as the quotients cancel."""
-    import flint
-
-    if x == 0:
-        return flint.arb(1), flint.arb(0.5), flint.arb(0.5)
-    with flint.ctx.workprec(bits + 16 + max(0, -2 * exponent)):
-        c = (-x).exp()
-        phi1 = -(-x).expm1() / x
-        return c, (1 - phi1) / x, (phi1 - c) / x
-
-
-class _Sparse(NamedTuple):
-    """A polynomial with a gap of zeros in the middle, which a long delay leaves and the recursion keeps."""
-
-    degree: int
-    low: list[Any]  # lowest power first
-    high: list[Any]  # highest power first
-
-    def dense(self) -> list[Any]:
-        """All coefficients, lowest power first; what overlaps is added."""
-        p = [*self.low, *[0] * (self.degree + 1 - len(self.low))]
-        for index, value in enumerate(self.high):
-            p[self.degree - index] += value
+        here = plant(delta, d - int(d), bits)
+        n = [a for a in (here.a0, here.a1, here.a2) if a is not None]
+        stiffness, damping = flint.arb(alpha), flint.arb(beta)
+        s = stiffness + damping
+        wall = [-n[0] * damping, *(left * s - right * damping for left, right in pairwise(n)), n[-1] * s]
+        p = [*wall, *[flint.arb(0)] * (int(d) + 1)]
+        for index, value in enumerate((here.c, -(1 + here.c), flint.arb(1)), len(p) - 3):
+            p[index] += value
         return p
-
-
-def _coefficients(alpha: Any, beta: Any, plant: _BallDevice, whole: int) -> _Sparse:
-    """P, for balls as well as for rational numbers."""
-    c, n = plant
-    s = alpha + beta
-    wall = [-n[0] * beta, *(left * s - right * beta for left, right in pairwise(n)), n[-1] * s]
-    return _Sparse(whole + len(n) + 1, wall, [1 + 0 * c, -(1 + c), c])
-
-
-def _edge_coefficients(beta: Any, plant: _BallDevice, whole: int) -> _Sparse:
-    """``P/(z - 1)`` at alpha = 0."""
-    c, n = plant
-    return _Sparse(whole + len(n), [a * beta for a in n], [1 + 0 * c, -c])
-
-
-def _sparse_schur_cohn(p: _Sparse) -> bool | None:
-    """`schur_cohn` at a cost proportional to the degree."""
-    degree, low, high = p
-    while degree > len(low) + len(high):
-        within = _last_within_lead(low[0], high[0])
-        if not within:
-            return within
-        k = low[0] / high[0]
-        low, high = _less(low[1:], k, high[1:]), _less(high, k, low)
-        degree -= 1
-    return schur_cohn(_Sparse(degree, low, high).dense())
-
-
-def schur_cohn(p: list[Any]) -> bool | None:
-    """Whether all zeros lie inside the unit circle, lowest power first; None if the balls do not tell."""
-    while len(p) > 1:
-        within = _last_within_lead(p[0], p[-1])
-        if not within:
-            return within
-        p = _less(p[1:], p[0] / p[-1], p[-2::-1])
-    return True
-
-
-def _last_within_lead(last: Any, lead: Any) -> bool | None:
-    """Whether ``|last| < |lead|``. Where it fails the zeros' product, hence one of them, is above one."""
-    margin = abs(lead) - abs(last)
-    if margin > 0:
-        return True
-    return False if margin < 0 else None
-
-
-def _less(x: list[Any], k: Any, y: list[Any]) -> list[Any]:
-    """``x - k y``, the shorter one continued by zeros."""
-    both = [left - k * right for left, right in zip(x, y, strict=False)]
-    return both + x[len(y) :] + [-k * right for right in y[len(x) :]]
-
-
-def _decide_rational(alpha: float, beta: float, d: float, max_bits: int) -> Verdict:
-    """Decide a point with delta = 0 that no precision decides: a pole of it may be exactly on the circle."""
-    import flint
-
-    undecided = Verdict(False, Status.UNDECIDED, max_bits)
-    exact = flint.fmpq_poly(_rational_coefficients(alpha, beta, d))
-    paired = exact.gcd(flint.fmpq_poly(exact.coeffs()[::-1]))
-    if paired.degree() == 0:
-        return undecided
-    rest = (exact / paired).numer()
-    bits = max_bits
-    with flint.ctx.workprec(bits):
-        inside = schur_cohn([flint.arb(value) for value in rest.coeffs()])
-        if inside is None:
-            # The recursion also stops where the zeros' product is one; none of them is on the circle.
-            found: Any = rest.complex_roots()
-            sizes = [abs(zero) for zero, _multiplicity in found]
-            inside = False if any(size > 1 for size in sizes) else all(size < 1 for size in sizes) or None
-        if inside is False:
-            return Verdict(False, Status.OK, bits)
-        roots: Any = paired.numer().complex_roots()
-        zeros = [zero for zero, _multiplicity in roots]
-        if any(abs(zero) > 1 for zero in zeros):
-            return Verdict(False, Status.OK, bits)
-        # 1/conj(z) is a zero too; where its ball meets no other zero's, it is z itself: z is on the circle.
-        alone = all(
-            sum((1 / flint.acb(zero.real, -zero.imag)).overlaps(other) for other in zeros) == 1 for zero in zeros
-        )
-        return Verdict(False, Status.ON_BOUNDARY, bits) if inside and alone else undecided
-
-
-def _rational_coefficients(alpha: float, beta: float, d: float) -> list:
-    """P at delta = 0, where phi1 = 1 and phi2 = psi = 1/2, as rational numbers."""
-    import flint
-
-    def exact(value: float) -> flint.fmpq:
-        return flint.fmpq(*value.as_integer_ratio())
-
-    f = exact(d - int(d))
-    t, half = 1 - f, flint.fmpq(1, 2)
-    n = (half, half) if f == 0 else (f * f * half, (t * t + 4 * t * f + f * f) * half, t * t * half)
-    plant = _BallDevice(flint.fmpq(1), n)
-    if alpha == 0:
-        return _edge_coefficients(exact(beta), plant, int(d)).dense()
-    return _coefficients(exact(alpha), exact(beta), plant, int(d)).dense()
 
 
 def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -239,6 +268,5 @@ def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np
     stable, status, bits = np.zeros(count, bool), np.zeros(count, np.int32), np.zeros(count, np.int32)
     alpha, beta, delta, d = (column.tolist() for column in columns)
     for index in range(count):
-        verdict = decide(alpha[index], beta[index], delta[index], d[index], max_bits)
-        stable[index], status[index], bits[index] = verdict
+        stable[index], status[index], bits[index] = decide(alpha[index], beta[index], delta[index], d[index], max_bits)
     return stable, status, bits

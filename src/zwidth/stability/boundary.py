@@ -2,62 +2,68 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple, TypeAlias
 
-import jax
-import jax.numpy as jnp
 import numpy as np
-import optimistix
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import is_traced, pointwise, to_caller
+from zwidth.batching import elementwise, is_traced
+from zwidth.domain import WALL_RANGE, check_scalars, wall_status, within
 from zwidth.errors import InputError, check_choice
-from zwidth.loop import (
-    BoundaryCurve,
-    FrequencyLoop,
-    check_delay_model,
-    frequency_boundary,
-    frequency_loop,
-    poison,
-    valid_device,
+from zwidth.loop import BoundaryCurve, check_delay_model, frequency_boundary, frequency_loop, poison, valid_device
+from zwidth.stability.crossover import stable_at
+from zwidth.stability.curve import (
+    Lobe,
+    RowEnd,
+    bisect_place,
+    column_end,
+    creeps,
+    device_of,
+    frequency,
+    lobe,
+    peak,
+    row_end,
+    spread,
+    wall,
 )
-from zwidth.stability.bracketing import bisect
-from zwidth.stability.curve import lobe_end
-from zwidth.stability.poles import radius_by_companion
-from zwidth.stability.ridge import ridge_kernel
-from zwidth.stability.ridge_kkt import frequency_residual
+from zwidth.stability.devices import ANY, Device, Kind, kind_of
+from zwidth.stability.row_limit import short_row
 from zwidth.status import Status
+from zwidth.xp import epsilon, frozen, namespace, repeat
 
-# Cells into which the lobe is cut to bracket its crossings with a line.
-_CELLS = 256
-# Poles are looked at this far (relative) before and behind a boundary point, until they tell the sides apart. A small
-# step does not leave the tip of a corner on its far side; a large one still moves the poles of a very soft wall.
-_SIDE_STEPS = (1e-8, 1e-5, 1e-11, 1e-14)
-# Below this distance from the unit circle the magnitude of a pole, double ones included, may be rounding.
-_ROUNDING = 1e-10
-# What to look for on a line: its lowest crossing, the next one above that, or the first one ahead of its origin.
-_LOWEST, _ABOVE_LOWEST, _AHEAD = 0.0, 1.0, 2.0
+PointMethod: TypeAlias = Literal["auto", "optimistix"]
+_METHODS: tuple[str, ...] = ("auto", "optimistix")
+
+# Places of the lobe at which a ray is looked for, and Newton's steps from between two of them.
+_PLACES, _RAY_STEPS = 24, 12
+# One Newton step through which derivatives pass makes the first ones exact, a second one the second ones.
+_EXACT_STEPS = 2
+# Closer to pi the frequency of a fractional power of less than one has too few digits.
+_NEAREST_PI = 1e-3
 
 
 def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> BoundaryCurve:
     """Return the wall that puts a pole pair of the loop at ``e^(+-j omega)``, in closed form.
 
     With ``q = -z^n (z - 1)(z - c)/(n0(z) + n1(z)/z)`` on ``z = e^(j omega)``: ``beta = Im q / sin omega``,
-    ``alpha = Re q - tan(omega/2) Im q``. The curve starts at (0, -delta), eq. (19). It lists candidates: which of its
-    pieces bound the stable set is decided by counting poles, see `zwidth.stable_region`.
+    ``alpha = Re q - tan(omega/2) Im q``. The curve starts at (0, -delta), eq. (19). Its first lobe bounds the stable
+    set, see `zwidth.stable_region`; behind it the curve only lists walls with a pole on the circle.
 
     Args:
         omega: frequency in radians a period, 0 <= omega <= pi.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not. All three broadcast.
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, whole or not. All three broadcast.
         delay: "held" (exact) or "fractional_power" (the paper's z^(1+d), principal branch).
 
     Returns:
-        BoundaryCurve with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega -> 0 and -> pi the
-        values are the limits; for delta = 0, or a fractional power, the curve runs to infinity at pi.
+        BoundaryCurve with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega = 0 and pi the
+        values are the limits. They are finite unless the curve runs to infinity at pi: where N(-1) = 0, as for
+        delta = 0 and whole d (for held delays between whole numbers it vanishes at one damping, if at all), and for a
+        fractional power.
 
     Raises:
-        InputError: an argument is no real number, shapes do not broadcast, or ``delay`` is unknown.
+        InputError: a plain number is beyond its range, an argument is no real number, shapes do not broadcast, or
+            ``delay`` is unknown.
 
     Numerics:
         A few units in the last place, at a cost that does not grow with d. Traceable, also in d (derivatives at whole
@@ -72,13 +78,15 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
         -0.25
     """
     check_delay_model(delay)
-    return pointwise(_boundary_kernel, ("omega", "delta", "d"), (omega, delta, d), (delay,))
+    check_scalars(delta=delta, d=d)
+    return elementwise(_boundary_kernel, ("omega", "delta", "d"), (omega, delta, d), (delay,))
 
 
 def _boundary_kernel(omega: Array, delta: Array, d: Array, delay: str) -> BoundaryCurve:
+    xp = namespace(omega, delta, d)
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     spoiled = poison(ok, omega, delta, d)
-    omega, delta, d = (jnp.where(ok, value, 1.0) for value in (omega, delta, d))
+    omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
     curve = frequency_boundary(omega, frequency_loop(delta, d, delay), delay)
     return BoundaryCurve(curve.alpha + spoiled, curve.beta + spoiled)
 
@@ -99,36 +107,43 @@ def boundary_point(
     beta: ArrayLike | None = None,
     alpha: ArrayLike | None = None,
     side: str = "lower",
-    ray: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike] | None = None,
+    ray: tuple[ArrayLike, ArrayLike, ArrayLike, ArrayLike] | ArrayLike | None = None,
     delay: DelayModel = "held",
+    method: PointMethod = "auto",
 ) -> BoundaryPoint:
-    """Find the exact boundary point on a line, by an optimistix solve of ``P(e^(j omega)) = 0`` in real unknowns.
+    """Find the exact boundary point on a line: ``P(e^(j omega)) = 0`` on the edge of the stable set.
 
     Exactly one of ``beta``, ``alpha`` and ``ray`` is given: the stiffest stable wall of that damping; the smallest
     (``side="lower"``) or largest (``"upper"``) stable damping of that stiffness; or the first boundary point on the
     ray ``(alpha0, beta0) + s (dalpha, dbeta)``, s > 0, from a stable wall (alpha0, beta0).
 
     Args:
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0.
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, whole or not.
         beta: normalized virtual damping of a row.
         alpha: normalized stiffness of a column, > 0.
         side: which end of the column.
-        ray: (alpha0, beta0, dalpha, dbeta). Everything broadcasts.
+        ray: (alpha0, beta0, dalpha, dbeta), or an array of which these are the first axis. Everything broadcasts.
         delay: "held" or "fractional_power".
+        method: "auto" solves the proved monotone functions of the lobe; "optimistix" the frequency response in real
+            unknowns, from a bracket by jaxopt, for any loop that has one: an independent judge, which compiles.
 
     Returns:
         BoundaryPoint: ``alpha``, ``beta``; ``omega`` of the pole on the circle (0 and pi: the real ones);
-        ``status``, NO_BOUNDARY with NaN where the line has no stable part, NOT_CONVERGED with NaN where the wall is
-        too soft (alpha below about 1e-30) for its frequency to be found.
+        ``status``, see `zwidth.Status`, with NaN where it is not OK: NO_BOUNDARY where a row or column holds no stable
+        wall or a ray starts at none, UNDECIDED where the outline, looked at in places along it, does not show one
+        crossing ahead, or lies closer to omega = pi than its digits allow (a fractional power of almost 0).
 
     Raises:
-        InputError: not exactly one line is given, an argument is no real number, or a name is unknown.
+        InputError: not exactly one line is given, a plain number is beyond its range, an argument is no real number,
+            or a name is unknown.
 
     Numerics:
-        Agrees with the closed form to 1e-12. Called directly with a held delay, a point is refused where the poles a
-        little before and behind it contradict that the line leaves the stable set there. Traced calls rely on the
-        single-lobe shape of the stable set instead. Traceable, also in d.
+        alpha and ``beta + delta`` to about 1e-15 relative, times the condition of the line: close to the ridge a column
+        determines beta to half the digits only. The same in NumPy, compiled and traced; a scalar takes a fraction of a
+        millisecond and compiles nothing. Traceable with first and second derivatives, also in d (at whole d from the
+        right). Rows and columns are intervals by proof (docs/theory/one-lobe.md); that a ray leaves the stable set but
+        once rests on its convexity, seen on every device looked at and not proved.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V.
@@ -140,171 +155,260 @@ def boundary_point(
     """
     check_delay_model(delay)
     check_choice("side", side, ("lower", "upper"))
+    check_choice("method", method, _METHODS)
     given = [name for name, value in (("beta", beta), ("alpha", alpha), ("ray", ray)) if value is not None]
     if len(given) != 1:
         raise InputError(f"beta, alpha, ray: got {' and '.join(given) or 'none'}; give exactly one of the three")
-    if beta is not None:
-        values, search = (0.0, beta, 1.0, 0.0), _AHEAD
-    elif alpha is not None:
-        values, search = (alpha, 0.0, 0.0, 1.0), _LOWEST if side == "lower" else _ABOVE_LOWEST
+    check_scalars(delta=delta, d=d)
+    if ray is not None:
+        line, (alpha0, beta0, dalpha, dbeta) = "ray", _four(ray)
+        check_scalars(alpha=alpha0, beta=beta0)
+        names, values = ("alpha0", "beta0", "dalpha", "dbeta"), (alpha0, beta0, dalpha, dbeta)
+    elif beta is not None:
+        check_scalars(beta=beta)
+        line, names, values = "row", ("beta",), (beta,)
     else:
-        if not isinstance(ray, tuple | list) or len(ray) != 4:
-            raise InputError(f"ray: got {ray!r}; give the four numbers (alpha0, beta0, dalpha, dbeta)")
-        values, search = tuple(ray), _AHEAD
-    names = ("delta", "d", "alpha0", "beta0", "dalpha", "dbeta", "search")
+        check_scalars(alpha=alpha)
+        line, names, values = side, ("alpha",), (alpha,)
     everything = (delta, d, *values)
-    # What to search for travels as a number: one compilation serves rows, columns and rays.
-    point = pointwise(_point_kernel, names, (*everything, search), (delay,), fused=False)
-    if is_traced(*everything) or delay != "held":
-        return point
-    return _counted(point, everything, search)
+    if method == "optimistix":
+        # Its solvers take a second to import.
+        from zwidth.stability.boundary_solve import solved_point
+
+        return solved_point(names, everything, line, delay)
+    return elementwise(_KERNELS[line], ("delta", "d", *names), everything, (line, delay, _kind(d)))
 
 
-class _Line(NamedTuple):
-    """A line in the (alpha, beta) plane, walked in one direction from its origin."""
+def _four(ray: Any) -> tuple[ArrayLike, ...]:
+    """The four parts of a ray."""
+    try:
+        parts = () if isinstance(ray, str) else tuple(ray)
+    except TypeError:
+        parts = ()
+    if len(parts) != 4:
+        raise InputError(f"ray: got {ray!r}; give the four numbers (alpha0, beta0, dalpha, dbeta)")
+    return parts
+
+
+def _kind(d: ArrayLike) -> Kind:
+    """Which delays occur, as far as that is known before the kernel runs."""
+    try:
+        return ANY if is_traced(d) else kind_of(np.asarray(d, np.float64))
+    except (TypeError, ValueError):
+        # `elementwise` says what is wrong with it.
+        return ANY
+
+
+def _row_kernel(delta: Array, d: Array, beta: Array, line: str, delay: str, kind: Kind) -> BoundaryPoint:
+    xp = namespace(delta, d, beta)
+    given = wall_status(0.0 * beta, beta, delta, d)
+    here = device_of(delta, d, delay, kind)
+    curve = lobe(here, d, delay, kind)
+    creeping = creeps(delay, kind)
+    fixed = frozen(curve, xp)
+    row = frozen(row_end(beta, fixed, creeping), xp)
+    x, meets, beyond, _ = row
+    smooth, at = _follow(x, curve, lambda wall: (wall.b - (beta + delta), wall.d_b), xp)
+    # What `zwidth.is_stable` compares with, to the last place.
+    limit = _limit(beta, row, here, fixed, delay)
+    alpha = xp.where(beyond, _on_line(curve, xp) - 2.0 * beta, _with_slope(limit, at.alpha, xp))
+    omega = xp.where(beyond, np.pi, frequency(smooth, curve))
+    exists = (meets | beyond) & (limit > 0)
+    return _answer(alpha, beta, omega, given, exists, _too_close(x, creeping, curve), (delta, d, beta))
+
+
+def _limit(beta: Array, row: RowEnd, here: Device, curve: Lobe, delay: str) -> Array:
+    """The stiffest stable alpha of a row."""
+    if delay != "held":
+        xp = namespace(beta)
+        return xp.where(row.beyond, _on_line(curve, xp) - 2.0 * beta, wall(row.x, curve).alpha)
+    if curve.long is None:
+        return short_row(beta, here)
+    if curve.short is None:
+        return row.alpha
+    return namespace(beta).where(curve.is_short, short_row(beta, here), row.alpha)
+
+
+def _column_kernel(delta: Array, d: Array, alpha: Array, line: str, delay: str, kind: Kind) -> BoundaryPoint:
+    xp = namespace(delta, d, alpha)
+    given = wall_status(alpha, 0.0 * alpha, delta, d)
+    curve = lobe(device_of(delta, d, delay, kind), d, delay, kind)
+    creeping = creeps(delay, kind)
+    fixed, goal = frozen((curve, alpha), xp)
+    top = peak(fixed, creeping)
+    exists = (goal > 0) & (goal < top.alpha)
+    goal = xp.where(exists, goal, 0.5 * top.alpha)
+    x, on_line = frozen(column_end(goal, top, fixed, line == "upper", creeping), xp)
+    smooth, at = _follow(x, curve, lambda wall: (wall.alpha - alpha, wall.d_alpha), xp)
+    beta = _with_slope(wall(x, fixed).b - delta, at.b - delta, xp)
+    beta = xp.where(on_line, 0.5 * (_on_line(curve, xp) - alpha), beta)
+    omega = xp.where(on_line, np.pi, frequency(smooth, curve))
+    return _answer(alpha, beta, omega, given, exists, _too_close(x, creeping, curve), (delta, d, alpha))
+
+
+def _follow(x: Array, curve: Lobe, residual: Any, xp: Any) -> tuple[Array, Any]:
+    """A root that moves with the curve and the line: it stands still in NumPy, which knows no derivative."""
+    if xp is not np:
+        for _ in range(_EXACT_STEPS):
+            value, slope = residual(wall(x, curve))
+            x = x - value / slope
+    return x, wall(x, curve)
+
+
+def _with_slope(value: Array, moving: Array, xp: Any) -> Array:
+    """A value with the derivatives of another expression for it."""
+    return value if xp is np else frozen(value, xp) + (moving - frozen(moving, xp))
+
+
+def _on_line(curve: Lobe, xp: Any) -> Array:
+    """``alpha + 2 beta`` on the line of a real pole at z = -1, of no meaning where no corner is reached."""
+    return 1.0 / xp.where(curve.to_corner, curve.tilt, 1.0)
+
+
+def _too_close(x: Array, creeping: bool, curve: Lobe) -> Array:
+    """Where the frequency of a fractional power of less than one is too close to pi."""
+    near = x != x
+    return near | ((np.pi - x < _NEAREST_PI) & (curve.long[1] > 0.5) & (curve.long[1] < 1.5)) if creeping else near
+
+
+def _answer(
+    alpha: Array, beta: Array, omega: Array, given: Array, exists: Array, undecided: Array, inputs: tuple[Array, ...]
+) -> BoundaryPoint:
+    """NaN, derivatives included, and the reason where there is no point."""
+    xp = namespace(alpha, beta, *inputs)
+    status = xp.where(exists, xp.where(undecided, int(Status.UNDECIDED), int(Status.OK)), int(Status.NO_BOUNDARY))
+    status = xp.where(given == int(Status.OK), status, given)
+    spoiled = poison(status == int(Status.OK), *inputs)
+    return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
+
+
+def _ray_kernel(
+    delta: Array,
+    d: Array,
+    alpha0: Array,
+    beta0: Array,
+    dalpha: Array,
+    dbeta: Array,
+    line: str,
+    delay: str,
+    kind: Kind,
+) -> BoundaryPoint:
+    xp = namespace(delta, d, alpha0, beta0, dalpha, dbeta)
+    inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
+    given = line_status(*inputs)
+    size = xp.maximum(xp.abs(dalpha), xp.abs(dbeta))
+    size = xp.where(given == int(Status.OK), size, 1.0)
+    dalpha, dbeta = dalpha / size, dbeta / size
+    here = device_of(delta, d, delay, kind)
+    curve = lobe(here, d, delay, kind)
+    creeping = creeps(delay, kind)
+    ray = _Ray(alpha0, beta0 + delta, dalpha, dbeta)
+    fixed, still = frozen((curve, ray), xp)
+    row = frozen(row_end(beta0, fixed, creeping), xp)
+    # For a held delay the verdict of `zwidth.is_stable` itself.
+    inside = (alpha0 > 0) & (row.meets | row.beyond) & (alpha0 < _limit(beta0, row, here, fixed, delay))
+    starts = stable_at(alpha0, beta0, here, kind) if delay == "held" else inside
+    x, on_lobe, single = frozen(_first_crossing(still, row, fixed, creeping), xp)
+    smooth, at = _follow(x, curve, lambda wall: (ray.offset(wall), ray.offset_slope(wall)), xp)
+    # Off the lobe: along the line of z = -1 or along alpha = 0, whichever comes first.
+    rate = dalpha + 2.0 * dbeta
+    to_line = xp.where(curve.to_corner & (rate > 0), _on_line(curve, xp) - alpha0 - 2.0 * beta0, np.inf)
+    to_line = to_line / xp.where(rate > 0, rate, 1.0)
+    to_zero = xp.where(dalpha < 0, alpha0, np.inf) / xp.where(dalpha < 0, -dalpha, 1.0)
+    at_zero = to_zero < to_line
+    s = xp.where(at_zero, to_zero, to_line)
+    ends = on_lobe | (s < np.inf)
+    s = xp.where(on_lobe | ~ends, 0.0, s)
+    alpha = xp.where(on_lobe & (dalpha != 0), at.alpha, xp.where(at_zero & ~on_lobe, 0.0, alpha0 + s * dalpha))
+    beta = xp.where(on_lobe & (dbeta != 0), at.b - delta, beta0 + s * dbeta)
+    omega = xp.where(on_lobe, frequency(smooth, curve), xp.where(at_zero, 0.0, np.pi))
+    undecided = _too_close(xp.where(on_lobe, x, 0.0), creeping, curve) | (on_lobe & ~single) | ~ends
+    return _answer(alpha, beta, omega, given, starts, undecided, inputs)
+
+
+def line_status(delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array) -> Array:
+    """The `Status` of a device and a ray."""
+    xp = namespace(delta, d, alpha0, beta0, dalpha, dbeta)
+    given = wall_status(alpha0, beta0, delta, d)
+    inside = within(dalpha, WALL_RANGE) & within(dbeta, WALL_RANGE)
+    given = xp.where((given == int(Status.OK)) & ~inside, int(Status.OUT_OF_RANGE), given)
+    real = xp.isfinite(dalpha) & xp.isfinite(dbeta) & ((dalpha != 0) | (dbeta != 0))
+    return xp.where(real, given, int(Status.INVALID_INPUT))
+
+
+class _Ray(NamedTuple):
+    """A ray from (alpha, b), b = beta + delta."""
 
     alpha: Array
-    beta: Array
+    b: Array
     dalpha: Array
     dbeta: Array
 
-    def offset(self, wall: BoundaryCurve) -> Array:
-        """Zero where a wall lies on the line, of opposite sign on its two sides."""
-        return self.dalpha * (wall.beta - self.beta) - self.dbeta * (wall.alpha - self.alpha)
+    def offset(self, wall: Any) -> Array:
+        """Negative on the side of the ray from which the lobe, followed from its start, comes ahead of its origin."""
+        return self.dalpha * (wall.b - self.b) - self.dbeta * (wall.alpha - self.alpha)
 
-    def distance(self, wall: BoundaryCurve) -> Array:
-        """How far along the line a wall on it lies, in lengths of the direction."""
-        along = (wall.alpha - self.alpha) * self.dalpha + (wall.beta - self.beta) * self.dbeta
-        return along / (self.dalpha**2 + self.dbeta**2)
-
-
-def _point_kernel(
-    delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array, search: Array, delay: str
-) -> BoundaryPoint:
-    inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
-    ok = valid_device(delta, d) & jnp.isfinite(sum(inputs)) & ((dalpha != 0) | (dbeta != 0))
-    delta, d, *direction = (jnp.where(ok, value, 1.0) for value in inputs)
-    line = _Line(*direction)
-    loop = frequency_loop(delta, d, delay)
-    omegas = _lobe_frequencies(delta, d, loop, delay)
-    on_curve = _curve_crossings(line, omegas, loop, delay)
-    real = _real_pole_crossings(line, loop)
-    index, exists = _choose(on_curve, real, search)
-    # For alpha <= 0 a real pole is at 1 or beyond, whatever beta.
-    exists = exists & ((line.dalpha != 0) | (line.alpha > 0))
-    cell = jnp.minimum(index, _CELLS - 1)
-    omega, distance, converged = _polish(line, omegas[cell], omegas[cell + 1], loop, delay)
-    is_real = index >= _CELLS
-    omega = jnp.where(is_real, jnp.where(index == _CELLS, 0.0, jnp.pi), omega)
-    distance = jnp.where(is_real, real[jnp.clip(index - _CELLS, 0, 1)], distance)
-    solved = is_real | converged
-    found = ok & exists & solved
-    status = jnp.where(exists, jnp.where(solved, Status.OK, Status.NOT_CONVERGED), Status.NO_BOUNDARY)
-    status = jnp.where(ok, status, Status.INVALID_INPUT)
-    spoiled = poison(found, *inputs)
-    return BoundaryPoint(
-        line.alpha + distance * line.dalpha + spoiled,
-        line.beta + distance * line.dbeta + spoiled,
-        omega + spoiled,
-        status.astype(jnp.int32),
-    )
+    def offset_slope(self, wall: Any) -> Array:
+        """The derivative of `offset` along the lobe."""
+        return self.dalpha * wall.d_b - self.dbeta * wall.d_alpha
 
 
-def _lobe_frequencies(delta: Array, d: Array, loop: FrequencyLoop, delay: str) -> Array:
-    """Cell edges along the lobe; the ridge is one of them, so that a column meets at most one edge a cell."""
-    top = jax.lax.stop_gradient(ridge_kernel(delta, d, delay).omega)
-    end = lobe_end(loop, d, delay)
-    part = jnp.linspace(0.0, 1.0, _CELLS // 2 + 1)
-    return jnp.concatenate([top * part, top + (end - top) * part[1:]])
+def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tuple[Array, Array, Array]:
+    """Where a ray from a stable wall leaves through the lobe, whether it does, and whether it was seen to do so once.
+
+    Of the row on which the wall lies, ``row`` is the end: a ray upwards can only leave behind that, one downwards
+    before it.
+    """
+    xp = namespace(curve.delta, ray.alpha)
+    upwards = ray.dbeta >= 0
+    low, high = xp.where(upwards, row.x, 0.0), xp.where(upwards, curve.end, row.x)
+    # Places even in the square of omega, in which the start of the lobe is straight.
+    square = _squared(curve, xp)
+    first, last = xp.where(square, low * low, low), xp.where(square, high * high, high)
+    share = np.linspace(0.0, 1.0, _PLACES + 1)
+    share = xp.asarray(share, first.dtype) if xp is not np else share
+    even = first[..., None] + (last - first)[..., None] * share
+    places = xp.where(square[..., None], xp.sqrt(even), even)
+    wide = spread(curve)
+    wide_ray = _Ray(*(part[..., None] for part in ray))
+    offsets = wide_ray.offset(wall(places, wide))
+    begins, ends = offsets[..., 0], offsets[..., -1]
+    # Where the lobe returns, alpha is 0 to the last digit.
+    returned = ray.dalpha * (wall(curve.end, curve).b - ray.b) + ray.dbeta * ray.alpha
+    ends = xp.where(upwards & ~curve.to_corner, returned, ends)
+    leaves = xp.where(upwards, (ends >= 0) & ~row.beyond, (begins < 0) & (ends > 0))
+    passed = offsets >= 0
+    inner = passed[..., 1:-1]
+    single = xp.all(inner[..., 1:] >= inner[..., :-1], axis=-1)
+    # The number of places before the crossing: 1 to all but the last.
+    index = 1 + xp.sum(~inner, axis=-1)
+    after = xp.take_along_axis(places, index[..., None], -1)[..., 0]
+    before = xp.take_along_axis(places, index[..., None] - 1, -1)[..., 0]
+    if creeping:
+        x = bisect_place(lambda x: ray.offset(wall(x, curve)) < 0, xp.maximum(before, 1e-32 * after), after, xp)
+        return x, leaves, single
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        x, below, above, _ = state
+        at = wall(x, curve)
+        value = ray.offset(at)
+        below, above = xp.where(value < 0, x, below), xp.where(value < 0, above, x)
+        new = x - value / ray.offset_slope(at)
+        new = xp.where((new >= below) & (new <= above), new, 0.5 * (below + above))
+        return new, below, above, xp.abs(new - x)
+
+    left, right = (xp.take_along_axis(offsets, (index - k)[..., None], -1)[..., 0] for k in (1, 0))
+    part = xp.clip(left / xp.where(left == right, 1.0, left - right), 0.0, 1.0)
+    between = before * before + (after * after - before * before) * part
+    start = xp.where(square, xp.sqrt(between), before + (after - before) * part)
+    x, _, _, last_step = repeat(_RAY_STEPS, step, (start, before, after, start), xp)
+    return x, leaves, single & (last_step <= epsilon(x) ** 0.5 * x)
 
 
-def _curve_crossings(line: _Line, omegas: Array, loop: FrequencyLoop, delay: str) -> Array:
-    """The distance along the line at which each cell of the lobe crosses it, infinite where it does not."""
-    walls = jax.vmap(lambda omega: frequency_boundary(omega, loop, delay))(jax.lax.stop_gradient(omegas))
-    offset, distance = line.offset(walls), line.distance(walls)
-    before, after = offset[:-1], offset[1:]
-    crosses = ((before < 0) & (after >= 0)) | ((before > 0) & (after <= 0))
-    share = before / jnp.where(crosses, before - after, 1.0)
-    return jnp.where(crosses, distance[:-1] + share * (distance[1:] - distance[:-1]), jnp.inf)
+def _squared(curve: Lobe, xp: Any) -> Array:
+    if curve.is_short is not None:
+        return ~curve.is_short
+    return curve.end == curve.end if curve.short is None else curve.end != curve.end
 
 
-def _real_pole_crossings(line: _Line, loop: FrequencyLoop) -> Array:
-    """The distances at which the line meets alpha = 0 (a pole at z = 1) and P(-1) = 0."""
-    at_one = -line.alpha / jnp.where(line.dalpha == 0, 1.0, line.dalpha)
-    plant, lag = loop
-    whole = lag == jnp.floor(lag)
-    sign = 1.0 - 2.0 * jnp.mod(lag, 2.0)
-    usable = whole & (plant.gap != 0)
-    sum_at_minus_one = sign * 2.0 * (1.0 + plant.c) / jnp.where(usable, plant.gap, 1.0)
-    rate = line.dalpha + 2.0 * line.dbeta
-    at_minus_one = (sum_at_minus_one - line.alpha - 2.0 * line.beta) / jnp.where(rate == 0, 1.0, rate)
-    exists = jnp.stack([line.dalpha != 0, usable & (rate != 0)])
-    return jnp.where(exists, jnp.stack([at_one, at_minus_one]), jnp.inf)
-
-
-def _choose(on_curve: Array, real: Array, search: Array) -> tuple[Array, Array]:
-    """Which crossing bounds the stable part of the line: a cell, then z = 1, then z = -1; and whether there is one."""
-    lowest = jnp.argmin(on_curve)
-    candidates = jnp.concatenate([on_curve, real])
-    # A column is left upwards, beyond its lower end; a ray is left at the first crossing ahead.
-    start = jnp.where(search == _ABOVE_LOWEST, on_curve[lowest], 0.0)
-    ahead = jnp.where(candidates > start, candidates, jnp.inf)
-    index = jnp.where(search == _LOWEST, lowest, jnp.argmin(ahead))
-    chosen = jnp.where(search == _LOWEST, on_curve[lowest], ahead[index])
-    return index, jnp.isfinite(chosen)
-
-
-def _polish(line: _Line, lower: Array, upper: Array, loop: FrequencyLoop, delay: str) -> tuple[Array, Array, Array]:
-    """Solve P = 0 for the frequency and the distance along the line, from a bracket of the frequency."""
-    start, bracketed = bisect(
-        lambda omega, line, loop: line.offset(frequency_boundary(omega, loop, delay)), lower, upper, line, loop
-    )
-    distance = jax.lax.stop_gradient(line.distance(frequency_boundary(start, loop, delay)))
-    scale = jnp.where(distance == 0, 1.0, jnp.abs(distance))
-
-    def residual(unknowns: Array, args: tuple[_Line, FrequencyLoop]) -> Array:
-        line, loop = args
-        s = unknowns[0] * scale
-        return frequency_residual(unknowns[1], line.alpha + s * line.dalpha, line.beta + s * line.dbeta, loop)
-
-    tolerance = float(16 * jnp.finfo(start.dtype).eps)
-    solution = optimistix.root_find(
-        residual,
-        optimistix.Newton(rtol=tolerance, atol=tolerance),
-        jnp.stack([distance / scale, start]),
-        args=(line, loop),
-        max_steps=8,
-        throw=False,
-    )
-    omega, distance = solution.value[1], solution.value[0] * scale
-    # Of a wall softer than about 1e-30 the frequency is below what a bracket resolves.
-    wall = frequency_boundary(omega, loop, delay)
-    missed = jnp.abs(line.offset(wall)) / jnp.hypot(line.dalpha, line.dbeta)
-    hit = missed <= 1e-9 * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
-    return omega, distance, bracketed & hit & (jnp.abs(omega - start) <= 1e-6)
-
-
-def _counted(point: BoundaryPoint, everything: tuple[ArrayLike, ...], search: float) -> BoundaryPoint:
-    """Keep a point unless the poles beside it say that the inner side is unstable or the outer one stable."""
-    numbers = [np.asarray(value, dtype=np.float64) for value in everything]
-    status = np.asarray(point.status)
-    delta, d, _, _, dalpha, dbeta = (np.broadcast_to(number, status.shape).ravel() for number in numbers)
-    alpha, beta = np.asarray(point.alpha).ravel(), np.asarray(point.beta).ravel()
-    outward = -1.0 if search == _LOWEST else 1.0
-    found = status.ravel() == Status.OK
-    confirmed, possible, refuted = (np.zeros(found.shape, dtype=bool) for _ in range(3))
-    for share in _SIDE_STEPS:
-        if not (found & ~confirmed & ~refuted).any():
-            break
-        step = outward * share * np.hypot(alpha, beta) / np.hypot(dalpha, dbeta)
-        inner, outer = (
-            np.asarray(radius_by_companion(alpha + away * dalpha, beta + away * dbeta, delta, d)) - 1.0
-            for away in (-step, step)
-        )
-        confirmed |= (inner < -_ROUNDING) & (outer > _ROUNDING)
-        refuted |= (outer < -_ROUNDING) & ~confirmed
-        possible |= inner <= _ROUNDING
-    kept = (found & ~refuted & (confirmed | possible)).reshape(status.shape)
-    status = np.where((status == Status.OK) & ~kept, Status.NO_BOUNDARY, status)
-    alpha, beta, omega = (np.where(kept, np.asarray(value), np.nan) for value in (point.alpha, point.beta, point.omega))
-    return to_caller(BoundaryPoint(alpha, beta, omega, status.astype(np.int32)), everything)
+_KERNELS = {"row": _row_kernel, "lower": _column_kernel, "upper": _column_kernel, "ray": _ray_kernel}

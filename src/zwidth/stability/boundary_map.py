@@ -7,56 +7,46 @@ row work into the comparison and repeat it at every point, a hundred times slowe
 from __future__ import annotations
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth.batching import concretely
-from zwidth.stability.devices import Device, compiled_device
-from zwidth.stability.layout import DeviceWork, Points, assemble, device_ok, per_device, split
-from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY, long_device, long_row, short_row
+from zwidth.domain import WALL_RANGE, within
+from zwidth.stability.devices import Device, compiled_device, device, kind_of
+from zwidth.stability.layout import DeviceWork, Points, assemble, per_device, split
+from zwidth.stability.row_limit import long_device, long_row, short_row
 
 # Smaller maps are compared by NumPy, with nothing to compile.
 _WORTH_COMPILING = 1 << 16
+# So few rows are solved by NumPy.
+_FEW_ROWS = 1 << 12
 # A place in the order that no count reaches: alpha <= 0 and NaN are never stable.
 _NEVER = np.iinfo(np.int16).max
 # A pattern is as long as two rows: with fewer rows it would be a cost of its own.
 _ENOUGH_ROWS = 8
 
 
-class BoundaryMap(NamedTuple):
-    """Labels of the folded points, and the devices for which the shape of the stable set is known."""
-
-    stable: np.ndarray
-    known: np.ndarray
-
-
-def boundary_map(points: Points) -> BoundaryMap:
-    """Label every point by the limit of its row.
+def boundary_map(points: Points) -> np.ndarray:
+    """Label every point by the limit of its row: stable walls are those with ``0 < alpha < limit``.
 
     Args:
         points: folded arguments.
 
     Returns:
-        BoundaryMap: ``stable`` of the broadcast shape, False for a point out of range; ``known`` of the shape of
-        (delta, d): False outside the verified range, where ``stable`` means nothing and another method must decide.
+        Labels of the shape that the arguments broadcast to, False for a point out of range.
 
     Numerics:
         The limit is right to about 1e-15 relative, and to 1e-15 of the largest limit near the lobe's end.
     """
-    limit = row_limits(points.beta, points.delta, points.d)
-    return BoundaryMap(_compare(points.alpha, limit), in_verified_range(points))
-
-
-def in_verified_range(points: Points) -> np.ndarray:
-    """Where pole counts have confirmed that a row's stable walls are one interval that starts at alpha = 0."""
-    return ~device_ok(points) | ((points.delta <= VERIFIED_DAMPING) & (points.d <= VERIFIED_DELAY))
+    alpha, beta = (np.where(within(part, WALL_RANGE), part, np.nan) for part in (points.alpha, points.beta))
+    return _compare(alpha, row_limits(beta, points.delta, points.d, _FEW_ROWS))
 
 
 @cache
 def _rows(short: bool) -> DeviceWork:
+    import jax
+
     if short:
         return DeviceWork(compiled_device(), jax.jit(lambda beta, fields: short_row(beta, Device(*fields))), np.float64)
     solved = jax.jit(lambda fields: long_device(Device(*fields)))
@@ -65,17 +55,32 @@ def _rows(short: bool) -> DeviceWork:
 
 @cache
 def _compiled(name: str) -> Any:
+    import jax
+    import jax.numpy as jnp
+
     return jax.jit({"less": jnp.less, "between": lambda alpha, limit: (alpha > 0) & (alpha < limit)}[name])
 
 
-def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range."""
+def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0) -> np.ndarray:
+    """The stiffest stable wall of every (beta, delta, d), of their broadcast shape; NaN where out of range.
+
+    Compiled, unless there are at most ``few``: the two routes may differ in the last place, and what is stored must not
+    depend on how it was cut into pieces.
+    """
     shape = np.broadcast_shapes(beta.shape, delta.shape, d.shape)
+    here = int(np.prod(shape)) <= few
 
     def of(long: bool, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
-        return per_device(_rows(not long), [beta], delta, d)
+        return _solved_here(long, beta, delta, d) if here else per_device(_rows(not long), [beta], delta, d)
 
     return assemble(split((beta, delta, d), d >= 1), shape, np.float64, of)
+
+
+def _solved_here(long: bool, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """The same by NumPy, each device computed once."""
+    with np.errstate(all="ignore"):
+        here = device(*np.broadcast_arrays(delta, d), kind_of(d))
+        return long_row(beta, long_device(here)) if long else short_row(beta, here)
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:

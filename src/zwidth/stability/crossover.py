@@ -80,12 +80,12 @@ def gain_crossover(alpha: Array, beta: Array, here: Device, kind: Kind) -> Cross
         h0 = xp.where(far, (one - other) * (one + other), h0)
         h1 = xp.where(far, gap * gap * spread - g1 * tall - 2.0 * (em * em + 8.0 * c), h1)
         h2 = xp.where(far, 4.0 * c - corner * tall + g1 * spread, h2)
-    near = _first_zero(h0, h1, h2, h3, kind.fractional, xp)
+    near = first_zero(h0, h1, h2, h3, kind.fractional, xp)
     u, y = xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near)
     return Crossover(u, y, exists & (near > 0) & (near <= 1.0))
 
 
-def _first_zero(h0: Array, h1: Array, h2: Array, h3: Array, fractional: bool, xp: Any) -> Array:
+def first_zero(h0: Array, h1: Array, h2: Array, h3: Array, fractional: bool, xp: Any) -> Array:
     """The zero in (0, 1] of a cubic that is positive before it and negative behind; a quadratic for h3 = 0."""
     lead = -(h2 + 0.5 * h3) if fractional else -h2
     root = xp.sqrt(xp.maximum(h1 * h1 + 4.0 * lead * h0, 0.0))

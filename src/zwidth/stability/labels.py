@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import BLOCK, FEW, concretely, elementwise, in_blocks, is_number, to_caller
+from zwidth.batching import BLOCK, FEW, elementwise, in_blocks, is_number, to_caller
 from zwidth.domain import check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
@@ -169,7 +169,7 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
 
 def _by_crossover(points: Points) -> np.ndarray:
     if points.is_dense:
-        return boundary_map(points).stable
+        return boundary_map(points)
     shape, kind = points.shape, kind_of(points.d)
     if points.size <= FEW:
         with np.errstate(all="ignore"):
@@ -196,4 +196,4 @@ def _one_device(kind: Kind) -> Any:
 def _scattered(kind: Kind) -> Any:
     import jax
 
-    return jax.jit(lambda *columns: stable_kernel(*columns, kind))
+    return jax.jit(lambda alpha, beta, delta, d: stable_kernel(alpha, beta, delta, d, kind))

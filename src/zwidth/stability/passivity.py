@@ -9,99 +9,139 @@ the force arrives; with s = sin(w/2) and G = j e^(jw(n + 1/2)) (alpha - 2j beta 
 
     delta > (-h + sqrt(h^2 + 4 f (1 - f) s^2 |G|^2)) / (4 s),   h = Re{((1 - f) + f e^(jw)) G}
 
-Both are convex in (alpha, beta).
+Both are convex and homogeneous in (alpha, beta): one convex set for each delay, whatever the device. Where the bound is
+highest: `zwidth.stability.needed_damping`. On a map of one delay it is a polynomial of one variable, the direction.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import as_float64, is_traced, pointwise, to_caller
-from zwidth.errors import InputError, TracedDelayError
+from zwidth.batching import FEW, as_float64, elementwise, in_blocks, is_traced, to_caller
+from zwidth.domain import LONGEST_DELAY, check_scalars
+from zwidth.errors import InputError
 from zwidth.loop import poison, valid_wall
-from zwidth.plant import split_delay
-from zwidth.stability.golden import golden_section
+from zwidth.stability.devices import ANY, Kind, kind_of
+from zwidth.stability.layout import NAMES, lay_out, split
+from zwidth.stability.needed_damping import directions, larger_root, needed_damping
+from zwidth.xp import horner, namespace
 
-# Samples per half wave of the fastest term, how many peaks are refined, and by how many steps.
-_SAMPLES_PER_LAG = 12
-_PEAKS = 6
-_REFINEMENTS = 40
-# The first peak lies at omega (d + 1) < 1.1 pi.
-_FIRST_HALF_WAVE = 1.25 * np.pi
-
-
-def needed_damping_at(omega: Array, alpha: Array, beta: Array, d: Array) -> Array:
-    """The physical damping that the wall needs at one frequency in [0, pi]; at 0 the limit."""
-    n, f = split_delay(d)
-    s = jnp.sin(0.5 * omega)
-    tiny = s < 1e-150
-    s_safe = jnp.where(tiny, 1.0, s)
-
-    def ratio(k: Array) -> Array:
-        """sin(k w)/sin(w/2)."""
-        return jnp.where(tiny, 2.0 * k, jnp.sin(k * omega) / s_safe)
-
-    # h/s, free of the division by a small s
-    spring = (1.0 - f) * ratio(n + 0.5) + f * ratio(n + 1.5)
-    damper = (1.0 - f) * jnp.cos((n + 1.0) * omega) + f * jnp.cos((n + 2.0) * omega)
-    h = -alpha * spring + 2.0 * beta * damper
-    # |G|^2 = |alpha + beta (1 - z)|^2
-    size = (alpha + 2.0 * beta * s * s) ** 2 + (beta * jnp.sin(omega)) ** 2
-    curved = 4.0 * f * (1.0 - f) * size
-    root = jnp.sqrt(h * h + curved)
-    # -h + sqrt(h^2 + x) cancels for h > 0
-    both = root + h
-    stable_form = curved / jnp.where(both > 0, both, 1.0)
-    return 0.25 * jnp.where(h > 0, stable_form, root - h)
+# Chebyshev terms: the last one is below 1e-16 for every delay.
+_TERMS = 30
+_MAP_BLOCK = 1 << 15
+# Each narrows the bracket of a direction eightfold.
+_ROUNDS = 17
+_NO_DELAY = Kind(True, False, False)
 
 
-def needed_damping(alpha: Array, beta: Array, d: Array, samples: int) -> Array:
-    """The supremum of `needed_damping_at` over frequency: samples, then golden section round the best peaks."""
-    cost = partial(needed_damping_at, alpha=alpha, beta=beta, d=d)
-    grid = jnp.linspace(0.0, jnp.pi, samples + 1, dtype=alpha.dtype)
-    values = jax.vmap(cost)(grid)
-    padded = jnp.pad(values, 1, constant_values=-jnp.inf)
-    is_peak = (values >= padded[:-2]) & (values >= padded[2:])
-    # Peaks may tie to within what the sampling resolves: the highest sample need not mark the highest peak.
-    heights, best = jax.lax.top_k(jnp.where(is_peak, values, -jnp.inf), _PEAKS)
-    # Where d + 1 peaks nearly tie (small alpha, beta > 0) the first one was found to be the highest, for every d.
-    first = jnp.argmax(jnp.where(grid * (d + 1.0) <= _FIRST_HALF_WAVE, values, -jnp.inf))
-    heights, best = jnp.append(heights, values[first]), jnp.append(best, first)
-    refined = jax.vmap(lambda center: _refined_peak(cost, center, jnp.pi / samples))(grid[best])
-    return jnp.maximum(jnp.max(jnp.where(jnp.isfinite(heights), refined, -jnp.inf)), 0.0)
-
-
-def _refined_peak(cost: Callable[[Array], Array], center: Array, step: float) -> Array:
-    """The height of the peak within one step of ``center``, by golden section."""
-    low, high = jnp.maximum(center - step, 0.0), jnp.minimum(center + step, jnp.pi)
-    low, high = golden_section(lambda omega: -cost(omega), low, high, _REFINEMENTS)
-    return jnp.maximum(cost(0.5 * (low + high)), cost(center))
-
-
-def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, samples: int) -> Array:
+def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) -> Array:
+    xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d)
-    safe_alpha, safe_beta, safe_d = (jnp.where(ok, value, 0.0) for value in (alpha, beta, d))
-    spoiled = poison(ok, alpha, beta, delta, d)
-    # A spring of negative stiffness stores unbounded energy, which the frequency condition does not see.
-    margin = delta - needed_damping(safe_alpha, safe_beta, safe_d, samples)
-    return jnp.where(alpha < 0, jnp.minimum(margin, alpha), margin) + spoiled
+    stiff, damper, delay = xp.where(ok, xp.maximum(alpha, 0.0), 0.0), xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
+    margin = delta - needed_damping(stiff, damper, delay, kind)
+    return _limited(margin, alpha) + poison(ok, alpha, beta, delta, d)
 
 
-def _sample_count(d: ArrayLike) -> int:
-    """Enough samples for the longest delay, rounded up so that few different counts are compiled."""
-    if is_traced(d):
-        raise TracedDelayError(
-            "d: got a traced value, but the number of frequencies depends on it; pass a plain number"
+def _limited(margin: Array, alpha: Array) -> Array:
+    """A spring of negative stiffness gives unbounded energy, which the frequency condition does not see."""
+    xp = namespace(margin, alpha)
+    return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
+
+
+class Table(NamedTuple):
+    """What all walls of one delay need, as one polynomial of the direction."""
+
+    f: float
+    at_zero: float  # the slope in alpha of what is needed at w = 0, for whole d
+    first: float  # `Directions`
+    width: float
+    last: float  # in the variable of the polynomial
+    limit: float  # the same, infinite where there is none
+    powers: list[float]
+
+
+@lru_cache(maxsize=256)
+def table(d: float) -> Table:
+    """The `Table` of one delay.
+
+    Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x = beta
+    - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
+    """
+    turn = directions(np.float64(d))
+    width = 0.5 * (d + 0.5)
+    span = turn.last - turn.first
+    last = span / (span + width) if np.isfinite(span) else 1.0
+    # Whole turns taken off in whole numbers: an angle of 30 pi would leave half of them without their last digits.
+    turns = np.outer(np.arange(_TERMS), 2 * np.arange(_TERMS) + 1) % (4 * _TERMS)
+    cosines = np.cos(np.pi * turns / (2 * _TERMS))
+    node = cosines[1]
+    place = 0.5 * last * (node + 1.0)
+    alpha = 1.0 - place
+    beta = turn.first * alpha + place * width
+    with np.errstate(all="ignore"):
+        needed = needed_damping(alpha, beta, np.full(_TERMS, d), kind_of(d))
+    # place width + alpha width is the width.
+    terms = cosines @ needed * (2.0 / (_TERMS * width))
+    terms[0] *= 0.5
+    # By powers, whose coefficients fall as well: Clenshaw's sum loses two digits towards the ends.
+    powers = np.polynomial.chebyshev.cheb2poly(terms)
+    limit = float(last) if np.isfinite(span) else np.inf
+    return Table(d - np.floor(d), d + 0.5, float(turn.first), width, float(last), limit, powers.tolist())
+
+
+def _map_kernel(alpha: Array, beta: Array, delta: Array, known: Table) -> Array:
+    """`passivity_margin` at one delay."""
+    xp = namespace(alpha)
+    f, at_zero, first, width, last, limit, powers = known
+    ok = valid_wall(alpha, beta, delta, 0.0 * delta)
+    stiff = xp.maximum(alpha, 0.0)
+    beyond = beta - first * stiff
+    size = beyond + width * stiff
+    place = beyond / xp.where(beyond > 0, size, 1.0)
+    y = 2.0 * place / last - 1.0
+    inside = size * horner(y, powers)
+    zero, _ = larger_root(at_zero * stiff - beta, f * (1.0 - f) * stiff * stiff, xp)
+    pi = (1.0 - f) * (beta + 0.5 * stiff)
+    needed = xp.where(beyond > 0, xp.where(place < limit, inside, pi), zero)
+    return xp.where(ok, _limited(delta - needed, alpha), xp.nan)
+
+
+@cache
+def _compiled_map() -> Any:
+    import jax
+
+    return jax.jit(_map_kernel)
+
+
+def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: float) -> np.ndarray:
+    """`passivity_margin` of arrays of one shape by NumPy; a point's value does not depend on the others."""
+    if not 0 <= d <= LONGEST_DELAY:
+        return np.full(alpha.shape, np.nan)
+    with np.errstate(all="ignore"):
+        return _map_kernel(alpha, beta, delta, table(d))
+
+
+def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
+    """`passivity_margin` of many walls that share few delays; None where they do not."""
+    laid = lay_out(values)
+    alpha, beta, delta, d = laid.points
+    if laid.points.size <= FEW or np.unique(d).size * FEW > laid.points.size:
+        return None
+    out = np.full(laid.points.shape, np.nan)
+    for delay, arrays, place in split((alpha, beta, delta), d):
+        if not 0 <= delay <= LONGEST_DELAY:
+            continue
+        columns = np.broadcast_arrays(*arrays)
+        known = table(float(delay))
+        flat = in_blocks(
+            lambda *part, known=known: _compiled_map()(*part, known), [c.reshape(-1) for c in columns], _MAP_BLOCK
         )
-    delays = as_float64("d", d)
-    longest = np.max(delays, initial=0.0, where=np.isfinite(delays))
-    return 1 << int(np.ceil(np.log2(_SAMPLES_PER_LAG * (longest + 3.0))))
+        out[place] = flat.reshape(columns[0].shape)
+    return to_caller(laid.spread(out), values)
 
 
 def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -111,20 +151,24 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
     d = 0 it is ``delta - alpha/2 - |beta|``, eq. (21).
 
     Args:
-        alpha: normalized stiffness; a negative one is never passive and limits the margin to alpha itself.
+        alpha: normalized stiffness; no damping makes a wall of negative stiffness passive, and its margin is at most
+            alpha itself.
         beta: normalized virtual damping.
         delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, whole or not (held); concrete also inside `jit`. All four broadcast.
+        d: delay in periods, >= 0, whole or not (held). All four broadcast.
 
     Returns:
-        Array of the broadcast shape; NaN where the input is out of range.
+        Array of the broadcast shape; NaN where the input is out of range (see `zwidth.domain`).
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
-        TracedDelayError: d is traced.
+        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
-        The supremum is sampled 12 times a half wave and refined by golden section: about 1e-14 of the terms.
+        About 1e-15 of what is needed, at a cost that does not grow with d. The peak of the condition is the first one,
+        which for whole d is proved to be the only candidate (`zwidth.stability.needed_damping`), and Newton's method
+        finds it from a start in closed form. Many walls that share a delay go by a polynomial of the direction in the
+        (alpha, beta) plane. Traceable in all four: `jit`, `vmap`, `grad` and second derivatives, by the envelope
+        theorem; those in d at whole d are from the right.
 
     References:
         Colgate, Schenkel 1994; Hulin, Preusche, Hirzinger 2006, eqs. (20), (21), here extended to any delay.
@@ -134,9 +178,18 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         >>> print(f"{zwidth.passivity_margin(0.2, 0.3, 1.0, 0):.2f}")
         0.60
     """
-    samples = _sample_count(d)
-    chunk = max(1, (1 << 20) // samples)
-    return pointwise(_margin_kernel, ("alpha", "beta", "delta", "d"), (alpha, beta, delta, d), (samples,), chunk)
+    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
+    values = (alpha, beta, delta, d)
+    if is_traced(*values):
+        return elementwise(_margin_kernel, NAMES, values, (ANY,))
+    if max(map(np.size, values)) > FEW or len({np.shape(value) for value in values}) > 1:
+        found = _on_maps(values)
+        if found is not None:
+            return found
+    delay = as_float64("d", d)
+    kind = kind_of(delay)
+    # Compiled, one text serves every delay.
+    return elementwise(_margin_kernel, NAMES, values, (kind if kind == _NO_DELAY or delay.size <= FEW else ANY,))
 
 
 def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -154,7 +207,10 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         Boolean array of the broadcast shape; False where the input is out of range.
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
+        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
+
+    Numerics:
+        The sign of `passivity_margin`: right beyond about 1e-15 of the boundary.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.
@@ -175,27 +231,31 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 def passive_stiffness_slope(d: float) -> tuple[float, float]:
     """The stiffest passive wall and its damping, both over delta, for one delay.
 
-    The condition is homogeneous in (alpha, beta, delta), so ``alpha_passive = slope * delta`` for every delta. The
-    passive set is convex: for each beta bisect the largest alpha, then golden section over beta.
+    The condition is homogeneous in (alpha, beta, delta), so ``alpha_passive = slope * delta`` for every delta. For
+    whole d the damping has no effect on the peak where cos((d + 1) w) = 0: ``slope = 2 tan(pi/(4 (d + 1)))``. For a
+    held delay the direction is searched: the passive set is convex, so that it has one tip.
     """
-
+    check_scalars(d=d)
     delay = as_float64("d", d)
     if delay.ndim or not (np.isfinite(delay) and delay >= 0):
         raise InputError(f"d: got {d!r}; a single finite number of at least 0 is needed")
+    period = float(delay) + 1.0
+    if period == np.floor(period):
+        half = np.pi / (4.0 * period)
+        slope = 2.0 * np.tan(half)
+        return float(slope), float(slope * (0.25 / (period * np.sin(half) ** 2) - 0.5))
+    unit = 1.0 / (period - 0.5)
 
-    def largest_alpha(betas: np.ndarray) -> np.ndarray:
-        low, high = np.zeros_like(betas), np.full_like(betas, 2.0)
-        for _ in range(50):
-            middle = 0.5 * (low + high)
-            inside = np.asarray(passivity_margin(middle, betas, 1.0, d)) >= 0
-            low, high = np.where(inside, middle, low), np.where(inside, high, middle)
-        return low
+    def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        alpha, beta = unit * np.cos(angles), np.sin(angles)
+        needed = needed_damping(alpha, beta, np.full(angles.shape, float(delay)), kind_of(delay))
+        return alpha / needed, beta / needed
 
-    lower, upper = -1.0, 1.0
-    for _ in range(12):
-        # A row of trial values costs one call; each round narrows the bracket eightfold.
-        trials = np.linspace(lower, upper, 17)
-        best = int(np.argmax(largest_alpha(trials)))
-        lower, upper = trials[max(best - 1, 0)], trials[min(best + 1, 16)]
-    beta = np.array([0.5 * (lower + upper)])
-    return float(largest_alpha(beta)[0]), float(beta[0])
+    lower, upper = -0.49 * np.pi, 0.49 * np.pi
+    with np.errstate(all="ignore"):
+        for _ in range(_ROUNDS):
+            angles = np.linspace(lower, upper, 17)
+            best = int(np.argmax(stiffness(angles)[0]))
+            lower, upper = angles[max(best - 1, 0)], angles[min(best + 1, 16)]
+        alpha, beta = stiffness(np.array([0.5 * (lower + upper)]))
+    return float(alpha[0]), float(beta[0])

@@ -201,7 +201,9 @@ def proved(log_r: Array, tolerances: Sequence[Any], loop: Loop, fractional: bool
         full, sure = [at.full for at in seen], [at.sure for at in seen]
     else:
         # One text for all circles.
-        at = circle(log_r + xp.stack(offsets), loop, fractional)
+        shape = (len(offsets), *np.shape(log_r))
+        spread = Loop(*(xp.broadcast_to(field, shape) for field in loop))
+        at = circle(xp.broadcast_to(log_r, shape) + xp.stack(offsets), spread, fractional)
         full, sure = at.full, at.sure
     return [full[k] & sure[k] & ~full[k + 1] & sure[k + 1] for k in range(0, len(offsets), 2)]
 
@@ -234,7 +236,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     eps = epsilon(found.re)
     known, simple = proved(found.re, [eps**0.25, eps**0.58], still, fractional)
     moved = followed(found.re, found.im, loop_of(alpha, beta, delta, d, fractional), still, fractional)
-    change = xp.where(simple, moved, np.nan)
+    change = moved * xp.where(simple, 1.0, np.nan)
     # The value itself is not changed by what its derivatives are worth.
     value = frozen(xp.where(simple, found.re + moved, found.re), xp) + (change - frozen(change, xp))
     value = xp.where(simple, value, frozen(found.re, xp) + 0.0 * change)

@@ -5,20 +5,29 @@ from __future__ import annotations
 from enum import IntEnum
 from typing import Literal, NamedTuple, TypeAlias
 
-import jax.numpy as jnp
+import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import pointwise
+from zwidth.batching import as_float64, elementwise, pointwise
+from zwidth.domain import check_scalars, device_status
 from zwidth.errors import check_choice
-from zwidth.loop import check_delay_model, frequency_loop, valid_device
-from zwidth.stability.ridge_newton import newton_ridge, start_of
+from zwidth.loop import check_delay_model
+from zwidth.plant import Plant, split_delay, undelayed_plant
+from zwidth.stability.devices import ANY, Kind, kind_of
+from zwidth.stability.ridge_newton import Ridge, is_undelayed, start_of
+from zwidth.stability.ridge_slopes import (
+    alpha_by_lag,
+    alpha_change,
+    differentiable_plant,
+    differentiable_ridge,
+    plant_slopes,
+)
 from zwidth.status import Status
+from zwidth.xp import epsilon, is_traced, namespace
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
-# Small enough for the second-level cache, large enough to pay for its dispatch.
 _CHUNK = 1 << 13
-_LEAST = 1 << 4
 
 
 class RidgeKind(IntEnum):
@@ -80,28 +89,78 @@ def alpha_max(
     """
     check_delay_model(delay)
     check_choice("method", method, _METHODS)
-    # "auto" and "newton" share one compilation.
-    route = "kkt" if method == "kkt" else "newton"
-    # The general route iterates over long formulas.
-    fused = route == "newton"
-    return pointwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, route), _CHUNK, fused, _LEAST)
-
-
-def ridge_kernel(delta: Array, d: Array, delay: str, method: str = "newton") -> RidgePoint:
-    """`alpha_max` of one point."""
-    ok = valid_device(delta, d)
-    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
-    mask = jnp.where(ok, 1.0, jnp.nan)
-    delta, d = delta * mask, d * mask
+    check_scalars(delta=delta, d=d)
     if method == "kkt":
-        # Its solvers take a second to import.
-        from zwidth.stability.ridge_kkt import kkt_ridge
+        # The general route iterates over long formulas; its solvers take a second to import.
+        from zwidth.stability.ridge_kkt import kkt_kernel
 
-        alpha, beta, omega, is_corner, converged = kkt_ridge(delta, d, delay)
-    else:
-        loop = frequency_loop(delta, d, delay)
-        alpha, beta, omega, is_corner, converged = newton_ridge(loop.plant, loop.lag, start_of(delta, d), delay)
-    found = jnp.where(converged, 1.0, jnp.nan)
-    status = jnp.where(ok, jnp.where(converged, Status.OK, Status.NOT_CONVERGED), Status.INVALID_INPUT)
-    kind = jnp.where(is_corner, RidgeKind.CORNER, RidgeKind.SMOOTH)
-    return RidgePoint(alpha * found, beta * found, omega * found, kind.astype(jnp.int32), status.astype(jnp.int32))
+        return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
+    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, occurring(d)))
+
+
+def occurring(d: ArrayLike) -> Kind:
+    """Which delays there are among concrete ones; every kind is possible where they are traced."""
+    if isinstance(d, float | int):
+        return Kind(not d >= 1, d >= 1, d % 1.0 != 0)
+    return ANY if is_traced(d) else kind_of(as_float64("d", d))
+
+
+def ridge_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> RidgePoint:
+    """`alpha_max`, elementwise."""
+    return _point(*_solved(delta, d, delay, kind)[:2])
+
+
+class RidgeSlopes(NamedTuple):
+    """The stiffest wall with its derivatives."""
+
+    point: RidgePoint
+    by_delta: Array
+    by_d: Array
+
+
+def slopes_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> RidgeSlopes:
+    """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
+    ridge, status, plant, lag, (delta, f) = _solved(delta, d, delay, kind)
+    by_delta, by_f = plant_slopes(delta, f)
+    undelayed = is_undelayed(delay, kind)
+    fractional = delay == "fractional_power"
+    by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
+    mask = found(ridge)
+    return RidgeSlopes(
+        _point(ridge, status), alpha_change(ridge.s, plant, lag, by_delta, undelayed) * mask, by_d * mask
+    )
+
+
+def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
+    """The ridge, its status, the plant behind a lag, and the plant's damping and fraction."""
+    xp = namespace(delta, d)
+    status = device_status(delta, d)
+    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
+    mask = xp.where(status == Status.OK, 1.0, np.nan)
+    delta, d = delta * mask, d * mask
+    whole, f = split_delay(d)
+    if not kind.fractional:
+        # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
+        delay = "held"
+    if delay == "fractional_power":
+        whole, f = d, 0.0 * d
+    start = start_of(delta, d, f, kind)
+    plant = differentiable_plant(delta, f) if kind.fractional and delay == "held" else undelayed_plant(delta)
+    ridge = differentiable_ridge(plant, whole, start, delay, kind)
+    return ridge, status, plant, whole, (delta, f)
+
+
+def found(ridge: Ridge) -> Array:
+    """1, or NaN where the solver did not converge."""
+    # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
+    xp = namespace(ridge.s)
+    return xp.where(xp.abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s, 1.0, np.nan)
+
+
+def _point(ridge: Ridge, status: Array) -> RidgePoint:
+    xp = namespace(ridge.alpha)
+    mask = found(ridge)
+    status = xp.where((status == Status.OK) & xp.isnan(mask), int(Status.NOT_CONVERGED), status)
+    kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
+    values = (ridge.alpha * mask, ridge.beta * mask, ridge.omega * mask)
+    return RidgePoint(*values, kind.astype(np.int32), status.astype(np.int32))

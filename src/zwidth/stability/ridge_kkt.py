@@ -19,9 +19,12 @@ import optimistix
 
 from zwidth._types import Array
 from zwidth.batching import stored
+from zwidth.domain import device_status
 from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
 from zwidth.stability.bracketing import bisect
 from zwidth.stability.curve import corner, lobe_end
+from zwidth.stability.ridge import RidgeKind, RidgePoint
+from zwidth.status import Status
 
 _MAX_STEPS = 16
 
@@ -63,6 +66,18 @@ def kkt_residual(unknowns: Array, args: KktArguments) -> Array:
     size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
     stationary = (by_beta[0] * by_omega[1] - by_beta[1] * by_omega[0]) / size
     return jnp.stack([value[0], value[1], stationary])
+
+
+def kkt_kernel(delta: Array, d: Array, delay: str) -> RidgePoint:
+    """`zwidth.alpha_max` of one point by this route."""
+    status = device_status(delta, d)
+    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
+    mask = jnp.where(status == Status.OK, 1.0, jnp.nan)
+    alpha, beta, omega, is_corner, converged = kkt_ridge(delta * mask, d * mask, delay)
+    found = jnp.where(converged, 1.0, jnp.nan)
+    status = jnp.where((status == Status.OK) & ~converged, int(Status.NOT_CONVERGED), status)
+    kind = jnp.where(is_corner, RidgeKind.CORNER, RidgeKind.SMOOTH)
+    return RidgePoint(alpha * found, beta * found, omega * found, kind.astype(jnp.int32), status.astype(jnp.int32))
 
 
 def kkt_ridge(delta: Array, d: Array, delay: str) -> tuple[Array, Array, Array, Array, Array]:

@@ -1,14 +1,14 @@
-"""The ridge by Newton's method on its closed-form optimality condition.
+"""The ridge by Newton's method on its closed-form optimality condition, one text for NumPy and JAX.
 
-The curve z = e^(j omega) and its slope are written in ``y = sin^2(omega/2)``. There the maximum stays a regular
-one at omega = pi, where every derivative in omega vanishes by symmetry, and the corner is the end point y = 1.
-With D = n + 1 (held) or D = d + 1 (fractional power), q = 1 - y, M = N(z)/z and a prime for d/dy:
+The curve z = e^(j omega) and its slope are written in ``y = s^2``, ``s = sin(omega/2)``. There the maximum stays a
+regular one at omega = pi, where every derivative in omega vanishes by symmetry, and the corner is the end point s = 1.
+With D = lag + 1, lag = n (held) or d (fractional power), q = 1 - y, M = N(z)/z and a prime for d/dy:
 
     (z - c) conj M = g1 + j g2 sin omega     quadratic and linear in y
     |M|^2 = rho = m^2 + k^2 4 y q            m = Re M = N(1) - 2 b y, b = a2 + a0, k = a2 - a0
     tau = sin(D omega)/sin omega             kappa = cos(D omega)
-    Q = tau g1 + kappa g2
-    alpha = 4 y Q/rho                        beta = -(kappa g1 - 4 y q tau g2)/rho - alpha/2
+    Q = tau g1 + kappa g2                    B = kappa g1 - 4 y q tau g2
+    alpha = 4 y Q/rho                        beta = -B/rho - alpha/2
     T = rho (Q + y Q') - y Q rho' = 0        T = rho^2 alpha'/4,  T' = rho (2 Q' + y Q'') - y Q rho''
 
 tau is the Chebyshev polynomial U_(D-1) of cos omega for whole D, kappa is T_D, hence
@@ -16,22 +16,27 @@ tau is the Chebyshev polynomial U_(D-1) of cos omega for whole D, kappa is T_D, 
     kappa' = -2 D tau     tau' = (D kappa - tau cos omega)/(2 y q)
     tau'' = -((3/2) cos omega tau' + (D^2 - 1) tau)/(y q)          and for D = 1: tau = 1, kappa = 1 - 2 y
 
-No logarithm, no arc tangent and, for D = 1, no angle at all. The number of steps is fixed: no point waits for another.
+The lobe has one maximum (docs/theory/one-lobe.md, Theorem 3b), so nothing is searched. The number of steps is fixed:
+no point waits for another.
 """
 
 from __future__ import annotations
 
-from functools import partial
 from math import factorial
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array
 from zwidth.batching import stored
 from zwidth.plant import Plant
+from zwidth.stability.crossover import ARCSINE
+from zwidth.stability.devices import ANY, Kind
+from zwidth.xp import epsilon, frozen, horner, namespace, repeat
+
+# Taylor series; on [0, pi/2] the first term left out is below 1e-17.
+_SIN = [(-1.0) ** k / factorial(2 * k + 1) for k in range(11)]
+_COS = [(-1.0) ** k / factorial(2 * k) for k in range(12)]
 
 
 class Curve(NamedTuple):
@@ -47,7 +52,7 @@ class Curve(NamedTuple):
 
 def curve_of(plant: Plant) -> Curve:
     """The curve of one plant; every coefficient is free of cancellation where the ridge can be."""
-    c, em, a2, a1, a0, gap = plant.c, plant.em, plant.a2, plant.a1, plant.a0, plant.gap
+    c, em, a2, a1, a0, gap = plant
     b = a2 + a0
     at_one = b + a1
     g1 = (em * at_one, -2.0 * (4.0 * a0 - gap + em * b), 8.0 * a0)
@@ -55,100 +60,83 @@ def curve_of(plant: Plant) -> Curve:
     return Curve(g1, g2, at_one, b, a2 - a0, gap)
 
 
-def _chebyshev_fit(terms: int) -> list[float]:
-    """``asin(sqrt y)/sqrt y`` on [0, 1/2] as powers of 4 y - 1, by interpolation: 2e-16 relative with 19 terms."""
-    node = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
-    y = 0.25 * (node + 1.0)
-    fit = np.polynomial.chebyshev.chebfit(node, np.arcsin(np.sqrt(y)) / np.sqrt(y), terms - 1)
-    return np.polynomial.chebyshev.cheb2poly(fit).tolist()
-
-
-_ARCSIN = _chebyshev_fit(19)
-# Taylor series; on |x| <= pi/2 the first term left out is below 1e-17.
-_SIN = [(-1.0) ** i / factorial(2 * i + 1) for i in range(11)]
-_COS = [(-1.0) ** i / factorial(2 * i) for i in range(12)]
-
-
-def _horner(x: Array, coefficients: list[float]) -> Array:
-    total = jnp.full_like(x, coefficients[-1])
-    for coefficient in reversed(coefficients[:-1]):
-        total = total * x + coefficient
-    return total
-
-
-def omega_of(s: Array) -> Array:
-    """``omega = 2 asin(s)``, pi with derivative 0 at the corner."""
-    corner = s >= 1.0
-    y = jnp.where(corner, 0.25, s * s)
-    low = y < 0.5
-    small = jnp.where(low, y, 1.0 - y)
-    angle = 2.0 * jnp.sqrt(small) * _horner(4.0 * small - 1.0, _ARCSIN)
-    return jnp.where(corner, np.pi, jnp.where(low, angle, np.pi - angle))
-
-
 class Wave(NamedTuple):
-    """The oscillating factors at one s, finite with all their derivatives for every ridge."""
+    """What depends on the frequency and the exponent alone."""
 
-    tau: Array  # times scale
+    y: Array
+    q: Array
+    half: Array  # omega/2, of no meaning at the corner
+    per_sin: Array  # 1/sin omega, of no meaning at the corner
+    tau: Array
     kappa: Array
-    scale: Array  # sin^2 omega, 1 where it may vanish
+    tau1: Array  # d tau/dy
+    tau2: Array
 
 
-def wave(s: Array, D: Array, delay: str) -> Wave:
-    """tau and kappa without a division."""
-    y = s * s
-    q = 1.0 - y
-    if delay == "fractional_power":
-        # D omega as omega + d omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
-        x = (D - 1.0) * omega_of(s)
-        sin, cos = jnp.sin(x), jnp.cos(x)
-        inside = s < 1.0
-        sin2 = jnp.where(inside, 4.0 * y * q, 1.0)
-        sin_w = jnp.where(inside, jnp.sqrt(sin2), 0.0)
-        return Wave(cos * sin2 + (q - y) * sin_w * sin, (q - y) * cos - sin_w * sin, sin2)
-    is_one = D <= 1.0
-    # D >= 2 keeps y below 0.43 and x inside [-pi/2, pi/2]; where D = 1 neither it nor the root is used.
-    x = 2.0 * D * (s * _horner(4.0 * y - 1.0, _ARCSIN)) - 0.5 * np.pi
-    sin, cos = _horner(x * x, _COS), -x * _horner(x * x, _SIN)
-    tau = 2.0 * s * jnp.sqrt(jnp.where(is_one, 1.0, q)) * sin
-    return Wave(jnp.where(is_one, 1.0, tau), jnp.where(is_one, q - y, cos), jnp.where(is_one, 1.0, 4.0 * y * q))
-
-
-def _real_m(y: Array, curve: Curve) -> Array:
-    """Re M, free of cancellation at both ends."""
-    return jnp.where(y < 0.5, curve.at_one - 2.0 * curve.b * y, 2.0 * curve.b * (1.0 - y) - curve.gap)
-
-
-def wall(s: Array, curve: Curve, D: Array, delay: str) -> tuple[Array, Array]:
-    """(alpha, beta) of the curve at one s."""
-    y = s * s
-    tau, kappa, scale = wave(s, D, delay)
-    g1 = curve.g1[0] + y * (curve.g1[1] + y * curve.g1[2])
-    g2 = curve.g2[0] + y * curve.g2[1]
-    sin2 = 4.0 * y * (1.0 - y)
-    over_rho = 1.0 / (scale * (_real_m(y, curve) ** 2 + curve.k * curve.k * sin2))
-    kappa = kappa * scale
-    alpha = 4.0 * y * (tau * g1 + kappa * g2) * over_rho
-    return alpha, -(kappa * g1 - sin2 * tau * g2) * over_rho - 0.5 * alpha
-
-
-def stationarity(s: Array, curve: Curve, D: Array, delay: str) -> tuple[Array, Array]:
-    """T and dT/ds, both times scale^3 (sin^6 omega), see the head of this file."""
-    y = s * s
-    q = 1.0 - y
+def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
+    """The oscillating factors at one s, finite with their derivatives up to the corner. ``undelayed``: all D are 1."""
+    xp = namespace(s, lag)
+    y, q = s * s, (1.0 - s) * (1.0 + s)
     cos_w = q - y
-    tau, kappa, scale = wave(s, D, delay)
+    # At the corner D = 1, and what the root enters is 0.
+    root = xp.sqrt(xp.where(s < 1.0, q, 1.0))
+    low = y < 0.5
+    small = xp.where(low, s, root)
+    half = small * horner(4.0 * small * small - 1.0, ARCSINE)
+    half = xp.where(low, half, 0.5 * np.pi - half)
+    per_sin = 0.5 / (s * root)
+    if undelayed:
+        return Wave(y, q, half, per_sin, 1.0, cos_w, 0.0, 0.0)
+    # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
+    D, x = lag + 1.0, lag * half
+    square = x * x
+    sine, cosine = x * horner(square, _SIN), horner(square, _COS)
+    ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
+    sin2 = 4.0 * y * q
+    tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio
     # For D = 1 kappa is cos omega and the next two are exactly 0.
-    tau1 = 2.0 * (D * kappa * scale - tau * cos_w)
-    tau2 = -4.0 * (1.5 * cos_w * tau1 + (D * D - 1.0) * tau * scale)
-    tau, kappa, tau1 = tau * scale * scale, kappa * scale * scale * scale, tau1 * scale
-    g1 = curve.g1[0] + y * (curve.g1[1] + y * curve.g1[2])
-    g2 = curve.g2[0] + y * curve.g2[1]
+    square = 4.0 * per_sin * per_sin
+    # D kappa - tau cos omega
+    tau1 = 0.5 * (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * square
+    return Wave(y, q, half, per_sin, tau, kappa, tau1, -(1.5 * cos_w * tau1 + lag * (D + 1.0) * tau) * square)
+
+
+class Sides(NamedTuple):
+    """What wall and stationarity share."""
+
+    g1: Array
+    g2: Array
+    m: Array
+    rho: Array
+
+
+def sides(at: Wave, curve: Curve) -> Sides:
+    """(z - c) conj M and M at one s."""
+    xp = namespace(at.y, curve.b)
+    g1 = curve.g1[0] + at.y * (curve.g1[1] + at.y * curve.g1[2])
+    g2 = curve.g2[0] + at.y * curve.g2[1]
+    # Free of cancellation at both ends.
+    m = xp.where(at.y < 0.5, curve.at_one - 2.0 * curve.b * at.y, 2.0 * curve.b * at.q - curve.gap)
+    return Sides(g1, g2, m, m * m + curve.k * curve.k * (4.0 * at.y * at.q))
+
+
+def wall(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
+    """(alpha, beta) of the curve at one s."""
+    at = wave(s, lag, undelayed)
+    g1, g2, _, rho = sides(at, curve)
+    per_rho = 1.0 / rho
+    alpha = 4.0 * at.y * (at.tau * g1 + at.kappa * g2) * per_rho
+    return alpha, -(at.kappa * g1 - 4.0 * at.y * at.q * at.tau * g2) * per_rho - 0.5 * alpha
+
+
+def stationarity(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
+    """T and dT/ds, see the head of this file."""
+    at = wave(s, lag, undelayed)
+    y, q, tau, kappa, tau1, tau2 = at.y, at.q, at.tau, at.kappa, at.tau1, at.tau2
+    g1, g2, m, rho = sides(at, curve)
+    cos_w, k2, twice = q - y, curve.k * curve.k, 2.0 * (lag + 1.0)
     dg1, dg2 = curve.g1[1] + 2.0 * y * curve.g1[2], curve.g2[1]
-    m, k2 = _real_m(y, curve), curve.k * curve.k
-    rho = m * m + 4.0 * k2 * y * q
     drho, ddrho = 4.0 * (k2 * cos_w - curve.b * m), 8.0 * (curve.b * curve.b - k2)
-    twice = 2.0 * D
     value = tau * g1 + kappa * g2
     slope = tau1 * g1 + tau * (dg1 - twice * g2) + kappa * dg2
     bend = tau2 * g1 + tau1 * (2.0 * dg1 - twice * g2) + 2.0 * tau * (curve.g1[2] - twice * dg2)
@@ -157,26 +145,31 @@ def stationarity(s: Array, curve: Curve, D: Array, delay: str) -> tuple[Array, A
     return first, 2.0 * s * (rho * (2.0 * slope + y * bend) - weighted * ddrho)
 
 
-def ends_in_corner(curve: Curve, D: Array, known: Array) -> Array:
-    """Whether the ridge is the double pole at z = -1: the lobe reaches y = 1 with alpha > 0, still rising.
+def _corner(curve: Curve, lag: Array, known: Array) -> tuple[Array, ...]:
+    """Whether the ridge is the double pole at z = -1, and what `Ridge` holds there.
 
-    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0. ``known`` is
-    `Start.corner`, which decides where it can.
+    It is where the lobe reaches y = 1 with alpha > 0, still rising. The curve gets there on the first lobe only if
+    D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0. ``known`` is `Start.corner`, which decides where it can.
     """
+    xp = namespace(curve.b, lag)
     g1 = sum(curve.g1[1:], curve.g1[0])
     g2 = curve.g2[0] + curve.g2[1]
     value, slope = g1 - g2, curve.g1[1] + 2.0 * curve.g1[2] - 2.0 * g2 - curve.g2[1]
     rho, drho = curve.gap**2, 4.0 * (curve.b * curve.gap - curve.k**2)
     rising = rho * (value + slope) - value * drho >= 0.0
-    judged = (D <= 1.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0) & rising
-    return jnp.where(known == 0.0, judged, known > 0.0)
+    judged = (lag <= 0.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0) & rising
+    corner = xp.where(known == 0.0, judged, known > 0.0)
+    rho = xp.where(corner, rho, 1.0)
+    alpha = 4.0 * value / rho
+    return corner, alpha, g1 / rho - 0.5 * alpha, np.pi, 1.0, 0.0
 
 
 class Start(NamedTuple):
-    """What the solver needs to know of (delta, d) to begin."""
+    """Where the solver begins."""
 
-    scale: Array  # u = 1/(d + 1)
-    strength: Array  # t = r/(r + 3) with r = delta (d + 1): 0 undamped, 1 for delta -> infinity
+    scale: Array  # u = 1/(d + 1): s lies between 0.5 u and 1.3 u
+    s: Array
+    power: Array  # Newton's method is applied to T s^power
     corner: Array  # whether the ridge is a corner, where (delta, d) alone says so: 1 yes, -1 no, 0 unknown
 
 
@@ -184,141 +177,123 @@ class Start(NamedTuple):
 # rounded coefficients of the curve, its next neighbors would fall on either side.
 _TAKE_OVER = 3.6593616274217835
 
-
-def start_of(delta: Array, d: Array) -> Start:
-    """Where to begin for one (delta, d)."""
-    r = delta * (d + 1.0)
-    corner = jnp.where(d == 0.0, jnp.where(delta > _TAKE_OVER, 1.0, -1.0), 0.0)
-    return jax.lax.stop_gradient(Start(1.0 / (d + 1.0), r / (r + 3.0), corner))
-
-
-# For every delta and d, s (d + 1) lies between 0.53 and 1.25, and the fit below is within 4 %: four steps then leave
-# nothing but rounding (the third about 1e-9).
-_HELD_STEPS = 4
+# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one
+# period, 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
+_SHORT = (
+    (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
+    (-0.1878, 3.83, -4.872, 1.835),
+    (1.511, -6.996, 5.233),
+    (0.2643, 1.186),
+    (-0.4501,),
+)
+_LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
+# Below one period T bends more; so much that the power matters.
+_POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
+_HELD_STEPS = 3
 _FRACTIONAL_STEPS = 12
 
 
-def _first(start: Start, lower: Array, upper: Array) -> Array:
-    """A fit of s by least squares over delta and d, clipped to the bracket."""
-    u, t, _ = start
-    return jnp.clip((0.551 + 0.493 * t + (t * u) ** 2 * (1.204 * u - 0.701)) * u, lower, upper)
+def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
+    return horner(t, [horner(u, list(row)) for row in rows])
 
 
-def _solve_held(curve: Curve, D: Array, start: Start) -> tuple[Array, Array]:
+def start_of(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
+    """Where to begin for one (delta, d); ``strength`` 1 stands for delta -> infinity."""
+    xp = namespace(delta, d)
+    delta, d, f = frozen((delta, d, fraction), xp)
+    r = delta * (d + 1.0)
+    u, t = 1.0 / (d + 1.0), r / (r + 3.0) if strength is None else strength
+    s = power = corner = zero = 0.0 * u
+    if kind.long:
+        s = _polynomial(t, u, _LONG) + 0.4702 * f * (1.0 - f) * u * u * t
+    if kind.short:
+        short, low, bent = d < 1.0, _polynomial(t, u, _SHORT), _polynomial(t, u, _POWER)
+        s, power = (xp.where(short, low, s), xp.where(short, bent, zero)) if kind.long else (low, bent)
+        corner = xp.where(d == 0.0, xp.where(delta > _TAKE_OVER, 1.0, -1.0), zero)
+    return Start(u, s * u, power, corner)
+
+
+class Ridge(NamedTuple):
+    """The ridge of one plant: s is exactly 1 at a corner, ``last`` the last step taken in s."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    s: Array
+    last: Array
+
+
+def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
     """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
-    lower, upper = 0.5 * start.scale, jnp.minimum(1.0, 1.3 * start.scale)
-    s = _first(start, lower, upper)
+    xp = namespace(curve.b, lag)
+    lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
+    s = xp.minimum(xp.maximum(start.s, lower), upper)
 
-    def step(_: int, state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
         s, _ = state
-        value, slope = stationarity(s, curve, D, "held")
-        new = jnp.clip(s - value / slope, lower, upper)
-        return new, new - s
+        first, second = stationarity(s, curve, lag, undelayed)
+        new = s - first * s / (second * s + start.power * first)
+        return xp.minimum(xp.maximum(new, lower), upper), s
 
-    return jax.lax.fori_loop(0, _HELD_STEPS, step, (s, s))
+    s, before = repeat(_HELD_STEPS, step, (s, s), xp)
+    return s, s - before
 
 
-def _solve_fractional(curve: Curve, D: Array, start: Start) -> tuple[Array, Array]:
+def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Array]:
     """The same with a shrinking bracket.
 
     For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2): there the step is
     Newton's for ``T q^(3/2)`` as a function of ``q^(5/2)``.
     """
-    d = D - 1.0
-    is_one = D <= 1.0
-    lower = 0.5 * start.scale
+    xp = namespace(curve.b, lag)
+    d = lag
     # d = 0 may end at pi itself, where 1/sin omega is infinite.
-    rest = jnp.maximum(0.3 * jnp.minimum(d, 0.05) ** (2.0 / 3.0), jnp.finfo(d.dtype).eps)
-    upper = jnp.minimum(jnp.sqrt(1.0 - rest), 1.05 * start.scale)
-    s = _first(start, lower, upper)
+    rest = xp.maximum(0.3 * xp.minimum(d, 0.05) ** (2.0 / 3.0), epsilon(d))
+    lower, upper = 0.5 * start.scale, xp.minimum(xp.sqrt(1.0 - rest), 1.05 * start.scale)
 
-    def step(_: int, state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
-        s, _, lower, upper = state
-        value, slope = stationarity(s, curve, D, "fractional_power")
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        s, lower, upper = state
+        value, slope = stationarity(s, curve, lag)
         rising = value > 0.0
-        lower, upper = jnp.where(rising, s, lower), jnp.where(rising, upper, s)
-        q = 1.0 - s * s
-        near = (q < 0.5) & ~is_one
+        lower, upper = xp.where(rising, s, lower), xp.where(rising, upper, s)
+        q = (1.0 - s) * (1.0 + s)
+        near = (q < 0.5) & (d > 0.0)
         # dq = -2 s ds
         scaled = 3.0 * s * value - q * slope
         ratio = 1.0 - 5.0 * s * value / scaled
-        usable = jnp.where(near, (scaled > 0.0) & (ratio > 0.0), slope < 0.0)
-        power = jnp.where(near & usable, ratio, 1.0) ** 0.4
-        candidate = jnp.clip(jnp.where(near, jnp.sqrt(1.0 - q * power), s - value / slope), lower, upper)
+        usable = xp.where(near, (scaled > 0.0) & (ratio > 0.0), slope < 0.0)
+        power = xp.where(near & usable, ratio, 1.0) ** 0.4
+        candidate = xp.where(near, xp.sqrt(1.0 - q * power), s - value / slope)
+        candidate = xp.minimum(xp.maximum(candidate, lower), upper)
         # Off the bracket, towards pi, q is bisected geometrically: it may be small.
-        inner = jnp.sqrt(1.0 - jnp.sqrt((1.0 - lower * lower) * (1.0 - upper * upper)))
-        new = jnp.where(usable, candidate, jnp.where(rising, inner, 0.5 * (lower + upper)))
-        return new, new - s, lower, upper
+        inner = xp.sqrt(1.0 - xp.sqrt((1.0 - lower * lower) * (1.0 - upper * upper)))
+        return xp.where(usable, candidate, xp.where(rising, inner, 0.5 * (lower + upper))), lower, upper
 
-    s, last, _, _ = jax.lax.fori_loop(0, _FRACTIONAL_STEPS, step, (s, s, lower, upper))
-    return s, last
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
-def ridge_point(curve: Curve, D: Array, start: Start, delay: str) -> tuple[Array, Array]:
-    """The s of the ridge, exactly 1 at a corner, and the last step taken; differentiable in ``curve`` and D."""
-    solve = _solve_fractional if delay == "fractional_power" else _solve_held
-    s, last = solve(curve, D, start)
-    corner = ends_in_corner(curve, D, start.corner)
-    # Just before the take-over a smooth optimum may round to the corner's place.
-    smooth = jnp.minimum(s, 1.0 - 0.5 * jnp.finfo(s.dtype).eps)
-    return jnp.where(corner, 1.0, smooth), jnp.where(corner, 0.0, last)
+    first = xp.minimum(xp.maximum(start.s, lower), upper)
+    state = repeat(_FRACTIONAL_STEPS - 1, step, (first, lower, upper), xp)
+    s = step(state)[0]
+    return s, s - state[0]
 
 
-@ridge_point.defjvp
-def _ridge_point_jvp(delay: str, primals: tuple, tangents: tuple) -> tuple:
-    """Implicit derivative ``ds = -dT/(dT/ds)``; calls `ridge_point` itself, hence right to any order."""
-    curve, D, start = primals
-    s, last = ridge_point(curve, D, start, delay)
-    change = _directional(lambda c, e: stationarity(s, c, e, delay)[0], curve, D, tangents, delay)
-    _, slope = stationarity(s, curve, D, delay)
-    smooth = s < 1.0
-    ds = jnp.where(smooth, -change / jnp.where(smooth, slope, 1.0), 0.0)
-    return (s, last), (ds, jnp.zeros_like(last))
+def is_undelayed(delay: str, kind: Kind) -> bool:
+    """Whether every D is 1."""
+    return delay == "held" and not kind.long
 
 
-def _directional(function, curve: Curve, D: Array, tangents: tuple, delay: str) -> Array:
-    """The change of ``function(curve, D)``; in the held model D is whole and does not move."""
-    if delay == "held":
-        return jax.jvp(lambda c: function(c, D), (curve,), (tangents[0],))[1]
-    return jax.jvp(function, (curve, D), (tangents[0], tangents[1]))[1]
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(3,))
-def peak(curve: Curve, D: Array, s: Array, delay: str) -> Array:
-    """alpha at the ridge's s. Envelope theorem: its derivative is the partial one at fixed s, corner or smooth."""
-    return wall(s, curve, D, delay)[0]
-
-
-@peak.defjvp
-def _peak_jvp(delay: str, primals: tuple, tangents: tuple) -> tuple[Array, Array]:
-    curve, D, s = primals
-    # The tangent is a function of s too: that is where second derivatives come from.
-    change = _directional(lambda c, e: wall(s, c, e, delay)[0], curve, D, tangents, delay)
-    return wall(s, curve, D, delay)[0], change
-
-
-class NewtonRidge(NamedTuple):
-    """The ridge of one point."""
-
-    alpha: Array
-    beta: Array
-    omega: Array
-    is_corner: Array
-    converged: Array
-
-
-def newton_ridge(plant: Plant, lag: Array, start: Start, delay: str) -> NewtonRidge:
-    """The ridge of one plant behind ``lag`` periods (whole in the held model), with exact derivatives."""
+def solve(plant: Plant, lag: Array, start: Start, delay: str, kind: Kind) -> Ridge:
+    """The ridge of one plant behind ``lag`` periods (whole in the held model)."""
+    xp = namespace(plant.a2, lag)
+    undelayed = is_undelayed(delay, kind)
     curve = curve_of(stored(plant, start.scale))
-    D = lag + 1.0
-    s, last = stored(ridge_point(curve, D, start, delay), start.scale)
-    # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
-    converged = jnp.abs(last) <= jnp.sqrt(jnp.finfo(s.dtype).eps) * s
-    is_corner = s >= 1.0
-    alpha, beta, omega = peak(curve, D, s, delay), wall(s, curve, D, delay)[1], omega_of(s)
     if delay == "fractional_power":
-        # The corner is left like -d^(2/3) as soon as d > 0: all three fall with infinite slope.
-        fall = jnp.where(is_corner, jnp.sqrt(jnp.where(is_corner, lag, 1.0)), 0.0)
-        alpha, beta, omega = alpha - fall, beta - fall, omega - fall
-    return NewtonRidge(alpha, beta, omega, is_corner, converged)
+        s, last = _solve_fractional(curve, lag, start)
+    else:
+        s, last = _solve_held(curve, lag, start, undelayed)
+    # Just before the take-over a smooth optimum may round to the corner's place.
+    s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))
+    alpha, beta = wall(s, curve, lag, undelayed)
+    ridge = Ridge(alpha, beta, 2.0 * wave(s, lag, True).half, s, last)
+    if not kind.short:
+        return ridge
+    corner, *there = _corner(curve, lag, start.corner)
+    return Ridge(*(xp.where(corner, end, value) for end, value in zip(there, ridge, strict=True)))

@@ -1,9 +1,8 @@
 """The stiffest stable wall of each virtual damping, in closed form: where a row of the (alpha, beta) plane ends.
 
-For a held delay d = n + f the stable walls of one (beta, delta, d) were found to be ``0 < alpha < limit``: the limit is
-the first lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1. Seen, not proved: pole
-counts on some 700,000 random walls, on both sides of the limit and far from it, with delta = 0 and 1e-6 to 1e6, n = 0
-to 60, f anywhere, down to 1e-16 beside whole numbers. `VERIFIED_DELAY` and `VERIFIED_DAMPING` state the range.
+For a held delay d = n + f the stable walls of one (beta, delta, d) are ``0 < alpha < limit``: the limit is the first
+lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md, Theorem
+3a).
 
 Notation: ``N(z) = a2 z^2 + a1 z + a0`` of `zwidth.plant`, ``em = 1 - c``, ``sigma = a2 + a0``, ``mu = a2 - a0``,
 ``y = sin(w/2)^2``, ``k = n + 1/2``, and the boundary at ``z = e^(j w)`` in the form
@@ -28,10 +27,6 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.stability.devices import Device, device
 from zwidth.xp import horner, namespace, repeat
-
-# Beyond these the single lobe is not assumed.
-VERIFIED_DELAY = 500.0
-VERIFIED_DAMPING = 1e6
 
 # From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
 # 2 leave a row with some 2e-9 of its frequency, which the step in alpha behind them squares.
@@ -102,7 +97,7 @@ def long_device(device: Device) -> Array:
     b2 = -8.0 * a0 * (1.0 - 2.0 * delta * a2)
     fields = [delta, k, *g, *h, *v, b1, b2]
     end = _lobe_end(fields, em / (p1 + f * em), whole + f)
-    total, d_total, scale, d_scale = _offset(_Angles(end, fields), fields)
+    total, d_total, scale, d_scale = offset(Angles(end, fields), fields)
     top = total / scale
     # Rows start from sqrt(b/top) = sin(bow w/end)/sin(bow), with the slope of the curve at the lobe's end, where
     # strong damping makes it nearly flat; `bend` adds the slope at w = 0. Right to 0.4 %. The relative slope at the
@@ -115,7 +110,7 @@ def long_device(device: Device) -> Array:
     return xp.stack([*fields, end, top, bow, sin_bow, bend])
 
 
-class _Angles:
+class Angles:
     """The trigonometric terms of one frequency, from two short series."""
 
     def __init__(self, omega: Array, fields: list[Array] | Array):
@@ -137,7 +132,7 @@ class _Angles:
         self.base, self.dbase = y * (b1 + y * b2), dy * (b1 + 2.0 * y * b2)
 
 
-def _offset(at: _Angles, fields: list[Array] | Array) -> tuple[Array, Array, Array, Array]:
+def offset(at: Angles, fields: list[Array] | Array) -> tuple[Array, Array, Array, Array]:
     """``b = beta + delta`` on the curve as T/Q, accurate relative to b itself, with the derivatives of T and Q."""
     k, s, c = fields[1], at.s, at.c
     total = c * at.base + at.E * at.drop + s * c * 2.0 * at.sin_k * at.H
@@ -156,7 +151,7 @@ class _Turned(NamedTuple):
     dF: Array
 
 
-def _turned(at: _Angles, turns: Array) -> _Turned:
+def turned(at: Angles, turns: Array) -> _Turned:
     # (n + 1) w = k w + w/2
     sine = at.sin_k * at.c + at.cos_k * at.s
     cosine = at.cos_k * at.c - at.sin_k * at.s
@@ -177,8 +172,8 @@ def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
     limit = np.pi / (d + 0.5)
 
     def step(omega: Array) -> Array:
-        at = _Angles(omega, fields)
-        x = _turned(at, turns)
+        at = Angles(omega, fields)
+        x = turned(at, turns)
         size = at.E * at.E + x.F * x.F
         # Less than a quarter turn away sin cos is a safe stand-in for the phase left; farther off, creep up.
         left = xp.where(x.along < 0, x.across * x.along, -0.2 * size)
@@ -190,7 +185,12 @@ def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
 
 
 def long_row(beta: Array, fields: Array) -> Array:
-    """The limit for d >= 1; 0 where no alpha is stable, NaN for bad input.
+    """The limit for d >= 1; 0 where no alpha is stable, NaN for bad input."""
+    return long_row_point(beta, fields)[0]
+
+
+def long_row_point(beta: Array, fields: Array) -> tuple[Array, Array]:
+    """The limit for d >= 1 and the frequency w there, of no meaning where no alpha is stable.
 
     b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
     lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
@@ -204,15 +204,15 @@ def long_row(beta: Array, fields: Array) -> Array:
     r = xp.sqrt(share)
     omega = xp.minimum(end * (_arcsine(r * sin_bow) / bow + bend * r * (1.0 - share)), end)
     for _ in range(_ROW_STEPS):
-        omega = xp.clip(omega - _newton_step(goal, _Angles(omega, fields), fields), 0.0, end)
-    at = _Angles(omega, fields)
-    x = _turned(at, fields[1] + 0.5)
+        omega = xp.clip(omega - _newton_step(goal, Angles(omega, fields), fields), 0.0, end)
+    at = Angles(omega, fields)
+    x = turned(at, fields[1] + 0.5)
     numerator, denominator = 2.0 * at.s * x.across, at.c * at.V
     # The last step is taken in alpha itself.
     step = _newton_step(goal, at, fields)
     numerator -= step * (at.c * x.across + 2.0 * at.s * x.d_across)
     denominator -= step * (at.c * at.dV - 0.5 * at.s * at.V)
-    return _finish(xp.where(inside, numerator / denominator, 0.0), b)
+    return _finish(xp.where(inside, numerator / denominator, 0.0), b), omega - step
 
 
 def _arcsine(x: Array) -> Array:
@@ -222,17 +222,17 @@ def _arcsine(x: Array) -> Array:
     return 2.0 * t * horner(t * t, _ARCTAN)
 
 
-def _newton_step(goal: Array, at: _Angles, fields: list[Array] | Array) -> Array:
+def _newton_step(goal: Array, at: Angles, fields: list[Array] | Array) -> Array:
     """``2 (b - sqrt(goal b))/b'`` with sqrt(goal/b) as (1 + 3 goal/b)/(3 + goal/b): one division in all.
 
     XLA fuses a chain of such steps into one loop over the rows only while no quotient is used twice.
     """
-    total, d_total, scale, d_scale = _offset(at, fields)
+    total, d_total, scale, d_scale = offset(at, fields)
     part = goal * scale
     return 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))
 
 
 def limit_kernel(beta: Array, delta: Array, d: Array) -> Array:
-    """The limit for any delay, for use inside a transformation; it means something in the verified range only."""
+    """The limit for any delay, for use inside a transformation."""
     here = device(delta, d)
     return namespace(beta, delta, d).where(d < 1, short_row(beta, here), long_row(beta, long_device(here)))

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-import jax
-import jax.numpy as jnp
+import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import pointwise
+from zwidth.batching import elementwise
+from zwidth.domain import check_scalars, device_status
 from zwidth.loop import check_delay_model
 from zwidth.plant import Plant, split_delay
-from zwidth.stability.ridge_newton import Start, newton_ridge
-
-_CHUNK = 1 << 13
-_LEAST = 1 << 4
+from zwidth.stability.devices import ANY, Kind
+from zwidth.stability.ridge import found, occurring
+from zwidth.stability.ridge_newton import start_of
+from zwidth.stability.ridge_slopes import differentiable_ridge
+from zwidth.status import Status
+from zwidth.xp import namespace
 
 
 def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
@@ -53,16 +55,18 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
         0.631130
     """
     check_delay_model(delay)
-    return pointwise(slope_kernel, ("d",), (d,), (delay,), _CHUNK, least=_LEAST)
+    check_scalars(d=d)
+    return elementwise(slope_kernel, ("d",), (d,), (delay, occurring(d)))
 
 
-def slope_kernel(d: Array, delay: str) -> Array:
-    """`stiffness_slope` of one point."""
-    d = d * jnp.where(jnp.isfinite(d) & (d >= 0), 1.0, jnp.nan)
-    lag, f = split_delay(d) if delay == "held" else (d, jnp.zeros_like(d))
-    zero, one = jnp.zeros_like(d), jnp.ones_like(d)
+def slope_kernel(d: Array, delay: str, kind: Kind = ANY) -> Array:
+    """`stiffness_slope`, elementwise."""
+    xp = namespace(d)
+    d = d * xp.where(device_status(0.0 * d, d) == Status.OK, 1.0, np.nan)
+    zero = 0.0 * d
+    lag, f = split_delay(d) if delay == "held" else (d, zero)
     # delta N(z) for delta -> infinity: the velocity follows the force at once, e^-delta and its like vanish.
-    plant = Plant(c=zero, em=one, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
-    start = jax.lax.stop_gradient(Start(1.0 / (d + 1.0), one, zero))
-    ridge = newton_ridge(plant, lag, start, delay)
-    return ridge.alpha * jnp.where(ridge.converged, 1.0, jnp.nan)
+    plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
+    start = start_of(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
+    ridge = differentiable_ridge(plant, lag, start, delay, kind)
+    return ridge.alpha * found(ridge)

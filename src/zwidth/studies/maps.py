@@ -9,8 +9,8 @@ import numpy as np
 from zwidth.figures import draw_map
 from zwidth.figures.data import MapData, SIScale
 from zwidth.stability.labels import is_stable
-from zwidth.stability.radii import spectral_radius
 from zwidth.stability.passivity import is_passive
+from zwidth.stability.radii import spectral_radius
 from zwidth.studies.outcome import Outcome
 from zwidth.sweep.studies import MapStudy
 

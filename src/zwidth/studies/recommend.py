@@ -18,7 +18,7 @@ from zwidth.stability.ridge import alpha_max
 from zwidth.studies.boundaries import outline
 from zwidth.studies.outcome import Outcome, stack
 from zwidth.studies.passivity import passive_outlines
-from zwidth.studies.steps import respond, response_columns
+from zwidth.studies.steps import respond, response_columns, unsettled
 from zwidth.sweep.devices import PhysicalDevice
 from zwidth.sweep.responses import RecommendStudy
 
@@ -56,8 +56,8 @@ def run_recommend(study: RecommendStudy, stem: str) -> Outcome:
         f"{stem}.md": _markdown(device, data, verdict),
     }
     notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
-    if not math.isfinite(response.settling_time):
-        notes.append(f"the response does not settle within {study.duration}")
+    if note := unsettled(response, physical=True):
+        notes.append(note)
     table = stack([response_columns(response, physical=True)])
     return Outcome(
         table=table, figures={"": partial(draw_recommendation, data)}, documents=documents, notes=tuple(notes)
@@ -157,4 +157,4 @@ def _markdown(device: PhysicalDevice, data: RecommendationData, verdict: Assessm
 def _settling(response: Response) -> str:
     if math.isfinite(response.settling_time):
         return f"{with_unit(response.settling_time, 's', 3)} after a step of force"
-    return "later than the simulated time"
+    return "not known"

@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.figures import draw_step
 from zwidth.figures.data import Response, StepData
-from zwidth.quantities import with_unit
+from zwidth.quantities import plain, with_unit
 from zwidth.response import step_response
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.outcome import Outcome, stack
@@ -54,14 +54,24 @@ def run_step(study: StepStudy) -> Outcome:
         label = device.label or _wall_text(device, alpha, beta) or f"device {number}"
         times = {"periods": study.periods(device), "substeps": study.substeps}
         responses.append(respond(device, alpha, beta, label=label, physical=physical, **times))
-        if not np.isfinite(responses[-1].settling_time):
-            notes.append(f"{label}: the response does not settle within {study.duration}")
+        if note := unsettled(responses[-1], physical):
+            notes.append(f"{label}: {note}")
     data = StepData(tuple(responses), physical)
     return Outcome(
         table=stack(response_columns(response, physical) for response in responses),
         figures={"": partial(draw_step, data)},
         notes=tuple(notes),
     )
+
+
+def unsettled(response: Response, physical: bool) -> str:
+    """What to say of a response that has not settled at the end of the time shown; nothing otherwise."""
+    if np.isnan(response.settling_time):
+        return "no settling time: the wall is not stable, its poles nearly coincide, or the delay exceeds 500 periods"
+    if response.settles_in_view:
+        return ""
+    after = with_unit(response.settling_time, "s", 3) if physical else f"{plain(response.settling_time)} periods"
+    return f"the response settles after {after}, later than the time shown"
 
 
 def _wall_text(device: AnyDevice, alpha: float, beta: float) -> str:

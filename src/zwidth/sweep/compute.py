@@ -17,12 +17,10 @@ import numpy as np
 
 from zwidth.grouping import degree_of, groups
 from zwidth.stability.boundary_map import row_limits
-from zwidth.stability.passivity import _sample_count as sample_count
-from zwidth.stability.passivity import passivity_margin
+from zwidth.stability.passivity import margin_at_one_delay
 from zwidth.stability.poles import companion_chunk, radius_by_companion
 from zwidth.stability.proved import certified_columns
 from zwidth.stability.ridge import alpha_max
-from zwidth.stability.row_limit import VERIFIED_DAMPING, VERIFIED_DELAY
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
 from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, Family
@@ -33,6 +31,7 @@ Columns: TypeAlias = tuple[np.ndarray, ...]
 _PIECE = 1 << 9
 _ROW_PIECE = 1 << 12
 _NEWTON_PIECE = 1 << 12
+_WALL_PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
@@ -93,7 +92,7 @@ def _walls(
     if "stable" in outputs:
         found["stable"] = _stable(block, shape)
     if {"passive", "passivity_margin"} & set(outputs):
-        margin = _by_device(_passivity, block, shape, _passivity_groups)
+        margin = _by_device(_passivity, block, shape, _delays)
         found |= {"passivity_margin": margin, "passive": margin > 0}
     found["status"] = _status(outputs, found, block, shape)
     return found
@@ -120,17 +119,12 @@ def _settling_time(radius: np.ndarray, block: Block) -> np.ndarray:
 
 
 def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
-    """Which walls are stable: by the boundary where its shape is known, elsewhere by their poles."""
+    """Which walls are stable: those below the limit of their row."""
     stable = np.empty(shape, dtype=bool)
     limit = _limits(block)
     for plane, alpha, ends in zip(stable, block.alpha, limit, strict=True):
         np.less(alpha[:, None], ends, out=plane)
         plane[~(alpha > 0)] = False
-    known = (block.delta <= VERIFIED_DAMPING) & (block.d <= VERIFIED_DELAY)
-    if not known.all():
-        parts = {name: part[~known] for name, part in block._asdict().items() if np.size(part) and name != "rows"}
-        rest = block._replace(**parts)
-        stable[~known] = _radius(rest, (int((~known).sum()), *shape[1:])) < 1.0
     return stable
 
 
@@ -207,12 +201,11 @@ def _degrees(d: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _passivity(columns: Columns) -> np.ndarray:
-    size = max(1, min(_PIECE, (1 << 20) // sample_count(columns[3])))
-    return in_pieces(lambda *piece: (passivity_margin(*piece),), columns, size)[0]
+    *walls, d = columns
+    return in_pieces(lambda *piece: (margin_at_one_delay(*piece, d=float(d[0])),), tuple(walls), _WALL_PIECE)[0]
 
 
-def _passivity_groups(d: np.ndarray) -> Iterator[np.ndarray]:
-    """Devices whose delays call for the same number of frequencies: it is chosen for a whole batch."""
-    counts = np.array([sample_count(value) for value in d])
-    for count in np.unique(counts):
-        yield np.flatnonzero(counts == count)
+def _delays(d: np.ndarray) -> Iterator[np.ndarray]:
+    """Devices of one delay."""
+    values, which = np.unique(d, return_inverse=True)
+    return (np.flatnonzero(which == index) for index in range(values.size))

@@ -348,7 +348,7 @@ def _rate(output: str, method: str, poles: float) -> float:
     if output == "stable":
         return 3e8
     if output == "passive":
-        return 1.5e6 / poles
+        return 4e6
     if method == "newton":
         return 4e5 * 4.0 / poles
     return 1e6 / (poles / 4.0) ** 2.5

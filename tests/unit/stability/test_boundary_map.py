@@ -6,7 +6,7 @@ import pytest
 
 from zwidth.stability import boundary_map as maps
 from zwidth.stability.boundary_map import row_limits
-from zwidth.stability.methods import is_stable
+from zwidth.stability.labels import is_stable
 
 ROWS, COLUMNS = 331, 400
 LIMITS = np.concatenate([np.linspace(-0.1, 1.1, ROWS - 5), [np.nan, np.inf, -np.inf, 0.0, 0.25]])[:, None]
@@ -69,10 +69,10 @@ def test_few_long_rows_and_more_values_than_places():
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 4.3, 50.0])
 def test_a_map_and_its_points_one_by_one_agree(d):
     alpha, beta = np.linspace(-0.01, 0.9, 301)[None, :], np.linspace(-0.3, 1.1, 303)[:, None]
-    stable = is_stable(alpha, beta, 0.2, d, method="boundary")
+    stable = is_stable(alpha, beta, 0.2, d)
     # A pair of columns of one length is no map: each point is a row of its own.
     columns = [np.ravel(part) for part in np.broadcast_arrays(alpha, beta)]
-    np.testing.assert_array_equal(stable.ravel(), is_stable(*columns, 0.2, d, method="boundary"))
+    np.testing.assert_array_equal(stable.ravel(), is_stable(*columns, 0.2, d))
     assert 0 < stable.sum() < stable.size
 
 

@@ -5,41 +5,33 @@ import pytest
 
 import zwidth
 from zwidth.bench import extremes
-from zwidth.stability.methods import radius_of
+from zwidth.stability.radii import radius_of
 from zwidth.status import Status
 
-# (method, precision) -> the farthest relative distance from the boundary at which a label may be wrong.
+# method -> the farthest relative distance from the boundary at which a label may be wrong.
 HELD = {
-    ("boundary", "float64"): 1e-15,
-    ("schur_cohn", "float64"): 1e-12,
+    "crossover": 1e-15,
     # Where poles nearly coincide, eigenvalues keep half of their digits, and fewer for strong damping.
-    ("companion", "float64"): 1e-4,
-    ("schur_cohn", "float32"): 1e-2,
+    "companion": 1e-4,
 }
-# For long delays the boundary alone is compiled here.
-DELAYS = [0.0, float(np.nextafter(1.0, 0.0)), 1.0, 50.0, 500.0]
+DELAYS = [0.0, float(np.nextafter(1.0, 0.0)), 1.0, 50.0, 500.0, 1e5]
 
 
 @pytest.mark.parametrize("d", DELAYS, ids=str)
 def test_every_method_holds_where_it_says(d, monkeypatch):
     if d >= 50:
-        monkeypatch.setattr(extremes, "METHODS", [("boundary", "float64")])
+        # All poles of long delays take long, and show nothing new.
+        monkeypatch.setattr(extremes, "METHODS", ["crossover"])
     outcomes = list(extremes.judge(d))
     assert {outcome.points >= 60 for outcome in outcomes} == {True}
     for outcome in outcomes:
-        allowed = HELD[outcome.method, outcome.dtype]
-        if outcome.method == "boundary" and np.isnan(outcome.farthest):
-            pytest.fail(f"{outcome}: beside the start and for soft walls the boundary is exact")
+        if outcome.method == "crossover" and np.isnan(outcome.farthest):
+            pytest.fail(f"{outcome}: beside the start and for soft walls the closed form is exact")
         # Soft walls and those beside the start are told apart by less than a rounding error of the coefficients.
-        assert np.isnan(outcome.farthest) or outcome.farthest <= allowed, outcome
+        assert np.isnan(outcome.farthest) or outcome.farthest <= HELD[outcome.method], outcome
 
 
-def test_rough_methods_are_seen_to_be_rough():
-    float32 = [outcome for outcome in extremes.judge(1.0) if outcome.dtype == "float32"]
-    assert sum(outcome.wrong for outcome in float32) > 20
-
-
-@pytest.mark.parametrize("method", ["boundary", "schur_cohn", "companion", "certified"])
+@pytest.mark.parametrize("method", ["crossover", "companion", "certified"])
 def test_bad_input_among_good(method):
     bad = [np.nan, np.inf, -np.inf]
     alpha = np.array([0.1, *bad, 0.1, 0.1, 0.1, 0.1, 0.1])
@@ -53,7 +45,7 @@ def test_bad_input_among_good(method):
 
 @pytest.mark.parametrize("delta", extremes.DELTAS, ids=str)
 def test_the_radius_of_a_stiff_wall_and_a_soft_one(delta):
-    walls = (np.array([1e-300, 1e3 * (1 + delta)]), 0.1 * (1 + delta), delta, 0.0)
+    walls = (np.array([1e-30, 1e3 * (1 + delta)]), 0.1 * (1 + delta), delta, 0.0)
     found = radius_of(*walls, method="newton")
     assert (found.status == Status.OK).all()
     # The soft wall's slowest pole is at 1, to rounding; the stiff one's is far outside.
@@ -65,7 +57,7 @@ def test_the_radius_of_a_stiff_wall_and_a_soft_one(delta):
 
 def test_the_report_names_every_method_and_delay():
     text = extremes.report((0.0,))
-    for method, dtype in extremes.METHODS:
-        assert f"| {method}{' float32' if dtype == 'float32' else ''} | " in text
+    for method in extremes.METHODS:
+        assert f"| {method} | " in text
     assert text.count("## ") == 4
     assert "d = 0" in text

@@ -93,8 +93,9 @@ def test_derivatives(model):
         from_pi = 1 / (np.pi - omega)
     corner = np.isinf(from_pi)
     assert np.all(jacobian[corner, 2] == 0)
-    # sin(omega/2) lies near 1 there, and determines (pi - omega)^2, to which the slope is inverse, to a rounding error.
-    by_omega = tol.RIDGE_SLOPE.float64 + 1e-15 * from_pi[~corner] ** 2
+    # sin(omega/2) lies near 1 there, and determines (pi - omega)^2, to which the slope is inverse, to its last places:
+    # three, since each rounding of one of the curve's coefficients moves it by about one.
+    by_omega = tol.RIDGE_SLOPE.float64 + 12 * tol.EPS64 / 2 * from_pi[~corner] ** 2
     # At the last smooth delta that error is as large as (pi - omega)^2 itself.
     assert by_omega[by_omega < 1].size >= by_omega.size - 1
     # What is rounded and subtracted in a derivative: the value over the distance at which it changes.

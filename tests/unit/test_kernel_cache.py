@@ -7,10 +7,10 @@ import warnings
 
 import pytest
 
-from zwidth.sweep.compiled import mend_compilation_cache, use_compilation_cache
+from zwidth.kernel_cache import mend_compilation_cache, use_compilation_cache
 
 PROGRAM = """
-from zwidth.sweep.compiled import use_compilation_cache
+from zwidth.kernel_cache import use_compilation_cache
 use_compilation_cache()
 import jax
 print(float(jax.jit(lambda x: x * 3 + 1)(2.0)))
@@ -34,6 +34,25 @@ def test_half_an_entry_is_removed_without_a_word(tmp_path):
         entry.write_bytes(data[: len(data) // 2])
     assert run() == entries
     assert all(entry.stat().st_size > len(data) // 2 for entry, data in zip(entries, whole, strict=True))
+
+
+LATE = """
+import jax
+from zwidth.kernel_cache import use_compilation_cache
+empty = use_compilation_cache()
+jax.jit(lambda x: x * 3 + 1)(2.0)
+full = use_compilation_cache()
+print(empty.nbytes, full.nbytes > 1000, full.folder == empty.folder)
+"""
+
+
+def test_it_may_be_asked_for_after_jax_was_imported(tmp_path):
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    result = subprocess.run(
+        [sys.executable, "-c", LATE], capture_output=True, text=True, check=True, timeout=120, env=environment
+    )
+    assert result.stdout == "0 True True\n", result.stderr
 
 
 @pytest.fixture

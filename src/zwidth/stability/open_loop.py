@@ -1,0 +1,138 @@
+"""Size and phase of the loop ``L = B/T`` at a frequency, for the margins.
+
+Notation as in `zwidth.stability.crossover`: with ``u = 1 - cos w``, ``s = sin w``,
+
+    L = -(W M)/(Z e^...)      W = alpha + beta u + j beta s,  M at e^(j w),  Z = s + j (em - u)
+    |L|^2 = |W|^2 |M|^2 / (2 u (em^2 + 2 c u))
+    phase = arg W + arg M + arg Z - (n + 1/2) w = pi + arg L
+
+each argument principal and continuous in w, so that the phase needs no unwrapping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth._types import Array, ArrayLike
+from zwidth.batching import broadcast, elementwise, in_blocks, to_caller, tree_map
+from zwidth.stability.crossover import Crossover
+from zwidth.stability.devices import Device
+from zwidth.xp import is_traced, namespace
+
+
+def angle_of(crossover: Crossover) -> Array:
+    """w of u and 2 - u, from the smaller of them."""
+    xp = namespace(crossover.u)
+    near = crossover.u <= 1.0
+    small = xp.maximum(xp.where(near, crossover.u, crossover.y), 0.0)
+    angle = 2.0 * xp.arcsin(xp.sqrt(0.5 * xp.where(small > 0, small, 1.0)))
+    angle = xp.where(small > 0, angle, 0.0)
+    return xp.where(near, angle, np.pi - angle)
+
+
+def size_and_phase(w: Array, alpha: Array, beta: Array, here: Device) -> tuple[Array, Array]:
+    """``|L|`` and its phase above -pi, at w in (0, pi]."""
+    xp = namespace(w, alpha)
+    half = xp.sin(0.5 * w)
+    u, s = 2.0 * half * half, xp.sin(w)
+    wall_re, wall_im = alpha + beta * u, beta * s
+    cos_half = xp.cos(0.5 * w)
+    m_re, m_im = 2.0 * (here.a2 + here.a0) * cos_half * cos_half - here.gap, (here.a2 - here.a0) * s
+    top = (wall_re * wall_re + wall_im * wall_im) * (m_re * m_re + m_im * m_im)
+    size = xp.sqrt(top / (2.0 * u * (here.em * here.em + 2.0 * here.c * u)))
+    phase = xp.arctan2(wall_im, wall_re) + xp.arctan2(m_im, m_re) + xp.arctan2(here.em - u, s)
+    return size, phase - (here.whole + 0.5) * w
+
+
+class _Bracket(NamedTuple):
+    low: Any
+    high: Any
+    at_low: Any  # weights: the values, halved where an end stays twice
+    at_high: Any
+    side: Any  # which end moved last, 1 the low one
+    best: Any
+    value: Any
+
+
+# A point becomes some hundreds of samples.
+_BLOCK = 1 << 9
+# A phase in radians is not known better.
+_ROUNDING = 1e-15
+
+
+def sign_change(
+    function: Callable[[Array], Array],
+    low: Array,
+    high: Array,
+    at_low: Array,
+    at_high: Array,
+    steps: int,
+    width: Array | float,
+) -> Array:
+    """Where a function that is positive at ``low`` and not at ``high`` changes sign.
+
+    False position with halved weights, every sixth step a bisection. NumPy stops when every point is done: its value
+    no more than rounding, or the bracket no wider than ``width``.
+    """
+    xp = namespace(low, at_low)
+
+    def step(k: Any, at: _Bracket) -> _Bracket:
+        middle = 0.5 * (at.low + at.high)
+        gap = at.at_low - at.at_high
+        trial = at.low + (at.high - at.low) * (at.at_low / xp.where(gap > 0, gap, 1.0))
+        trial = xp.where((trial > at.low) & (trial < at.high) & (k % 6 != 5), trial, middle)
+        # A scalar of NumPy is five times faster than an array of no dimension.
+        trial = trial[()]
+        value = function(trial)
+        above, better = value > 0, xp.abs(value) < xp.abs(at.value)
+        return _Bracket(
+            xp.where(above, trial, at.low),
+            xp.where(above, at.high, trial),
+            xp.where(above, value, xp.where(at.side < 0, 0.5 * at.at_low, at.at_low)),
+            xp.where(above, xp.where(at.side > 0, 0.5 * at.at_high, at.at_high), value),
+            xp.where(above, 1.0, -1.0) + 0.0 * value,
+            xp.where(better, trial, at.best),
+            xp.where(better, value, at.value),
+        )
+
+    lower = at_low < -at_high
+    none = 0.0 * at_low
+    at = _Bracket(low, high, at_low, at_high, none, xp.where(lower, low, high), xp.where(lower, at_low, at_high))
+    if xp is np:
+        for k in range(steps):
+            at = step(k, at)
+            if np.all((np.abs(at.value) <= _ROUNDING) | (at.high - at.low <= width)):
+                break
+        return at.best
+    from jax.lax import fori_loop
+
+    return fori_loop(0, steps, step, at).best
+
+
+def along(values: np.ndarray, like: Array) -> Array:
+    """Values along a new last axis behind those of ``like``."""
+    xp = namespace(like)
+    return xp.asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
+
+
+def by_samples(kernel: Callable[..., Any], names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Any:
+    """`elementwise` for a kernel that makes hundreds of samples of a point: compiled for traced values only.
+
+    Compiling takes many seconds and then wins nothing over NumPy.
+    """
+    if is_traced(*values):
+        return elementwise(kernel, names, values)
+    arrays = broadcast(names, values)
+    shape = arrays[0].shape
+    if arrays[0].size <= _BLOCK:
+        return elementwise(kernel, names, values)
+
+    def quietly(*columns: np.ndarray) -> Any:
+        with np.errstate(all="ignore"):
+            return kernel(*columns)
+
+    flat = in_blocks(quietly, [array.reshape(-1) for array in arrays], _BLOCK)
+    return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)

@@ -1,0 +1,190 @@
+"""The verdict in float64 balls: every intermediate encloses what the same text gives in python-flint's balls.
+
+Those are held to poles in mpmath by test_certified_balls.py; the device's numbers here to mpmath's formulas.
+"""
+
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+
+import oracles
+from zwidth.stability import balls, enclosed_plant, enclosed_verdict, enclosure
+from zwidth.stability.certified import certified_stable
+from zwidth.stability.enclosed_plant import phi, plant
+from zwidth.stability.enclosed_verdict import (
+    enclose_zero,
+    gain_cubic,
+    long_device,
+    long_verdict,
+    loop_vector,
+    short_device,
+    short_verdict,
+    take_lag,
+)
+from zwidth.stability.enclosure import Ball
+
+flint = pytest.importorskip("flint")
+BITS = 400
+UNIT = 2.0**-53
+DELTAS = np.array([0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-3, 0.3, 1.0, 1.4999, 1.5, 1.51, 7.0, 50.0, 699.0, 750.0, 1e12])
+
+
+def leaves(tree):
+    """Every number of a device, in order."""
+    if tree is None:
+        return []
+    if not isinstance(tree, tuple):
+        return [tree]
+    return [leaf for part in tree for leaf in leaves(part)]
+
+
+def escaped(found, exact, index):
+    """How many balls of one point miss the numbers in the balls of arb."""
+    count = 0
+    with flint.ctx.workprec(BITS):
+        for ball, truth in zip(leaves(found), leaves(exact), strict=True):
+            mid, rad = (
+                float(np.broadcast_to(x, index + 1 if np.ndim(x) == 0 else x.shape)[index])
+                for x in (ball.mid, ball.radius)
+            )
+            count += not abs(truth - mid) <= rad
+    return count
+
+
+def walls(count, seed, d):
+    """Walls on and around the stable set of many devices."""
+    rng = np.random.default_rng(seed)
+    delta = np.where(rng.random(count) < 0.5, rng.exponential(1.0, count), 10.0 ** rng.uniform(-9, 9, count))
+    d = np.full(count, float(d)) if np.ndim(d) == 0 else rng.choice(d, count)
+    scale = (1 + delta) / (1 + d)
+    return rng.uniform(0, 2, count) * scale, rng.uniform(-1, 2, count) * (delta + 1 / (1 + d)), delta, d
+
+
+@pytest.mark.parametrize("d", [1.0, 2.0, 7.0, 500.0, 1.5, 3.25, 60.7, np.nextafter(2.0, 1.0), 1.0 + 1e-12, 99999.5])
+def test_every_intermediate_of_the_crossover_is_enclosed(d):
+    alpha, beta, delta, d = walls(60, 11, d)
+    fraction = d - np.floor(d)
+    a, b = Ball(alpha), Ball(beta)
+    with np.errstate(all="ignore"):
+        here = long_device(plant(delta, fraction if fraction.any() else None))
+        cubic = gain_cubic(a, b, here)
+        u, found = enclose_zero(cubic)
+        q = u * (2 - u)
+        lag, vector = take_lag(u, q, np.floor(d)), loop_vector(a, b, u, q, here)
+    seen = 0
+    for index in range(alpha.size):
+        with flint.ctx.workprec(BITS):
+            x, y = flint.arb(alpha[index]), flint.arb(beta[index])
+            device = balls._device(delta[index], d[index], BITS)
+            truth = gain_cubic(x, y, device)
+            assert escaped(here, device, index) == 0
+            assert escaped(cubic, truth, index) == 0
+            if not found[index]:
+                continue
+            root, sure = balls._enclose_zero(truth)
+            assert sure
+            square = root * (2 - root)
+            exact = balls._take_lag(root, square, int(d[index]))
+            assert escaped((u, q), (root, square), index) == 0
+            assert escaped(vector, loop_vector(x, y, root, square, device), index) == 0
+            if exact.within:
+                seen += 1
+                assert escaped(tuple(lag[:2]), tuple(exact[:2]), index) == 0
+            assert not lag.within[index] or exact.within
+            assert not lag.beyond[index] or exact.beyond
+    assert seen > 15
+
+
+@pytest.mark.parametrize("d", [0.0, 0.5, 1e-9, 5e-324, 0.125, 0.93, 1.0 - 2.0**-53])
+def test_every_number_of_a_short_device_is_enclosed(d):
+    with np.errstate(all="ignore"):
+        here = short_device(plant(DELTAS, np.full(DELTAS.size, d) if d else None))
+    for index, delta in enumerate(DELTAS):
+        assert escaped(here, balls._device(float(delta), d, 1600), index) == 0
+
+
+def test_bounds_too_small_are_noticed(monkeypatch):
+    _, _, delta, d = walls(60, 11, [1.0, 4.0, 2.5])
+    monkeypatch.setattr(enclosure, "UNIT", 2.0**-58)
+    monkeypatch.setattr(enclosed_plant, "UNIT", 2.0**-58)
+    here = long_device(plant(delta, d - np.floor(d)))
+    missed = sum(escaped(here, balls._device(delta[i], d[i], BITS), i) for i in range(60) if d[i] % 1)
+    assert missed > 10
+
+
+def test_phi_errors_are_as_stated():
+    x = np.concatenate([np.random.default_rng(5).uniform(0, 4, 1500), DELTAS])
+    c, phi2, psi = phi(x)
+    for index, value in enumerate(x):
+        with mp.workdps(oracles.digits_for(value)):
+            exact = oracles.phi(value)
+            assert oracles.relative_error(c[index], exact.c, floor=1e-280) <= 8 * UNIT
+            assert oracles.relative_error(phi2[index], exact.phi2) <= 20 * UNIT
+            assert oracles.relative_error(psi[index], exact.psi) <= 20 * UNIT
+
+
+def test_device_is_that_of_the_printed_formulas():
+    for delta in (1e-6, 0.4, 3.0, 40.0):
+        for f in (0.0, 1e-7, 0.4, 0.999):
+            with mp.workdps(oracles.digits_for(delta)):
+                exact = oracles.numerator(delta, f)[: 3 if f else 2]
+                here = plant(np.float64(delta), np.float64(f) if f else None)
+                for ball, value in zip((here.a2, here.a1, here.a0), exact, strict=False):
+                    assert abs(mpf(float(ball.mid)) - value) <= mpf(float(ball.radius))
+                assert abs(mpf(float(here.c.mid)) - mp.exp(-mpf(delta))) <= mpf(float(here.c.radius))
+
+
+def test_arcsine_series_is_as_close_as_stated():
+    # Over boxes that cover [0, 0.5002], by Taylor polynomials of the difference with a bounded remainder.
+    pieces, order, worst = 200, 8, 0.0
+    with flint.ctx.workprec(200):
+        fit = flint.arb_poly([flint.arb(c) for c in enclosed_verdict._ARCSINE])(flint.arb_poly([-1, 4]))
+        half = flint.arb(0.5002) / (2 * pieces)
+        offset = flint.arb(0, (half * 1.0001).upper())
+        for piece in range(pieces):
+            centre = (2 * piece + 1) * half
+            total, power = flint.arb(0), flint.arb(1)
+            for k in range(order + 1):
+                at = centre if k < order else centre + offset
+                total += (_arcsine_derivative(at, k) - fit(flint.arb_poly([at, 1]))[k]) * power
+                power *= offset
+            worst = max(worst, float(abs(total).upper()))
+    # The rest up to 2^-46 is room for the rounding of the evaluation.
+    assert 2.0**-48 < worst < 2.0**-46.5
+
+
+def _arcsine_derivative(y, k):
+    """The k-th derivative over k! of ``asin(sqrt y)/sqrt y = sum_j binom(2 j, j)/(4^j (2 j + 1)) y^j``."""
+    total, term, power = flint.arb(0), flint.arb(1), flint.arb(1)
+    for j in range(120):
+        if j >= k:
+            total += term / (2 * j + 1) * flint.arb.bin_uiui(j, k) * power
+            power *= y
+        term = term * (2 * j + 1) / (2 * j + 2)
+    # Later terms fall by more than y 120/(120 - k) < 0.54 each.
+    return total + flint.arb(0, (term / 241 * flint.arb.bin_uiui(120, k) * power * 3).upper())
+
+
+@pytest.mark.parametrize("d", [0.0, 0.4, 1.0, 3.0, 1.7, 40.0])
+def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
+    rng = np.random.default_rng(17)
+    alpha, beta, delta, _ = walls(400, 19, d)
+    width = 10.0 ** rng.uniform(-5, -1, 400)
+    boxes = [Ball(x, 1.001 * width * np.abs(x)) for x in (alpha, beta)]
+    f = d % 1
+    with np.errstate(all="ignore"):
+        here = plant(delta, np.full(400, f) if f else None)
+        if d < 1:
+            verdict = short_verdict(*boxes, short_device(here))
+        else:
+            verdict = long_verdict(*boxes, d // 1, long_device(here), enclose_zero, take_lag)
+        meant = (boxes[0] > 0) & (boxes[1] + delta > 0)
+    stable, unstable = verdict.stable & meant, verdict.unstable & meant
+    assert stable.sum() > 20
+    assert unstable.sum() > 20
+    for _ in range(8):
+        inside = [x * (1 + width * rng.uniform(-1, 1, 400)) for x in (alpha, beta)]
+        truth = certified_stable(*inside, delta, d)
+        assert (truth.status == 0).all()
+        assert truth.stable[stable].all()
+        assert not truth.stable[unstable].any()
