@@ -73,7 +73,7 @@ def beyond(value: Array) -> float:
 
 
 def until(steps: int, step: Callable[[Any], Any], done: Callable[[Any], Array], state: Any, xp: Any) -> Any:
-    """Apply ``step`` up to so many times, or until every point is done."""
+    """Apply ``step`` up to so many times, or until every point is done, which at the start none may be."""
     if xp is np:
         for _ in range(steps):
             state = step(state)
@@ -100,7 +100,7 @@ def level(high: Array, loop: Loop) -> Array:
         new = xp.where(xp.isfinite(new), xp.clip(new, 0.1 * at, high), at)
         return new, xp.abs(new - at)
 
-    return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, high), xp)[0]
+    return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
 
 
 def slow_pole(loop: Loop) -> Found:
@@ -186,7 +186,7 @@ def polished(
         im = xp.abs(im)
         return re, xp.where(im > np.pi, 2.0 * np.pi - im, im), size
 
-    start = (found.re, found.im, 0.0 * found.re)
+    start = (found.re, found.im, 0.0 * found.re + np.inf)
     re, im, size = until(steps, step, lambda state: state[2] < 1e-24, start, xp)
     settled = (size < _SETTLED) | ((loop.alpha == 0) & (re == 0))
     return Found(xp.where(settled, re, np.nan), im)
