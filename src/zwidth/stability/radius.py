@@ -26,6 +26,7 @@ _GUESS_STEPS = 3
 # Squares of steps, over the distance between poles: longer ones lead astray, shorter ones have settled.
 _LONGEST_STEP = 4.0
 _SETTLED = 1e-4
+_DONE = 1e-24
 
 
 class Found(NamedTuple):
@@ -94,11 +95,13 @@ def level(high: Array, loop: Loop) -> Array:
     xp = namespace(high)
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        at, _ = state
+        at, moved = state
         front, _ = real_ends(at, sides(at, loop), loop)
         new = at - front.level / front.slope
-        new = xp.where(xp.isfinite(new), xp.clip(new, 0.1 * at, high), at)
-        return new, xp.abs(new - at)
+        # What is done stays: a point's value must not depend on how long its neighbors take.
+        going = xp.isfinite(new) & ~(moved < 1e-3 * at)
+        new = xp.where(going, xp.clip(new, 0.1 * at, high), at)
+        return new, xp.where(going, xp.abs(new - at), moved)
 
     return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
 
@@ -177,17 +180,18 @@ def polished(
     xp = namespace(found.re)
 
     def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        re, im, _ = state
+        re, im, last = state
         by_re, by_im = stepper(near(re, im, loop, fractional))
-        size = (by_re * by_re + by_im * by_im) * loop.turns * loop.turns
-        good = (size < _LONGEST_STEP) & ((loop.alpha != 0) | (re != 0))
+        going = ~(last < _DONE)
+        size = xp.where(going, (by_re * by_re + by_im * by_im) * loop.turns * loop.turns, last)
+        good = going & (size < _LONGEST_STEP) & ((loop.alpha != 0) | (re != 0))
         re, im = xp.where(good, re + by_re, re), xp.where(good, im + by_im, im)
         # Past the real axis the conjugate is meant.
         im = xp.abs(im)
         return re, xp.where(im > np.pi, 2.0 * np.pi - im, im), size
 
     start = (found.re, found.im, 0.0 * found.re + np.inf)
-    re, im, size = until(steps, step, lambda state: state[2] < 1e-24, start, xp)
+    re, im, size = until(steps, step, lambda state: state[2] < _DONE, start, xp)
     settled = (size < _SETTLED) | ((loop.alpha == 0) & (re == 0))
     return Found(xp.where(settled, re, np.nan), im)
 
