@@ -16,7 +16,7 @@ from zwidth.stability.radius import proved, radius_kernel
 from zwidth.status import Status
 
 # Counts, whether some of them bisect, and Newton steps on the pole: nearly all points need the first.
-_EFFORTS = ((5, False, 2), (40, False, 12), (90, True, 40))
+_EFFORTS = ((5, False, 2), (10, False, 6), (25, False, 12), (90, True, 40))
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(1, 12)
 _LARGEST_ERROR = 0.1

@@ -26,6 +26,7 @@ _GUESS_STEPS = 3
 # Squares of steps, over the distance between poles: longer ones lead astray, shorter ones have settled.
 _LONGEST_STEP = 4.0
 _SETTLED = 1e-4
+_DONE = 1e-24
 
 
 class Found(NamedTuple):
@@ -73,7 +74,7 @@ def beyond(value: Array) -> float:
 
 
 def until(steps: int, step: Callable[[Any], Any], done: Callable[[Any], Array], state: Any, xp: Any) -> Any:
-    """Apply ``step`` up to so many times, or until every point is done."""
+    """Apply ``step`` up to so many times, or until every point is done, which at the start none may be."""
     if xp is np:
         for _ in range(steps):
             state = step(state)
@@ -94,13 +95,15 @@ def level(high: Array, loop: Loop) -> Array:
     xp = namespace(high)
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        at, _ = state
+        at, moved = state
         front, _ = real_ends(at, sides(at, loop), loop)
         new = at - front.level / front.slope
-        new = xp.where(xp.isfinite(new), xp.clip(new, 0.1 * at, high), at)
-        return new, xp.abs(new - at)
+        # What is done stays: a point's value must not depend on how long its neighbors take.
+        going = xp.isfinite(new) & ~(moved < 1e-3 * at)
+        new = xp.where(going, xp.clip(new, 0.1 * at, high), at)
+        return new, xp.where(going, xp.abs(new - at), moved)
 
-    return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, high), xp)[0]
+    return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
 
 
 def slow_pole(loop: Loop) -> Found:
@@ -177,17 +180,18 @@ def polished(
     xp = namespace(found.re)
 
     def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        re, im, _ = state
+        re, im, last = state
         by_re, by_im = stepper(near(re, im, loop, fractional))
-        size = (by_re * by_re + by_im * by_im) * loop.turns * loop.turns
-        good = (size < _LONGEST_STEP) & ((loop.alpha != 0) | (re != 0))
+        going = ~(last < _DONE)
+        size = xp.where(going, (by_re * by_re + by_im * by_im) * loop.turns * loop.turns, last)
+        good = going & (size < _LONGEST_STEP) & ((loop.alpha != 0) | (re != 0))
         re, im = xp.where(good, re + by_re, re), xp.where(good, im + by_im, im)
         # Past the real axis the conjugate is meant.
         im = xp.abs(im)
         return re, xp.where(im > np.pi, 2.0 * np.pi - im, im), size
 
-    start = (found.re, found.im, 0.0 * found.re)
-    re, im, size = until(steps, step, lambda state: state[2] < 1e-24, start, xp)
+    start = (found.re, found.im, 0.0 * found.re + np.inf)
+    re, im, size = until(steps, step, lambda state: state[2] < _DONE, start, xp)
     settled = (size < _SETTLED) | ((loop.alpha == 0) & (re == 0))
     return Found(xp.where(settled, re, np.nan), im)
 
@@ -201,7 +205,9 @@ def proved(log_r: Array, tolerances: Sequence[Any], loop: Loop, fractional: bool
         full, sure = [at.full for at in seen], [at.sure for at in seen]
     else:
         # One text for all circles.
-        at = circle(log_r + xp.stack(offsets), loop, fractional)
+        shape = (len(offsets), *np.shape(log_r))
+        spread = Loop(*(xp.broadcast_to(field, shape) for field in loop))
+        at = circle(xp.broadcast_to(log_r, shape) + xp.stack(offsets), spread, fractional)
         full, sure = at.full, at.sure
     return [full[k] & sure[k] & ~full[k + 1] & sure[k + 1] for k in range(0, len(offsets), 2)]
 
@@ -234,7 +240,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     eps = epsilon(found.re)
     known, simple = proved(found.re, [eps**0.25, eps**0.58], still, fractional)
     moved = followed(found.re, found.im, loop_of(alpha, beta, delta, d, fractional), still, fractional)
-    change = xp.where(simple, moved, np.nan)
+    change = moved * xp.where(simple, 1.0, np.nan)
     # The value itself is not changed by what its derivatives are worth.
     value = frozen(xp.where(simple, found.re + moved, found.re), xp) + (change - frozen(change, xp))
     value = xp.where(simple, value, frozen(found.re, xp) + 0.0 * change)
