@@ -233,7 +233,7 @@ def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Cr
     ]
     quotient = sizes[0] / sizes[2] * (sizes[1] / sizes[3])
     re, slope_im, rate = loop.turns, 0.0 * x, loop.turns
-    for k, (zero, part, part_im, size) in enumerate(parts):
+    for zero, part, part_im, size in parts:
         scaled = zero / size
         re = re + scaled * part
         slope_im = slope_im - scaled * part_im
