@@ -233,7 +233,7 @@ def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Cr
     ]
     quotient = sizes[0] / sizes[2] * (sizes[1] / sizes[3])
     re, slope_im, rate = loop.turns, 0.0 * x, loop.turns
-    for k, (zero, part, part_im, size) in enumerate(parts):
+    for zero, part, part_im, size in parts:
         scaled = zero / size
         re = re + scaled * part
         slope_im = slope_im - scaled * part_im
@@ -409,7 +409,10 @@ def ratio_step(at: Near) -> tuple[Array, Array]:
 
 
 def newton_step(at: Near) -> tuple[Array, Array]:
-    """Newton's step on P itself, for poles next to a zero of T or B: ``P/P' = (1 + y)/(y F' + (1 + y) B'/B)``, y = T/B."""
+    """Newton's step on P itself, for poles next to a zero of T or B.
+
+    ``P/P' = (1 + y)/(y F' + (1 + y) B'/B)`` with y = T/B.
+    """
     xp = namespace(at.level)
     size = xp.exp(at.level)
     y_re, y_im = -size * xp.cos(at.past), -size * xp.sin(at.past)
