@@ -92,6 +92,9 @@ CASES = [
 
 # Public functions that take no arrays point by point: their own tests hold their contract.
 OTHERS = {
+    "use_compilation_cache": "a setting",
+    "margins": "a tuple of margins: its own tests",
+    "count_poles": "any linear loop: its own tests",
     "allowed_delay": "design questions are slow to compile: their own tests cover batches, bad entries and tracing",
     "assess": "one scene",
     "fastest_damping": "a design question",

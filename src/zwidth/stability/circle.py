@@ -409,7 +409,10 @@ def ratio_step(at: Near) -> tuple[Array, Array]:
 
 
 def newton_step(at: Near) -> tuple[Array, Array]:
-    """Newton's step on P itself, for poles next to a zero of T or B: ``P/P' = (1 + y)/(y F' + (1 + y) B'/B)``, y = T/B."""
+    """Newton's step on P itself, for poles next to a zero of T or B.
+
+    ``P/P' = (1 + y)/(y F' + (1 + y) B'/B)`` with y = T/B.
+    """
     xp = namespace(at.level)
     size = xp.exp(at.level)
     y_re, y_im = -size * xp.cos(at.past), -size * xp.sin(at.past)

@@ -51,7 +51,7 @@ def _search(columns: list[np.ndarray], accuracy: float, fractional: bool, effort
     if columns[0].size <= FEW:
         with np.errstate(all="ignore"):
             return radius_kernel(*columns, tolerance, fractional, *_EFFORTS[effort])
-    return in_blocks(_compiled(fractional, effort), [*columns, tolerance], BLOCK >> 2)
+    return in_blocks(_compiled(fractional, effort), [*columns, tolerance], BLOCK >> 3)
 
 
 def outermost_poles(columns: list[np.ndarray], accuracy: float) -> Poles:

@@ -15,7 +15,7 @@ from zwidth.loop import check_has_poles
 from zwidth.stability.poles import radius_and_bound, radius_by_companion
 from zwidth.stability.proved import Proved, proved_radii
 from zwidth.stability.radius import traced_kernel
-from zwidth.status import Method, Status
+from zwidth.status import Method
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)

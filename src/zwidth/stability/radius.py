@@ -200,11 +200,11 @@ def proved(log_r: Array, tolerances: Sequence[Any], loop: Loop, fractional: bool
     """Whether the radius is ``e^log_r`` within each relative tolerance, in float64 arithmetic."""
     xp = namespace(log_r)
     offsets = [sign * tolerance + 0.0 * log_r for tolerance in tolerances for sign in (1.0, -1.0)]
-    if np.ndim(log_r) == 0 and xp is np:
+    if len(tolerances) == 1:
         seen = [circle(log_r + offset, loop, fractional) for offset in offsets]
         full, sure = [at.full for at in seen], [at.sure for at in seen]
     else:
-        # One text for all circles.
+        # One text for all circles compiles sooner; a text for each runs faster.
         shape = (len(offsets), *np.shape(log_r))
         spread = Loop(*(xp.broadcast_to(field, shape) for field in loop))
         at = circle(xp.broadcast_to(log_r, shape) + xp.stack(offsets), spread, fractional)
