@@ -233,7 +233,7 @@ def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Cr
     ]
     quotient = sizes[0] / sizes[2] * (sizes[1] / sizes[3])
     re, slope_im, rate = loop.turns, 0.0 * x, loop.turns
-    for k, (zero, part, part_im, size) in enumerate(parts):
+    for zero, part, part_im, size in parts:
         scaled = zero / size
         re = re + scaled * part
         slope_im = slope_im - scaled * part_im
@@ -304,12 +304,18 @@ def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     return front, back
 
 
-def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, high: Array = np.inf) -> Circle:
-    """Count the poles inside ``|z| = e^log_r``, and tell where Newton's method expects the next one.
+class _Count(NamedTuple):
+    """How many poles are inside, and what was seen on the way."""
 
-    On a crossover T and B are equally large: one Newton step for ``log(T/B) = an odd multiple of j pi`` leads to a
-    pole, outwards where there are poles outside, else inwards. On the real axis the same in real numbers.
-    """
+    count: Array
+    full: Array
+    sure: Array
+    at: Sides
+    ends: tuple[_End, _End]
+    crossings: list[tuple[_Crossing, Array, Array]]
+
+
+def _counted(log_r: Array, loop: Loop, fractional: bool) -> _Count:
     xp = namespace(log_r, loop.alpha)
     at = sides(log_r, loop)
     sizes = _sizes(at, loop, fractional)
@@ -338,9 +344,24 @@ def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, hig
         crossings.append((here, rest, valid))
     right = xp.where(outer, back.device, back.wall)
     count = right - left + 2.0 * turn
-    full = count == loop.turns + 2.0
-    expected = _expected((log_r, low, high), full, crossings, (front, back), at, loop)
-    return Circle(count, full, sure, *expected)
+    return _Count(count, count == loop.turns + 2.0, sure, at, (front, back), crossings)
+
+
+def inside(log_r: Array, loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """Whether every pole is inside ``|z| = e^log_r``, and whether rounding errors cannot have decided that."""
+    found = _counted(log_r, loop, fractional)
+    return found.full, found.sure
+
+
+def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, high: Array = np.inf) -> Circle:
+    """Count the poles inside ``|z| = e^log_r``, and tell where Newton's method expects the next one.
+
+    On a crossover T and B are equally large: one Newton step for ``log(T/B) = an odd multiple of j pi`` leads to a
+    pole, outwards where there are poles outside, else inwards. On the real axis the same in real numbers.
+    """
+    found = _counted(log_r, loop, fractional)
+    expected = _expected((log_r, low, high), found.full, found.crossings, found.ends, found.at, loop)
+    return Circle(found.count, found.full, found.sure, *expected)
 
 
 def _expected(
