@@ -61,6 +61,11 @@ def _compiled(fractional: bool, effort: int) -> Any:
 def _search(
     columns: list[np.ndarray], accuracy: float, fractional: bool, effort: int, few: int = FEW
 ) -> tuple[np.ndarray, ...]:
+    if columns[0].size == 1:
+        # Plain numbers are several times faster than arrays of one.
+        with np.errstate(all="ignore"):
+            found = _kernel(effort)(*(column[0] for column in columns), accuracy, fractional)
+        return tuple(np.reshape(leaf, 1) for leaf in found)
     tolerance = np.full_like(columns[0], accuracy)
     if columns[0].size <= few:
         with np.errstate(all="ignore"):
@@ -118,12 +123,14 @@ def _map_poles(area: Map, accuracy: float) -> Poles:
 def _by_map(area: Map, accuracy: float) -> Poles:
     """The outermost poles in the order of the axes that the caller gave."""
     fractional = area.d != np.floor(area.d)
-    shape = (area.d.size, area.beta.size, area.alpha.size)
-    found = Poles(*(np.empty(shape) for _ in Poles._fields))
-    for part in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
-        if part.size:
-            here = _map_poles(area.of(part), accuracy)
-            for whole, leaf in zip(found, here, strict=True):
+    parts = [part for part in (np.flatnonzero(fractional), np.flatnonzero(~fractional)) if part.size]
+    if len(parts) == 1:
+        found = _map_poles(area, accuracy)
+    else:
+        shape = (area.d.size, area.beta.size, area.alpha.size)
+        found = Poles(*(np.empty(shape) for _ in Poles._fields))
+        for part in parts:
+            for whole, leaf in zip(found, _map_poles(area.of(part), accuracy), strict=True):
                 whole[part] = leaf
     back = np.argsort(area.order)
     return Poles(*(leaf.reshape(area.shape).transpose(back).reshape(-1) for leaf in found))
@@ -155,19 +162,34 @@ def poles_of(arrays: list[np.ndarray], accuracy: float) -> tuple[Poles, np.ndarr
     return outermost_poles(columns, accuracy), status
 
 
-def proved_radii(values: tuple[ArrayLike, ...], accuracy: float) -> Proved:
+def radii(values: tuple[ArrayLike, ...], accuracy: float) -> Array:
     """Spectral radii of concrete arguments."""
+    arrays = broadcast(NAMES, values)
+    found, status = poles_of(arrays, accuracy)
+    return to_caller(_radius(found, status).reshape(arrays[0].shape), values)
+
+
+def _radius(found: Poles, status: np.ndarray) -> np.ndarray:
+    radius = np.exp(found.re)
+    radius[np.flatnonzero(status)] = np.nan
+    return radius
+
+
+def proved_radii(values: tuple[ArrayLike, ...], accuracy: float) -> Proved:
+    """Spectral radii of concrete arguments, with errors and certificates."""
     arrays = broadcast(NAMES, values)
     shape = arrays[0].shape
     found, status = poles_of(arrays, accuracy)
-    radius = np.exp(found.re)
+    radius = _radius(found, status)
+    ok = status == Status.OK
+    certified = ok & (found.error <= accuracy)
+    error = np.where(certified, np.expm1(accuracy), np.inf)
+    rest = np.flatnonzero(~certified & np.isfinite(found.error))
+    error[rest] = np.expm1(found.error[rest])
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
-    error = (np.expm1(found.error) + 2e-16) * radius
-    error = np.where(np.isfinite(found.error), error, np.inf)
-    certified = found.error <= accuracy
-    bad = np.flatnonzero(status)
-    radius[bad], error[bad], certified[bad] = np.nan, np.nan, False
-    status = np.where((status == Status.OK) & ~certified, np.int32(Status.NOT_CONVERGED), status).astype(np.int32)
+    error = np.where(np.isinf(error), error, (error + 2e-16) * radius)
+    error[~ok] = np.nan
+    status = np.where(ok & ~certified, np.int32(Status.NOT_CONVERGED), status).astype(np.int32)
     leaves = Proved(radius, error, certified, status)
     return to_caller(Proved(*(leaf.reshape(shape) for leaf in leaves)), values)
 

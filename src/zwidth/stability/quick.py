@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.stability.circle import Loop, inside, loop_of, near, ratio_step
-from zwidth.stability.pole_step import pole_step
+from zwidth.stability.circle import Loop, inside, loop_of
+from zwidth.stability.pole_step import pole_step, ratio_step
 from zwidth.stability.radius import Found, largest, level, slow_pole
 from zwidth.xp import namespace, repeat
 
+_LEVEL_STEPS = 3
 _RATIO_STEPS = 2
 _STEPS = 6
 # Bounds of the distance to a pole at which Newton's method has nearly arrived.
@@ -48,11 +49,11 @@ def stepped(re: Array, im: Array, loop: Loop, fractional: bool, limit: bool = Tr
 def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     """The first pair of the ring, to a few digits."""
     xp = namespace(loop.alpha)
-    re = level(largest(loop), loop)
+    re = level(largest(loop), loop, _LEVEL_STEPS)
     im = np.pi / (loop.turns + 1.0) + 0.0 * re
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        by_re, by_im = ratio_step(near(*state, loop, fractional))
+        by_re, by_im = ratio_step(*state, loop, fractional)
         good = (by_re * by_re + by_im * by_im) * loop.turns * loop.turns < 4.0
         return moved(*state, xp.where(good, by_re, 0.0), xp.where(good, by_im, 0.0))
 
@@ -68,7 +69,7 @@ def candidate(loop: Loop, fractional: bool) -> Found:
     def step(state: tuple[Array, Array, Array, Array]) -> tuple[Array, ...]:
         return (*stepped(*state[:2], loop, fractional), *stepped(*state[2:], loop, fractional))
 
-    slow_re, slow_im, re, im = repeat(_STEPS - 1, step, starts, xp)
+    slow_re, slow_im, re, im = _iterated(step, starts, xp)
     last, last_pair = pole_step(slow_re, slow_im, loop, fractional), pole_step(re, im, loop, fractional)
     slow_re, slow_im = moved(slow_re, slow_im, last.re, last.im)
     re, im = moved(re, im, last_pair.re, last_pair.im)
@@ -83,6 +84,17 @@ def candidate(loop: Loop, fractional: bool) -> Found:
     at_one = still & (re == 0)
     after_re, after_im = stepped(re, im, loop, fractional)
     return Found(xp.where(at_one, 0.0, after_re), xp.where(at_one, 0.0, after_im))
+
+
+def _iterated(step: Any, state: Any, xp: Any) -> Any:
+    """All steps but the last; a single point stops where it stands still."""
+    if xp is not np or np.ndim(state[0]):
+        return repeat(_STEPS - 1, step, state, xp)
+    for _ in range(_STEPS - 1):
+        before, state = state, step(state)
+        if all(abs(new - old) < 1e-6 for new, old in zip(state, before, strict=True)):
+            break
+    return state
 
 
 def certified(found: Found, tolerance: Array, loop: Loop, fractional: bool) -> tuple[Array, Array, Array]:

@@ -60,9 +60,11 @@ class Map(NamedTuple):
 def as_map(points: Points) -> Map | None:
     """The points as a map of one or several devices, where they are one and it is large enough."""
     shape, alone = points.shape, []
-    for array in (points.beta, points.alpha):
-        varying = [axis for axis, length in enumerate(array.shape) if length > 1]
-        if len(varying) != 1 or any(other.shape[varying[0]] > 1 for other in points if other is not array):
+    for name in ("beta", "alpha"):
+        varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1]
+        # By name: one and the same array may be given twice.
+        others = [array for other, array in points._asdict().items() if other != name]
+        if len(varying) != 1 or any(other.shape[varying[0]] > 1 for other in others):
             return None
         alone.append(varying[0])
     if points.alpha.size * points.beta.size < SMALLEST_MAP:
