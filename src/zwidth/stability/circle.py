@@ -261,10 +261,17 @@ class _End(NamedTuple):
     opposite: Array  # their signs differ
     level: Array  # log |T/B|
     slope: Array  # F' there, a real number
+    device_size: Array  # |T| and |B|
+    wall_size: Array
 
 
 def _end(
-    log_r: Array, factors: tuple[Array, ...], signs: tuple[Array, Array], angles: tuple[Array, Array], loop: Loop
+    log_r: Array,
+    at: Sides,
+    factors: tuple[Array, ...],
+    signs: tuple[Array, Array],
+    angles: tuple[Array, Array],
+    loop: Loop,
 ) -> _End:
     """From z - 1, z - c, a2 z + h, 1 + q/z, s z - beta and z + q, all real."""
     one, pole, body, late, wall, shifted = factors
@@ -272,7 +279,8 @@ def _end(
     level = loop.turns * log_r + xp.log(xp.abs(one * pole / (body * late * wall)))
     slope = loop.turns + 1.0 / one + loop.c / pole + loop.h / body - loop.beta / wall
     slope = slope + xp.where(loop.q > 0, loop.q / shifted, 0.0)
-    return _End(*angles, signs[0] != signs[1], level, slope)
+    sizes = at.up * xp.abs(one * pole), at.down * xp.abs(body * late * wall)
+    return _End(*angles, signs[0] != signs[1], level, slope, *sizes)
 
 
 def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
@@ -284,6 +292,7 @@ def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     behind = at.front < 0
     front = _end(
         log_r,
+        at,
         (at.near, at.off, at.body, 1.0 + ratio, at.front, r + loop.q),
         ((at.near < 0) != (at.off < 0), behind),
         (device, xp.where(behind, half, 0.0)),
@@ -293,6 +302,7 @@ def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     flipped = (body < 0) != ((late < 0) != (wall < 0))
     back = _end(
         log_r,
+        at,
         (-1.0 - r, -loop.c - r, body, late, wall, loop.q - r),
         (xp.mod(loop.turns, 2.0) == 1.0, flipped),
         (
@@ -304,12 +314,24 @@ def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     return front, back
 
 
-def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, high: Array = np.inf) -> Circle:
-    """Count the poles inside ``|z| = e^log_r``, and tell where Newton's method expects the next one.
+def _tied(end: _End, blur: Array) -> Array:
+    """Whether T and B may cancel there but for rounding errors."""
+    xp = namespace(blur)
+    return end.opposite & (xp.abs(end.device_size - end.wall_size) < blur * end.wall_size)
 
-    On a crossover T and B are equally large: one Newton step for ``log(T/B) = an odd multiple of j pi`` leads to a
-    pole, outwards where there are poles outside, else inwards. On the real axis the same in real numbers.
-    """
+
+class _Count(NamedTuple):
+    """How many poles are inside, and what was seen on the way."""
+
+    count: Array
+    full: Array
+    sure: Array
+    at: Sides
+    ends: tuple[_End, _End]
+    crossings: list[tuple[_Crossing, Array, Array]]
+
+
+def _counted(log_r: Array, loop: Loop, fractional: bool) -> _Count:
     xp = namespace(log_r, loop.alpha)
     at = sides(log_r, loop)
     sizes = _sizes(at, loop, fractional)
@@ -320,7 +342,7 @@ def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, hig
     eps = epsilon(log_r)
     blur = 4.0 * eps * (loop.turns + 8.0)
     # Where a real pole is on the circle itself.
-    sure = ~((front.opposite & (xp.abs(front.level) < blur)) | (back.opposite & (xp.abs(back.level) < blur)))
+    sure = ~(_tied(front, blur) | _tied(back, blur))
     turn, crossings = 0.0 * left, []
     for x in zeros:
         valid = (x >= 0) & (x < 1.0)
@@ -338,9 +360,24 @@ def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, hig
         crossings.append((here, rest, valid))
     right = xp.where(outer, back.device, back.wall)
     count = right - left + 2.0 * turn
-    full = count == loop.turns + 2.0
-    expected = _expected((log_r, low, high), full, crossings, (front, back), at, loop)
-    return Circle(count, full, sure, *expected)
+    return _Count(count, count == loop.turns + 2.0, sure, at, (front, back), crossings)
+
+
+def inside(log_r: Array, loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """Whether every pole is inside ``|z| = e^log_r``, and whether rounding errors cannot have decided that."""
+    found = _counted(log_r, loop, fractional)
+    return found.full, found.sure
+
+
+def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, high: Array = np.inf) -> Circle:
+    """Count the poles inside ``|z| = e^log_r``, and tell where Newton's method expects the next one.
+
+    On a crossover T and B are equally large: one Newton step for ``log(T/B) = an odd multiple of j pi`` leads to a
+    pole, outwards where there are poles outside, else inwards. On the real axis the same in real numbers.
+    """
+    found = _counted(log_r, loop, fractional)
+    expected = _expected((log_r, low, high), found.full, found.crossings, found.ends, found.at, loop)
+    return Circle(found.count, found.full, found.sure, *expected)
 
 
 def _expected(

@@ -13,7 +13,7 @@ from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.poles import radius_and_bound, radius_by_companion
-from zwidth.stability.proved import Proved, proved_radii
+from zwidth.stability.proved import Proved, proved_radii, radii
 from zwidth.stability.radius import traced_kernel
 from zwidth.status import Method
 
@@ -90,7 +90,7 @@ def spectral_radius(
         return radius_by_companion(*values)
     if is_traced(*values):
         return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
-    return proved_radii(values, wanted).radius
+    return radii(values, wanted)
 
 
 def _exp(value: Array) -> Array:

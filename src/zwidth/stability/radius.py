@@ -90,7 +90,7 @@ def until(steps: int, step: Callable[[Any], Any], done: Callable[[Any], Array], 
     )[1]
 
 
-def level(high: Array, loop: Loop) -> Array:
+def level(high: Array, loop: Loop, steps: int = _LEVEL_STEPS) -> Array:
     """Where T and B are equally large on the real axis, the top of the curve on which the poles lie."""
     xp = namespace(high)
 
@@ -103,7 +103,7 @@ def level(high: Array, loop: Loop) -> Array:
         new = xp.where(going, xp.clip(new, 0.1 * at, high), at)
         return new, xp.where(going, xp.abs(new - at), moved)
 
-    return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
+    return until(steps, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
 
 
 def slow_pole(loop: Loop) -> Found:
