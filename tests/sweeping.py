@@ -28,7 +28,10 @@ def study(name="map", axes=None, outputs=("stable",), **fields):
     return {"kind": "sweep", "name": name, "axes": AXES if axes is None else axes, "outputs": list(outputs), **fields}
 
 
-WALLS = ("stable", "spectral_radius", "margin", "settling_time", "passive", "passivity_margin")
+WALLS = (
+    *("stable", "spectral_radius", "margin", "decay_rate", "settling_time", "passive", "passivity_margin"),
+    *("gain_margin", "phase_margin", "delay_margin", "modulus_margin"),
+)
 DEVICES = ("alpha_max", "beta_at_max", "kind")
 FEW = {"alpha": [0.0, 0.1, 0.5], "beta": [-0.05, 0.1, 0.4, 0.9], "delta": [0.0, 0.3], "d": [0, 0.5, 2]}
 IN_SI = {

@@ -133,8 +133,7 @@ def _cells(fractional: bool) -> Any:
         middle, re, im, device = (part[..., None, None] for part in (middle, re, im, device))
         da, db = alpha - middle[0], beta - middle[1]
         z_re, z_im = (
-            part[0] + da * (part[1] + da * part[3] + db * part[4]) + db * (part[2] + db * part[5])
-            for part in (re, im)
+            part[0] + da * (part[1] + da * part[3] + db * part[4]) + db * (part[2] + db * part[5]) for part in (re, im)
         )
         z_re, z_im = moved(z_re, z_im, 0.0, 0.0)
         nothing = 0.0 * device[0]

@@ -17,12 +17,14 @@ import numpy as np
 
 from zwidth.batching import FEW
 from zwidth.stability.boundary_map import row_limits
+from zwidth.stability.decay import decay_rate
+from zwidth.stability.margins import margins
 from zwidth.stability.passivity import margin_at_one_delay
 from zwidth.stability.proved import proved_radii
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
-from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, Family
+from zwidth.sweep.outputs import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 Columns: TypeAlias = tuple[np.ndarray, ...]
 
@@ -37,6 +39,7 @@ _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
 _MANY_ROWS = 256
 _DECAY = math.log(50.0)
+_MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
 def compute(family: Family, outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
@@ -80,12 +83,17 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
     found: dict[str, np.ndarray] = {}
     unproved = False
-    if {"spectral_radius", "margin", "settling_time"} & set(outputs):
-        radius, proved = _radius(block, shape, accuracy)
-        found["spectral_radius"], unproved = radius, ~proved
-        found["margin"] = 1.0 - radius
-        if "settling_time" in outputs:
-            found["settling_time"] = _settling_time(radius, block)
+    if RADIUS_OUTPUTS & set(outputs):
+        radius, proved, rate = _by_device(partial(_radius_columns, accuracy), block, shape, _all_devices, leaves=3)
+        found["spectral_radius"], unproved = radius, proved == 0
+        # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
+        found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
+        found["margin"] = -np.expm1(-rate)
+        found["settling_time"] = _settling_time(rate, block)
+    if MARGIN_OUTPUTS & set(outputs):
+        found |= dict(zip(_MARGINS, _by_device(_margins, block, shape, _all_devices, leaves=4), strict=True))
+        if block.period.size:
+            found["delay_margin"] = found["delay_margin"] * block.period[:, None, None]
     if "stable" in outputs:
         found["stable"] = _stable(block, shape)
     if {"passive", "passivity_margin"} & set(outputs):
@@ -106,7 +114,7 @@ def _status(
     status = np.full(shape, Status.OK, dtype=np.uint8)
     status[unproved] = Status.NOT_CONVERGED
     for name in outputs:
-        if OUTPUTS[name].dtype == "float64":
+        if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS:
             status[np.isnan(found[name])] = Status.NOT_CONVERGED
     device = np.isfinite(block.delta) & np.isfinite(block.d)
     alpha, beta = np.isfinite(block.alpha), np.isfinite(block.beta)
@@ -115,10 +123,10 @@ def _status(
     return status
 
 
-def _settling_time(radius: np.ndarray, block: Block) -> np.ndarray:
+def _settling_time(rate: np.ndarray, block: Block) -> np.ndarray:
     """The time in which the slowest pole decays to 2 %, in seconds where there is a period."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        periods = np.where(radius < 1.0, _DECAY / -np.log(radius), np.where(np.isnan(radius), np.nan, np.inf))
+        periods = np.where(rate > 0, _DECAY / rate, np.where(np.isnan(rate), np.nan, np.inf))
     return periods * block.period[:, None, None] if block.period.size else periods
 
 
@@ -182,19 +190,26 @@ def _by_device(
     return results
 
 
-def _radius(block: Block, shape: tuple[int, ...], accuracy: float) -> tuple[np.ndarray, np.ndarray]:
-    """The spectral radius, and whether it is proved to an accuracy; NaN where no error bound is."""
-    radius, proved = _by_device(partial(_radius_columns, accuracy), block, shape, _all_devices, leaves=2)
-    return radius, proved != 0
-
-
 def _radius_columns(accuracy: float, columns: Columns) -> Columns:
+    """The spectral radius, whether it is proved to an accuracy (NaN where no error bound is), and the rate of decay."""
+
     def of_piece(*piece: np.ndarray) -> Columns:
         found = proved_radii(piece, accuracy)
+        rate = np.asarray(decay_rate(*piece))
         radius = np.where(np.isfinite(found.error), found.radius, np.nan)
-        return radius, np.asarray(found.certified, dtype=np.float64)
+        # The rate has more digits of it.
+        radius = np.where(np.isfinite(rate), np.exp(-rate), radius)
+        return radius, np.asarray(found.certified, dtype=np.float64), rate
 
     return in_pieces(of_piece, columns, _RADIUS_PIECE)
+
+
+def _margins(columns: Columns) -> Columns:
+    def of_piece(*piece: np.ndarray) -> Columns:
+        found = margins(*piece)
+        return tuple(np.asarray(getattr(found, name)) for name in _MARGINS)
+
+    return in_pieces(of_piece, columns, _WALL_PIECE)
 
 
 def _all_devices(d: np.ndarray) -> Iterator[np.ndarray]:

@@ -15,7 +15,7 @@ import numpy as np
 from zwidth.errors import ResourceError
 from zwidth.sweep.files import check_folder, existing
 from zwidth.sweep.grid import Grid
-from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
+from zwidth.sweep.outputs import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.sweep.sweeps import SweepStudy
 
 MEMORY = 2**28
@@ -31,7 +31,6 @@ _LARGEST_CHUNK = 2**25
 _FEWEST_CHUNKS = 16
 _SMALLEST_CHUNK = 2**15
 _LAID_OUT_BYTES = 96 * 2**20
-_RADIUS_OUTPUTS = {"spectral_radius", "margin", "settling_time"}
 
 Methods: TypeAlias = dict[str, str]
 Rate: TypeAlias = Callable[[str], float]
@@ -224,7 +223,7 @@ def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
     methods = {}
     if "stable" in study.outputs:
         methods["stable"] = ("crossover", "no pole is needed: the end of each row in closed form, then a comparison")
-    if _RADIUS_OUTPUTS & set(study.outputs):
+    if RADIUS_OUTPUTS & set(study.outputs):
         proof = f"each value proved to {study.accuracy:g} by two counts of the poles, at a cost that is flat in d"
         methods["spectral_radius"] = ("newton", proof)
     return methods
@@ -286,15 +285,17 @@ def _machine_memory() -> int:
 
 def _computed(outputs: tuple[str, ...]) -> set[str]:
     """The outputs that cost something; the others follow from them."""
-    costly = {"spectral_radius" if name in _RADIUS_OUTPUTS else name for name in outputs}
+    costly = {"spectral_radius" if name in RADIUS_OUTPUTS else name for name in outputs}
     costly = {"passive" if name == "passivity_margin" else name for name in costly}
+    costly = {"modulus_margin" if name in MARGIN_OUTPUTS else name for name in costly}
     return {"alpha_max" if OUTPUTS[name].family == "device" else name for name in costly}
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:
     """Memory for a point of a chunk: results, what they are made of, and copies while they are written."""
     floats = sum(OUTPUTS[name].dtype == "float64" for name in outputs)
-    hidden = 40 if _RADIUS_OUTPUTS & set(outputs) else 0
+    hidden = 56 if RADIUS_OUTPUTS & set(outputs) else 0
+    hidden += 32 if MARGIN_OUTPUTS & set(outputs) else 0
     hidden += 8 if {"passive", "passivity_margin"} & set(outputs) else 0
     return 8 * floats + hidden + (16 if floats else 0) + len(outputs) + 4
 
@@ -319,7 +320,7 @@ def _most_periods(study: SweepStudy, grid: Grid) -> float:
 
 def _rate(output: str) -> float:
     """Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it."""
-    return {"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 8e4}[output]
+    return {"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 8e4, "modulus_margin": 5e3}[output]
 
 
 def _size(count: float) -> str:
