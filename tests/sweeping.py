@@ -41,7 +41,7 @@ def config_of_everything():
     """Every output, in both kinds of units, and radii to an accuracy."""
     return config_of(
         study("map", FEW, (*WALLS, *DEVICES)),
-        study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-9),
+        study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-11),
         study("si", IN_SI, (*WALLS, "stiffness_max", "virtual_damping_at_max")),
     )
 

@@ -99,7 +99,8 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
 
     NaN where the wall is not stable, where poles so nearly coincide that rounding hides their modes, and for d > 500.
     """
-    stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
+    with np.errstate(all="ignore"):
+        stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
     if not stable or d > _LONGEST:
         return math.nan
     with np.errstate(all="ignore"):

@@ -70,17 +70,21 @@ def gain_crossover(alpha: Array, beta: Array, here: Device, kind: Kind) -> Cross
     h1 = 2.0 * (p1 * p1 * ((beta - delta) * (beta + delta) + alpha * beta) - m1 * square)
     rest = corner * square - 2.0 * m1 * spread
     h2, h3 = rest - 4.0 * c, corner * spread
+    at_one = h0 + (h1 + h2 + h3)
     # At z = -1 the device and its delay must be the larger part.
     one, other = 2.0 * (1.0 + c), gap * turned
     exists = xp.abs(other) < one
     far, first = False, (h1, rest, h3)
     if kind.short:
-        far = h0 + (h1 + h2 + h3) > 0
+        far = at_one > 0
         g1 = 2.0 * (mu * mu - gap * sigma)
         tall = turned * turned
         h0 = xp.where(far, (one - other) * (one + other), h0)
         h1 = xp.where(far, gap * gap * spread - g1 * tall - 2.0 * (em * em + 8.0 * c), h1)
         h2 = xp.where(far, 4.0 * c - corner * tall + g1 * spread, h2)
+    else:
+        # A zero behind u = 1 is not sought: what the steps towards it end with means nothing.
+        exists = exists & (at_one <= 0)
     near = first_zero(h0, h1, h2, h3, kind.fractional, xp)
     u, y = xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near)
     return Crossover(u, y, _lean(alpha, u, first, here, xp), exists & (near > 0) & (near <= 1.0))

@@ -14,7 +14,7 @@ from zwidth._types import Array, ArrayLike
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_wall
 from zwidth.plant import split_delay
-from zwidth.stability.crossover import gain_crossover, phase_at
+from zwidth.stability.crossover import gain_crossover, stable_at
 from zwidth.stability.devices import ANY, Device, device
 from zwidth.stability.modulus import modulus
 from zwidth.stability.open_loop import along, angle_of, by_samples, sign_change, size_and_phase
@@ -27,6 +27,8 @@ _STEPS = 240
 _FRACTIONS = 64
 # alpha, beta, delta, d and any phase.
 _STABLE_WALL = (0.1, 0.4, 0.1, 0.0, 1.0)
+# Of a stable wall whose margins vanish in rounding.
+_LEAST_MARGIN = float(np.finfo(np.float32).tiny)
 # A phase that says unstable, where |L| is above 1 at every frequency.
 _NO_CROSSOVER = -1e-3
 
@@ -104,8 +106,7 @@ def _margins_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Margin
     w = xp.where(crosses, angle_of(crossover), 1.0)
     decisive = crosses & (beta > -delta)
     phase = xp.where(decisive, size_and_phase(w, alpha, beta, here)[1], xp.nan)
-    at = phase_at(alpha, beta, crossover, here)
-    stable = at.usable & (at.im > 0)
+    stable = stable_at(alpha, beta, here, ANY)
     gain, phase_crossover = _gain_margin(alpha, beta, here, xp)
     # Elsewhere a wall that is stable is asked about.
     known = zip((alpha, beta, delta, d, phase), _STABLE_WALL, strict=True)
@@ -113,15 +114,20 @@ def _margins_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Margin
     delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
     distance, closest = modulus(alpha, beta, here)
     fields = (
-        gain,
-        phase * (180.0 / np.pi),
-        delay,
+        _on_the_side(gain, 1.0, epsilon(gain), stable, xp),
+        _on_the_side(phase * (180.0 / np.pi), 0.0, _LEAST_MARGIN, stable, xp),
+        xp.where(stable, xp.maximum(delay, _LEAST_MARGIN), delay),
         distance,
         phase_crossover,
         xp.where(crosses, w, xp.nan),
         closest,
     )
     return Margins(*(field + spoiled for field in fields))
+
+
+def _on_the_side(margin: Array, edge: float, least: float, stable: Array, xp: Any) -> Array:
+    """A margin on the verdict's side of the edge: within rounding of it the two would contradict each other."""
+    return xp.where(stable, xp.maximum(margin, edge + least), xp.minimum(margin, edge))
 
 
 def _gain_margin(alpha: Array, beta: Array, here: Device, xp: Any) -> tuple[Array, Array]:
@@ -131,10 +137,14 @@ def _gain_margin(alpha: Array, beta: Array, here: Device, xp: Any) -> tuple[Arra
     ends the stable part, or the line of z = -1 does, where ``|L(-1)| = 1``.
     """
 
-    def phase(log_w: Array) -> Array:
-        return size_and_phase(xp.exp(log_w), alpha, beta, here)[1]
-
     whole, em = here.whole, here.em
+
+    def phase(log_w: Array) -> Array:
+        # Times a positive factor: of order one on either side of sqrt(em), where for light damping the phase itself
+        # is below rounding long before it changes sign.
+        w = xp.exp(log_w)
+        return size_and_phase(w, alpha, beta, here)[1] * ((w + em) / (w * w + em))
+
     # Here the phase of an undamped device is still that of its slope, of any other it is above pi/2 - 1/2.
     slowness = 1.0 / xp.where(em > 0, em, 1e-9) + whole + 2.0 + xp.abs(beta) / alpha
     low, high = -xp.log(2.0 * slowness), xp.log(np.pi / (whole + 1.0))

@@ -72,7 +72,8 @@ def short_row(beta: Array, device: Device) -> Array:
     curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / (p1 * p1 + y * (v1 + v2 * y))
     corner_reached = (tilt > 0) & (start + slope + 16.0 * a0 > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
-    fractional = xp.where((square >= 0) & (y <= 1), curve, beyond)
+    # Behind the lobe the curve comes from infinity with b < 0: a row above all of the lobe must not end there.
+    fractional = xp.where((square >= 0) & (y <= 1) & (u0 + u1 * y > 0), curve, beyond)
     limit = xp.where(f == 0, whole, fractional)
     line = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
     limit = xp.where(tilt > 0, xp.minimum(limit, line), limit)

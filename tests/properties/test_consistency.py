@@ -1,0 +1,214 @@
+"""What different functions say of one wall agrees, over the whole domain and in its corners.
+
+Every function here answers by itself: the verdict by the phase at the gain crossover, the radius by Newton steps and
+two counts, the limits by the lobe's monotone functions, passivity by a frequency condition, settling by modes. Where
+two of them say different things of a wall, the certified verdict, proved in balls, tells which of them is wrong.
+
+As a program: ``python tests/properties/test_consistency.py COUNT SEED`` prints how many contradictions it finds.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.domain import wall_status
+from zwidth.settling import settling_time
+from zwidth.stability.radii import radius_of
+from zwidth.status import Status
+
+# Walls that are judged at one time: few enough for NumPy, so that nothing is compiled.
+BLOCK = 2000
+ULP = 2.0**-52
+# Every limit is right to about this, times its condition: so close to it two functions may round to different sides.
+ROUNDING = 1e-13
+DELTAS = [0.0, 1e-300, 1e-30, 1e-16, 1e-8, 1e-3, 1.0, 3.65936162742, 40.0, 750.0, 1e6, 1e12]
+DELAYS = [0.0, 5e-324, 1e-300, 1e-16, 0.25, 0.5, 1 - ULP / 2, 1.0, 1 + ULP, 2.0, 3 - 2 * ULP, 8.0, 64.5, 500.0]
+DELAYS += [1e4 + 0.3, 99999.5, 1e5 - 1e-10, 1e5]
+ALPHAS = [0.0, 1e-60, 1e-30, 1e-17, 1e-13, 1e-8, 0.1, 1e3, 1e30, 1e60]
+
+
+class Walls(NamedTuple):
+    """Walls on their devices, arrays of one length."""
+
+    alpha: np.ndarray
+    beta: np.ndarray
+    delta: np.ndarray
+    d: np.ndarray
+
+    def __getitem__(self, chosen) -> Walls:
+        return Walls(*(column[chosen] for column in tuple(self)))
+
+
+def draw(count: int, random: np.random.Generator) -> Walls:
+    """Half of them all over the domain, half of them in its corners, for each of the four numbers by itself."""
+    wide, corner = random.random((2, count)) < 0.5
+
+    def power(low, high):
+        return 10.0 ** random.uniform(low, high, count)
+
+    delta = np.where(wide, np.where(random.random(count) < 0.1, 0.0, power(-9, 6)), random.choice(DELTAS, count))
+    whole = np.floor(power(0, 2.5) - 1.0)
+    anywhere = np.where(random.random(count) < 0.5, whole, np.minimum(power(-4, 5), 1e5))
+    d = np.where(random.random(count) < 0.5, anywhere, random.choice(DELAYS, count))
+    ridge = zwidth.alpha_max(delta, d)
+    # Stiffnesses below and above the stiffest, or next to a corner of the range.
+    alpha = ridge.alpha * np.where(random.random(count) < 0.5, random.uniform(0, 1.3, count), power(-8, 0.3))
+    alpha = np.where(corner & (random.random(count) < 0.4), random.choice(ALPHAS, count), alpha)
+    alpha = np.where(random.random(count) < 0.03, -alpha, alpha)
+    beta = inside_out(alpha, delta, d, ridge, random)
+    rows = random.random(count) < 0.15
+    limit = zwidth.boundary_point(delta, d, beta=beta).alpha
+    alpha = np.where(rows & (limit > 0), nudged(limit, random), alpha)
+    walls = Walls(limited(alpha, 1e60), limited(beta, 1e60), delta, d)
+    assert np.all(wall_status(*walls) == Status.OK)
+    return walls
+
+
+def inside_out(alpha, delta, d, ridge, random):
+    """Dampings across the stable ones of each column and beyond, beside their ends, and in the corners."""
+    count = alpha.size
+    soft = np.minimum(np.abs(alpha), 0.999 * ridge.alpha)
+    soft = np.where(soft > 0, np.maximum(soft, 1e-60), 0.5 * ridge.alpha)
+    low, high = (zwidth.boundary_point(delta, d, alpha=soft, side=side).beta for side in ("lower", "upper"))
+    width = np.where(np.isfinite(high - low), high - low, 1.0)
+    low = np.where(np.isfinite(low), low, -delta)
+    across = low + width * random.uniform(-0.4, 1.4, count)
+    ulps = -delta * (1.0 + random.integers(-4, 5, count) * ULP)
+    near_start = -delta + width * 10.0 ** random.uniform(-17, 0, count)
+    choices = [
+        across,
+        across,
+        near_start,
+        ulps,
+        nudged(low, random),
+        nudged(low + width, random),
+        ridge.beta,
+        np.zeros(count),
+        random.choice([-1.0, 1.0], count) * 10.0 ** random.uniform(-60, 60, count),
+    ]
+    return np.choose(random.integers(0, len(choices), count), choices)
+
+
+def nudged(value, random):
+    """Within 1e-12 of a value, half of them within some units in the last place."""
+    close = random.integers(-3, 4, value.size) * ULP
+    return value * (1.0 + np.where(random.random(value.size) < 0.5, close, random.uniform(-1e-12, 1e-12, value.size)))
+
+
+def limited(value, most):
+    size = np.abs(value)
+    return np.where(size < 1e-60, 0.0, np.sign(value) * np.minimum(size, most))
+
+
+class Facts(NamedTuple):
+    """What the functions say of the same walls."""
+
+    walls: Walls
+    stable: np.ndarray
+    proved: np.ndarray  # the certified verdict, where there is one
+    known: np.ndarray  # whether there is one
+    row: zwidth.BoundaryPoint
+    lower: zwidth.BoundaryPoint
+    upper: zwidth.BoundaryPoint
+    ridge: zwidth.RidgePoint
+    margins: zwidth.Margins
+    rate: np.ndarray
+    radius: np.ndarray
+    error: np.ndarray
+    passive: np.ndarray
+    excess: np.ndarray
+
+
+def facts_of(walls: Walls) -> Facts:
+    """Ask every function about every wall."""
+    alpha, beta, delta, d = walls
+    certified = zwidth.stability_of(*walls, method="certified")
+    found = radius_of(*walls)
+    column = np.where(alpha > 0, alpha, np.nan)
+    return Facts(
+        walls,
+        zwidth.is_stable(*walls),
+        certified.stable,
+        np.isin(certified.status, [Status.OK, Status.ON_BOUNDARY]),
+        zwidth.boundary_point(delta, d, beta=beta),
+        zwidth.boundary_point(delta, d, alpha=column, side="lower"),
+        zwidth.boundary_point(delta, d, alpha=column, side="upper"),
+        zwidth.alpha_max(delta, d),
+        zwidth.margins(*walls),
+        zwidth.decay_rate(*walls),
+        found.radius,
+        found.error,
+        zwidth.is_passive(*walls),
+        zwidth.passivity_margin(*walls),
+    )
+
+
+def contradictions(f: Facts) -> dict[str, np.ndarray]:
+    """Each statement that must hold of all walls, and where it does not."""
+    alpha, beta = f.walls.alpha, f.walls.beta
+    spring = alpha > 0
+    stable, m = f.stable, f.margins
+    rows, columns = f.row.status == Status.OK, f.lower.status == Status.OK
+    inside = (beta > f.lower.beta) & (beta < f.upper.beta)
+    unknown = (Status.OK, Status.NO_BOUNDARY)
+    return {
+        "the certified verdict is known": ~f.known,
+        "the certified verdict is the verdict": f.known & (f.proved != stable),
+        "stable walls are springs": stable & ~spring,
+        "the radius is below 1 for stable walls": stable & (f.radius > 1.0 + np.maximum(f.error, 4 * ULP)),
+        "the radius of other walls is not": ~stable & (f.radius < 1.0 - np.maximum(f.error, 4 * ULP)),
+        "the decay rate has the sign of the verdict": ~np.isnan(f.rate) & ((f.rate > 0) != stable),
+        "the decay rate is the radius": np.abs(np.exp(-f.rate) - f.radius) > 1e-9 * f.radius + f.error,
+        "the phase margin has the sign of the verdict": spring & ((m.phase_margin > 0) & (beta > -f.walls.delta))
+        != stable,
+        "the gain margin is above 1 for stable walls": spring & ((m.gain_margin > 1) != stable),
+        "stable walls bear more delay": spring & ((m.delay_margin > 0) != stable),
+        "the modulus margin is at most 1 for stable walls": stable & ~((m.modulus_margin > 0) & (m.modulus_margin <= 1)),
+        "a row ends beyond its stable walls": stable & ~(rows & (f.row.alpha > alpha)),
+        "a row ends before its other walls": spring & ~stable & rows & (f.row.alpha > alpha),
+        "rows are OK or empty": ~np.isin(f.row.status, unknown),
+        "a column holds its stable walls": stable & ~(columns & inside),
+        "a column holds no other walls": spring & ~stable & columns & inside,
+        "columns are OK or empty": spring & ~np.isin(f.lower.status, unknown),
+        "both ends of a column exist": spring & (f.lower.status != f.upper.status),
+        "columns are in order": columns & ~(f.lower.beta <= f.upper.beta),
+        "no row is longer than the stiffest wall": rows & ~(f.row.alpha <= f.ridge.alpha * (1 + 8 * ULP)),
+        "no stable wall is stiffer than the stiffest": stable & ~(alpha < f.ridge.alpha * (1 + 8 * ULP)),
+        "every device has a stiffest wall": (f.ridge.status != Status.OK) | ~(f.ridge.alpha > 0),
+        "passive springs are stable": f.passive & spring & ~stable,
+        "passive walls have an excess": f.passive != (f.excess > 0),
+    }
+
+
+def near_the_edge(walls: Walls) -> np.ndarray:
+    """Whether the proved verdict changes within rounding of the wall, in stiffness or in damping."""
+    alpha, beta, delta, d = walls
+    # b = beta + delta is known to some rounding errors of its terms.
+    shift = 64 * ULP * (np.abs(beta) + delta)
+    labels = [
+        zwidth.is_stable(alpha * (1 + a), limited(beta + b * shift, 1e60), delta, d, method="certified")
+        for a in (-ROUNDING, ROUNDING)
+        for b in (-1.0, 1.0)
+    ]
+    return np.any(np.stack(labels) != labels[0], axis=0)
+
+
+def found_in(count: int, seed: int) -> dict[str, list[tuple]]:
+    """The contradictions among so many walls, by statement: the walls, and whether the edge is within rounding."""
+    random = np.random.default_rng(seed)
+    found: dict[str, list[tuple]] = {}
+    for start in range(0, count, BLOCK):
+        facts = facts_of(draw(min(BLOCK, count - start), random))
+        for statement, where in contradictions(facts).items():
+            bad = np.flatnonzero(where)
+            if bad.size:
+                near = near_the_edge(facts.walls[bad])
+                rows = zip(*(column.tolist() for column in facts.walls[bad]), near.tolist(), strict=True)
+                found.setdefault(statement, []).extend(rows)
+    return found
