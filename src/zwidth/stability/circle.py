@@ -1,8 +1,9 @@
 """How many poles lie inside the circle |z| = r, in closed form: where the two parts of the loop are equally large.
 
 P = T + B as in `zwidth.stability.crossover`, ``T = z^(1+n) (z - 1)(z - c)`` and ``B = M(z) (s z - beta)`` with
-s = alpha + beta and ``M = (a2 z + h)(1 + q/z)``, whose zeros are real and not positive. On ``z = r e^(j w)``, 0 < w < pi,
-with x = sin^2(w/2) every factor has ``|z - a|^2 = (r - a)^2 + 4 r a x`` and an imaginary part of one sign. Hence
+s = alpha + beta and ``M = (a2 z + h)(1 + q/z)``, whose zeros are real and not positive. On ``z = r e^(j w)``,
+0 < w < pi, with x = sin^2(w/2) every factor has ``|z - a|^2 = (r - a)^2 + 4 r a x`` and an imaginary part of one sign.
+Hence
 
 - |T|^2 - |B|^2 is a quadratic in x (whole delays) or a cubic; its zeros in (0, 1) are the crossovers;
 - every argument is continuous where it is principal, and between crossovers that of P stays within a quarter turn of
@@ -22,8 +23,8 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.loop import valid_wall
 from zwidth.plant import held_plant, split_delay, undelayed_plant
-from zwidth.stability.crossover import ARCSINE
-from zwidth.xp import epsilon, horner, namespace
+from zwidth.stability.arcs import angle, turn_of
+from zwidth.xp import epsilon, namespace
 
 # What rounding makes of a bracket, and of an odd multiple over the number of turns, in rounding units.
 _NEAR = 5e3
@@ -167,28 +168,6 @@ def _between(low: Array, high: Array, first: Array, last: Array, h: tuple[Array,
     return xp.where(exists, x, np.nan)
 
 
-def angle(re: Array, im: Array) -> Array:
-    """The argument in (-pi, pi]; four times faster than the compiler's."""
-    xp = namespace(re, im)
-    if xp is np:
-        return np.arctan2(im, re)
-    size = xp.abs(re)
-    length = xp.sqrt(re * re + im * im)
-    half = 0.5 * im * im / (length * (length + size))
-    value = 2.0 * xp.sqrt(half) * horner(4.0 * half - 1.0, ARCSINE)
-    value = xp.where(re < 0, np.pi - value, value)
-    return xp.where(im < 0, -value, value)
-
-
-def _turn(x: Array, y: Array, xp: Any) -> Array:
-    """The w of ``x = sin^2(w/2)`` and y = 1 - x."""
-    if xp is np:
-        return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
-    low = xp.minimum(x, y)
-    value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)
-    return xp.where(x > y, np.pi - value, value)
-
-
 class _Crossing(NamedTuple):
     theta: Array
     w: Array
@@ -200,8 +179,8 @@ class _Crossing(NamedTuple):
     wall_im: Array
 
 
-def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Crossing:
-    """``arg T - arg B`` at a crossover, continuous from w = 0, and the derivative of the logarithm of their quotient."""
+def crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Crossing:
+    """``arg T - arg B`` at a crossover, continuous from w = 0, and the derivative of ``log(T/B)``."""
     y = 1.0 - x
     r = at.r
     im, twice = 2.0 * r * xp.sqrt(x * y), 2.0 * r * x
@@ -216,7 +195,7 @@ def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Cr
     v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
     phase = angle(v_re, v_im)
     phase = xp.where((v_im < 0) & (q_im >= 0), phase + 2.0 * np.pi, phase)
-    w = _turn(x, y, xp)
+    w = turn_of(x, y, xp)
     theta = loop.turns * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
     sizes = [
         one * one + im * im,
@@ -347,7 +326,7 @@ def _counted(log_r: Array, loop: Loop, fractional: bool) -> _Count:
     for x in zeros:
         valid = (x >= 0) & (x < 1.0)
         x = xp.where(valid, x, 0.5)
-        here = _crossing(x, at, loop, fractional, xp)
+        here = crossing(x, at, loop, fractional, xp)
         part = here.theta / (2.0 * np.pi)
         whole = xp.round(part)
         turn = turn + xp.where(valid, xp.where(outer, whole, -whole), 0.0)
@@ -414,48 +393,3 @@ def _expected(
         better = good & (new > best) & (new > low) & (new < high)
         best, best_im = xp.where(better, new, best), xp.where(better, im, best_im)
     return xp.where(best == -np.inf, np.nan, best), xp.clip(best_im, 0.0, np.pi)
-
-
-class Near(NamedTuple):
-    """The loop at ``z = e^(re + j im)``, by logarithms; F' is the derivative of F = log(T/B) by log z."""
-
-    level: Array  # log |T/B|
-    past: Array  # arg T - arg B less the nearest odd multiple of pi
-    re: Array  # F'
-    im: Array
-    wall_re: Array  # the derivative of log B
-    wall_im: Array
-
-
-def near(re: Array, im: Array, loop: Loop, fractional: bool) -> Near:
-    """Evaluate at a point of the upper half plane, 0 <= im <= pi."""
-    xp = namespace(re, loop.alpha)
-    at = sides(re, loop)
-    sine = xp.sin(0.5 * im)
-    here = _crossing(sine * sine, at, loop, fractional, xp)
-    level = loop.turns * re + 0.5 * xp.log(here.quotient)
-    part = here.theta / (2.0 * np.pi)
-    past = 2.0 * np.pi * (part - xp.floor(part) - 0.5)
-    return Near(level, past, here.re, here.im, here.wall_re, here.wall_im)
-
-
-def ratio_step(at: Near) -> tuple[Array, Array]:
-    """Newton's step on log(T/B), for poles of long delays: all but their powers of z is nearly constant."""
-    norm = at.re * at.re + at.im * at.im
-    return -(at.level * at.re + at.past * at.im) / norm, -(at.past * at.re - at.level * at.im) / norm
-
-
-def newton_step(at: Near) -> tuple[Array, Array]:
-    """Newton's step on P itself, for poles next to a zero of T or B.
-
-    ``P/P' = (1 + y)/(y F' + (1 + y) B'/B)`` with y = T/B.
-    """
-    xp = namespace(at.level)
-    size = xp.exp(at.level)
-    y_re, y_im = -size * xp.cos(at.past), -size * xp.sin(at.past)
-    sum_re = 1.0 + y_re
-    # 1 + y cancels near a pole; that loses nothing that y had.
-    slope_re = y_re * at.re - y_im * at.im + sum_re * at.wall_re - y_im * at.wall_im
-    slope_im = y_re * at.im + y_im * at.re + sum_re * at.wall_im + y_im * at.wall_re
-    norm = slope_re * slope_re + slope_im * slope_im
-    return -(sum_re * slope_re + y_im * slope_im) / norm, -(y_im * slope_re - sum_re * slope_im) / norm

@@ -1,8 +1,8 @@
 """Newton's steps on one pole by arithmetic alone, and a proof that a pole is near: the inner loop of many points.
 
 P = z^p A + D with p = 1 + n, A = (z - 1)(z - c) and D = (a2 z + h)(s z - beta); for delays that are not whole periods
-both take one factor more, z and z + q. On ``z = e^(re + j im)`` everything is formed from z - 1, so that poles next to 1
-keep their digits, and the larger of z^p and 1 is divided out, so that nothing grows with n.
+both take one factor more, z and z + q. On ``z = e^(re + j im)`` everything is formed from z - 1, so that poles next to
+1 keep their digits, and the larger of z^p and 1 is divided out, so that nothing grows with n.
 """
 
 from __future__ import annotations
@@ -12,7 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.stability.circle import Loop, angle
+from zwidth.stability.arcs import angle
+from zwidth.stability.circle import Loop
 from zwidth.xp import epsilon, horner, namespace
 
 # sin(x)/x and cos(x) as series in x^2: on |x| <= pi/2 what is left out is below 1e-18.
@@ -109,7 +110,7 @@ def pole_step(re: Array, im: Array, loop: Loop, fractional: bool) -> Step:
 
 
 def ratio_step(re: Array, im: Array, loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """Newton's step for ``log(-T/D) = 0``: among the poles of a long delay all but the powers of z is nearly constant."""
+    """Newton's step for ``log(-T/D) = 0``: with long delays all but the powers of z is nearly constant."""
     xp = namespace(re, loop.alpha)
     at = _parts(re, im, loop.turns + 1.0 if fractional else loop.turns, loop, fractional)
     t_re, t_im = _over(at.t, at.d)

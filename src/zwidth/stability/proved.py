@@ -1,7 +1,11 @@
-"""Spectral radii of arrays, each proved by two counts: the quick search for all, more patience for what is left."""
+"""Spectral radii of arrays, each proved: the quick way for all, a search for what that leaves.
+
+On maps of alpha and beta the poles of neighboring points are followed (`zwidth.stability.radius_map`).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import Any, NamedTuple
 
@@ -44,11 +48,12 @@ class Poles(NamedTuple):
     error: np.ndarray
 
 
-def _kernel(effort: int) -> Any:
+def _kernel(effort: int) -> Callable[..., Any]:
     """The quick way for all, then a search."""
     if effort == 0:
         return quick_kernel
-    return lambda *arguments: radius_kernel(*arguments, *_EFFORTS[effort - 1])
+    steps: tuple[Any, ...] = _EFFORTS[effort - 1]
+    return lambda *arguments: radius_kernel(*arguments, *steps)
 
 
 @cache
@@ -144,7 +149,7 @@ def _ladder(columns: list[np.ndarray], re: np.ndarray, error: np.ndarray, accura
         if not left.size or tolerance > _LARGEST_ERROR:
             return
         with np.errstate(all="ignore"):
-            loop = loop_of(*(column[left] for column in columns), kind)
+            loop = loop_of(columns[0][left], columns[1][left], columns[2][left], columns[3][left], kind)
             here = proved(re[left], [tolerance], loop, kind)[0]
         error[left[here]] = tolerance
 

@@ -15,7 +15,9 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.loop import poison, valid_wall
-from zwidth.stability.circle import Loop, Near, angle, circle, loop_of, near, newton_step, ratio_step, real_ends, sides
+from zwidth.stability.arcs import angle
+from zwidth.stability.circle import Loop, circle, loop_of, real_ends, sides
+from zwidth.stability.log_step import Near, near, newton_step, ratio_step
 from zwidth.stability.pole_derivative import followed
 from zwidth.xp import epsilon, frozen, namespace
 

@@ -80,15 +80,6 @@ def as_map(points: Points) -> Map | None:
     return Map(points.alpha.reshape(-1), points.beta.reshape(-1), delta, d, order, whole)
 
 
-class _Nodes(NamedTuple):
-    """Of every cell: its middle, the pole there as log z, its derivatives (complex), and the device."""
-
-    alpha: np.ndarray
-    beta: np.ndarray
-    taylor: np.ndarray  # (6, cells): the pole, by alpha, by beta, by alpha twice, both, beta twice
-    device: np.ndarray  # (2, cells)
-
-
 def _taylor(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) -> np.ndarray:
     """``w = log z`` of the nodes and its derivatives, from those of P(e^w; alpha, beta) = 0."""
     power = loop.turns + 1.0 if fractional else loop.turns
@@ -126,7 +117,6 @@ def _taylor(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) -> np.
 def _cells(fractional: bool) -> Any:
     """The compiled work on a list of cells: arrays (cells, points of beta, points of alpha)."""
     import jax
-    import jax.numpy as jnp
 
     def kernel(alpha: Array, beta: Array, middle: Array, re: Array, im: Array, device: Array, tolerance: Array) -> Any:
         alpha, beta = alpha[:, None, :], beta[:, :, None]
@@ -166,7 +156,8 @@ def followed_poles(
     """The pole of every point and whether it is proved to be the outermost, from those of the nodes."""
     across, down = _cut(area.alpha), _cut(area.beta)
     with np.errstate(all="ignore"):
-        taylor = _taylor(re, im, loop_of(*nodes, fractional), fractional)
+        alpha, beta, delta, d = nodes
+        taylor: Any = _taylor(re, im, loop_of(alpha, beta, delta, d, fractional), fractional)
     # A real pole stays real.
     real = (im == 0) | (im == np.pi)
     parts = np.stack([taylor.real, np.where(real & (np.arange(6)[:, None] > 0), 0.0, taylor.imag)])
