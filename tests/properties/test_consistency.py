@@ -103,7 +103,7 @@ def nudged(value, random):
 
 def limited(value, most):
     size = np.abs(value)
-    return np.where(size < 1e-60, 0.0, np.sign(value) * np.minimum(size, most))
+    return np.where(size < 0.5e-60, 0.0, np.sign(value) * np.clip(size, 1e-60, most))
 
 
 class Facts(NamedTuple):
@@ -192,7 +192,7 @@ def near_the_edge(walls: Walls) -> np.ndarray:
     # b = beta + delta is known to some rounding errors of its terms.
     shift = 64 * ULP * (np.abs(beta) + delta)
     labels = [
-        zwidth.is_stable(alpha * (1 + a), limited(beta + b * shift, 1e60), delta, d, method="certified")
+        zwidth.is_stable(limited(alpha * (1 + a), 1e60), limited(beta + b * shift, 1e60), delta, d, method="certified")
         for a in (-ROUNDING, ROUNDING)
         for b in (-1.0, 1.0)
     ]

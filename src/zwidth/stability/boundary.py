@@ -162,7 +162,7 @@ def boundary_point(
     check_scalars(delta=delta, d=d)
     if ray is not None:
         line, (alpha0, beta0, dalpha, dbeta) = "ray", _four(ray)
-        check_scalars(alpha=alpha0, beta=beta0)
+        check_scalars(alpha0=alpha0, beta0=beta0, dalpha=dalpha, dbeta=dbeta)
         names, values = ("alpha0", "beta0", "dalpha", "dbeta"), (alpha0, beta0, dalpha, dbeta)
     elif beta is not None:
         check_scalars(beta=beta)
