@@ -33,6 +33,8 @@ class Case:
     extra_axes: int = 0
     # Whether a transformation is refused altogether.
     refuses_tracing: bool = False
+    # Where the derivatives are tested, of a function whose gradient compiles for long.
+    gradient_in: str = ""
     # A bad number by itself raises as well, since quantities in SI units come one by one.
     strict: bool = False
 
@@ -70,6 +72,7 @@ SI_DEVICE = {**SI, "damping": [0.0, 10.0, 5.0], "delay": [0.0, 1e-3, 3e-3]}
 BAD_SI = {"mass": -1.0, "period": 0.0, "damping": -1.0, "delay": np.nan}
 BEYOND_SI = {"mass": 1e31, "period": 1e-31, "damping": 1e31, "delay": 1e31}
 WANTED = {"stiffness": [1e4, 5e3, 2e4]}
+REQUIREMENTS = "tests/unit/design/test_requirements.py"
 WALLS = "alpha, beta 0 or 1e-60 to 1e60 in magnitude; delta 0 to 1e12; d 0 to 1e5"
 DEVICES = "delta 0 to 1e12; d 0 to 1e5"
 QUANTITIES = "SI quantities 0 or 1e-30 to 1e30; mass, period above 0"
@@ -126,7 +129,9 @@ CASES = [
     of_walls(zwidth.stability_of, derivatives=None, value="False where bad, and why", refuses_tracing=True),
     of_walls(zwidth.is_passive, derivatives=None, value="False where bad"),
     of_walls(zwidth.passivity_margin),
-    of_walls(zwidth.margins, value="NaN where bad or alpha <= 0"),
+    of_walls(
+        zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/stability/test_margins.py"
+    ),
     of_walls(zwidth.modulus_margin, value="NaN where bad or alpha <= 0"),
     of_devices("boundary", zwidth.boundary, {"omega": [0.0, 0.5, 3.0]}),
     of_devices(
@@ -151,9 +156,9 @@ CASES = [
     of_quantities(zwidth.max_stiffness, SI_DEVICE),
     of_quantities(zwidth.sensitivities, SI_DEVICE, derivatives=1),
     of_quantities(zwidth.required_damping, ("mass", "period", "delay")),
-    of_quantities(zwidth.required_mass, ("damping", "period", "delay")),
-    of_quantities(zwidth.required_period, ("mass", "damping", "delay")),
-    of_quantities(zwidth.allowed_delay, ("mass", "damping", "period")),
+    of_quantities(zwidth.required_mass, ("damping", "period", "delay"), gradient_in=REQUIREMENTS),
+    of_quantities(zwidth.required_period, ("mass", "damping", "delay"), gradient_in=REQUIREMENTS),
+    of_quantities(zwidth.allowed_delay, ("mass", "damping", "period"), gradient_in=REQUIREMENTS),
     Case(
         "count_poles",
         lambda gain, lag, radius: zwidth.count_poles([0.8], [1.0, 0.9], gain, lag, radius),

@@ -233,11 +233,15 @@ def batch(case, beyond=True):
     return [np.array([row[name] for row in rows]) for name in case.free], good
 
 
+def has_gradient(case):
+    return case.derivatives is not None and not case.gradient_in
+
+
 # Compiled in a fraction of the time, to run once.
 QUICKLY = {"xla_disable_hlo_passes": "fusion", "xla_backend_optimization_level": 0}
 TRACED = [case for case in CASES if not case.refuses_tracing]
 TRACEABLE = pytest.mark.parametrize("case", TRACED, ids=lambda case: case.name)
-SMOOTH = pytest.mark.parametrize("case", [case for case in TRACED if case.derivatives], ids=lambda case: case.name)
+SMOOTH = pytest.mark.parametrize("case", [case for case in TRACED if has_gradient(case)], ids=lambda case: case.name)
 
 
 def fixed_of(case):
@@ -255,7 +259,7 @@ def compiled(case_name):
         parts = [jnp.sum(jnp.abs(v)) for v in leaves.values() if v.dtype.kind in "fc"]
         return sum(parts, start=jnp.zeros(())), leaves
 
-    function = jax.value_and_grad(total, has_aux=True) if case.derivatives else total
+    function = jax.value_and_grad(total, has_aux=True) if has_gradient(case) else total
     return jax.jit(jax.vmap(function), compiler_options=QUICKLY)
 
 
@@ -265,7 +269,7 @@ def in_float64(case_name):
     case = next(case for case in CASES if case.name == case_name)
     with jax.enable_x64(True):
         result = compiled(case_name)([jnp.asarray(column) for column in batch(case)[0]])
-    (_, leaves), gradient = result if case.derivatives else (result, None)
+    (_, leaves), gradient = result if has_gradient(case) else (result, None)
     return {name: np.asarray(value) for name, value in leaves.items()}, gradient
 
 
@@ -281,7 +285,8 @@ def test_inside_a_transformation_values_and_statuses_are_those_of_the_direct_cal
     for name, value in traced.items():
         assert value.shape == direct[name].shape, name
         assert value.dtype == direct[name].dtype or value.dtype.kind == "i", name
-        np.testing.assert_allclose(value, direct[name], rtol=1e-11, atol=1e-12, err_msg=name)
+        rtol = 1e-9 if name == "modulus_frequency" else 1e-11  # a minimum lies where half of the digits say
+        np.testing.assert_allclose(value, direct[name], rtol=rtol, atol=1e-12, err_msg=name)
 
 
 @TRACEABLE
@@ -290,7 +295,7 @@ def test_inside_a_transformation_bad_points_leave_their_neighbors_alone(case):
     clean = [np.where(good, column, column[0]) for column in columns]
     with jax.enable_x64(True):
         result = compiled(case.name)([jnp.asarray(column) for column in clean])
-    leaves = (result[0] if case.derivatives else result)[1]
+    leaves = (result[0] if has_gradient(case) else result)[1]
     traced = in_float64(case.name)[0]
     for name, value in leaves.items():
         np.testing.assert_array_equal(np.asarray(value)[good], traced[name][good], err_msg=name)
