@@ -53,12 +53,8 @@ def _status(valid: Array, inside: Array, xp: Any) -> Array:
     return status.astype(np.int32)
 
 
-_ALLOWED = {
-    "alpha": f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude",
-    "beta": f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude",
-    "delta": f"0 to {LARGEST_DAMPING:g}",
-    "d": f"0 to {LONGEST_DELAY:g}",
-}
+# Every other name is one of a wall's numbers.
+_LARGEST = {"delta": LARGEST_DAMPING, "d": LONGEST_DELAY}
 
 
 def check_scalars(**values: Any) -> None:
@@ -66,9 +62,10 @@ def check_scalars(**values: Any) -> None:
     for name, value in values.items():
         if not isinstance(value, int | float | np.floating | np.integer) or not np.isfinite(value):
             continue
-        if name in ("alpha", "beta"):
-            inside = bool(within(np.float64(value), WALL_RANGE))
+        if name in _LARGEST:
+            inside, allowed = value <= _LARGEST[name], f"0 to {_LARGEST[name]:g}"
         else:
-            inside = value <= (LARGEST_DAMPING if name == "delta" else LONGEST_DELAY)
+            inside = bool(within(np.float64(value), WALL_RANGE))
+            allowed = f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude"
         if not inside:
-            raise InputError(f"{name}: got {value!r}; it must be {_ALLOWED[name]}")
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}")

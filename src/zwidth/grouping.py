@@ -9,6 +9,7 @@ import numpy as np
 
 from zwidth import batching
 from zwidth._types import ArrayLike
+from zwidth.domain import LONGEST_DELAY
 
 NAMES = ("alpha", "beta", "delta", "d")
 
@@ -35,7 +36,8 @@ def degree_of(d: float) -> Degree:
 
 def groups(d: np.ndarray) -> Iterator[tuple[Degree, np.ndarray]]:
     """The degrees that occur in a flat array of delays, each with the positions where it does."""
-    defined = np.where(np.isfinite(d) & (d >= 0), d, 0.0)
+    # What is beyond the range of the model becomes NaN, and must not decide the length of all others.
+    defined = np.where((d >= 0) & (d <= LONGEST_DELAY), d, 0.0)
     # Twice the whole part, plus one where a fraction remains, orders the degrees.
     code = 2.0 * np.floor(defined) + (defined != np.floor(defined))
     for value in np.unique(code):

@@ -17,7 +17,7 @@ import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike
 from zwidth.batching import concrete_delay
-from zwidth.domain import device_status, wall_status
+from zwidth.domain import check_scalars, device_status, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import Degree, by_degree, few_poles
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
@@ -249,7 +249,8 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
         otherwise. Where degrees are mixed, shorter polynomials have zeros in front. A point out of range is NaN.
 
     Raises:
-        InputError: an argument is no real number, shapes do not broadcast, or ``delay="fractional_power"``.
+        InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, or
+            ``delay="fractional_power"``.
         TracedDelayError: d is traced.
 
     Numerics:
@@ -264,6 +265,7 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
         [ 1.   -1.5   1.25 -0.25]
     """
     check_has_poles(delay)
+    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
     return by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
 
 

@@ -33,6 +33,8 @@ _LONGEST = 500
 _MISFIT = 1e-6
 # Instants laid out at one time.
 _BLOCK = 1 << 16
+# How many such blocks are searched at most: some seconds.
+_MOST_BLOCKS = 1 << 12
 _BISECTIONS = 60
 
 
@@ -97,7 +99,8 @@ def modes(alpha: float, beta: float, delta: float, d: float) -> Modes | None:
 def settling_time(alpha: float, beta: float, delta: float, d: float, band: float = SETTLING_BAND) -> float:
     """The last instant at which a step response is outside the band round its final value, in periods.
 
-    NaN where the wall is not stable, where poles so nearly coincide that rounding hides their modes, and for d > 500.
+    NaN where the wall is not stable, where poles so nearly coincide that rounding hides their modes, for d > 500, and
+    where the motion is within the band for so many periods before its modes must be that the search is given up.
     """
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
@@ -132,7 +135,9 @@ def _last_outside(found: Modes, instants: np.ndarray, last: int, allowed: float)
     """Search backwards, block by block, then halve the interval in which the response enters the band for good."""
     shape = found.shape(instants)
     rows = max(1, _BLOCK // (instants.size * max(found.z.size, 1)))
-    for stop in range(last + 1, 0, -rows):
+    for searched, stop in enumerate(range(last + 1, 0, -rows)):
+        if searched == _MOST_BLOCKS:
+            return math.nan
         k = np.arange(max(stop - rows, 0), stop)
         size = np.abs(np.real((found.z ** k[:, None]) @ shape.T)).ravel()
         time = (k[:, None] + instants).ravel()

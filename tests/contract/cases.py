@@ -14,23 +14,43 @@ import zwidth
 
 @dataclass(frozen=True)
 class Case:
-    """A function of arrays with three good points and, per argument, a value that is out of range."""
+    """A function of arrays with three good points and, per argument, a bad value and one beyond the range."""
 
     name: str
     call: Callable[..., Any]
     good: dict[str, list[float]]
     bad: dict[str, float]
+    # Finite numbers that the model does not go to: a status in arrays, an error by themselves.
+    beyond: dict[str, float] = field(default_factory=dict)
+    # What the table says of the arguments, of the values and of the derivatives.
+    domain: str = ""
+    value: str = "NaN where bad"
+    # The order up to which derivatives are promised; None where the result has none.
+    derivatives: int | None = 2
     # Arguments that must stay concrete inside a transformation.
     concrete: tuple[str, ...] = ()
     # How many axes the results have beyond those of the arguments.
     extra_axes: int = 0
-    # Compiling it once more takes seconds: its own tests trace it.
-    heavy: bool = False
-    fields: tuple[str, ...] = field(default=())
+    # Whether a transformation is refused altogether.
+    refuses_tracing: bool = False
+    # Where the derivatives are tested, of a function whose gradient compiles for long.
+    gradient_in: str = ""
+    # A bad number by itself raises as well, since quantities in SI units come one by one.
+    strict: bool = False
+
+    @property
+    def function(self) -> str:
+        """The public name, without the way in which it is called here."""
+        return self.name.partition(" ")[0]
 
     @property
     def arguments(self) -> dict[str, np.ndarray]:
         return {name: np.array(values) for name, values in self.good.items()}
+
+    @property
+    def free(self) -> list[str]:
+        """The arguments that may be traced."""
+        return [name for name in self.good if name not in self.concrete]
 
     def leaves(self, result: Any) -> dict[str, Any]:
         """The arrays of a result by name."""
@@ -42,77 +62,128 @@ class Case:
 
 WALL = {"alpha": [0.05, 0.1, 0.2], "beta": [0.3, 0.4, 0.1], "delta": [0.0, 0.1, 1.5]}
 BAD_WALL = {"alpha": np.inf, "beta": np.nan, "delta": -1.0, "d": -0.5}
+BEYOND_WALL = {"alpha": 1e61, "beta": -1e61, "delta": 1e13, "d": 1e6}
 ONE_DELAY = {"d": [1.0, 1.0, 1.0]}
 DEVICE = {"delta": [0.0, 0.1, 1.5], "d": [0.0, 1.0, 2.5]}
+BAD_DEVICE = {"delta": -1.0, "d": np.nan}
+BEYOND_DEVICE = {"delta": 1e13, "d": 1e6}
 SI = {"mass": [0.1, 0.2, 1.0], "period": [1e-3, 1e-3, 2e-3]}
+SI_DEVICE = {**SI, "damping": [0.0, 10.0, 5.0], "delay": [0.0, 1e-3, 3e-3]}
+BAD_SI = {"mass": -1.0, "period": 0.0, "damping": -1.0, "delay": np.nan}
+BEYOND_SI = {"mass": 1e31, "period": 1e-31, "damping": 1e31, "delay": 1e31}
+WANTED = {"stiffness": [1e4, 5e3, 2e4]}
+REQUIREMENTS = "tests/unit/design/test_requirements.py"
+WALLS = "alpha, beta 0 or 1e-60 to 1e60 in magnitude; delta 0 to 1e12; d 0 to 1e5"
+DEVICES = "delta 0 to 1e12; d 0 to 1e5"
+QUANTITIES = "SI quantities 0 or 1e-30 to 1e30; mass, period above 0"
 
 
-def of_walls(function, name, **options):
-    return Case(name, function, {**WALL, **ONE_DELAY}, BAD_WALL, concrete=("d",), **options)
+def of_walls(call, **options):
+    options = {"domain": WALLS, **options}
+    return Case(call.__name__, call, {**WALL, **ONE_DELAY}, BAD_WALL, BEYOND_WALL, **options)
+
+
+def of_devices(name, call, line=None, **options):
+    line = line or {}
+    bad = {**BAD_DEVICE, **dict.fromkeys(line, np.nan)}
+    beyond = {**BEYOND_DEVICE, **{key: 1e61 for key in line if key != "omega"}}
+    return Case(name, call, {**line, **DEVICE}, bad, beyond, domain=DEVICES, **options)
+
+
+def of_quantities(call, names, name=None, **options):
+    names = set(names) | ({"stiffness"} if call.__name__ not in ("max_stiffness", "sensitivities") else set())
+    columns = {**WANTED, **SI_DEVICE}
+    bad, beyond = {"stiffness": -1.0, **BAD_SI}, {"stiffness": 1e31, **BEYOND_SI}
+    good, bad, beyond = ({k: v for k, v in kept.items() if k in names} for kept in (columns, bad, beyond))
+    return Case(name or call.__name__, call, good, bad, beyond, domain=QUANTITIES, strict=True, **options)
+
+
+def ray_point(alpha0, beta0, dalpha, dbeta, delta, d):
+    return zwidth.boundary_point(delta, d, ray=(alpha0, beta0, dalpha, dbeta))
 
 
 CASES = [
     Case(
         "normalize",
         zwidth.normalize,
-        {**SI, "damping": [0.0, 10.0, 5.0], "delay": [0.0, 1e-3, 3e-3], "stiffness": [1e3, 5e3, 0.0]},
+        {**SI_DEVICE, "stiffness": [1e3, 5e3, 0.0]},
         {"mass": 0.0, "damping": -1.0, "delay": np.nan},
-    ),
-    Case("denormalize", zwidth.denormalize, {**SI, **WALL}, {"mass": -1.0, "delta": np.nan}),
-    of_walls(zwidth.char_poly, "char_poly", extra_axes=1),
-    of_walls(zwidth.poles, "poles", extra_axes=1),
-    Case("spectral_radius", zwidth.spectral_radius, {**WALL, **ONE_DELAY}, BAD_WALL),
-    Case("decay_rate", zwidth.decay_rate, {**WALL, **ONE_DELAY}, BAD_WALL),
-    of_walls(zwidth.is_stable, "is_stable"),
-    Case("is_passive", zwidth.is_passive, {**WALL, **ONE_DELAY}, BAD_WALL),
-    Case("passivity_margin", zwidth.passivity_margin, {**WALL, **ONE_DELAY}, BAD_WALL),
-    Case("margins", zwidth.margins, {**WALL, **ONE_DELAY}, BAD_WALL, heavy=True),
-    Case(
-        "boundary",
-        zwidth.boundary,
-        {"omega": [0.0, 0.5, 3.0], **DEVICE},
-        {"omega": 3.5, "delta": -1e-9, "d": np.inf},
+        {**BEYOND_SI, "stiffness": 1e31},
+        domain=QUANTITIES,
+        strict=True,
     ),
     Case(
-        "boundary_point",
+        "denormalize",
+        zwidth.denormalize,
+        {**SI, **WALL},
+        {"mass": -1.0, "delta": np.nan},
+        {"mass": 1e31, "alpha": 1e61, "delta": 1e13},
+        domain=f"{WALLS}; {QUANTITIES}",
+        strict=True,
+    ),
+    of_walls(zwidth.char_poly, concrete=("d",), extra_axes=1),
+    of_walls(zwidth.poles, concrete=("d",), extra_axes=1, derivatives=1, domain=f"{WALLS}; at most 4,000 poles"),
+    of_walls(zwidth.spectral_radius),
+    of_walls(zwidth.decay_rate),
+    of_walls(zwidth.is_stable, derivatives=None, value="False where bad"),
+    of_walls(zwidth.stability_of, derivatives=None, value="False where bad, and why", refuses_tracing=True),
+    of_walls(zwidth.is_passive, derivatives=None, value="False where bad"),
+    of_walls(zwidth.passivity_margin),
+    of_walls(
+        zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/stability/test_margins.py"
+    ),
+    of_walls(zwidth.modulus_margin, value="NaN where bad or alpha <= 0"),
+    of_devices("boundary", zwidth.boundary, {"omega": [0.0, 0.5, 3.0]}),
+    of_devices(
+        "boundary_point of a row",
+        lambda beta, delta, d: zwidth.boundary_point(delta, d, beta=beta),
+        {"beta": [0.3, 0.1, 0.05]},
+    ),
+    of_devices(
+        "boundary_point of a column",
         lambda alpha, delta, d: zwidth.boundary_point(delta, d, alpha=alpha),
-        {"alpha": [0.3, 0.1, 0.05], **DEVICE},
-        {"alpha": np.nan, "delta": -1.0, "d": np.inf},
-        heavy=True,
+        {"alpha": [0.3, 0.1, 0.05]},
     ),
-    Case("alpha_max", zwidth.alpha_max, DEVICE, {"delta": -1.0, "d": np.nan}),
+    of_devices(
+        "boundary_point on a ray",
+        ray_point,
+        {"alpha0": [0.1, 0.05, 0.05], "beta0": [0.3, 0.2, 0.1], "dalpha": [1.0, 0.5, 1.0], "dbeta": [0.5, 0.1, -0.2]},
+    ),
+    of_devices("alpha_max", zwidth.alpha_max),
+    of_devices("stable_area", zwidth.stable_area, derivatives=1),
+    of_devices("passive_area", zwidth.passive_area),
+    Case("stiffness_slope", zwidth.stiffness_slope, {"d": [0.0, 1.0, 2.5]}, {"d": -1.0}, {"d": 1e6}, domain="d 0 to 1e5"),
+    of_quantities(zwidth.max_stiffness, SI_DEVICE),
+    of_quantities(zwidth.sensitivities, SI_DEVICE, derivatives=1),
+    of_quantities(zwidth.required_damping, ("mass", "period", "delay")),
+    of_quantities(zwidth.required_mass, ("damping", "period", "delay"), gradient_in=REQUIREMENTS),
+    of_quantities(zwidth.required_period, ("mass", "damping", "delay"), gradient_in=REQUIREMENTS),
+    of_quantities(zwidth.allowed_delay, ("mass", "damping", "period"), gradient_in=REQUIREMENTS),
     Case(
-        "max_stiffness",
-        zwidth.max_stiffness,
-        {**SI, "damping": [0.0, 10.0, 5.0], "delay": [0.0, 1e-3, 3e-3]},
-        {"mass": -1.0, "damping": -1.0, "delay": np.nan},
+        "count_poles",
+        lambda gain, lag, radius: zwidth.count_poles([0.8], [1.0, 0.9], gain, lag, radius),
+        {"gain": [0.01, 0.02, -0.1], "lag": [3.0, 20.0, 0.0], "radius": [1.0, 0.95, 1.1]},
+        {"gain": np.nan, "lag": -1.0, "radius": 0.0},
+        {"lag": 2.0**53},
+        domain="lag whole, 0 to 2^52; radius above 0; gain finite",
+        value="-1 where bad or float64 cannot tell",
+        derivatives=None,
+        strict=True,
     ),
-    Case("stiffness_slope", zwidth.stiffness_slope, {"d": [0.0, 1.0, 2.5]}, {"d": -1.0}),
 ]
 
-# Public functions that take no arrays point by point: their own tests hold their contract.
+# Public functions that take no arrays point by point, or that compile for long: who holds their contract instead.
 OTHERS = {
-    "use_compilation_cache": "a setting",
-    "margins": "a tuple of margins: its own tests",
-    "count_poles": "any linear loop: its own tests",
-    "allowed_delay": "design questions are slow to compile: their own tests cover batches, bad entries and tracing",
-    "assess": "one scene",
-    "fastest_damping": "a design question",
-    "fastest_wall": "a design question",
-    "load_config": "a file",
-    "modulus_margin": "a design question",
-    "most_robust_damping": "a design question",
-    "open_dataset": "a folder",
-    "passive_area": "a design question",
-    "required_damping": "a design question",
-    "required_mass": "a design question",
-    "required_period": "a design question",
-    "robust_max_stiffness": "boxes of devices",
-    "robust_wall": "boxes of devices",
-    "run": "a configuration",
-    "sensitivities": "a design question",
-    "stable_area": "a design question",
-    "stability_of": "is_stable with its status; tested beside the methods",
-    "stable_region": "one device",
-    "step_response": "one wall",
+    "assess": "one scene: tests/unit/test_report.py, tests/properties/test_consistency.py",
+    "fastest_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
+    "fastest_wall": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
+    "load_config": "a file: tests/unit/sweep/test_config.py",
+    "most_robust_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
+    "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
+    "robust_max_stiffness": "boxes of devices: tests/unit/design/test_robust.py",
+    "robust_wall": "boxes of devices: tests/unit/design/test_robust.py",
+    "run": "a configuration: tests/unit/studies/test_runner.py",
+    "stable_region": "one device: tests/unit/stability/test_region.py",
+    "step_response": "one wall: tests/unit/test_response.py",
+    "use_compilation_cache": "a setting: tests/unit/test_kernel_cache.py",
 }

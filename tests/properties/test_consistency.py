@@ -10,7 +10,6 @@ As a program: ``python tests/properties/test_consistency.py COUNT SEED`` prints 
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -103,7 +102,7 @@ def nudged(value, random):
 
 def limited(value, most):
     size = np.abs(value)
-    return np.where(size < 1e-60, 0.0, np.sign(value) * np.minimum(size, most))
+    return np.where(size < 0.5e-60, 0.0, np.sign(value) * np.clip(size, 1e-60, most))
 
 
 class Facts(NamedTuple):
@@ -156,7 +155,6 @@ def contradictions(f: Facts) -> dict[str, np.ndarray]:
     stable, m = f.stable, f.margins
     rows, columns = f.row.status == Status.OK, f.lower.status == Status.OK
     inside = (beta > f.lower.beta) & (beta < f.upper.beta)
-    unknown = (Status.OK, Status.NO_BOUNDARY)
     return {
         "the certified verdict is known": ~f.known,
         "the certified verdict is the verdict": f.known & (f.proved != stable),
@@ -173,14 +171,14 @@ def contradictions(f: Facts) -> dict[str, np.ndarray]:
         & ~((m.modulus_margin > 0) & (m.modulus_margin <= 1)),
         "a row ends beyond its stable walls": stable & ~(rows & (f.row.alpha > alpha)),
         "a row ends before its other walls": spring & ~stable & rows & (f.row.alpha > alpha),
-        "rows are OK or empty": ~np.isin(f.row.status, unknown),
+        # A column within rounding of the ridge may be undecided.
+        "rows are OK or empty": ~np.isin(f.row.status, (Status.OK, Status.NO_BOUNDARY)),
         "a column holds its stable walls": stable & ~(columns & inside),
         "a column holds no other walls": spring & ~stable & columns & inside,
-        "columns are OK or empty": spring & ~np.isin(f.lower.status, unknown),
         "both ends of a column exist": spring & (f.lower.status != f.upper.status),
         "columns are in order": columns & ~(f.lower.beta <= f.upper.beta),
-        "no row is longer than the stiffest wall": rows & ~(f.row.alpha <= f.ridge.alpha * (1 + 8 * ULP)),
-        "no stable wall is stiffer than the stiffest": stable & ~(alpha < f.ridge.alpha * (1 + 8 * ULP)),
+        "no row is longer than the stiffest wall": rows & ~(f.row.alpha <= f.ridge.alpha * (1 + 20 * ULP)),
+        "no stable wall is stiffer than the stiffest": stable & ~(alpha < f.ridge.alpha * (1 + 20 * ULP)),
         "every device has a stiffest wall": (f.ridge.status != Status.OK) | ~(f.ridge.alpha > 0),
         "passive springs are stable": f.passive & spring & ~stable,
         "passive walls have an excess": f.passive != (f.excess > 0),
@@ -193,23 +191,145 @@ def near_the_edge(walls: Walls) -> np.ndarray:
     # b = beta + delta is known to some rounding errors of its terms.
     shift = 64 * ULP * (np.abs(beta) + delta)
     labels = [
-        zwidth.is_stable(alpha * (1 + a), limited(beta + b * shift, 1e60), delta, d, method="certified")
+        zwidth.is_stable(limited(alpha * (1 + a), 1e60), limited(beta + b * shift, 1e60), delta, d, method="certified")
         for a in (-ROUNDING, ROUNDING)
         for b in (-1.0, 1.0)
     ]
     return np.any(np.stack(labels) != labels[0], axis=0)
 
 
+# What the functions say alone, whatever the distance from the edge.
+ALWAYS = (
+    "the certified verdict is known",
+    "stable walls are springs",
+    "the decay rate has the sign of the verdict",
+    "the gain margin is above 1 for stable walls",
+    "stable walls bear more delay",
+    "rows are OK or empty",
+    "every device has a stiffest wall",
+    "no row is longer than the stiffest wall",
+    "passive walls have an excess",
+)
+
+
 def found_in(count: int, seed: int) -> dict[str, list[tuple]]:
-    """The contradictions among so many walls, by statement: the walls, and whether the edge is within rounding."""
+    """The contradictions among so many walls, by statement, but those that rounding explains."""
     random = np.random.default_rng(seed)
     found: dict[str, list[tuple]] = {}
     for start in range(0, count, BLOCK):
         facts = facts_of(draw(min(BLOCK, count - start), random))
         for statement, where in contradictions(facts).items():
             bad = np.flatnonzero(where)
+            if bad.size and statement not in ALWAYS:
+                bad = bad[~near_the_edge(facts.walls[bad])]
             if bad.size:
-                near = near_the_edge(facts.walls[bad])
-                rows = zip(*(column.tolist() for column in facts.walls[bad]), near.tolist(), strict=True)
-                found.setdefault(statement, []).extend(rows)
+                found.setdefault(statement, []).extend(zip(*(part.tolist() for part in facts.walls[bad]), strict=True))
     return found
+
+
+def test_no_two_functions_contradict_each_other():
+    assert found_in(2000, 20) == {}
+
+
+# Found by this file among 10^5 walls; the proved verdict on each is "unstable", the first two rows have no end.
+ONCE_WRONG = [
+    # Rows far above the whole lobe, where the curve comes back from infinity.
+    (2.335447764326184e-07, 3.692815079655784e38, 0.0, 1 - ULP / 2),
+    (325966003164.7999, 2.354637921449004e41, 1e12, 0.5),
+    # Crossovers behind a quarter turn, beside walls of a fractional delay.
+    (1000.0, 1.179223312502481e49, 1e-300, 1.0),
+    (0.0003979204995852754, 32868943419.924587, 1e-16, 3.0),
+    (1e-13, 1.2276672712930513e19, 0.0, 2.0),
+    # Rows next to the lobe's end after a long delay, 0.3 and 1.2 % too long.
+    (2.674211185961894e-09, 3.6593616254797103, 3.65936162742, 1e5),
+    (1000.0, 999999999116.872, 1e12, 99999.5),
+]
+
+
+def test_walls_once_called_stable_are_not():
+    fraction = (0.1, 0.4, 0.1, 1.5)
+    walls = Walls(*np.array([*ONCE_WRONG, fraction]).T)
+    assert zwidth.is_stable(*walls).tolist() == [False] * len(ONCE_WRONG) + [True]
+    assert zwidth.is_stable(*walls, method="certified").tolist() == [False] * len(ONCE_WRONG) + [True]
+    row = zwidth.boundary_point(walls.delta, walls.d, beta=walls.beta)
+    assert not np.any(row.alpha[:-1] > walls.alpha[:-1])
+
+
+def test_rows_next_to_the_end_of_the_lobe_and_columns_are_the_same_curve():
+    random = np.random.default_rng(5)
+    count = 2000
+    d = np.minimum(np.where(random.random(count) < 0.5, 1e5, 10 ** random.uniform(0, 5, count)), 1e5)
+    delta = np.where(random.random(count) < 0.1, 0.0, 10 ** random.uniform(-9, 12, count))
+    end = zwidth.boundary_point(delta, d, alpha=np.full(count, 1e-60), side="upper").beta
+    beta = end - (end + delta) * 10 ** random.uniform(-12, -2, count)
+    alpha = zwidth.boundary_point(delta, d, beta=beta).alpha
+    there = alpha > 0
+    assert there.mean() > 0.9
+    again = zwidth.boundary_point(delta[there], d[there], alpha=alpha[there], side="upper").beta
+    assert np.max(np.abs(again - beta[there]) / (np.abs(beta) + delta)[there]) < 32 * ULP
+
+
+@pytest.mark.parametrize("delta", [1e-300, 1e-100, 1e-20])
+def test_the_gain_margin_has_a_limit_for_light_damping(delta):
+    walls = (0.13548921166348554, 0.47387196928852116), (1.7032855202028993e-09, 0.013311947546541589)
+    for (alpha, beta), d in zip(walls, (1.0, 117.0), strict=True):
+        undamped = zwidth.margins(alpha, beta, 0.0, d).gain_margin
+        assert zwidth.margins(alpha, beta, delta, d).gain_margin == pytest.approx(undamped, rel=1e-12)
+
+
+def test_settling_times_belong_to_stable_walls():
+    random = np.random.default_rng(22)
+    walls = draw(600, random)
+    # Settling is searched backwards period by period: slow loops take too long for a test.
+    slow = np.abs(zwidth.decay_rate(*walls)) < 1e-2
+    walls = walls[(walls.d <= 40) & (walls.alpha != 0) & ~slow]
+    stable = zwidth.is_stable(*walls)
+    times = np.array([settling_time(*(float(value) for value in wall)) for wall in zip(*walls, strict=True)])
+    assert np.all(np.isnan(times) | (stable & np.isfinite(times) & (times >= 0)))
+    assert np.mean(np.isfinite(times[stable])) > 0.5
+
+
+def test_an_assessment_says_what_the_functions_say():
+    random = np.random.default_rng(23)
+    walls = draw(200, random)
+    walls = walls[(walls.delta == 0) | (walls.delta >= 1e-30)]
+    walls = walls[np.all([(x == 0) | ((np.abs(x) > 1e-29) & (np.abs(x) < 1e29)) for x in walls], axis=0)]
+    assert walls.alpha.size > 60
+    for wall in zip(*(column.tolist() for column in walls), strict=True):
+        alpha, beta, delta, d = wall
+        scene = zwidth.Scene(zwidth.Device(1.0, delta), zwidth.Timing(1.0, d), zwidth.VirtualWall(alpha, beta))
+        found = zwidth.assess(scene)
+        assert found.alpha == alpha
+        assert (found.beta, found.delta) == (beta, delta)
+        # A quotient next to a whole number counts as that.
+        wall = alpha, beta, delta, found.d
+        stands, rate = zwidth.margins(*wall), zwidth.decay_rate(*wall)
+        same = {
+            "stable": zwidth.is_stable(*wall),
+            "passive": zwidth.is_passive(*wall),
+            "passivity_margin": zwidth.passivity_margin(*wall),
+            "decay_rate": rate,
+            "spectral_radius": np.exp(-rate),
+            "stiffness_limit": zwidth.boundary_point(delta, found.d, beta=beta).alpha,
+            "stiffness_max": zwidth.alpha_max(delta, found.d).alpha,
+            "gain_margin": stands.gain_margin,
+            "phase_margin": stands.phase_margin,
+            "delay_margin": stands.delay_margin,
+            "modulus_margin": stands.modulus_margin,
+        }
+        for name, value in same.items():
+            assert getattr(found, name) == pytest.approx(float(value), rel=1e-15, nan_ok=True), name
+        assert np.isnan(found.time_constant) or found.stable == (0 < found.time_constant < np.inf)
+
+
+def main(count: str, seed: str) -> None:
+    """Print what is found among so many walls."""
+    found = found_in(int(count), int(seed))
+    for statement, walls in found.items():
+        print(f"{statement}: not so for {len(walls)}")
+        print(*walls[:10], sep="\n")
+    print(f"{sum(map(len, found.values()))} contradictions among {count} walls, seed {seed}")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

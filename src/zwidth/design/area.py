@@ -10,6 +10,7 @@ from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_device
 from zwidth.stability.curve import device_of, lobe, spread, wall
 from zwidth.stability.devices import ANY, Kind, kind_of
+from zwidth.stability.open_loop import along
 from zwidth.xp import frozen, namespace
 
 # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic.
@@ -57,7 +58,7 @@ def _area_kernel(delta: Array, d: Array, kind: Kind) -> Array:
     xp = namespace(delta, d)
     curve = lobe(device_of(delta, d, "held", kind), d, "held", kind)
     end = frozen(curve.end, xp)
-    node, weight = (xp.asarray(part, end.dtype) for part in (0.5 + 0.5 * _NODE, 0.5 * _WEIGHT))
+    node, weight = (along(part, end) for part in (0.5 + 0.5 * _NODE, 0.5 * _WEIGHT))
     at = wall(end[..., None] * node, spread(curve))
     under_lobe = xp.sum(at.alpha * at.d_b * weight, axis=-1) * end
     # From a corner back to alpha = 0 along alpha + 2 beta = const.

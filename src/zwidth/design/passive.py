@@ -21,6 +21,7 @@ from zwidth.batching import elementwise
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_device
 from zwidth.stability.needed_damping import directions, needed_damping
+from zwidth.stability.open_loop import along
 from zwidth.xp import frozen, namespace
 
 # Gauss-Legendre nodes for each of the three parts.
@@ -83,7 +84,7 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
 
 def _integral(needed: Callable[[Array], Array], low: Array, high: Array, nodes: int) -> Array:
     xp = namespace(low)
-    node, weight = (values.astype(low.dtype) for values in np.polynomial.legendre.leggauss(nodes))
+    node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(nodes))
     width = high - low
     theta = low[..., None] + width[..., None] * (0.5 * (node + 1.0))
     # Of no width: the values are finite and do not matter.

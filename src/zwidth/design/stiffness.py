@@ -19,7 +19,7 @@ from zwidth.stability.ridge import occurring, ridge_kernel, slopes_kernel
 from zwidth.status import Status
 from zwidth.xp import is_traced, namespace
 
-_NAMES = ("mass", "damping", "period", "delta", "d")
+_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
 
 
 def checked_device(**quantities: ArrayLike) -> Normalized:
@@ -134,17 +134,17 @@ def sensitivities(
     """
     check_delay_model(delay_model)
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
-    values = (mass, damping, period, device.delta, device.d)
+    values = (mass, damping, period, delay, device.delta, device.d)
     return elementwise(_sensitivities_kernel, _NAMES, values, (delay_model, occurring(device.d)))
 
 
 def _sensitivities_kernel(
-    mass: Array, damping: Array, period: Array, delta: Array, d: Array, delay_model: str, kind: Kind
+    mass: Array, damping: Array, period: Array, delay: Array, delta: Array, d: Array, delay_model: str, kind: Kind
 ) -> Sensitivities:
     xp = namespace(mass, delta, d)
     point, by_delta, by_d = slopes_kernel(delta, d, delay_model, kind)
     # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
-    given = quantity_status(mass=mass, damping=damping, period=period)
+    given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
     status = xp.where(given == Status.OK, point.status, given).astype(np.int32)
     alpha, rate = point.alpha, 1.0 / period
     return Sensitivities(

@@ -27,6 +27,7 @@ from zwidth.stability.curve import (
     wall,
 )
 from zwidth.stability.devices import ANY, Device, Kind, kind_of
+from zwidth.stability.open_loop import along
 from zwidth.stability.row_limit import short_row
 from zwidth.status import Status
 from zwidth.xp import epsilon, frozen, namespace, repeat
@@ -162,7 +163,7 @@ def boundary_point(
     check_scalars(delta=delta, d=d)
     if ray is not None:
         line, (alpha0, beta0, dalpha, dbeta) = "ray", _four(ray)
-        check_scalars(alpha=alpha0, beta=beta0)
+        check_scalars(alpha0=alpha0, beta0=beta0, dalpha=dalpha, dbeta=dbeta)
         names, values = ("alpha0", "beta0", "dalpha", "dbeta"), (alpha0, beta0, dalpha, dbeta)
     elif beta is not None:
         check_scalars(beta=beta)
@@ -312,9 +313,10 @@ def _ray_kernel(
     smooth, at = _follow(x, curve, lambda wall: (ray.offset(wall), ray.offset_slope(wall)), xp)
     # Off the lobe: along the line of z = -1 or along alpha = 0, whichever comes first.
     rate = dalpha + 2.0 * dbeta
-    to_line = xp.where(curve.to_corner & (rate > 0), _on_line(curve, xp) - alpha0 - 2.0 * beta0, np.inf)
-    to_line = to_line / xp.where(rate > 0, rate, 1.0)
-    to_zero = xp.where(dalpha < 0, alpha0, np.inf) / xp.where(dalpha < 0, -dalpha, 1.0)
+    # Divided before it is chosen: the derivative of an infinite distance would be NaN.
+    to_line = (_on_line(curve, xp) - alpha0 - 2.0 * beta0) / xp.where(rate > 0, rate, 1.0)
+    to_line = xp.where(curve.to_corner & (rate > 0), to_line, np.inf)
+    to_zero = xp.where(dalpha < 0, alpha0 / xp.where(dalpha < 0, -dalpha, 1.0), np.inf)
     at_zero = to_zero < to_line
     s = xp.where(at_zero, to_zero, to_line)
     ends = on_lobe | (s < np.inf)
@@ -365,8 +367,7 @@ def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tupl
     # Places even in the square of omega, in which the start of the lobe is straight.
     square = _squared(curve, xp)
     first, last = xp.where(square, low * low, low), xp.where(square, high * high, high)
-    share = np.linspace(0.0, 1.0, _PLACES + 1)
-    share = xp.asarray(share, first.dtype) if xp is not np else share
+    share = along(np.linspace(0.0, 1.0, _PLACES + 1), first)
     even = first[..., None] + (last - first)[..., None] * share
     places = xp.where(square[..., None], xp.sqrt(even), even)
     wide = spread(curve)

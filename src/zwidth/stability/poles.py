@@ -9,7 +9,7 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64, is_traced
-from zwidth.domain import check_scalars, wall_status
+from zwidth.domain import LONGEST_DELAY, check_scalars, wall_status
 from zwidth.errors import InputError
 from zwidth.grouping import Degree, by_degree, degree_of, few_poles
 from zwidth.loop import check_has_poles, coefficients, evaluate, plant_of, poison, valid_wall
@@ -85,7 +85,7 @@ def check_degree(d: ArrayLike) -> None:
     if is_traced(d):
         return
     delays = as_float64("d", d)
-    longest = float(np.max(delays, where=np.isfinite(delays), initial=0.0))
+    longest = float(np.max(delays, where=delays <= LONGEST_DELAY, initial=0.0))
     poles = degree_of(longest).poles
     if poles > MOST_POLES:
         raise InputError(

@@ -69,7 +69,8 @@ def short_row(beta: Array, device: Device) -> Array:
     square = linear * linear + 4.0 * b * p1 * p1 * (u1 - b * v2)
     y = 2.0 * b * p1 * p1 / (linear + xp.sqrt(xp.maximum(square, 0.0)))
     start, slope = p1 * ((1.0 + f) * em + p1), -4.0 * (a1 + (3.0 + em) * a0)
-    curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / (p1 * p1 + y * (v1 + v2 * y))
+    # V = |N|^2 vanishes where the curve runs to infinity; rounding must not turn its sign there.
+    curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / xp.abs(p1 * p1 + y * (v1 + v2 * y))
     corner_reached = (tilt > 0) & (start + slope + 16.0 * a0 > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
     # Behind the lobe the curve comes from infinity with b < 0: a row above all of the lobe must not end there.
@@ -113,6 +114,9 @@ def long_device(device: Device) -> Array:
     flat = xp.clip(1.0 - 0.5 * end * (d_total / total - d_scale / scale), 0.0, 1.0)
     bow = xp.sqrt(3.0 * flat / (1.0 + flat * (0.2 + 0.01585 * flat)))
     sin_bow = xp.sin(bow)
+    # As the rows compute it, so that they start exact at the lobe's end, where strong damping and a long delay leave b
+    # no slope and Newton's steps would only halve an error.
+    bow = _arcsine(sin_bow)
     slope = (0.25 * b1 + 0.5 * g0 * (k * k - 0.25) + k * h0) / v0
     bend = xp.sqrt(top / slope) / end - sin_bow / bow
     return xp.stack([*fields, end, top, bow, sin_bow, bend])

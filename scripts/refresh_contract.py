@@ -1,0 +1,21 @@
+#!/usr/bin/env python3
+"""Write docs/contract.md: what every public function promises, from the cases that the tests run through."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from contract.table import page  # noqa: E402
+
+
+def main() -> None:
+    """Write the page."""
+    (ROOT / "docs" / "contract.md").write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
