@@ -173,7 +173,7 @@ class SweepStudy(Study):
     )
     """Relative error to prove of every spectral radius.
 
-    It is proved by counting the poles inside two circles; the values themselves have nearly all digits whatever is
+    It is proved by counting the poles inside two circles; most values have nearly all digits whatever is
     asked for. Where no proof is found, next to double poles above all, the status is NOT_CONVERGED: the value is there
     if a larger error of at most 0.1 is proved, and NaN otherwise.
     """
