@@ -48,8 +48,9 @@ LARGE = [
 
 def call(quantity: str, method: str, d: float, points: int):
     """The function to measure, and how many points it computes."""
-    from zwidth.bench import problems
     from zwidth.stability.methods import is_stable, spectral_radius
+
+    from zwidth.bench import problems
 
     walls = problems.grid(d, points)
     function = is_stable if quantity == "stable" else spectral_radius

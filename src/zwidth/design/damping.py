@@ -94,7 +94,12 @@ def _fastest_kernel(
 
 def _radius_over(alpha: Array, delta: Array, d: Array, degree: Degree) -> Cost:
     """The spectral radius as a function of the virtual damping."""
-    return lambda betas: (radius_kernel(*jnp.broadcast_arrays(alpha, betas, delta, d), degree), ())
+
+    def cost(betas: Array) -> tuple[Array, tuple]:
+        a, b, x, y = jnp.broadcast_arrays(alpha, betas, delta, d)
+        return radius_kernel(a, b, x, y, degree), ()
+
+    return cost
 
 
 def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> DampingChoice:

@@ -93,8 +93,8 @@ def gain_crossover(alpha: Array, beta: Array, here: Device, kind: Kind) -> Cross
 def _lean(alpha: Array, u: Array, first: tuple[Array, Array, Array], here: Device, xp: Any) -> Array:
     """``alpha - 2 u``, which vanishes beside both for slow, nearly undamped loops, by the equation that u solves.
 
-    ``phi1^2 (alpha^2 - 4 u^2) = -(h1 u + (h2 + 4 c) u^2 + h3 u^3) - 4 u^2 (phi1^2 - c)``, wherever its terms are smaller
-    than those of the difference itself.
+    ``phi1^2 (alpha^2 - 4 u^2) = -(h1 u + (h2 + 4 c) u^2 + h3 u^3) - 4 u^2 (phi1^2 - c)``, wherever its terms are
+    smaller than those of the difference itself.
     """
     terms = [first[0] * u, first[1] * (u * u), first[2] * (u * u * u), 4.0 * here.excess * (u * u)]
     total, scale = alpha + 2.0 * u, here.p1 * here.p1

@@ -66,15 +66,17 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     columns = [array.reshape(-1) for array in arrays]
     ok = np.asarray(wall_status(*columns)) == Status.OK
     columns = [np.where(ok, column, fill) for column, fill in zip(columns, (0.1, 0.1, 1.0, 0.0), strict=True)]
+    alpha, beta, delta, d = columns
     found = outermost_poles(columns, _ACCURACY)
     rate = np.array(-found.re)
     refine = np.flatnonzero((np.abs(rate) < _SLOW) | (found.error > _ACCURACY))
     for start in range(0, refine.size, BLOCK):
         part = refine[start : start + BLOCK]
         with np.errstate(all="ignore"):
-            rate[part] = refined_rate(*(column[part] for column in columns), found.re[part], found.im[part])
+            wall = alpha[part], beta[part]
+            rate[part] = refined_rate(*wall, delta[part], d[part], found.re[part], found.im[part])
     with np.errstate(all="ignore"):
-        stable = np.asarray(stable_kernel(*columns, kind_of(columns[3])))
+        stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
     # The two agree but for walls within rounding of the circle: there the verdict's side is kept.
     rate = np.where(stable & (rate <= 0), np.finfo(float).tiny, np.where(~stable & (rate > 0), 0.0, rate))
     known = (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))

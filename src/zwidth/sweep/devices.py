@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DELAY_MODELS, DelayModel
-from zwidth.errors import InputError
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
+from zwidth.errors import InputError
 from zwidth.scene import Device, Scene, Timing, VirtualWall, normalize
 from zwidth.sweep.axes import MAX_DELAY_PERIODS
 from zwidth.sweep.faults import LocatedProblem, describe, listing, problem, short
@@ -112,8 +112,9 @@ class _PhysicalPlant(_OneKind):
             numbers = self.to_scene().normalized
         for field, name in (("damping", "delta"), ("stiffness", "alpha"), ("virtual_damping", "beta")):
             least, most = (0.0, LARGEST_DAMPING) if name == "delta" else WALL_RANGE
-            if not within(getattr(numbers, name), (least, most)):
-                what = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(getattr(numbers, name))}"
+            value = float(getattr(numbers, name))
+            if not within(np.float64(value), (least, most)):
+                what = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(value)}"
                 allowed = (
                     f"{name} must be at most {most:g}" if not least else f"{name} must be 0 or {least:g} to {most:g}"
                 )
