@@ -129,9 +129,7 @@ CASES = [
     of_walls(zwidth.stability_of, derivatives=None, value="False where bad, and why", refuses_tracing=True),
     of_walls(zwidth.is_passive, derivatives=None, value="False where bad"),
     of_walls(zwidth.passivity_margin),
-    of_walls(
-        zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/stability/test_margins.py"
-    ),
+    of_walls(zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/stability/test_margins.py"),
     of_walls(zwidth.modulus_margin, value="NaN where bad or alpha <= 0"),
     of_devices("boundary", zwidth.boundary, {"omega": [0.0, 0.5, 3.0]}),
     of_devices(
@@ -152,7 +150,9 @@ CASES = [
     of_devices("alpha_max", zwidth.alpha_max),
     of_devices("stable_area", zwidth.stable_area, derivatives=1),
     of_devices("passive_area", zwidth.passive_area),
-    Case("stiffness_slope", zwidth.stiffness_slope, {"d": [0.0, 1.0, 2.5]}, {"d": -1.0}, {"d": 1e6}, domain="d 0 to 1e5"),
+    Case(
+        "stiffness_slope", zwidth.stiffness_slope, {"d": [0.0, 1.0, 2.5]}, {"d": -1.0}, {"d": 1e6}, domain="d 0 to 1e5"
+    ),
     of_quantities(zwidth.max_stiffness, SI_DEVICE),
     of_quantities(zwidth.sensitivities, SI_DEVICE, derivatives=1),
     of_quantities(zwidth.required_damping, ("mass", "period", "delay")),

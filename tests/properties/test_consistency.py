@@ -167,7 +167,8 @@ def contradictions(f: Facts) -> dict[str, np.ndarray]:
         != stable,
         "the gain margin is above 1 for stable walls": spring & ((m.gain_margin > 1) != stable),
         "stable walls bear more delay": spring & ((m.delay_margin > 0) != stable),
-        "the modulus margin is at most 1 for stable walls": stable & ~((m.modulus_margin > 0) & (m.modulus_margin <= 1)),
+        "the modulus margin is at most 1 for stable walls": stable
+        & ~((m.modulus_margin > 0) & (m.modulus_margin <= 1)),
         "a row ends beyond its stable walls": stable & ~(rows & (f.row.alpha > alpha)),
         "a row ends before its other walls": spring & ~stable & rows & (f.row.alpha > alpha),
         # A column within rounding of the ridge may be undecided.
