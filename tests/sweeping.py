@@ -28,7 +28,10 @@ def study(name="map", axes=None, outputs=("stable",), **fields):
     return {"kind": "sweep", "name": name, "axes": AXES if axes is None else axes, "outputs": list(outputs), **fields}
 
 
-WALLS = ("stable", "spectral_radius", "margin", "settling_time", "passive", "passivity_margin")
+WALLS = (
+    *("stable", "spectral_radius", "margin", "decay_rate", "settling_time", "passive", "passivity_margin"),
+    *("gain_margin", "phase_margin", "delay_margin", "modulus_margin"),
+)
 DEVICES = ("alpha_max", "beta_at_max", "kind")
 FEW = {"alpha": [0.0, 0.1, 0.5], "beta": [-0.05, 0.1, 0.4, 0.9], "delta": [0.0, 0.3], "d": [0, 0.5, 2]}
 IN_SI = {
@@ -41,7 +44,7 @@ def config_of_everything():
     """Every output, in both kinds of units, and radii to an accuracy."""
     return config_of(
         study("map", FEW, (*WALLS, *DEVICES)),
-        study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-9),
+        study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-11),
         study("si", IN_SI, (*WALLS, "stiffness_max", "virtual_damping_at_max")),
     )
 

@@ -256,12 +256,12 @@ def _in_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: in
     store(0, first)
     if count > size:
         # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
-        with ThreadPoolExecutor(threads or _processors()) as pool:
+        with ThreadPoolExecutor(threads or processors()) as pool:
             list(pool.map(lambda start: store(start, run(start)), range(size, count, size)))
     return whole
 
 
-def _processors() -> int:
+def processors() -> int:
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS

@@ -13,7 +13,7 @@ def magnitudes(low: int, high: int) -> st.SearchStrategy[float]:
 deltas = st.just(0.0) | magnitudes(-12, 4)
 alphas = magnitudes(-9, 4)
 # In units of 1 + delta, the range in which stable dampings lie.
-shares = st.floats(-1.0, 1.0)
+shares = st.floats(-1.0, 1.0).map(lambda share: share if abs(share) > 1e-50 else 0.0)
 # Few degrees, because each is compiled once; the fractions are free.
 whole_delays = st.sampled_from([0, 1, 2, 4])
 fractions = st.floats(1e-9, 1 - 1e-9)

@@ -24,8 +24,11 @@ def test_poles_are_real_or_come_in_pairs(wall):
 @given(walls())
 def test_poles_rebuild_the_polynomial(wall):
     poles = zwidth.poles(*wall)
-    rebuilt, magnitude = np.poly(poles), np.poly(-np.abs(poles))
-    assert (np.abs(rebuilt - zwidth.char_poly(*wall)) <= tol.REBUILT.float64 * magnitude).all()
+    size = np.abs(poles)
+    rebuilt, magnitude = np.poly(poles), np.poly(-size)
+    # Eigenvalues are right to rounding of the largest one: poles far smaller may come out as 0.
+    rounding = np.poly(-(size + 1e-15 * size.max())) - magnitude
+    assert (np.abs(rebuilt - zwidth.char_poly(*wall)) <= tol.REBUILT.float64 * magnitude + rounding).all()
 
 
 @given(walls())

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth.stability import balls
 from zwidth.stability.boundary import boundary
 from zwidth.stability.certified import certified_stable
+from zwidth.stability.proved import outermost_poles
 from zwidth.stability.region import lobe
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status
@@ -20,15 +21,20 @@ MAP_DELTA = 0.5
 ERROR_DELTAS = (0.0, 1e-8, 0.1, 1.0, 4.0, 50.0)
 _SEED = 20060901
 _ROOT_BITS, _ROOT_WIDTH = 256, 1e-40
+# Of longer polynomials isolating all roots takes minutes.
+_MOST_ROOTS = 60
+_DIGITS = 40
+# Frequencies that are looked at in each period of the fastest oscillation, before the highest is refined.
+_PER_PERIOD = 64
 
 
 class Walls(NamedTuple):
     """Arguments of one problem; they broadcast."""
 
-    alpha: np.ndarray
-    beta: np.ndarray
-    delta: np.ndarray
-    d: np.ndarray
+    alpha: Any
+    beta: Any
+    delta: Any
+    d: Any
 
     @property
     def points(self) -> int:
@@ -73,6 +79,11 @@ def scattered(d: float, points: int) -> Walls:
     return Walls(alpha, beta, delta, np.full(points, float(d)))
 
 
+def single(d: float, points: int = 1) -> Walls:
+    """One of these walls, as numbers."""
+    return Walls(*(column[0].item() for column in scattered(d, points)))
+
+
 @cache
 def near_boundary(d: float, points: int) -> Labelled:
     """Walls 1e-3 to 1e-15 (relative, in alpha) off the boundary of many devices, with labels from ball arithmetic.
@@ -101,13 +112,14 @@ def near_boundary(d: float, points: int) -> Labelled:
 
 @cache
 def with_radius(d: float, points: int) -> tuple[Walls, np.ndarray]:
-    """Walls near the boundary and all over the map, with spectral radii enclosed by ball arithmetic."""
+    """Walls near the boundary and all over the map, with spectral radii to far more digits than float64 has."""
     near = near_boundary(d, 20 * len(ERROR_DELTAS)).walls
     some = np.random.default_rng(_SEED).permutation(near.points)[: points // 2]
     walls = [
         np.concatenate(pair) for pair in zip((part[some] for part in near), scattered(d, points // 2), strict=True)
     ]
-    radius = np.array([exact_radius(*map(float, wall)) for wall in zip(*walls, strict=True)])
+    exact = exact_radius if d <= _MOST_ROOTS else refined_radius
+    radius = np.array([exact(*map(float, wall)) for wall in zip(*walls, strict=True)])
     return Walls(*walls), radius
 
 
@@ -119,3 +131,80 @@ def exact_radius(alpha: float, beta: float, delta: float, d: float) -> float:
         coefficients = balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
         roots = flint.acb_poly([flint.acb(value) for value in coefficients]).roots(tol=_ROOT_WIDTH)
         return max(float(abs(root).mid()) for root in roots)
+
+
+def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
+    """The same for long delays: that one pole is the outermost rests on its proof in float64, its digits do not.
+
+    Raises:
+        ArithmeticError: there was no proof, or Newton's method left the pole.
+    """
+    import flint
+
+    pole = outermost_poles([np.array([value]) for value in (alpha, beta, delta, d)], 1e-9)
+    if not pole.error[0] <= 1e-9:
+        raise ArithmeticError(f"no proof of the outermost pole at {(alpha, beta, delta, d)}")
+    with flint.ctx.workprec(_ROOT_BITS):
+        coefficients = balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
+        terms = [(k, value.mid()) for k, value in enumerate(coefficients) if value != 0]
+        start = z = flint.acb(float(pole.re[0]), float(pole.im[0])).exp()
+        for _ in range(8):
+            value = sum((a * z**k for k, a in terms), flint.acb(0))
+            slope = sum((k * a * z ** (k - 1) for k, a in terms if k), flint.acb(0))
+            step = (value / slope).mid()
+            z = (z - step).mid()
+        if not (abs(step) < _ROOT_WIDTH and abs(z - start) < 1e-8):
+            raise ArithmeticError(f"Newton's method left the outermost pole at {(alpha, beta, delta, d)}")
+        return float(abs(z).mid())
+
+
+@cache
+def with_needed_damping(d: float, points: int) -> tuple[Walls, np.ndarray]:
+    """Undamped walls, and the damping that makes each of them passive."""
+    walls = scattered(d, points)._replace(delta=np.zeros(points))
+    needed = [exact_needed_damping(float(a), float(b), int(d)) for a, b in zip(walls.alpha, walls.beta, strict=True)]
+    return walls, np.array(needed)
+
+
+def exact_needed_damping(alpha: float, beta: float, d: int) -> float:
+    """The supremum of ``alpha D/2 - beta cos((d + 1) w)``, ``D = sin((d + 1/2) w)/sin(w/2)``, for a whole delay.
+
+    Every local maximum of a dense scan that comes close to the highest is refined in many digits.
+    """
+    from mpmath import mp
+
+    count = _PER_PERIOD * (d + 1)
+    w = np.linspace(0.0, np.pi, count + 1)[1:]
+    value = alpha * np.sin((d + 0.5) * w) / (2.0 * np.sin(w / 2.0)) - beta * np.cos((d + 1) * w)
+    with mp.workdps(_DIGITS):
+        a, b = mp.mpf(alpha), mp.mpf(beta)
+
+        def bound(w: Any) -> Any:
+            return a * mp.sin((d + 0.5) * w) / (2 * mp.sin(w / 2)) - b * mp.cos((d + 1) * w)
+
+        best = max(a * (d + mp.mpf("0.5")) - b, bound(mp.pi))
+        # Between two samples a maximum rises by less than 1 % of the bound's size.
+        near = value > value.max() - 0.01 * (abs(alpha) * (d + 1) + abs(beta))
+        tops = np.flatnonzero(near[1:-1] & (value[1:-1] >= value[:-2]) & (value[1:-1] >= value[2:])) + 1
+        for top in tops:
+            best = max(best, _highest(bound, mp.mpf(w[top - 1]), mp.mpf(w[top + 1])))
+        return float(best)
+
+
+def _highest(bound: Any, low: Any, high: Any) -> Any:
+    """The maximum within a bracket, by golden sections: half of the digits of its place are all of its height."""
+    from mpmath import mp
+
+    ratio = (mp.sqrt(5) - 1) / 2
+    first, second = high - ratio * (high - low), low + ratio * (high - low)
+    left, right = bound(first), bound(second)
+    for _ in range(60):
+        if left > right:
+            high, second, right = second, first, left
+            first = high - ratio * (high - low)
+            left = bound(first)
+        else:
+            low, first, left = first, second, right
+            second = low + ratio * (high - low)
+            right = bound(second)
+    return max(left, right)

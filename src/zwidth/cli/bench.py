@@ -11,7 +11,7 @@ from zwidth.cli.options import json_option
 
 
 @click.command()
-@click.option("--quick", is_flag=True, help="Short delays and small maps: about a minute instead of ten.")
+@click.option("--quick", is_flag=True, help="Few delays and small maps: less than a minute instead of some.")
 @click.option(
     "--out",
     type=click.Path(file_okay=False, path_type=Path),
@@ -20,13 +20,8 @@ from zwidth.cli.options import json_option
     help="Folder of bench.json, bench.md, summary.txt and the picture pareto.png.",
 )
 @click.option("--overwrite", is_flag=True, help="Replace the results of an earlier run in that folder.")
-@click.option(
-    "--install",
-    is_flag=True,
-    help="Let these costs choose the methods from now on, instead of those shipped with zwidth.",
-)
 @json_option
-def bench(quick: bool, out: Path, overwrite: bool, install: bool, as_json: bool) -> None:
+def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
     """Measure speed against error of every method, beside NumPy, JAX and python-control.
 
     Errors are measured against ball arithmetic: python-flint must be installed (extra "certified").
@@ -39,18 +34,12 @@ def bench(quick: bool, out: Path, overwrite: bool, install: bool, as_json: bool)
     if (out / "bench.json").exists() and not overwrite:
         raise InputError(f"--out: {out} holds results already; give --overwrite or choose another folder")
 
-    from zwidth import accuracy
     from zwidth.bench import report, suite
 
     if not suite.can_measure():
         raise ResourceError("bench: python-flint is not installed; install the extra: pip install 'zwidth[certified]'")
     rows = suite.measure(suite.QUICK if quick else suite.FULL, lambda text: click.echo(f"  {text}", err=True))
     written = report.write(rows, out)
-    if install:
-        table = accuracy.user_table()
-        table.parent.mkdir(parents=True, exist_ok=True)
-        table.write_text(json.dumps(report.costs(rows), indent=1) + "\n", encoding="utf-8")
-        written.append(table)
     if as_json:
         click.echo(json.dumps(report.document(rows), indent=1, allow_nan=False))
         return

@@ -107,7 +107,7 @@ def robust_max_stiffness(
         >>> from zwidth.design import Interval, robust_max_stiffness
         >>> worst = robust_max_stiffness(mass=Interval(0.08, 0.12), damping=10, period=1e-3, delay=1e-3)
         >>> print(worst.is_vertex, worst.mass, f"{worst.stiffness:.0f} N/m")
-        True 0.08 16975 N/m
+        True 0.08 17051 N/m
     """
     return RobustStiffness(*_each_box(_worst, RobustStiffness._fields, (mass, damping, period, delay)))
 

@@ -16,11 +16,15 @@ from zwidth.figures import style
 
 # Where no error was seen; left of every measured one.
 _NONE_SEEN = 1e-17
-_RANGE = (3e-18, 1.0)
-_TICKS = [_NONE_SEEN, 1e-14, 1e-11, 1e-8, 1e-5, 1e-2]
-_COLORS = {"stable": style.BLUE, "spectral_radius": style.VERMILION, "alpha_max": style.GREEN}
-_NAMES = {"stable": "stable or not", "spectral_radius": "spectral radius", "alpha_max": "stiffest wall"}
-_SHAPES = {"float64": "o", "float32": "s"}
+_LEAST = 3e-18
+_TICKS = [_NONE_SEEN, 1e-15, 1e-13, 1e-11, 1e-9, 1e-7, 1e-5, 1e-3, 1e-1]
+_COLORS = {"stable": style.BLUE, "spectral_radius": style.VERMILION, "passive": style.PURPLE, "alpha_max": style.GREEN}
+_NAMES = {
+    "stable": "stable or not",
+    "spectral_radius": "spectral radius",
+    "passive": "passive or not",
+    "alpha_max": "stiffest wall",
+}
 
 
 class Mark(NamedTuple):
@@ -28,7 +32,6 @@ class Mark(NamedTuple):
 
     quantity: str
     method: str
-    dtype: str
     layout: str
     d: float
     rate: float
@@ -38,7 +41,7 @@ class Mark(NamedTuple):
 def draw_pareto(marks: Sequence[Mark]) -> Figure:
     """Draw points a second over the worst error seen, both logarithmic: up and to the left is better.
 
-    Filled marks: maps (alpha and beta as axes); open ones: scattered points. Circles: float64; squares: float32.
+    Filled marks: maps (alpha and beta as axes); open ones: scattered points.
 
     Args:
         marks: the measurements; of several with one name the first is drawn.
@@ -55,7 +58,7 @@ def draw_pareto(marks: Sequence[Mark]) -> Figure:
         )
         for ax, d in zip(axes.ravel(), delays, strict=False):
             _draw_panel(ax, [mark for mark in marks if mark.d == d])
-            ax.set_title(f"d = {d:g}")
+            ax.set_title(f"d = {d:,.10g}")
         for ax in axes.ravel()[len(delays) :]:
             ax.set_visible(False)
         _shared_axes(axes, marks)
@@ -71,20 +74,20 @@ def draw(marks: Sequence[Mark], stem: Path) -> tuple[Path, Path]:
 def _draw_panel(ax: Axes, marks: Sequence[Mark]) -> None:
     drawn: dict[tuple[str, ...], Mark] = {}
     for mark in marks:
-        drawn.setdefault(mark[:4], mark)
+        drawn.setdefault(mark[:3], mark)
     labelled: dict[str, list[Mark]] = {}
     for mark in drawn.values():
         color = _COLORS[mark.quantity]
         ax.plot(
             max(mark.error, _NONE_SEEN),
             mark.rate,
-            _SHAPES[mark.dtype],
+            "o",
             color=color,
             markerfacecolor=color if mark.layout == "map" else "white",
             markersize=5.5,
             markeredgewidth=1.1,
         )
-        labelled.setdefault(f"{mark.quantity} {mark.method} {mark.dtype}", []).append(mark)
+        labelled.setdefault(f"{mark.quantity} {mark.method}", []).append(mark)
     # One name for the two marks of a method, beside the faster one; names in one place move apart.
     tops = [max(group, key=lambda mark: mark.rate) for group in labelled.values()]
     places = 10 ** style.spread([np.log10(top.rate) for top in tops], 0.34)
@@ -106,12 +109,13 @@ def _draw_panel(ax: Axes, marks: Sequence[Mark]) -> None:
 
 def _shared_axes(axes: np.ndarray, marks: Sequence[Mark]) -> None:
     rates = [mark.rate for mark in marks]
+    right = max(1e-11, 30 * max(mark.error for mark in marks))
     for ax in axes.ravel():
         ax.set_xscale("log")
         ax.set_yscale("log")
-        ax.set_xlim(*_RANGE)
+        ax.set_xlim(_LEAST, right)
         ax.set_ylim(min(rates) / 3, max(rates) * 5)
-        ax.xaxis.set_major_locator(FixedLocator(_TICKS))
+        ax.xaxis.set_major_locator(FixedLocator([tick for tick in _TICKS if tick < right]))
         ax.xaxis.set_minor_locator(NullLocator())
         ax.xaxis.set_major_formatter(
             FuncFormatter(lambda x, _: "none" if x < 1e-16 else f"$10^{{{round(np.log10(x))}}}$")
@@ -133,6 +137,4 @@ def _legend(marks: Sequence[Mark]) -> list[Line2D]:
     handles = [dot(_NAMES[name], marker="o", color=color) for name, color in _COLORS.items() if name in quantities]
     handles.append(dot("map", marker="o", color=style.GRAY))
     handles.append(dot("scattered points", marker="o", color=style.GRAY, markerfacecolor="white"))
-    if any(mark.dtype == "float32" for mark in marks):
-        handles.append(dot("float32", marker="s", color=style.GRAY))
     return handles

@@ -19,7 +19,7 @@ from zwidth.figures.sweep_data import Panel, PlaneData, Quantity, Scale
 # Light, so that curves drawn over them stay legible; in gray, passive is the darker one.
 STABLE, PASSIVE, MISSING = "#BFE3F7", "#F3C46B", "#D9D9D9"
 # Numbers whose contour at this level is the boundary of the stable walls.
-_EDGES = {"margin": 0.0, "spectral_radius": 1.0}
+_EDGES = {"margin": 0.0, "decay_rate": 0.0, "phase_margin": 0.0, "gain_margin": 1.0, "spectral_radius": 1.0}
 # Beyond this multiple of the smallest, a quantity that grows without end has one color.
 _STEEP = 100.0
 # A region that fills less of its panel than this has no room for labels.
@@ -222,7 +222,7 @@ def _explain(figure: Figure, axes: list[Axes], panels: tuple[Panel, ...], quanti
     if quantity.look == "diverging":
         edge = "passive" if quantity.name == "passivity_margin" else "stable"
         handles.append(Line2D([], [], color=style.BLACK, linewidth=1.3, label=f"edge of what is {edge}"))
-    if quantity.name == "settling_time":
+    if quantity.name in ("settling_time", "delay_margin"):
         handles.append(Patch(facecolor=MISSING, label="unstable"))
     elif any(_missing(panel.fields[quantity.name]) for panel in panels):
         handles.append(Patch(facecolor=MISSING, label="not computed"))

@@ -1,8 +1,9 @@
 """How many poles lie inside the circle |z| = r, in closed form: where the two parts of the loop are equally large.
 
 P = T + B as in `zwidth.stability.crossover`, ``T = z^(1+n) (z - 1)(z - c)`` and ``B = M(z) (s z - beta)`` with
-s = alpha + beta and ``M = (a2 z + h)(1 + q/z)``, whose zeros are real and not positive. On ``z = r e^(j w)``, 0 < w < pi,
-with x = sin^2(w/2) every factor has ``|z - a|^2 = (r - a)^2 + 4 r a x`` and an imaginary part of one sign. Hence
+s = alpha + beta and ``M = (a2 z + h)(1 + q/z)``, whose zeros are real and not positive. On ``z = r e^(j w)``,
+0 < w < pi, with x = sin^2(w/2) every factor has ``|z - a|^2 = (r - a)^2 + 4 r a x`` and an imaginary part of one sign.
+Hence
 
 - |T|^2 - |B|^2 is a quadratic in x (whole delays) or a cubic; its zeros in (0, 1) are the crossovers;
 - every argument is continuous where it is principal, and between crossovers that of P stays within a quarter turn of
@@ -22,8 +23,8 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.loop import valid_wall
 from zwidth.plant import held_plant, split_delay, undelayed_plant
-from zwidth.stability.crossover import ARCSINE
-from zwidth.xp import epsilon, horner, namespace
+from zwidth.stability.arcs import angle, turn_of
+from zwidth.xp import epsilon, namespace
 
 # What rounding makes of a bracket, and of an odd multiple over the number of turns, in rounding units.
 _NEAR = 5e3
@@ -167,28 +168,6 @@ def _between(low: Array, high: Array, first: Array, last: Array, h: tuple[Array,
     return xp.where(exists, x, np.nan)
 
 
-def angle(re: Array, im: Array) -> Array:
-    """The argument in (-pi, pi]; four times faster than the compiler's."""
-    xp = namespace(re, im)
-    if xp is np:
-        return np.arctan2(im, re)
-    size = xp.abs(re)
-    length = xp.sqrt(re * re + im * im)
-    half = 0.5 * im * im / (length * (length + size))
-    value = 2.0 * xp.sqrt(half) * horner(4.0 * half - 1.0, ARCSINE)
-    value = xp.where(re < 0, np.pi - value, value)
-    return xp.where(im < 0, -value, value)
-
-
-def _turn(x: Array, y: Array, xp: Any) -> Array:
-    """The w of ``x = sin^2(w/2)`` and y = 1 - x."""
-    if xp is np:
-        return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
-    low = xp.minimum(x, y)
-    value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)
-    return xp.where(x > y, np.pi - value, value)
-
-
 class _Crossing(NamedTuple):
     theta: Array
     w: Array
@@ -200,8 +179,8 @@ class _Crossing(NamedTuple):
     wall_im: Array
 
 
-def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Crossing:
-    """``arg T - arg B`` at a crossover, continuous from w = 0, and the derivative of the logarithm of their quotient."""
+def crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Crossing:
+    """``arg T - arg B`` at a crossover, continuous from w = 0, and the derivative of ``log(T/B)``."""
     y = 1.0 - x
     r = at.r
     im, twice = 2.0 * r * xp.sqrt(x * y), 2.0 * r * x
@@ -216,7 +195,7 @@ def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Cr
     v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
     phase = angle(v_re, v_im)
     phase = xp.where((v_im < 0) & (q_im >= 0), phase + 2.0 * np.pi, phase)
-    w = _turn(x, y, xp)
+    w = turn_of(x, y, xp)
     theta = loop.turns * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
     sizes = [
         one * one + im * im,
@@ -233,7 +212,7 @@ def _crossing(x: Array, at: Sides, loop: Loop, fractional: bool, xp: Any) -> _Cr
     ]
     quotient = sizes[0] / sizes[2] * (sizes[1] / sizes[3])
     re, slope_im, rate = loop.turns, 0.0 * x, loop.turns
-    for k, (zero, part, part_im, size) in enumerate(parts):
+    for zero, part, part_im, size in parts:
         scaled = zero / size
         re = re + scaled * part
         slope_im = slope_im - scaled * part_im
@@ -261,10 +240,17 @@ class _End(NamedTuple):
     opposite: Array  # their signs differ
     level: Array  # log |T/B|
     slope: Array  # F' there, a real number
+    device_size: Array  # |T| and |B|
+    wall_size: Array
 
 
 def _end(
-    log_r: Array, factors: tuple[Array, ...], signs: tuple[Array, Array], angles: tuple[Array, Array], loop: Loop
+    log_r: Array,
+    at: Sides,
+    factors: tuple[Array, ...],
+    signs: tuple[Array, Array],
+    angles: tuple[Array, Array],
+    loop: Loop,
 ) -> _End:
     """From z - 1, z - c, a2 z + h, 1 + q/z, s z - beta and z + q, all real."""
     one, pole, body, late, wall, shifted = factors
@@ -272,7 +258,8 @@ def _end(
     level = loop.turns * log_r + xp.log(xp.abs(one * pole / (body * late * wall)))
     slope = loop.turns + 1.0 / one + loop.c / pole + loop.h / body - loop.beta / wall
     slope = slope + xp.where(loop.q > 0, loop.q / shifted, 0.0)
-    return _End(*angles, signs[0] != signs[1], level, slope)
+    sizes = at.up * xp.abs(one * pole), at.down * xp.abs(body * late * wall)
+    return _End(*angles, signs[0] != signs[1], level, slope, *sizes)
 
 
 def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
@@ -284,6 +271,7 @@ def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     behind = at.front < 0
     front = _end(
         log_r,
+        at,
         (at.near, at.off, at.body, 1.0 + ratio, at.front, r + loop.q),
         ((at.near < 0) != (at.off < 0), behind),
         (device, xp.where(behind, half, 0.0)),
@@ -293,6 +281,7 @@ def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     flipped = (body < 0) != ((late < 0) != (wall < 0))
     back = _end(
         log_r,
+        at,
         (-1.0 - r, -loop.c - r, body, late, wall, loop.q - r),
         (xp.mod(loop.turns, 2.0) == 1.0, flipped),
         (
@@ -304,12 +293,24 @@ def real_ends(log_r: Array, at: Sides, loop: Loop) -> tuple[_End, _End]:
     return front, back
 
 
-def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, high: Array = np.inf) -> Circle:
-    """Count the poles inside ``|z| = e^log_r``, and tell where Newton's method expects the next one.
+def _tied(end: _End, blur: Array) -> Array:
+    """Whether T and B may cancel there but for rounding errors."""
+    xp = namespace(blur)
+    return end.opposite & (xp.abs(end.device_size - end.wall_size) < blur * end.wall_size)
 
-    On a crossover T and B are equally large: one Newton step for ``log(T/B) = an odd multiple of j pi`` leads to a
-    pole, outwards where there are poles outside, else inwards. On the real axis the same in real numbers.
-    """
+
+class _Count(NamedTuple):
+    """How many poles are inside, and what was seen on the way."""
+
+    count: Array
+    full: Array
+    sure: Array
+    at: Sides
+    ends: tuple[_End, _End]
+    crossings: list[tuple[_Crossing, Array, Array]]
+
+
+def _counted(log_r: Array, loop: Loop, fractional: bool) -> _Count:
     xp = namespace(log_r, loop.alpha)
     at = sides(log_r, loop)
     sizes = _sizes(at, loop, fractional)
@@ -320,12 +321,12 @@ def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, hig
     eps = epsilon(log_r)
     blur = 4.0 * eps * (loop.turns + 8.0)
     # Where a real pole is on the circle itself.
-    sure = ~((front.opposite & (xp.abs(front.level) < blur)) | (back.opposite & (xp.abs(back.level) < blur)))
+    sure = ~(_tied(front, blur) | _tied(back, blur))
     turn, crossings = 0.0 * left, []
     for x in zeros:
         valid = (x >= 0) & (x < 1.0)
         x = xp.where(valid, x, 0.5)
-        here = _crossing(x, at, loop, fractional, xp)
+        here = crossing(x, at, loop, fractional, xp)
         part = here.theta / (2.0 * np.pi)
         whole = xp.round(part)
         turn = turn + xp.where(valid, xp.where(outer, whole, -whole), 0.0)
@@ -338,9 +339,24 @@ def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, hig
         crossings.append((here, rest, valid))
     right = xp.where(outer, back.device, back.wall)
     count = right - left + 2.0 * turn
-    full = count == loop.turns + 2.0
-    expected = _expected((log_r, low, high), full, crossings, (front, back), at, loop)
-    return Circle(count, full, sure, *expected)
+    return _Count(count, count == loop.turns + 2.0, sure, at, (front, back), crossings)
+
+
+def inside(log_r: Array, loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """Whether every pole is inside ``|z| = e^log_r``, and whether rounding errors cannot have decided that."""
+    found = _counted(log_r, loop, fractional)
+    return found.full, found.sure
+
+
+def circle(log_r: Array, loop: Loop, fractional: bool, low: Array = -np.inf, high: Array = np.inf) -> Circle:
+    """Count the poles inside ``|z| = e^log_r``, and tell where Newton's method expects the next one.
+
+    On a crossover T and B are equally large: one Newton step for ``log(T/B) = an odd multiple of j pi`` leads to a
+    pole, outwards where there are poles outside, else inwards. On the real axis the same in real numbers.
+    """
+    found = _counted(log_r, loop, fractional)
+    expected = _expected((log_r, low, high), found.full, found.crossings, found.ends, found.at, loop)
+    return Circle(found.count, found.full, found.sure, *expected)
 
 
 def _expected(
@@ -377,45 +393,3 @@ def _expected(
         better = good & (new > best) & (new > low) & (new < high)
         best, best_im = xp.where(better, new, best), xp.where(better, im, best_im)
     return xp.where(best == -np.inf, np.nan, best), xp.clip(best_im, 0.0, np.pi)
-
-
-class Near(NamedTuple):
-    """The loop at ``z = e^(re + j im)``, by logarithms; F' is the derivative of F = log(T/B) by log z."""
-
-    level: Array  # log |T/B|
-    past: Array  # arg T - arg B less the nearest odd multiple of pi
-    re: Array  # F'
-    im: Array
-    wall_re: Array  # the derivative of log B
-    wall_im: Array
-
-
-def near(re: Array, im: Array, loop: Loop, fractional: bool) -> Near:
-    """Evaluate at a point of the upper half plane, 0 <= im <= pi."""
-    xp = namespace(re, loop.alpha)
-    at = sides(re, loop)
-    sine = xp.sin(0.5 * im)
-    here = _crossing(sine * sine, at, loop, fractional, xp)
-    level = loop.turns * re + 0.5 * xp.log(here.quotient)
-    part = here.theta / (2.0 * np.pi)
-    past = 2.0 * np.pi * (part - xp.floor(part) - 0.5)
-    return Near(level, past, here.re, here.im, here.wall_re, here.wall_im)
-
-
-def ratio_step(at: Near) -> tuple[Array, Array]:
-    """Newton's step on log(T/B), for poles of long delays: all but their powers of z is nearly constant."""
-    norm = at.re * at.re + at.im * at.im
-    return -(at.level * at.re + at.past * at.im) / norm, -(at.past * at.re - at.level * at.im) / norm
-
-
-def newton_step(at: Near) -> tuple[Array, Array]:
-    """Newton's step on P itself, for poles next to a zero of T or B: ``P/P' = (1 + y)/(y F' + (1 + y) B'/B)``, y = T/B."""
-    xp = namespace(at.level)
-    size = xp.exp(at.level)
-    y_re, y_im = -size * xp.cos(at.past), -size * xp.sin(at.past)
-    sum_re = 1.0 + y_re
-    # 1 + y cancels near a pole; that loses nothing that y had.
-    slope_re = y_re * at.re - y_im * at.im + sum_re * at.wall_re - y_im * at.wall_im
-    slope_im = y_re * at.im + y_im * at.re + sum_re * at.wall_im + y_im * at.wall_re
-    norm = slope_re * slope_re + slope_im * slope_im
-    return -(sum_re * slope_re + y_im * slope_im) / norm, -(y_im * slope_re - sum_re * slope_im) / norm

@@ -79,6 +79,9 @@ def sign_change(
     """
     xp = namespace(low, at_low)
 
+    def done(at: _Bracket) -> Array:
+        return (xp.abs(at.value) <= _ROUNDING) | (at.high - at.low <= width)
+
     def step(k: Any, at: _Bracket) -> _Bracket:
         middle = 0.5 * (at.low + at.high)
         gap = at.at_low - at.at_high
@@ -87,7 +90,8 @@ def sign_change(
         # A scalar of NumPy is five times faster than an array of no dimension.
         trial = trial[()]
         value = function(trial)
-        above, better = value > 0, xp.abs(value) < xp.abs(at.value)
+        # A point that is done keeps its value: it must not depend on the points beside it.
+        above, better = value > 0, (xp.abs(value) < xp.abs(at.value)) & ~done(at)
         return _Bracket(
             xp.where(above, trial, at.low),
             xp.where(above, at.high, trial),
@@ -104,7 +108,7 @@ def sign_change(
     if xp is np:
         for k in range(steps):
             at = step(k, at)
-            if np.all((np.abs(at.value) <= _ROUNDING) | (at.high - at.low <= width)):
+            if np.all(done(at)):
                 break
         return at.best
     from jax.lax import fori_loop

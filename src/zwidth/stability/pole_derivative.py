@@ -9,7 +9,8 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 from zwidth._types import Array
-from zwidth.stability.circle import Loop, near
+from zwidth.stability.circle import Loop
+from zwidth.stability.log_step import near
 from zwidth.xp import frozen, namespace
 
 

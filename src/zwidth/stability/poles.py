@@ -69,7 +69,7 @@ def _safe_step(z, value, slope, alpha, beta, plant, degree: Degree) -> Array:
 
 
 def radius_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool = False) -> Array:
-    """The spectral radius from the companion matrix; at least 1 for a wall without stiffness, which has a pole there."""
+    """The spectral radius from the companion matrix; at least 1 without stiffness, for a pole is there."""
     xp = namespace(alpha, beta, delta, d)
     radius = xp.max(xp.abs(pole_kernel(alpha, beta, delta, d, degree, spring)), axis=-1)
     return xp.where(alpha == 0, xp.maximum(radius, 1.0), radius)

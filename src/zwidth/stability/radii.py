@@ -13,9 +13,9 @@ from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.poles import radius_and_bound, radius_by_companion
-from zwidth.stability.proved import Proved, proved_radii
+from zwidth.stability.proved import Proved, proved_radii, radii
 from zwidth.stability.radius import traced_kernel
-from zwidth.status import Method, Status
+from zwidth.status import Method
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)
@@ -55,7 +55,7 @@ def spectral_radius(
         beta: normalized virtual damping B T/m.
         delta: normalized physical damping b T/m, >= 0.
         d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast.
-        method: "newton" (and "auto") finds the outermost pole and proves each value by two counts of the poles inside
+        method: "newton" (and "auto") finds the outermost pole and proves each value by counts of the poles inside
             a circle, at a cost that does not grow with d; "companion" computes all poles.
         accuracy: relative error to prove, 1e-9 by default, at least 1e-12. Newton's method ends with nearly all digits
             whatever is asked for, so nothing becomes faster by asking for less; "companion" takes any.
@@ -90,7 +90,7 @@ def spectral_radius(
         return radius_by_companion(*values)
     if is_traced(*values):
         return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
-    return proved_radii(values, wanted).radius
+    return radii(values, wanted)
 
 
 def _exp(value: Array) -> Array:
@@ -128,9 +128,10 @@ def radius_of(
         delay: only "held" has poles.
 
     Returns:
-        Radius: ``radius``; ``error``, absolute: where ``certified``, all poles were counted inside ``radius + error``
-        and not all inside ``radius - error``, in float64 arithmetic and with rounding errors that could not have
-        decided either, and the error is within what was asked for. ``status``: INVALID_INPUT or OUT_OF_RANGE with NaN;
+        Radius: ``radius``; ``error``, absolute: where ``certified``, all poles were counted inside ``radius + error``,
+        and one is not inside ``radius - error``, by a count too or because no polynomial of degree N has its zeros
+        farther than N |P/P'| from any z; in float64 arithmetic and with rounding errors that could not have decided
+        either, and the error is within what was asked for. ``status``: INVALID_INPUT or OUT_OF_RANGE with NaN;
         NOT_CONVERGED where the error is larger than asked for (next to multiple poles; it is then the least one that
         two counts do prove) or infinite where there is none. With "companion" the error bounds the distance from the
         largest computed pole to a true one, and nothing is certified. ``method``: a `Method`.

@@ -15,7 +15,9 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.loop import poison, valid_wall
-from zwidth.stability.circle import Loop, Near, angle, circle, loop_of, near, newton_step, ratio_step, real_ends, sides
+from zwidth.stability.arcs import angle
+from zwidth.stability.circle import Loop, circle, loop_of, real_ends, sides
+from zwidth.stability.log_step import Near, near, newton_step, ratio_step
 from zwidth.stability.pole_derivative import followed
 from zwidth.xp import epsilon, frozen, namespace
 
@@ -90,7 +92,7 @@ def until(steps: int, step: Callable[[Any], Any], done: Callable[[Any], Array], 
     )[1]
 
 
-def level(high: Array, loop: Loop) -> Array:
+def level(high: Array, loop: Loop, steps: int = _LEVEL_STEPS) -> Array:
     """Where T and B are equally large on the real axis, the top of the curve on which the poles lie."""
     xp = namespace(high)
 
@@ -103,7 +105,7 @@ def level(high: Array, loop: Loop) -> Array:
         new = xp.where(going, xp.clip(new, 0.1 * at, high), at)
         return new, xp.where(going, xp.abs(new - at), moved)
 
-    return until(_LEVEL_STEPS, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
+    return until(steps, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
 
 
 def slow_pole(loop: Loop) -> Found:
@@ -200,11 +202,11 @@ def proved(log_r: Array, tolerances: Sequence[Any], loop: Loop, fractional: bool
     """Whether the radius is ``e^log_r`` within each relative tolerance, in float64 arithmetic."""
     xp = namespace(log_r)
     offsets = [sign * tolerance + 0.0 * log_r for tolerance in tolerances for sign in (1.0, -1.0)]
-    if np.ndim(log_r) == 0 and xp is np:
+    if len(tolerances) == 1:
         seen = [circle(log_r + offset, loop, fractional) for offset in offsets]
         full, sure = [at.full for at in seen], [at.sure for at in seen]
     else:
-        # One text for all circles.
+        # One text for all circles compiles sooner; a text for each runs faster.
         shape = (len(offsets), *np.shape(log_r))
         spread = Loop(*(xp.broadcast_to(field, shape) for field in loop))
         at = circle(xp.broadcast_to(log_r, shape) + xp.stack(offsets), spread, fractional)

@@ -57,6 +57,11 @@ _ORDER = ("alpha", "stiffness", "beta", "virtual_damping", "delta", "damping", "
 _QUANTITIES = {
     "spectral_radius": ("spectral radius", r"\rho", "diverging", 1.0, True),
     "margin": ("margin", r"1 - \rho", "diverging", 0.0, False),
+    "decay_rate": ("rate of decay", r"-\ln\rho", "diverging", 0.0, False),
+    "gain_margin": ("gain margin", "g_m", "logarithmic", 0.0, False),
+    "phase_margin": ("phase margin", r"\varphi_m", "diverging", 0.0, False),
+    "delay_margin": ("delay margin", r"\tau_m", "logarithmic", 0.0, False),
+    "modulus_margin": ("modulus margin", "s_m", "sequential", 0.0, False),
     "passivity_margin": ("passivity margin, in units of", r"\delta", "diverging", 0.0, False),
     "settling_time": ("settling time to 2 %", r"t_s", "steep", 0.0, False),
     "alpha_max": ("maximum stable stiffness", r"\alpha_{\max}", "logarithmic", 0.0, False),
@@ -232,8 +237,9 @@ class _View:
         panels = []
         for place in places:
             fields = {each: self._values(each, {**place, **thin}, [y, x]) for each in names}
-            if name == "settling_time":
-                fields[name] = np.where(np.isfinite(fields[name]), fields[name], np.nan)
+            if name in ("settling_time", "gain_margin", "delay_margin"):
+                known = np.isfinite(fields[name]) & (fields[name] > 0)
+                fields[name] = np.where(known, fields[name], np.nan)
             panels.append(Panel(self._title(place), fields, self._peak(place, x, y)))
         scales = [self._scale(dim) for dim in (x, y)]
         scales = [replace(scale, values=scale.values[thin[scale.name]]) for scale in scales]

@@ -33,4 +33,4 @@ def perform(path: str, family: str, index: int) -> None:
 
     plan = store.plan.family(family)
     block = store.grid.block(plan.place(index))
-    store.write(task, compute(plan.family, plan.outputs, block, store.plan.methods, store.study.accuracy))
+    store.write(task, compute(plan.family, plan.outputs, block, store.study.accuracy))

@@ -15,35 +15,36 @@ from typing import TypeAlias
 
 import numpy as np
 
-from zwidth.grouping import degree_of, groups
+from zwidth.batching import FEW
 from zwidth.stability.boundary_map import row_limits
+from zwidth.stability.decay import decay_rate
+from zwidth.stability.margins import margins
 from zwidth.stability.passivity import margin_at_one_delay
-from zwidth.stability.poles import companion_chunk, radius_by_companion
-from zwidth.stability.proved import certified_columns
+from zwidth.stability.proved import proved_radii
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
-from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, Family
+from zwidth.sweep.outputs import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 Columns: TypeAlias = tuple[np.ndarray, ...]
 
 # Small where a point is expensive, for a sweep of a few points pays for a whole piece; the last one is for rows.
 _PIECE = 1 << 9
 _ROW_PIECE = 1 << 12
-_NEWTON_PIECE = 1 << 12
+# Few enough for NumPy: points that need more patience are tried again together, however many they are.
+_RADIUS_PIECE = FEW
 _WALL_PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
 _MANY_ROWS = 256
 _DECAY = math.log(50.0)
+_MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
-def compute(
-    family: Family, outputs: tuple[str, ...], block: Block, methods: dict[str, str], accuracy: float | None = None
-) -> dict[str, np.ndarray]:
+def compute(family: Family, outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
     """Every output of a family on a block, and its status; walls in shape (D, A, B), devices in shape (D,)."""
-    found = _devices(block) if family == "device" else _walls(outputs, block, methods, accuracy)
+    found = _devices(block) if family == "device" else _walls(outputs, block, accuracy)
     return {name: found[name] for name in (*outputs, STATUS_OF[family])}
 
 
@@ -77,32 +78,43 @@ def _devices(block: Block) -> dict[str, np.ndarray]:
     return found
 
 
-def _walls(
-    outputs: tuple[str, ...], block: Block, methods: dict[str, str], accuracy: float | None
-) -> dict[str, np.ndarray]:
+def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
     """What belongs to walls."""
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
     found: dict[str, np.ndarray] = {}
-    if {"spectral_radius", "margin", "settling_time"} & set(outputs):
-        wanted = accuracy if methods["spectral_radius"] == "newton" else None
-        found["spectral_radius"] = radius = _radius(block, shape, wanted)
-        found["margin"] = 1.0 - radius
-        if "settling_time" in outputs:
-            found["settling_time"] = _settling_time(radius, block)
+    unproved = False
+    if RADIUS_OUTPUTS & set(outputs):
+        radius, proved, rate = _by_device(partial(_radius_columns, accuracy), block, shape, _all_devices, leaves=3)
+        found["spectral_radius"], unproved = radius, proved == 0
+        # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
+        found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
+        found["margin"] = -np.expm1(-rate)
+        found["settling_time"] = _settling_time(rate, block)
+    if MARGIN_OUTPUTS & set(outputs):
+        found |= dict(zip(_MARGINS, _by_device(_margins, block, shape, _all_devices, leaves=4), strict=True))
+        if block.period.size:
+            found["delay_margin"] = found["delay_margin"] * block.period[:, None, None]
     if "stable" in outputs:
         found["stable"] = _stable(block, shape)
     if {"passive", "passivity_margin"} & set(outputs):
-        margin = _by_device(_passivity, block, shape, _delays)
+        (margin,) = _by_device(_passivity, block, shape, _delays)
         found |= {"passivity_margin": margin, "passive": margin > 0}
-    found["status"] = _status(outputs, found, block, shape)
+    found["status"] = _status(outputs, found, unproved, block, shape)
     return found
 
 
-def _status(outputs: tuple[str, ...], found: dict[str, np.ndarray], block: Block, shape: tuple[int, ...]) -> np.ndarray:
+def _status(
+    outputs: tuple[str, ...],
+    found: dict[str, np.ndarray],
+    unproved: np.ndarray | bool,
+    block: Block,
+    shape: tuple[int, ...],
+) -> np.ndarray:
     """Why each wall has its values."""
     status = np.full(shape, Status.OK, dtype=np.uint8)
+    status[unproved] = Status.NOT_CONVERGED
     for name in outputs:
-        if OUTPUTS[name].dtype == "float64":
+        if OUTPUTS[name].dtype == "float64" and name not in MARGIN_OUTPUTS:
             status[np.isnan(found[name])] = Status.NOT_CONVERGED
     device = np.isfinite(block.delta) & np.isfinite(block.d)
     alpha, beta = np.isfinite(block.alpha), np.isfinite(block.beta)
@@ -111,10 +123,10 @@ def _status(outputs: tuple[str, ...], found: dict[str, np.ndarray], block: Block
     return status
 
 
-def _settling_time(radius: np.ndarray, block: Block) -> np.ndarray:
+def _settling_time(rate: np.ndarray, block: Block) -> np.ndarray:
     """The time in which the slowest pole decays to 2 %, in seconds where there is a period."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        periods = np.where(radius < 1.0, _DECAY / -np.log(radius), np.where(np.isnan(radius), np.nan, np.inf))
+        periods = np.where(rate > 0, _DECAY / rate, np.where(np.isnan(rate), np.nan, np.inf))
     return periods * block.period[:, None, None] if block.period.size else periods
 
 
@@ -153,13 +165,14 @@ def _limits_of_one(beta: np.ndarray, delta: float, d: float, size: int) -> np.nd
 
 
 def _by_device(
-    function: Callable[[Columns], np.ndarray],
+    function: Callable[[Columns], Columns],
     block: Block,
     shape: tuple[int, ...],
     grouped: Callable[[np.ndarray], Iterator[np.ndarray]],
-) -> np.ndarray:
-    """Apply a function of columns to the walls of a block, group by group of devices."""
-    result = np.empty(shape)
+    leaves: int = 1,
+) -> Columns:
+    """Apply a function of columns to the walls of a block, group by group of devices; it gives so many arrays."""
+    results = tuple(np.empty(shape) for _ in range(leaves))
     rows = min(shape[1], max(1, _LAID_OUT // shape[2]))
     for group in grouped(block.d):
         step = max(1, _LAID_OUT // (rows * shape[2]))
@@ -172,37 +185,40 @@ def _by_device(
                 block.d[devices, None, None],
             )
             columns = tuple(parameter.ravel() for parameter in parameters)
-            result[devices, alphas] = function(columns).reshape(parameters[0].shape)
-    return result
+            for result, leaf in zip(results, function(columns), strict=True):
+                result[devices, alphas] = leaf.reshape(parameters[0].shape)
+    return results
 
 
-def _radius(block: Block, shape: tuple[int, ...], accuracy: float | None = None) -> np.ndarray:
-    """By companion eigenvalues; to a given accuracy, by Newton's method wherever that is proved."""
-    if accuracy is None:
-        return _by_device(_radius_columns, block, shape, _degrees)
-    return _by_device(lambda columns: _proved_radius_columns(columns, accuracy), block, shape, _degrees)
+def _radius_columns(accuracy: float, columns: Columns) -> Columns:
+    """The spectral radius, whether it is proved to an accuracy (NaN where no error bound is), and the rate of decay."""
+
+    def of_piece(*piece: np.ndarray) -> Columns:
+        found = proved_radii(piece, accuracy)
+        rate = np.asarray(decay_rate(*piece))
+        radius = np.where(np.isfinite(found.error), found.radius, np.nan)
+        # The rate has more digits of it.
+        radius = np.where(np.isfinite(rate), np.exp(-rate), radius)
+        return radius, np.asarray(found.certified, dtype=np.float64), rate
+
+    return in_pieces(of_piece, columns, _RADIUS_PIECE)
 
 
-def _proved_radius_columns(columns: Columns, accuracy: float) -> np.ndarray:
-    radius, proved = in_pieces(partial(certified_columns, accuracy=accuracy), columns, _NEWTON_PIECE)
-    rest = ~proved
-    if rest.any():
-        radius[rest] = _radius_columns(tuple(column[rest] for column in columns))
-    return radius
+def _margins(columns: Columns) -> Columns:
+    def of_piece(*piece: np.ndarray) -> Columns:
+        found = margins(*piece)
+        return tuple(np.asarray(getattr(found, name)) for name in _MARGINS)
+
+    return in_pieces(of_piece, columns, _WALL_PIECE)
 
 
-def _radius_columns(columns: Columns) -> np.ndarray:
-    size = min(_PIECE, companion_chunk(degree_of(columns[3][0])))
-    return in_pieces(lambda *piece: (radius_by_companion(*piece),), columns, size)[0]
+def _all_devices(d: np.ndarray) -> Iterator[np.ndarray]:
+    yield np.arange(d.size)
 
 
-def _degrees(d: np.ndarray) -> Iterator[np.ndarray]:
-    return (index for _, index in groups(d))
-
-
-def _passivity(columns: Columns) -> np.ndarray:
+def _passivity(columns: Columns) -> Columns:
     *walls, d = columns
-    return in_pieces(lambda *piece: (margin_at_one_delay(*piece, d=float(d[0])),), tuple(walls), _WALL_PIECE)[0]
+    return in_pieces(lambda *piece: (margin_at_one_delay(*piece, d=float(d[0])),), tuple(walls), _WALL_PIECE)
 
 
 def _delays(d: np.ndarray) -> Iterator[np.ndarray]:

@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DELAY_MODELS, DelayModel
 from zwidth.errors import InputError
+from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.scene import Device, Scene, Timing, VirtualWall, normalize
 from zwidth.sweep.axes import MAX_DELAY_PERIODS
 from zwidth.sweep.faults import LocatedProblem, describe, listing, problem, short
@@ -110,9 +111,13 @@ class _PhysicalPlant(_OneKind):
         with np.errstate(all="ignore"):
             numbers = self.to_scene().normalized
         for field, name in (("damping", "delta"), ("stiffness", "alpha"), ("virtual_damping", "beta")):
-            if not np.isfinite(getattr(numbers, name)):
-                what = f"got {short(getattr(self, field))}, whose normalized value {name} is beyond float64"
-                yield (field,), problem(what, f"{name} must be finite", "check the units and the mass")
+            least, most = (0.0, LARGEST_DAMPING) if name == "delta" else WALL_RANGE
+            if not within(getattr(numbers, name), (least, most)):
+                what = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(getattr(numbers, name))}"
+                allowed = (
+                    f"{name} must be at most {most:g}" if not least else f"{name} must be 0 or {least:g} to {most:g}"
+                )
+                yield (field,), problem(what, allowed, "check the units and the mass")
 
     @property
     def delta(self) -> float:

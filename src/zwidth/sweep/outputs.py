@@ -61,6 +61,27 @@ _ALL = (
     Output("spectral_radius", "wall", "float64", "largest pole magnitude"),
     Output("margin", "wall", "float64", "1 - spectral radius, positive for a stable wall"),
     Output(
+        "decay_rate",
+        "wall",
+        "float64",
+        "rate at which the slowest pole decays, -ln(spectral radius); negative where it grows",
+        units="1/period",
+        physical_units="1/s",
+    ),
+    Output(
+        "gain_margin", "wall", "float64", "factor by which stiffness and damping together may grow; below 1: must fall"
+    ),
+    Output("phase_margin", "wall", "float64", "phase above -180 degrees at the gain crossover", units="degree"),
+    Output(
+        "delay_margin",
+        "wall",
+        "float64",
+        "delay that the wall bears beyond its own; 0 for an unstable wall",
+        units="sampling periods",
+        physical_units="s",
+    ),
+    Output("modulus_margin", "wall", "float64", "least distance of the open loop from -1"),
+    Output(
         "passive",
         "wall",
         "bool",
@@ -77,7 +98,7 @@ _ALL = (
         "settling_time",
         "wall",
         "float64",
-        "time in which the slowest pole decays to 2 %, ln(50)/(-ln(spectral radius)); infinite for an unstable wall",
+        "time in which the slowest pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall",
         units="sampling periods",
         physical_units="s",
     ),
@@ -96,6 +117,10 @@ _ALL = (
     ),
 )
 OUTPUTS = {output.name: output for output in _ALL}
+
+RADIUS_OUTPUTS = frozenset({"spectral_radius", "margin", "decay_rate", "settling_time"})
+MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
+"""NaN there means that the wall has no such margin, as `zwidth.margins` says."""
 
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 """The variable that says for each point of a family why it has the values it has."""

@@ -12,11 +12,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from zwidth.accuracy import choose, table
 from zwidth.errors import ResourceError
 from zwidth.sweep.files import check_folder, existing
 from zwidth.sweep.grid import Grid
-from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
+from zwidth.sweep.outputs import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.sweep.sweeps import SweepStudy
 
 MEMORY = 2**28
@@ -32,13 +31,9 @@ _LARGEST_CHUNK = 2**25
 _FEWEST_CHUNKS = 16
 _SMALLEST_CHUNK = 2**15
 _LAID_OUT_BYTES = 96 * 2**20
-_RADIUS_OUTPUTS = {"spectral_radius", "margin", "settling_time"}
-# Closer in, rounding errors spoil the proofs of Newton's method; for longer delays its compilation takes minutes.
-_LEAST_PROVED = 1e-10
-_LONGEST_PROVED = 50.0
 
 Methods: TypeAlias = dict[str, str]
-Rate: TypeAlias = Callable[[str, str, float], float]
+Rate: TypeAlias = Callable[[str], float]
 
 
 @dataclass(frozen=True)
@@ -179,16 +174,14 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY, rate: Rate | None = No
     Args:
         study: the study.
         memory: bytes that a chunk may take while it is computed.
-        rate: points a second of an output by a method at a number of poles; a rough table where left out.
+        rate: points a second of an output; a rough table where left out.
     """
     grid = Grid(study)
-    chosen = choose_methods(study, grid)
+    chosen = choose_methods(study)
     methods = {name: method for name, (method, _) in chosen.items()}
-    longest = _most_periods(study, grid)
-    poles = longest + 4.0
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
-        slowness = sum(1.0 / (rate or _rate)(name, methods.get(name, ""), poles) for name in _computed(outputs))
+        slowness = sum(1.0 / (rate or _rate)(name) for name in _computed(outputs))
         per_point = _bytes_per_point(outputs)
         size = grid.size_of(family)
         target = min((memory - _LAID_OUT_BYTES) // per_point, _LARGEST_CHUNK, int(_CHUNK_SECONDS / slowness))
@@ -199,7 +192,7 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY, rate: Rate | None = No
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
     disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
-    model = _model(longest)
+    model = _model(_most_periods(study, grid))
     return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
@@ -225,33 +218,15 @@ def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
     return tuple(reversed(chunks))
 
 
-def choose_methods(study: SweepStudy, grid: Grid) -> dict[str, tuple[str, str]]:
+def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
     """The method of every output that has a choice, and why; it depends on the study alone, never on the machine."""
     methods = {}
     if "stable" in study.outputs:
-        methods["stable"] = ("boundary", "no pole is needed: the stiffest stable wall of each row, then a comparison")
-    if _RADIUS_OUTPUTS & set(study.outputs):
-        methods["spectral_radius"] = _radius_method(study, grid)
+        methods["stable"] = ("crossover", "no pole is needed: the end of each row in closed form, then a comparison")
+    if RADIUS_OUTPUTS & set(study.outputs):
+        proof = f"each value proved to {study.accuracy:g} by two counts of the poles, at a cost that is flat in d"
+        methods["spectral_radius"] = ("newton", proof)
     return methods
-
-
-def _radius_method(study: SweepStudy, grid: Grid) -> tuple[str, str]:
-    """Newton's method where the shipped table has it within the accuracy and cheaper, else companion eigenvalues."""
-    if study.accuracy is None:
-        return "companion", "no accuracy is given: all digits"
-    longest = _most_periods(study, grid)
-    if study.accuracy < _LEAST_PROVED or longest > _LONGEST_PROVED:
-        return "companion", f"Newton's method proves 1e-10 at best, for delays of up to {_LONGEST_PROVED:g} periods"
-    offered = [cost for cost in table(shipped=True) if cost.method in ("newton", "companion")]
-    choice = choose(
-        "spectral_radius",
-        d=longest,
-        points=grid.size_of("wall"),
-        layout="scattered",
-        accuracy=study.accuracy,
-        costs=offered,
-    )
-    return choice.method, choice.why
 
 
 def _model(longest: float) -> str:
@@ -310,15 +285,17 @@ def _machine_memory() -> int:
 
 def _computed(outputs: tuple[str, ...]) -> set[str]:
     """The outputs that cost something; the others follow from them."""
-    costly = {"spectral_radius" if name in _RADIUS_OUTPUTS else name for name in outputs}
+    costly = {"spectral_radius" if name in RADIUS_OUTPUTS else name for name in outputs}
     costly = {"passive" if name == "passivity_margin" else name for name in costly}
+    costly = {"modulus_margin" if name in MARGIN_OUTPUTS else name for name in costly}
     return {"alpha_max" if OUTPUTS[name].family == "device" else name for name in costly}
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:
     """Memory for a point of a chunk: results, what they are made of, and copies while they are written."""
     floats = sum(OUTPUTS[name].dtype == "float64" for name in outputs)
-    hidden = 24 if _RADIUS_OUTPUTS & set(outputs) else 0
+    hidden = 56 if RADIUS_OUTPUTS & set(outputs) else 0
+    hidden += 32 if MARGIN_OUTPUTS & set(outputs) else 0
     hidden += 8 if {"passive", "passivity_margin"} & set(outputs) else 0
     return 8 * floats + hidden + (16 if floats else 0) + len(outputs) + 4
 
@@ -341,17 +318,9 @@ def _most_periods(study: SweepStudy, grid: Grid) -> float:
     return longest * (study.axes.end("rate", True) if "rate" in given else 1.0 / study.axes.end("period", False))
 
 
-def _rate(output: str, method: str, poles: float) -> float:
+def _rate(output: str) -> float:
     """Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it."""
-    if output == "alpha_max":
-        return 1e6
-    if output == "stable":
-        return 3e8
-    if output == "passive":
-        return 4e6
-    if method == "newton":
-        return 4e5 * 4.0 / poles
-    return 1e6 / (poles / 4.0) ** 2.5
+    return {"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 8e4, "modulus_margin": 5e3}[output]
 
 
 def _size(count: float) -> str:

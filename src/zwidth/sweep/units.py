@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
 
+from zwidth.domain import SI_RANGE
 from zwidth.scene import normalize
 from zwidth.sweep.faults import describe, problem, short, suggestion
 from zwidth.sweep.fields import ANY, NOT_NEGATIVE, POSITIVE, Range, check_range, looks_like_number, to_float
@@ -99,9 +100,18 @@ def quantity(dimension: Dimension, allowed: Range = ANY) -> Callable[[Any], floa
 
     def validate(value: Any) -> float:
         amount, unit = _parse(value, dimension, periods=False)
-        return check_range(amount, allowed, unit)
+        return _check_magnitude(check_range(amount, allowed, unit), unit)
 
     return validate
+
+
+def _check_magnitude(value: float, unit: str) -> float:
+    """Return a quantity that the model is computed for, or raise a problem."""
+    least, most = SI_RANGE
+    if value and not least <= abs(value) <= most:
+        allowed = f"it must be 0 or {least:g} to {most:g} {unit} in magnitude"
+        raise problem(f"got {short(value)} {unit}", allowed, "check the units")
+    return value
 
 
 def span(allowed: Range) -> Callable[[Any], Span]:
@@ -109,7 +119,8 @@ def span(allowed: Range) -> Callable[[Any], Span]:
         if isinstance(value, Span):
             return value
         amount, unit = _parse(value, TIME, periods=True)
-        return Span(check_range(amount, allowed, unit), "periods" if unit == "periods" else "s")
+        amount = _check_magnitude(check_range(amount, allowed, unit), unit)
+        return Span(amount, "periods" if unit == "periods" else "s")
 
     return validate
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from zwidth import accuracy
 from zwidth.bench import problems, report, suite
 from zwidth.bench.baselines import available
 from zwidth.cli.commands import cli
@@ -34,20 +33,25 @@ def test_every_tool_finds_the_same_radii():
 def rows():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(suite, "_SECONDS", 0.0)
-        return suite.measure(suite.Sizes((0.0,), 40_000, 10_000, 60, 10))
+        patch.setattr(suite, "_LEAST", 1)
+        return suite.measure(suite.Sizes((0.0,), 6_400, 10_000, 60, 10))
 
 
 def test_a_tiny_run_measures_every_method(rows):
     methods = {(row.quantity, row.method) for row in rows if not row.baseline}
-    assert len(methods) == (4 + 1) + (3 + 2) + 2
+    assert methods == {
+        *(("stable", name) for name in ("crossover", "companion", "certified")),
+        *(("spectral_radius", name) for name in ("newton", "companion")),
+        ("passive", "worst frequency"),
+        *(("alpha_max", name) for name in ("newton", "kkt")),
+    }
     assert {row.method for row in rows if row.baseline} == set(available())
     for row in rows:
         assert row.rate > 0
         assert row.first_seconds >= 0
         assert row.error < 1e-2
-        if row.method in ("certified", suite.FILTER):
+        if row.method == "certified":
             assert row.wrong == 0
-        assert 0 <= row.open <= (1e-3 if row.method == suite.FILTER else 0.0)
 
 
 def test_what_is_written_can_be_read(rows, tmp_path):
@@ -59,13 +63,11 @@ def test_what_is_written_can_be_read(rows, tmp_path):
     assert text.count("|\n") > len(rows)
     assert "np.linalg.eigvals" in (tmp_path / "summary.txt").read_text()
     assert (tmp_path / "pareto.png").stat().st_size > 10_000
-    costs = accuracy.parse(report.costs(rows))
-    assert accuracy.choose("stable", d=0, points=10**6, layout="map", accuracy=1e-9, costs=costs).error <= 1e-9
 
 
 def test_the_figure_has_a_panel_for_each_delay_and_a_mark_for_each_method():
-    marks = [Mark("stable", "boundary", "float64", "map", d, 1e9, 0.0) for d in (0.0, 1.0, 4.0, 8.0)] + [
-        Mark("stable", "schur_cohn", "float32", "scattered", 0.0, 1e8, 1e-4)
+    marks = [Mark("stable", "crossover", "map", d, 1e9, 0.0) for d in (0.0, 1.0, 4.0, 8.0)] + [
+        Mark("stable", "companion", "scattered", 0.0, 1e8, 1e-4)
     ]
     figure = draw_pareto(marks)
     assert [ax.get_title(loc="left") for ax in figure.axes if ax.get_visible()] == ["d = 0", "d = 1", "d = 4", "d = 8"]

@@ -61,7 +61,7 @@ def test_no_damping_where_none_is_stable():
     assert choice.status.tolist() == [Status.NO_BOUNDARY, Status.NO_BOUNDARY, Status.INVALID_INPUT]
     assert np.all(np.isnan(choice.beta))
     with pytest.raises(zwidth.TracedDelayError, match="got a traced value"):
-        jax.jit(most_robust_damping)(0.1, 0.1, 1.0)
+        jax.jit(fastest_damping)(0.1, 0.1, 1.0)
 
 
 def test_the_fastest_wall_of_all():

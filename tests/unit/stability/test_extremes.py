@@ -11,8 +11,8 @@ from zwidth.status import Status
 # method -> the farthest relative distance from the boundary at which a label may be wrong.
 HELD = {
     "crossover": 1e-15,
-    # Where poles nearly coincide, eigenvalues keep half of their digits, and fewer for strong damping.
-    "companion": 1e-4,
+    # Where poles nearly coincide, eigenvalues keep half of their digits, and a quarter at delta = 1e12.
+    "companion": 1e-2,
 }
 DELAYS = [0.0, float(np.nextafter(1.0, 0.0)), 1.0, 50.0, 500.0, 1e5]
 

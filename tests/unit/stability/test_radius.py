@@ -142,9 +142,10 @@ def test_single_precision_keeps_its_digits():
     assert got == pytest.approx(zwidth.spectral_radius(0.5, 0.5, 0.1, 1.0), rel=1e-5)
 
 
-def exact_pole_derivative(alpha, beta, delta, d, h=mp.mpf(10) ** -20):
+def exact_pole_derivative(alpha, beta, delta, d):
     """d rho/d alpha by a central difference in 60 digits."""
     with mp.workdps(60):
+        h = mp.mpf(10) ** -20
         up, down = (
             max(abs(z) for z in oracles.roots(oracles.polynomial(mp.mpf(alpha) + sign * h, beta, delta, d)))
             for sign in (1, -1)
@@ -180,7 +181,7 @@ def test_nothing_is_compiled_and_no_delay_takes_long():
 
 def test_triple_poles_keep_their_bounds():
     # P = (z - r)^3 at d = 0, delta = 0: z (z - 1)^2 + (z + 1)((alpha + beta) z - beta)/2 has the coefficients
-    # s/2 - 2 = -3 r, 1 + alpha/2 = 3 r^2, -beta/2 = -r^3, s = alpha + beta, that is r^3 - 3 r^2 - 3 r + ... solved here.
+    # (alpha + beta)/2 - 2 = -3 r, 1 + alpha/2 = 3 r^2 and -beta/2 = -r^3.
     with mp.workdps(60):
         r = mp.findroot(lambda r: 2 * (3 * r**2 - 1) + 2 * r**3 - 4 + 6 * r, mp.mpf("0.6"))
         alpha, beta = float(2 * (3 * r**2 - 1)), float(2 * r**3)

@@ -66,27 +66,25 @@ def test_what_does_not_fit_is_refused(tmp_path):
 
 def test_a_plan_tells_what_it_will_do():
     text = "\n".join(plan_sweeps(config_of(study(outputs=("stable", "alpha_max"))))[0].lines())
-    for word in ("study map", "192,000", "d 4 x delta 4 x alpha 40 x beta 300", "chunks", "boundary", "disk", "memory"):
+    for word in (
+        "study map",
+        "192,000",
+        "d 4 x delta 4 x alpha 40 x beta 300",
+        "chunks",
+        "crossover",
+        "disk",
+        "memory",
+    ):
         assert word in text
 
 
-def methods_of(**fields):
-    return make_plan(config_of(study(axes={**HUGE, **fields.pop("axes", {})}, **fields)).studies[0])
-
-
-def test_an_accuracy_chooses_the_method_of_the_radius_and_the_plan_says_why():
-    asked = methods_of(outputs=("margin", "stable"), accuracy=1e-6)
-    assert asked.methods == {"spectral_radius": "newton", "stable": "boundary"}
-    lines = "\n".join(asked.lines())
-    assert "spectral_radius by newton: the cheapest within 1e-06 (companion" in lines
-    assert "stable by boundary: no pole is needed" in lines
-    assert "polynomials of degree up to 4" in lines
-    assert "all digits" in methods_of(outputs=("margin",)).reasons["spectral_radius"]
-    for exacting in ({"accuracy": 1e-12}, {"accuracy": 1e-6, "axes": {"d": [1, 70.5]}}):
-        plan = methods_of(outputs=("margin",), **exacting)
-        assert plan.methods["spectral_radius"] == "companion"
-        assert "1e-10 at best" in plan.reasons["spectral_radius"]
-    # What a store began with, it ends with, whatever a later table says.
-    kept = asked.as_dict() | {"methods": {"spectral_radius": "companion", "stable": "boundary"}}
-    study_asked = config_of(study(axes=HUGE, outputs=("margin", "stable"), accuracy=1e-6)).studies[0]
-    assert kept_plan(study_asked, kept).methods["spectral_radius"] == "companion"
+def test_the_plan_says_how_radii_are_found_and_what_is_proved_of_them():
+    axes = {**HUGE, "d": [1, 70.5]}
+    plan = make_plan(config_of(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)).studies[0])
+    assert plan.methods == {"spectral_radius": "newton", "stable": "crossover"}
+    lines = "\n".join(plan.lines())
+    assert "spectral_radius by newton: each value proved to 1e-06" in lines
+    assert "stable by crossover: no pole is needed" in lines
+    assert "polynomials of degree up to 74" in lines
+    usual = make_plan(config_of(study(axes=HUGE, outputs=("margin",))).studies[0])
+    assert "proved to 1e-09" in usual.reasons["spectral_radius"]

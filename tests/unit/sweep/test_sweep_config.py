@@ -115,6 +115,7 @@ NORMAL = "alpha: 1, delta: 1, d: 1"
         ("delta: 1, d: 1", ", outputs: [stiffness_max]", "outputs[0]", "SI units"),
         (NORMAL, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),
         (NORMAL, ", accuracy: 0", "accuracy", "at least"),
+        (NORMAL, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
         (NORMAL, ", accuracy: tight", "accuracy", "one number"),
         (NORMAL + ", betta: 1", "", "axes.betta", "did you mean 'beta'?"),
         (NORMAL + ", d: 1", "", "axes.d", "comes twice"),

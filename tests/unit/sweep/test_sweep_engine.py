@@ -221,7 +221,7 @@ def test_a_store_is_never_overwritten(finished):
         ({"axes": {**AXES, "d": [0, 0.5, 1, 3]}}, "axes.d[3]", "2.0, the configuration has 3.0"),
         ({"axes": {**AXES, "d": [0, 1]}}, "axes.d", "a list of 4 items, the configuration has a list of 2 items"),
         ({"outputs": ("stable", "alpha_max")}, "outputs", "a list of 1 item, the configuration has a list of 2 items"),
-        ({"accuracy": 1e-3}, "accuracy", "nothing, the configuration has 0.001"),
+        ({"accuracy": 1e-3}, "accuracy", "1e-09, the configuration has 0.001"),
     ],
 )
 def test_another_configuration_is_refused(finished, change, key, words):
