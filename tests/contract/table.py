@@ -6,20 +6,20 @@ from contract.cases import CASES, OTHERS, Case
 
 _HEAD = """# What every public function promises
 
-Written by `scripts/refresh_contract.py` from the cases of `tests/contract/cases.py`, each of which runs through all tests
-of `tests/contract/test_contract.py`:
+Written by `scripts/refresh_contract.py` from the cases of `tests/contract/cases.py`, each of which runs through all
+tests of `tests/contract/test_contract.py`:
 
-- **Anything in.** Numbers, lists, NumPy and JAX arrays that broadcast; numbers give NumPy scalars, NumPy arrays give NumPy
-  arrays, JAX arrays give JAX arrays, all in float64 whatever JAX's settings. A number is answered without loading JAX.
-  Nothing in, nothing out. What is no real number, and shapes that do not fit, raise `InputError` by name.
-- **Bad points.** An entry that is NaN, infinite or negative where it must not be gives what the column "bad points" says,
-  with INVALID_INPUT where there is a status; one beyond the domain likewise, with OUT_OF_RANGE. Its neighbors keep every
-  bit. A number beyond the domain raises `InputError` with field, value and range; "raises" in the column "bad number" says
-  that NaN and negative numbers raise as well.
+- **Anything in.** Numbers, lists, NumPy and JAX arrays that broadcast; numbers give NumPy scalars, NumPy arrays give
+  NumPy arrays, JAX arrays give JAX arrays, all in float64 whatever JAX's settings. A number is answered without loading
+  JAX. Nothing in, nothing out. What is no real number, and shapes that do not fit, raise `InputError` by name.
+- **Bad points.** An entry that is NaN, infinite or negative where it must not be gives what the column "bad points"
+  says, with INVALID_INPUT where there is a status; one beyond the domain likewise, with OUT_OF_RANGE. Its neighbors
+  keep every bit. A number beyond the domain raises `InputError` with field, value and range; "raises" in the column
+  "bad number" says that NaN and negative numbers raise as well.
 - **Inside `jit`, `vmap`, `grad` with x64.** Values and statuses are those of the direct call, to 1e-11; bad points and
   their neighbors behave as above.
-- **Inside `jit` without x64.** float32 values to 2e-3 at moderate points, the same statuses; what lies beyond the domain
-  is NaN there too.
+- **Inside `jit` without x64.** float32 values to 2e-3 at moderate points, the same statuses; what lies beyond the
+  domain is NaN there too.
 - **Derivatives** are finite at good points and NaN at bad ones. The first order is tested here, the second in the tests
   of each function.
 

@@ -222,7 +222,7 @@ ROWS = 16
 
 def batch(case, beyond=True):
     """(columns of the traceable arguments, how many rows are good): the others hold a bad number each."""
-    fixed = {name for name in case.concrete}
+    fixed = set(case.concrete)
     spoiled = [case.bad, case.beyond] if beyond else [case.bad]
     rows = [{name: values[k] for name, values in case.good.items()} for k in range(3)]
     for numbers in spoiled:
@@ -315,7 +315,7 @@ def test_derivatives_are_finite_at_good_points_and_nan_at_bad_ones(case):
 @TRACEABLE
 def test_without_x64_float32_is_computed_in_and_the_statuses_agree(case):
     # What is beyond the range of float64 is infinite in float32: another status, NaN all the same.
-    columns, good = batch(case, beyond=False)
+    columns, _ = batch(case, beyond=False)
     columns = [np.float32(column) for column in columns]
     direct = directly(case, [np.float64(column) for column in columns])
 
