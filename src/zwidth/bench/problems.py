@@ -148,6 +148,7 @@ def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
         coefficients = balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
         terms = [(k, value.mid()) for k, value in enumerate(coefficients) if value != 0]
         start = z = flint.acb(float(pole.re[0]), float(pole.im[0])).exp()
+        step = z
         for _ in range(8):
             value = sum((a * z**k for k, a in terms), flint.acb(0))
             slope = sum((k * a * z ** (k - 1) for k, a in terms if k), flint.acb(0))

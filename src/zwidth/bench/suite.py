@@ -160,7 +160,9 @@ def _timed(
 
 def _labels(d: float, sizes: Sizes) -> Iterator[Row]:
     methods: tuple[StabilityMethod, ...] = ("crossover", "companion", "certified")
-    for method in (name for name in methods if _possible(name, d)):
+    for method in methods:
+        if not _possible(method, d):
+            continue
 
         def classify(walls: Walls, method: StabilityMethod = method) -> Any:
             return is_stable(*walls, method=method)
@@ -177,7 +179,9 @@ def _labels(d: float, sizes: Sizes) -> Iterator[Row]:
 
 def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
     methods: tuple[RadiusMethod, ...] = ("newton", "companion")
-    for method in (name for name in methods if _possible(name, d)):
+    for method in methods:
+        if not _possible(method, d):
+            continue
 
         def radius(walls: Walls, method: RadiusMethod = method) -> Any:
             return spectral_radius(*walls, method=method)
