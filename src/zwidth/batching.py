@@ -45,24 +45,22 @@ def concretely() -> Iterator[None]:
         yield
 
 
-def _is_masked(value: ArrayLike) -> bool:
-    """Whether a value is a masked array; the module that defines them is loaded by those who make some."""
+def refuse_masked(name: str, value: ArrayLike) -> None:
+    """Raise `InputError` for a masked array; the module that defines them is loaded by those who make some."""
     masked = sys.modules.get("numpy.ma")
-    return masked is not None and isinstance(value, masked.MaskedArray)
+    if masked is not None and isinstance(value, masked.MaskedArray):
+        raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
 
 
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     """Convert one concrete argument to float64, or say what is wrong with it."""
+    refuse_masked(name, value)
     try:
-        if _is_masked(value):
-            raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
         array = np.asarray(value)
         if array.dtype.kind in "OSUcVmM":
             raise TypeError(array.dtype)
         return array.astype(np.float64, copy=False)
     except (TypeError, ValueError) as error:
-        if isinstance(error, InputError):
-            raise
         raise InputError(
             f"{name}: got {value!r}, a real number or a rectangular array of real numbers is needed"
         ) from error

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike, DelayModel
+from zwidth.batching import refuse_masked
 from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, within
 from zwidth.errors import InputError, check_choice
 from zwidth.status import Status
@@ -60,6 +61,7 @@ def _checked(name: str, value: ArrayLike) -> ArrayLike:
     """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
     if is_traced(value):
         return value
+    refuse_masked(name, value)
     try:
         number = np.asarray(value)
     except ValueError as error:

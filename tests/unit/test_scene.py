@@ -144,3 +144,8 @@ def test_a_scene_without_a_wall_has_none():
 def test_what_a_scene_refuses(make, message):
     with pytest.raises(InputError, match=message):
         make()
+
+
+def test_a_mask_is_not_ignored():
+    with pytest.raises(InputError, match="mass: got a masked array"):
+        zwidth.normalize(mass=np.ma.masked_array([0.1, 0.2], mask=[True, False]), period=1e-3)
