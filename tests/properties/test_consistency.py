@@ -159,8 +159,8 @@ def contradictions(f: Facts) -> dict[str, np.ndarray]:
         "the certified verdict is known": ~f.known,
         "the certified verdict is the verdict": f.known & (f.proved != stable),
         "stable walls are springs": stable & ~spring,
-        "the radius is below 1 for stable walls": stable & (f.radius > 1.0 + np.maximum(f.error, 4 * ULP)),
-        "the radius of other walls is not": ~stable & (f.radius < 1.0 - np.maximum(f.error, 4 * ULP)),
+        "the radius is below 1 for stable walls": stable & (f.radius >= 1.0),
+        "the radius of other walls is not": ~stable & (f.radius < 1.0),
         "the decay rate has the sign of the verdict": ~np.isnan(f.rate) & ((f.rate > 0) != stable),
         "the decay rate is the radius": np.abs(np.exp(-f.rate) - f.radius) > 1e-9 * f.radius + f.error,
         "the phase margin has the sign of the verdict": spring & ((m.phase_margin > 0) & (beta > -f.walls.delta))

@@ -16,6 +16,8 @@ from zwidth.batching import BLOCK, FEW, broadcast, in_blocks, to_caller
 from zwidth.domain import wall_status
 from zwidth.grouping import NAMES
 from zwidth.stability.circle import loop_of
+from zwidth.stability.crossover import stable_kernel
+from zwidth.stability.devices import kind_of
 from zwidth.stability.layout import Points, fold
 from zwidth.stability.quick import quick_kernel
 from zwidth.stability.radius import proved, radius_kernel
@@ -27,6 +29,9 @@ _EFFORTS = ((10, False, 6), (25, False, 12), (90, True, 40))
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(1, 12)
 _LARGEST_ERROR = 0.1
+# Closer to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is.
+_DOUBTFUL = 1e-8
+_BELOW_ONE = 1.0 - 2.0**-53
 # From so many points on a map's nodes are worth a compilation, too.
 _WORTH_COMPILING = 1 << 18
 
@@ -168,15 +173,23 @@ def poles_of(arrays: list[np.ndarray], accuracy: float) -> tuple[Poles, np.ndarr
 
 
 def radii(values: tuple[ArrayLike, ...], accuracy: float) -> Array:
-    """Spectral radii of concrete arguments."""
+    """Spectral radii of concrete arguments; NaN where no error bound is proved."""
     arrays = broadcast(NAMES, values)
     found, status = poles_of(arrays, accuracy)
-    return to_caller(_radius(found, status).reshape(arrays[0].shape), values)
+    return to_caller(_radius(found, status, arrays).reshape(arrays[0].shape), values)
 
 
-def _radius(found: Poles, status: np.ndarray) -> np.ndarray:
+def _radius(found: Poles, status: np.ndarray, arrays: list[np.ndarray]) -> np.ndarray:
+    """Radii on the verdict's side of the circle, which the proved error alone may not tell."""
     radius = np.exp(found.re)
-    radius[np.flatnonzero(status)] = np.nan
+    radius[np.flatnonzero((status != Status.OK) | np.isinf(found.error))] = np.nan
+    near = np.flatnonzero(np.abs(found.re) <= _DOUBTFUL)
+    if near.size:
+        alpha, beta, delta, d = (array.reshape(-1)[near] for array in arrays)
+        with np.errstate(all="ignore"):
+            stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
+        # The largest number below 1 is as near to the truth as 1 itself.
+        radius[near] = np.where(stable, np.minimum(radius[near], _BELOW_ONE), np.maximum(radius[near], 1.0))
     return radius
 
 
@@ -185,7 +198,7 @@ def proved_radii(values: tuple[ArrayLike, ...], accuracy: float) -> Proved:
     arrays = broadcast(NAMES, values)
     shape = arrays[0].shape
     found, status = poles_of(arrays, accuracy)
-    radius = _radius(found, status)
+    radius = _radius(found, status, arrays)
     ok = status == Status.OK
     certified = ok & (found.error <= accuracy)
     error = np.where(certified, np.expm1(accuracy), np.inf)

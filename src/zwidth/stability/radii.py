@@ -62,7 +62,8 @@ def spectral_radius(
         delay: only "held" has poles.
 
     Returns:
-        Array of the broadcast shape. NaN for a point out of range.
+        Array of the broadcast shape: below 1 exactly where `zwidth.is_stable` says so. NaN for a point out of range,
+        and where no error bound could be proved (some walls with multiple poles).
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, a name is unknown,
@@ -73,7 +74,7 @@ def spectral_radius(
         Float64 when called directly, few points without JAX; the ambient precision inside `jit`, where d may be traced.
         Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple one.
         Error bounds and certificates come from `radius_of`: next to a k-fold pole the radius is known to about
-        1e-16^(1/k). Where the loop is stable by less than 1e-16 the value rounds to 1: `decay_rate` does not.
+        1e-16^(1/k). How slowly a loop decays that is stable by less than 1e-16, `decay_rate` tells.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
