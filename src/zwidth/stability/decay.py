@@ -54,7 +54,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     Example:
         >>> import zwidth
         >>> print(f"{zwidth.decay_rate(1e-15, 1e-9, 1e-9, 1):.6e}")
-        5.005013e-07
+        9.999993e-10
     """
     values = (alpha, beta, delta, d)
     check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
