@@ -29,39 +29,41 @@ SETTINGS = {
     "one thread": "--xla_cpu_multi_thread_eigen=false",
     "none, again": "",
 }
-# What is timed under every setting: quantity, method, delay, points.
+# What is timed under every setting: quantity, method, layout, delay, points.
 CASES = [
-    ("stable", "schur_cohn", 0.0, 4_000_000),
-    ("stable", "schur_cohn", 4.0, 4_000_000),
-    ("stable", "schur_cohn", 8.0, 4_000_000),
-    ("stable", "boundary", 4.0, 4_000_000),
-    ("spectral_radius", "newton", 4.0, 1_000_000),
+    ("stable", "crossover", "map", 4.0, 4_000_000),
+    ("stable", "crossover", "scattered", 4.0, 4_000_000),
+    ("stable", "certified", "scattered", 4.0, 1_000_000),
+    ("passive", "worst frequency", "scattered", 4.0, 1_000_000),
+    ("spectral_radius", "newton", "scattered", 4.0, 250_000),
 ]
-# What is held against its memory: quantity, method, delay, bytes of the result a point.
+# What is held against its memory: quantity, method, layout, delay, points, bytes of the result a point.
 LARGE = [
-    ("stable", "boundary", 4.0, 1),
-    ("stable", "schur_cohn", 4.0, 1),
-    ("stable", "boundary", 500.0, 1),
-    ("spectral_radius", "newton", 4.0, 8),
+    ("stable", "crossover", "map", 4.0, 100_000_000, 1),
+    ("stable", "crossover", "map", 500.0, 100_000_000, 1),
+    ("stable", "crossover", "scattered", 4.0, 10_000_000, 1),
+    ("stable", "certified", "map", 4.0, 10_000_000, 1),
+    ("passive", "worst frequency", "map", 4.0, 10_000_000, 1),
+    ("spectral_radius", "newton", "map", 4.0, 1_000_000, 8),
 ]
 
 
-def call(quantity: str, method: str, d: float, points: int):
+def call(quantity: str, method: str, layout: str, d: float, points: int):
     """The function to measure, and how many points it computes."""
-    from zwidth.stability.methods import is_stable, spectral_radius
-
+    import zwidth
     from zwidth.bench import problems
 
-    walls = problems.grid(d, points)
-    function = is_stable if quantity == "stable" else spectral_radius
-    return (lambda: function(*walls, method=method)), walls.points
+    walls = problems.grid(d, points) if layout == "map" else problems.scattered(d, points)
+    function = {"stable": zwidth.is_stable, "spectral_radius": zwidth.spectral_radius, "passive": zwidth.is_passive}
+    options = {} if quantity == "passive" else {"method": method}
+    return (lambda: function[quantity](*walls, **options)), walls.points
 
 
 def time_cases(quick: bool) -> list[float]:
     """Points a second of every case, by the median of some calls."""
     rates = []
-    for quantity, method, d, points in CASES:
-        function, count = call(quantity, method, d, points // (16 if quick else 1))
+    for quantity, method, layout, d, points in CASES:
+        function, count = call(quantity, method, layout, d, points // (16 if quick else 1))
         function()
         durations = []
         for _ in range(3 if quick else 15):
@@ -78,12 +80,12 @@ def peak() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit
 
 
-def memory_of(quantity: str, method: str, d: float, points: int) -> list[int]:
+def memory_of(quantity: str, method: str, layout: str, d: float, points: int) -> list[int]:
     """Points, and the growth of the peak by a large map after a small one has compiled and loaded everything."""
-    small, _ = call(quantity, method, d, 250_000)
+    small, _ = call(quantity, method, layout, d, 100_000)
     small()
     before = peak()
-    large, count = call(quantity, method, d, points)
+    large, count = call(quantity, method, layout, d, points)
     assert np.asarray(large()).size == count
     return [count, peak() - before]
 
@@ -112,11 +114,11 @@ def report(quick: bool) -> str:
         "",
         "### XLA's flags",
         "",
-        "zwidth sets none, and changes no setting of JAX. Speed of maps as a multiple of the speed without a flag, for",
-        "a user who sets `XLA_FLAGS` before Python starts. The last line repeats the measurement without one: so far",
-        "apart are two of the same.",
+        "zwidth sets none, and changes no setting of JAX. Speed at d = 4 as a multiple of the speed without a flag,",
+        "for a user who sets `XLA_FLAGS` before Python starts. The last line repeats the measurement without one: so",
+        "far apart are two of the same.",
         "",
-        "| `XLA_FLAGS` | " + " | ".join(f"{method}, d = {d:g}" for _, method, d, _ in CASES) + " |",
+        "| `XLA_FLAGS` | " + " | ".join(f"{method}, {layout}" for _, method, layout, _, _ in CASES) + " |",
         "|---|" + "--:|" * len(CASES),
     ]
     for name, flags in SETTINGS.items():
@@ -129,14 +131,14 @@ def report(quick: bool) -> str:
         "",
         "Peak memory beyond that of a small map, after everything has been compiled, and beside it the result alone.",
         "",
-        "| asked for | method | d | points | memory | of it the result |",
-        "|---|---|--:|--:|--:|--:|",
+        "| asked for | method | layout | d | points | memory | of it the result |",
+        "|---|---|---|--:|--:|--:|--:|",
     ]
-    for quantity, method, d, size in LARGE:
-        points = 10_000_000 if quick or quantity != "stable" else 100_000_000
-        count, grown = in_program(["--memory", quantity, method, str(d), str(points)])
+    for quantity, method, layout, d, points, size in LARGE:
+        words = [quantity, method, layout, str(d), str(points // (10 if quick else 1))]
+        count, grown = in_program(["--memory", *words])
         asked = quantity.replace("_", " ")
-        lines.append(f"| {asked} | {method} | {d:g} | {count:,} | {_size(grown)} | {_size(count * size)} |")
+        lines.append(f"| {asked} | {method} | {layout} | {d:g} | {count:,} | {_size(grown)} | {_size(count * size)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -150,13 +152,13 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="small maps, one round")
     parser.add_argument("--out", type=Path, help="write the tables there")
     parser.add_argument("--time", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--memory", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--memory", nargs=5, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.time:
         print(json.dumps(time_cases(given.quick)))
     elif given.memory:
-        quantity, method, d, points = given.memory
-        print(json.dumps(memory_of(quantity, method, float(d), int(points))))
+        quantity, method, layout, d, points = given.memory
+        print(json.dumps(memory_of(quantity, method, layout, float(d), int(points))))
     else:
         text = report(given.quick)
         print(text)
