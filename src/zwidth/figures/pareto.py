@@ -50,11 +50,11 @@ def draw_pareto(marks: Sequence[Mark]) -> Figure:
         A new figure, unknown to pyplot.
     """
     delays = sorted({mark.d for mark in marks})
-    columns = min(3, len(delays))
+    columns = min(4, len(delays))
     rows = -(-len(delays) // columns)
     with style.house_style():
         figure, axes = style.new_figure(
-            max(3.4 * columns, 5.0), 3.6 * rows + 0.5, rows, columns, sharex=True, sharey=True
+            max(3.2 * columns, 5.0), 3.6 * rows + 0.5, rows, columns, sharex=True, sharey=True
         )
         for ax, d in zip(axes.ravel(), delays, strict=False):
             _draw_panel(ax, [mark for mark in marks if mark.d == d])
@@ -123,8 +123,10 @@ def _shared_axes(axes: np.ndarray, marks: Sequence[Mark]) -> None:
         ax.yaxis.set_major_locator(LogLocator(numticks=12))
         ax.yaxis.set_minor_locator(NullLocator())
         ax.grid(axis="y", color="#E8E8E8", linewidth=0.6)
-    for ax in axes[-1]:
-        ax.set_xlabel("worst error seen")
+    for column in axes.T:
+        lowest = [ax for ax in column if ax.get_visible()][-1]
+        lowest.set_xlabel("worst error seen")
+        lowest.tick_params(labelbottom=True)
     for ax in axes[:, 0]:
         ax.set_ylabel("points per second")
 
