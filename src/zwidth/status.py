@@ -32,8 +32,7 @@ class Method(IntEnum):
     COMPANION = 0
     CROSSOVER = 1
     CERTIFIED = 2
-    BISECTION = 3
-    NEWTON = 4
+    NEWTON = 3
 
 
 _MESSAGES = {

@@ -210,11 +210,3 @@ def proved_radii(values: tuple[ArrayLike, ...], accuracy: float) -> Proved:
     status = np.where(ok & ~certified, np.int32(Status.NOT_CONVERGED), status).astype(np.int32)
     leaves = Proved(radius, error, certified, status)
     return to_caller(Proved(*(leaf.reshape(shape) for leaf in leaves)), values)
-
-
-def certified_columns(
-    alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray, accuracy: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Radii of equally many values of each, and whether each is proved to a relative accuracy."""
-    found = proved_radii((alpha, beta, delta, d), accuracy)
-    return found.radius, found.certified

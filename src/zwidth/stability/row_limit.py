@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.stability.devices import Device, device
+from zwidth.stability.devices import Device
 from zwidth.xp import horner, namespace, repeat
 
 # From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
@@ -242,9 +242,3 @@ def _newton_step(goal: Array, at: Angles, fields: list[Array] | Array) -> Array:
     total, d_total, scale, d_scale = offset(at, fields)
     part = goal * scale
     return 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))
-
-
-def limit_kernel(beta: Array, delta: Array, d: Array) -> Array:
-    """The limit for any delay, for use inside a transformation."""
-    here = device(delta, d)
-    return namespace(beta, delta, d).where(d < 1, short_row(beta, here), long_row(beta, long_device(here)))

@@ -13,14 +13,12 @@ import numpy as np
 
 from zwidth.figures import draw_passivity_cost
 from zwidth.figures.data import DampingInterval, PassiveOutline, PassivityCost, PassivityData
-from zwidth.stability.passivity import passivity_margin
+from zwidth.stability.passivity import passive_stiffness_slope, passivity_margin
 from zwidth.studies.outcome import Outcome, stack
 from zwidth.studies.ridges import ridge_paths
 from zwidth.sweep.studies import PassivityStudy
 
 _DIRECTIONS = 721
-# Each search among the directions narrows the bracket 360-fold; five leave 1e-12.
-_ROUNDS = 5
 
 
 class PassiveWall(NamedTuple):
@@ -61,16 +59,8 @@ def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> tuple[DampingIn
 
 
 def stiffest_passive(d: float) -> PassiveWall:
-    """The stiffest passive wall, over delta; the passive set is convex, so the search cannot miss it."""
-    low, high = -0.5 * np.pi, 0.5 * np.pi
-    alpha = beta = np.zeros(1)
-    best = 0
-    for _ in range(_ROUNDS):
-        angles = np.linspace(low, high, _DIRECTIONS)
-        alpha, beta = passive_edge(angles, d)
-        best = int(np.argmax(alpha))
-        low, high = angles[max(best - 1, 0)], angles[min(best + 1, _DIRECTIONS - 1)]
-    return PassiveWall(float(alpha[best]), float(beta[best]))
+    """The stiffest passive wall, over delta."""
+    return PassiveWall(*passive_stiffness_slope(d))
 
 
 def run_passivity(study: PassivityStudy) -> Outcome:
