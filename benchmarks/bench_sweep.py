@@ -60,13 +60,12 @@ studies:
 # Runs a configuration twice in one program; prints the seconds of both.
 TWICE = """
 import shutil, sys, time
-from zwidth.sweep.config import load_config
-from zwidth.sweep.engine import run_sweeps
+import zwidth
 
-config = load_config(sys.argv[1])
+config = zwidth.load_config(sys.argv[1])
 for number in range(int(sys.argv[3])):
     start = time.perf_counter()
-    assert run_sweeps(config, f"{sys.argv[2]}/{number}").ok
+    assert zwidth.run(config, out=f"{sys.argv[2]}/{number}").ok
     print(time.perf_counter() - start)
     shutil.rmtree(f"{sys.argv[2]}/{number}")
 """

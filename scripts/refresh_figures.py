@@ -8,8 +8,7 @@ import tempfile
 from pathlib import Path
 
 import zwidth
-from zwidth.studies.stored import draw_stores
-from zwidth.sweep.engine import run_sweeps
+from zwidth.runs.draw import draw_stores
 
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
@@ -35,7 +34,7 @@ def main() -> None:
                 shutil.copy(result.folder / f"{figure}.svg", TARGET)
                 print(TARGET.relative_to(ROOT) / f"{figure}.svg")
         out = Path(folder, "dense")
-        run_sweeps(zwidth.load_config(ROOT / "configs" / "dense.yaml"), out)
+        zwidth.run(ROOT / "configs" / "dense.yaml", out=out)
         drawn = {file.name: file for file in draw_stores(out)}
         shutil.copy(drawn[STORED], TARGET)
         print(TARGET.relative_to(ROOT) / STORED)

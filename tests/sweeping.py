@@ -6,14 +6,16 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import patch
 
 import numpy as np
 
+from zwidth import run
 from zwidth.cli import main
+from zwidth.studies.document import Config
 from zwidth.sweep import plan
 from zwidth.sweep.chunks import perform
-from zwidth.sweep.document import Config
 from zwidth.sweep.store import find_stores, open_dataset
 
 AXES = {
@@ -62,6 +64,16 @@ def cut(monkeypatch, walls, devices):
 
 def config_of(*studies, name="test"):
     return Config.model_validate({"version": 1, "name": name, "studies": list(studies) or [study()]})
+
+
+def run_sweeps(config, out, **options):
+    """Run a configuration; returns what became of the chunks of all its sweeps together."""
+    result = run(config, out=out, **options)
+    sweeps = result.sweeps.values()
+    counts = {name: sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")}
+    failed = {chunk: error for sweep in sweeps for chunk, error in sweep.failed.items()}
+    more = {name: getattr(result, name) for name in ("ok", "repaired", "hopeless", "interrupted")}
+    return SimpleNamespace(**counts, **more, failed=failed)
 
 
 def values_of(path):

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from zwidth.loop import char_poly as char_poly
     from zwidth.response import StepResponse as StepResponse
     from zwidth.response import step_response as step_response
+    from zwidth.runs import run as run
     from zwidth.scene import Device as Device
     from zwidth.scene import Scene as Scene
     from zwidth.scene import Timing as Timing
@@ -70,8 +71,7 @@ if TYPE_CHECKING:
     from zwidth.stability.ridge import alpha_max as alpha_max
     from zwidth.stability.slope import stiffness_slope as stiffness_slope
     from zwidth.status import Status as Status
-    from zwidth.studies import run as run
-    from zwidth.sweep.config import load_config as load_config
+    from zwidth.studies.document import load_config as load_config
     from zwidth.sweep.store import open_dataset as open_dataset
 
 # public name -> the module that defines it
@@ -135,9 +135,9 @@ _HOME = {
     "alpha_max": "zwidth.stability.ridge",
     "stiffness_slope": "zwidth.stability.slope",
     "Status": "zwidth.status",
-    "load_config": "zwidth.sweep.config",
+    "load_config": "zwidth.studies.document",
     "open_dataset": "zwidth.sweep.store",
-    "run": "zwidth.studies",
+    "run": "zwidth.runs",
 }
 
 __all__ = [

@@ -50,7 +50,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _told(error: OSError) -> str:
     """What the system refused: the file, why, and what helps."""
-    from zwidth.sweep.files import REMEDIES
+    from zwidth.files.whole import REMEDIES
 
     what = ": ".join(str(part) for part in (error.filename, error.strerror or error) if part)
     remedy = REMEDIES.get(error.errno or 0)

@@ -8,11 +8,11 @@ from typing import Any
 import click
 
 from zwidth import __version__
-from zwidth.cli import sweeps
+from zwidth.cli import runs
 from zwidth.cli.bench import bench
 from zwidth.cli.options import json_option, physical_options
 from zwidth.cli.words import SlopesInWords, row, verdict_lines
-from zwidth.quantities import plain, with_unit
+from zwidth.formatting import plain, with_unit
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -121,10 +121,10 @@ def ridge(
 @cli.command()
 def schema() -> None:
     """Print the JSON Schema of configuration files, for editors."""
-    from zwidth.sweep.document import config_json_schema
+    from zwidth.studies.document import config_json_schema
 
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (*sweeps.COMMANDS, bench):
+for command in (*runs.COMMANDS, bench):
     cli.add_command(command)

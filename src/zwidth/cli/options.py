@@ -21,7 +21,7 @@ class Quantity(click.ParamType):
         """Parse one option."""
         from pydantic_core import PydanticCustomError
 
-        from zwidth.sweep import fields, units
+        from zwidth.config import fields, units
 
         allowed = fields.ANY if self.negative else (fields.POSITIVE if self.positive else fields.NOT_NEGATIVE)
         try:

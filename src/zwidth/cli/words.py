@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zwidth.quantities import plain, with_unit
+from zwidth.formatting import plain, with_unit
 
 if TYPE_CHECKING:
     from zwidth.assessment import Assessment

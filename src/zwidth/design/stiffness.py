@@ -11,8 +11,8 @@ from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import elementwise
 from zwidth.domain import check_scalars
 from zwidth.errors import InputError
+from zwidth.formatting import with_unit
 from zwidth.loop import check_delay_model
-from zwidth.quantities import with_unit
 from zwidth.scene import Normalized, normalize, quantity_status
 from zwidth.stability.devices import Kind
 from zwidth.stability.ridge import occurring, ridge_kernel, slopes_kernel

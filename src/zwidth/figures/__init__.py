@@ -13,15 +13,35 @@ an Axes of yours where one is given:
     draw_recommendation   the recommended wall of a device, in SI units
 """
 
-from zwidth.figures.boundary import draw_boundary
-from zwidth.figures.passivity_cost import draw_passivity_cost
-from zwidth.figures.recommendation import draw_recommendation
-from zwidth.figures.ridge import draw_ridge
-from zwidth.figures.slope import draw_slope
-from zwidth.figures.stability_map import draw_map
-from zwidth.figures.step import draw_step
-from zwidth.figures.style import house_style, save
-from zwidth.figures.zero_stiffness import draw_zero_stiffness
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from zwidth.figures.boundary import draw_boundary as draw_boundary
+    from zwidth.figures.passivity_cost import draw_passivity_cost as draw_passivity_cost
+    from zwidth.figures.recommendation import draw_recommendation as draw_recommendation
+    from zwidth.figures.ridge import draw_ridge as draw_ridge
+    from zwidth.figures.slope import draw_slope as draw_slope
+    from zwidth.figures.stability_map import draw_map as draw_map
+    from zwidth.figures.step import draw_step as draw_step
+    from zwidth.figures.style import house_style as house_style
+    from zwidth.figures.style import save as save
+    from zwidth.figures.zero_stiffness import draw_zero_stiffness as draw_zero_stiffness
+
+_HOME = {
+    "draw_boundary": "boundary",
+    "draw_passivity_cost": "passivity_cost",
+    "draw_recommendation": "recommendation",
+    "draw_ridge": "ridge",
+    "draw_slope": "slope",
+    "draw_map": "stability_map",
+    "draw_step": "step",
+    "house_style": "style",
+    "save": "style",
+    "draw_zero_stiffness": "zero_stiffness",
+}
 
 __all__ = [
     "draw_boundary",
@@ -35,3 +55,10 @@ __all__ = [
     "house_style",
     "save",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for: matplotlib takes a moment, and a plan or a configuration needs none of it."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'zwidth.figures' has no attribute {name!r}")
+    return getattr(import_module(f"zwidth.figures.{_HOME[name]}"), name)

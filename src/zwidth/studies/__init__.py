@@ -1,9 +1,10 @@
-"""Runs: a configuration in, a folder of tables, figures and texts out.
+"""Kinds of studies, one a module: what its configuration says, and how it is computed.
 
-One kind of study a module; `runner` puts them together.
+A new kind is a subclass of `ComputedStudy` given to `register`; the command line finds those that an installed package
+names in the entry points ``zwidth.studies``.
 """
 
-from zwidth.studies.events import ProgressCallback, RunResult, StudyEvent, StudyResult
-from zwidth.studies.runner import run
+from zwidth.studies.document import Config, load_config, register
+from zwidth.studies.outcome import ComputedStudy, Outcome
 
-__all__ = ["ProgressCallback", "RunResult", "StudyEvent", "StudyResult", "run"]
+__all__ = ["ComputedStudy", "Config", "Outcome", "load_config", "register"]

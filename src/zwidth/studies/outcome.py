@@ -1,4 +1,4 @@
-"""What a study hands to the runner: tables, arrays, figures and texts, each to be written under the study's name."""
+"""A study that is computed as a whole, and what it hands to the run: tables, arrays, figures and texts."""
 
 from __future__ import annotations
 
@@ -7,12 +7,18 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeAlias
+from typing import TYPE_CHECKING, ClassVar, TypeAlias
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from zwidth.figures import save
+from zwidth import figures
+from zwidth.config.axes import Axis
+from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.study import Study
+from zwidth.figures.data import SIScale
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Table: TypeAlias = dict[str, np.ndarray]
 
@@ -47,8 +53,45 @@ class Outcome:
             np.savez_compressed(folder / f"{name}.npz", **self.arrays)  # pyright: ignore[reportArgumentType]
             yield f"{name}.npz"
         for addition, draw in self.figures.items():
-            for file in save(draw(), folder / f"{name}{addition}"):
+            for file in figures.save(draw(), folder / f"{name}{addition}"):
                 yield file.name
+
+
+class ComputedStudy(Study):
+    """A study whose results are tables, figures and texts: a kind is such a class, its model and its computation.
+
+    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``points``, ``nbytes`` and
+    ``extent`` for the plan, and `compute`. `zwidth.studies.register` makes it known.
+    """
+
+    reads_scene: ClassVar[bool] = False
+    """Whether the results depend on the scene beyond what the study has taken from it."""
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """Compute everything; drawing and writing come later.
+
+        Args:
+            scene: the scene of the file.
+            alone: whether this is the file's only study of its kind.
+        """
+        raise NotImplementedError
+
+
+def scale_of(device: PhysicalDevice) -> SIScale:
+    """How normalized walls of a device read in N/m and N s/m."""
+    return SIScale(device.mass / device.period**2, device.mass / device.period)
+
+
+def si_of(delta: Axis, d: Axis, scene: AnyScene | None) -> SIScale | None:
+    """How to read walls in SI units: delta and d must be those of the file's scene alone."""
+    if not isinstance(scene, PhysicalScene):
+        return None
+    same = _is(delta, scene.delta) and _is(d, scene.d)
+    return scale_of(scene.device) if same else None
+
+
+def _is(axis: Axis, value: float) -> bool:
+    return axis.size == 1 and float(axis.values()[0]) == value
 
 
 def stack(parts: Iterable[Mapping[str, object]]) -> Table:

@@ -7,18 +7,49 @@ origin. The damping that a unit circle of walls needs therefore gives the whole 
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from zwidth.figures import draw_passivity_cost
+from zwidth import figures
+from zwidth.config.scenes import AnyScene
+from zwidth.config.study import HeldOnly, figure_layout
 from zwidth.figures.data import DampingInterval, PassiveOutline, PassivityCost, PassivityData
 from zwidth.stability.passivity import passive_stiffness_slope, passivity_margin
+from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, stack
-from zwidth.studies.ridges import ridge_paths
-from zwidth.sweep.studies import PassivityStudy
+from zwidth.studies.ridge import ridge_paths
 
 _DIRECTIONS = 721
+
+
+class PassivityStudy(CurvesStudy):
+    """What passivity costs: the largest passive and the largest stable stiffness over delta."""
+
+    what: ClassVar[str] = "a passivity study"
+    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_model")
+
+    kind: Literal["passivity"]
+
+    delay_model: HeldOnly = "held"
+    """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
+
+    figure: Annotated[Literal["passivity_cost"] | None, figure_layout("passivity_cost")] = None
+    """Layout of the figure; a generic one where left out."""
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """The stiffest passive and the stiffest stable wall over delta, as a table and a figure."""
+        delta, delays = self.delta.values(), self.d.values()
+        paths, notes = ridge_paths(delta, delays, self.delay_model)
+        costs = []
+        for path in paths:
+            wall = stiffest_passive(path.d)
+            passive = (wall.alpha * delta, wall.beta * delta)
+            costs.append(PassivityCost(path.d, delta, path.alpha_max, path.beta, *passive))
+        names = ("d", "delta", "alpha_max", "beta", "alpha_max_passive", "beta_passive")
+        table = stack({name: getattr(cost, name) for name in names} for cost in costs)
+        draw = partial(figures.draw_passivity_cost, PassivityData(tuple(costs)))
+        return Outcome(table=table, figures={"": draw}, notes=tuple(notes))
 
 
 class PassiveWall(NamedTuple):
@@ -61,19 +92,3 @@ def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> tuple[DampingIn
 def stiffest_passive(d: float) -> PassiveWall:
     """The stiffest passive wall, over delta."""
     return PassiveWall(*passive_stiffness_slope(d))
-
-
-def run_passivity(study: PassivityStudy) -> Outcome:
-    """Compare the stiffest passive wall with the stiffest stable one."""
-    delta, delays = study.delta.values(), study.d.values()
-    paths, notes = ridge_paths(delta, delays, study.delay_model)
-    costs = []
-    for path in paths:
-        wall = stiffest_passive(path.d)
-        passive = (wall.alpha * delta, wall.beta * delta)
-        costs.append(PassivityCost(path.d, delta, path.alpha_max, path.beta, *passive))
-    names = ("d", "delta", "alpha_max", "beta", "alpha_max_passive", "beta_passive")
-    table = stack({name: getattr(cost, name) for name in names} for cost in costs)
-    return Outcome(
-        table=table, figures={"": partial(draw_passivity_cost, PassivityData(tuple(costs)))}, notes=tuple(notes)
-    )

@@ -5,63 +5,93 @@ from __future__ import annotations
 import json
 import math
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
+from zwidth import figures
 from zwidth.assessment import Assessment, assess
-from zwidth.figures import draw_recommendation
-from zwidth.figures.data import BoundaryData, RecommendationData, Response, SIScale
-from zwidth.quantities import plain, with_unit
+from zwidth.config.fields import Fraction
+from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
+from zwidth.figures.data import BoundaryData, RecommendationData, Response
+from zwidth.formatting import plain, with_unit
 from zwidth.scene import Scene, VirtualWall
 from zwidth.stability.ridge import alpha_max
-from zwidth.studies.boundaries import outline
-from zwidth.studies.outcome import Outcome, stack
+from zwidth.studies.boundary import outline
+from zwidth.studies.outcome import Outcome, scale_of, stack
 from zwidth.studies.passivity import passive_outlines
-from zwidth.studies.steps import respond, response_columns, unsettled
-from zwidth.sweep.devices import PhysicalDevice
-from zwidth.sweep.responses import RecommendStudy
+from zwidth.studies.step import ResponseStudy, respond, response_columns, unsettled
 
 
-def si_scale(device: PhysicalDevice) -> SIScale:
-    """How normalized walls of a device read in N/m and N s/m."""
-    return SIScale(device.mass / device.period**2, device.mass / device.period)
+class RecommendStudy(ResponseStudy):
+    """Maximum stiffness and recommended damping of a device in SI units, and its response."""
 
+    what: ClassVar[str] = "a recommend study"
+    from_scene: ClassVar[tuple[str, ...]] = ("device", "delay_model")
 
-def run_recommend(study: RecommendStudy, stem: str) -> Outcome:
-    """Recommend a wall, judge it, and write both down as ``stem.md`` and ``stem.json``."""
-    device, si = study.device, si_scale(study.device)
-    bare = device.to_scene()
-    ridge = alpha_max(device.delta, device.d)
-    alpha, beta = study.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
-    wall = VirtualWall(stiffness=alpha * si.stiffness, virtual_damping=beta * si.virtual_damping)
-    verdict = assess(Scene(bare.device, bare.timing, wall))
-    times = {"periods": study.periods(device), "substeps": study.substeps}
-    response = respond(device, alpha, beta, label=device.label or study.name, physical=True, **times)
-    edge, verified = outline(device.delta, device.d, "held")
-    passive = passive_outlines(np.array([device.delta]), np.array([device.d]))
-    data = RecommendationData(
-        stiffness=wall.stiffness,
-        virtual_damping=wall.virtual_damping,
-        stiffness_fraction=study.stiffness_fraction,
-        stiffness_max=verdict.stiffness_max,
-        virtual_damping_at_max=verdict.virtual_damping_at_max,
-        virtual_damping_lower=verdict.virtual_damping_lower,
-        virtual_damping_upper=verdict.virtual_damping_upper,
-        region=BoundaryData((edge,), passive=passive, si=si),
-        response=response,
-    )
-    documents = {
-        f"{stem}.json": json.dumps(_summary(device, data, verdict), indent=2, allow_nan=False) + "\n",
-        f"{stem}.md": _markdown(device, data, verdict),
-    }
-    notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
-    if note := unsettled(response, physical=True):
-        notes.append(note)
-    table = stack([response_columns(response, physical=True)])
-    return Outcome(
-        table=table, figures={"": partial(draw_recommendation, data)}, documents=documents, notes=tuple(notes)
-    )
+    kind: Literal["recommend"]
+
+    device: PhysicalDevice
+    """Device in SI units; the scene's where left out."""
+
+    stiffness_fraction: Fraction = 0.75
+    """Stiffness of the recommended wall as a share of the maximum."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        filled = {"delay_model": scene.delay_model, **raw}
+        if isinstance(scene.device, PhysicalDevice):
+            filled.setdefault("device", scene.device)
+        return filled
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        if name == "device":
+            return "a recommendation in N/m needs a device in SI units", "give the scene mass and period"
+        return super().missing(name)
+
+    def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
+        """The one device; its wall is a share of the maximum."""
+        return ((self.device, None),)
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """Recommend a wall, judge it, and write both down as text and JSON, with a table and a figure."""
+        stem = "recommendation" if alone else f"{self.name}_recommendation"
+        device, si = self.device, scale_of(self.device)
+        bare = device.to_scene()
+        ridge = alpha_max(device.delta, device.d)
+        alpha, beta = self.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
+        wall = VirtualWall(stiffness=alpha * si.stiffness, virtual_damping=beta * si.virtual_damping)
+        verdict = assess(Scene(bare.device, bare.timing, wall))
+        times = {"periods": self.periods(device), "substeps": self.substeps}
+        response = respond(device, alpha, beta, label=device.label or self.name, physical=True, **times)
+        edge, verified = outline(device.delta, device.d, "held")
+        passive = passive_outlines(np.array([device.delta]), np.array([device.d]))
+        data = RecommendationData(
+            stiffness=wall.stiffness,
+            virtual_damping=wall.virtual_damping,
+            stiffness_fraction=self.stiffness_fraction,
+            stiffness_max=verdict.stiffness_max,
+            virtual_damping_at_max=verdict.virtual_damping_at_max,
+            virtual_damping_lower=verdict.virtual_damping_lower,
+            virtual_damping_upper=verdict.virtual_damping_upper,
+            region=BoundaryData((edge,), passive=passive, si=si),
+            response=response,
+        )
+        documents = {
+            f"{stem}.json": json.dumps(_summary(device, data, verdict), indent=2, allow_nan=False) + "\n",
+            f"{stem}.md": _markdown(device, data, verdict),
+        }
+        notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
+        if note := unsettled(response, physical=True):
+            notes.append(note)
+        table = stack([response_columns(response, physical=True)])
+        return Outcome(
+            table=table,
+            figures={"": partial(figures.draw_recommendation, data)},
+            documents=documents,
+            notes=tuple(notes),
+        )
 
 
 def _finite(value: float) -> float | None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterable
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from zwidth.errors import InputError
@@ -17,11 +18,12 @@ _CONNECT_SECONDS = 30
 _AHEAD = 4
 
 
-def on_cluster(jobs: Iterable[Job], address: str, perform: Perform) -> Generator[Finished]:
-    """Do jobs on the workers of a scheduler; they must see the stores under the same path.
+@contextmanager
+def connected(address: str) -> Iterator[Client]:
+    """A connection to a scheduler while the block runs.
 
-    A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
-    again at the end, one by one, before it is called a failure.
+    Raises:
+        InputError: nobody answers at the address.
     """
     from distributed import Client
 
@@ -30,17 +32,26 @@ def on_cluster(jobs: Iterable[Job], address: str, perform: Perform) -> Generator
     except (OSError, ValueError) as error:
         raise InputError(f"scheduler: no answer from {address!r} ({error}); check the address") from error
     try:
-        _check_folder(client, address, jobs := list(jobs))
-        given_up = []
-        for finished in _many(client, jobs, perform):
-            if finished.error and _is_death(finished.error):
-                given_up.append(finished.job)
-            else:
-                yield finished
-        for job in given_up:
-            yield from _many(client, [job], perform)
+        yield client
     finally:
         client.close()
+
+
+def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
+    """Do jobs on the workers of a scheduler; they must see the stores under the same path.
+
+    A worker that dies may take innocent chunks with it, those that it had just begun: what dask gives up is tried
+    again at the end, one by one, before it is called a failure.
+    """
+    _check_folder(client, jobs)
+    given_up = []
+    for finished in _many(client, jobs, perform):
+        if finished.error and _is_death(finished.error):
+            given_up.append(finished.job)
+        else:
+            yield finished
+    for job in given_up:
+        yield from _many(client, [job], perform)
 
 
 def _is_death(error: str) -> bool:
@@ -93,7 +104,7 @@ def _name(job: Job) -> str:
     return f"{os.path.basename(job.path)}-{job.task.family}-{job.task.index}"
 
 
-def _check_folder(client: Client, address: str, jobs: list[Job]) -> None:
+def _check_folder(client: Client, jobs: list[Job]) -> None:
     """Refuse workers that do not see the stores."""
     if not jobs or not client.nthreads():
         return
@@ -102,6 +113,6 @@ def _check_folder(client: Client, address: str, jobs: list[Job]) -> None:
     blind = [worker for worker, sees in seen.items() if not sees]
     if blind:
         raise InputError(
-            f"scheduler: the worker {blind[0]} of {address} does not see {path}; choose a folder that all machines "
-            "share with --out DIR"
+            f"scheduler: its worker {blind[0]} does not see {path}; choose a folder that all machines share with "
+            "--out DIR"
         )

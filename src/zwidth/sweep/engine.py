@@ -1,32 +1,30 @@
-"""The engine: every sweep of a configuration, chunk by chunk, in this process, in workers or on a cluster."""
+"""The engine: sweeps chunk by chunk, in this process, in workers or on a cluster."""
 
 from __future__ import annotations
 
 import math
-import os
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
+from typing import Any
 
-from zwidth.errors import InputError, StoreExistsError
-from zwidth.sweep.document import Config
+from zwidth.errors import StoreExistsError
 from zwidth.sweep.jobs import Finished, Job, Perform, in_this_process
-from zwidth.sweep.lock import holding
-from zwidth.sweep.plan import MEMORY, Plan, Task, check_resources, make_plan
-from zwidth.sweep.resume import check_same, new_store, remove, repair, store_path, sweep_up
+from zwidth.sweep.plan import Plan, Task
+from zwidth.sweep.resume import check_same, new_store, repair, store_path, sweep_up
 from zwidth.sweep.store import Store
-from zwidth.sweep.sweeps import SweepStudy
+from zwidth.sweep.study import SweepStudy
 
 
 @dataclass(frozen=True)
-class SweepEvent:
-    """How far the sweeps are, sent after every chunk.
+class Progress:
+    """How far the sweeps of a run are, told after every chunk.
 
     Attributes:
         study: name of the study that the chunk belongs to.
-        chunks, total_chunks: how many are done and how many there are in this run.
+        chunks, total_chunks: how many are done and how many there are to compute in this run.
         points, total_points: the same in points.
         rate: points a second since the start.
         seconds_left: at this rate; NaN before the first chunk.
@@ -43,145 +41,105 @@ class SweepEvent:
     error: str = ""
 
 
-@dataclass(frozen=True)
+@dataclass
 class SweepResult:
-    """What became of the sweeps.
+    """What became of one sweep.
 
     Attributes:
-        stores: the folder of each study's store by the study's name.
+        store: the folder of its store.
         computed: how many chunks this run computed.
         skipped: how many were done before.
         total: how many this run was to see done.
         repaired: the chunks whose files were damaged, and that were computed again.
         failed: the chunks that could not be computed, with the reason.
+    """
+
+    store: Path
+    computed: int = 0
+    skipped: int = 0
+    total: int = 0
+    repaired: tuple[str, ...] = ()
+    failed: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything that this run was to compute is there."""
+        return not self.failed and self.computed + self.skipped == self.total
+
+
+@dataclass
+class Sweeps:
+    """The sweeps of one run.
+
+    Attributes:
+        results: one a study, by its name.
         hopeless: the error that ended the run early, for no other chunk would have escaped it, as a full disk.
         interrupted: whether somebody stopped the run.
     """
 
-    stores: dict[str, Path]
-    computed: int
-    skipped: int
-    total: int
-    repaired: tuple[str, ...] = ()
-    failed: dict[str, str] = field(default_factory=dict)
+    results: dict[str, SweepResult]
     hopeless: str = ""
     interrupted: bool = False
 
-    @property
-    def ok(self) -> bool:
-        """Whether everything that this run was to do is done."""
-        return not self.failed and not self.interrupted
 
-
-def sweeps_of(config: Config) -> list[SweepStudy]:
-    """The sweep studies of a configuration."""
-    return [study for study in config.studies if isinstance(study, SweepStudy)]
-
-
-def plan_sweeps(config: Config, *, memory: int = MEMORY) -> list[Plan]:
-    """The plans of all sweeps, without doing anything."""
-    return [make_plan(study, memory=memory) for study in sweeps_of(config)]
-
-
-def run_sweeps(
-    config: Config,
-    out: str | os.PathLike[str],
+def compute_sweeps(
+    planned: Sequence[tuple[SweepStudy, Plan]],
+    folder: Path,
+    about: Mapping[str, Any],
     *,
-    resume: bool = False,
-    overwrite: bool = False,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    shard: tuple[int, int] | None = None,
-    memory: int = MEMORY,
-    progress: Callable[[SweepEvent], None] | None = None,
-    perform: Perform | None = None,
-) -> SweepResult:
-    """Compute the sweeps of a configuration into stores ``<out>/<study>.zarr``.
+    resume: bool,
+    shard: tuple[int, int] | None,
+    workers: int | None,
+    scheduler: str | None,
+    perform: Perform | None,
+    progress: Callable[[Progress], None],
+) -> Sweeps:
+    """Compute what is missing in the stores ``<folder>/<study>.zarr``, which are made where they are not there.
 
     Args:
-        config: the configuration; studies of other kinds are left alone.
-        out: the folder of the stores.
-        resume: go on with stores that exist: chunks that are done and undamaged are not computed again.
-        overwrite: remove stores that exist, and start again.
-        workers: how many processes compute on this machine; this process itself where left out. They are spawned: a
-            script that asks for them does its work below ``if __name__ == "__main__":``.
-        scheduler: address of a dask.distributed scheduler whose workers compute, and see the same folder.
-        shard: (i, n), 1 <= i <= n: compute every n-th chunk only, one of n such runs on the same stores.
-        memory: bytes that a chunk may take while it is computed.
-        progress: called with a `SweepEvent` after every chunk.
-        perform: what computes one chunk; for tests.
-
-    Returns:
-        SweepResult: where the stores are, and what was computed, skipped, repaired and failed. A chunk that fails
-        does not keep the others from being computed; Ctrl-C ends the run with ``interrupted`` set.
+        planned: the studies with their plans.
+        folder: held by the caller.
+        about: ``name``, ``description`` and ``config`` of the configuration, for the stores' attributes.
+        resume, shard, workers, scheduler, progress: as in `zwidth.run`.
+        perform: what computes a chunk instead of `zwidth.sweep.chunks.perform`; for tests.
 
     Raises:
-        StoreExistsError: a store exists and neither ``resume`` nor ``overwrite`` is set.
-        StoreBusyError: another run computes in this folder; shards (i, n) of one n do not exclude each other.
+        StoreExistsError: a store exists and the run does not go on.
         StoreError: a store is damaged, or was made from another configuration or by other releases.
-        ResourceError: the results do not fit on the disk, or the workers not into memory.
-        InputError: options that exclude each other.
-
-    Numerics:
-        Float64. The values do not depend on chunks, workers or engine; on another kind of processor or with another
-        release of JAX the last digits may differ.
+        InputError: the scheduler does not answer, or its workers do not see the folder.
     """
-    _check_options(workers, scheduler, shard, going_on=resume or shard is not None, overwrite=overwrite)
-    folder = Path(os.path.abspath(os.fsdecode(out)))
-    studies = sweeps_of(config)
-    plans = {study.name: make_plan(study, memory=memory) for study in studies}
-    # What does not fit is refused before anything is made.
-    check_resources(list(plans.values()), folder, workers or 1, begun=_found(studies, folder))
-    if not studies:
-        return SweepResult({}, 0, 0, 0)
-    with holding(folder, shard):
-        if overwrite:
-            for study in studies:
-                remove(folder, study)
-        stores, repaired = _stores(config, folder, plans, resume=resume, shard=shard)
-        engine = partial(_engine, workers=workers, scheduler=scheduler, perform=perform)
-        return _compute(stores, repaired, shard, engine, progress or (lambda event: None))
+    if perform is None:
+        from zwidth.sweep.chunks import perform
+    with ExitStack() as stack:
+        client = None
+        if scheduler is not None:
+            # Before anything is made that a scheduler that does not answer would leave behind.
+            from zwidth.sweep.distributed import connected
 
+            client = stack.enter_context(connected(scheduler))
+        stores, repaired = _stores(planned, folder, about, going_on=resume or shard is not None, shard=shard)
+        results = {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
+        names = {str(store.path): name for name, store in stores.items()}
+        points: dict[Job, int] = {}
+        for name, store in stores.items():
+            tasks = _share(store.plan, shard)
+            missing = [task for task in tasks if not store.is_done(task)]
+            points |= {Job(str(store.path), task): store.plan.points(task) for task in missing}
+            results[name].total, results[name].skipped = len(tasks), len(tasks) - len(missing)
+        sweeps = Sweeps(results)
+        if points:
+            if client is not None:
+                from zwidth.sweep.distributed import on_cluster
 
-def _compute(
-    stores: dict[str, Store],
-    repaired: list[str],
-    shard: tuple[int, int] | None,
-    engine: Callable[[list[Job]], Generator[Finished]],
-    progress: Callable[[SweepEvent], None],
-) -> SweepResult:
-    """Compute what is missing in the stores."""
-    jobs, points, total = [], {}, 0
-    for store in stores.values():
-        tasks = _share(store.plan, shard)
-        total += len(tasks)
-        for task in (task for task in tasks if not store.is_done(task)):
-            jobs.append(Job(str(store.path), task))
-            points[jobs[-1]] = store.plan.points(task)
-    names = {str(store.path): name for name, store in stores.items()}
-    follower = _Follower(names, points, progress)
-    interrupted = follower.follow(engine(jobs)) if jobs else False
-    failed = {
-        f"{names[job.path]}/{stores[names[job.path]].plan.describe(job.task)}": error
-        for job, error in follower.failed.items()
-    }
-    paths = {name: store.path for name, store in stores.items()}
-    return SweepResult(
-        paths, follower.done, total - len(jobs), total, tuple(repaired), failed, follower.hopeless, interrupted
-    )
+                finished = on_cluster(list(points), client, perform)
+            elif workers is not None:
+                from zwidth.sweep.pool import in_workers
 
-
-def _check_options(
-    workers: int | None, scheduler: str | None, shard: tuple[int, int] | None, *, going_on: bool, overwrite: bool
-) -> None:
-    if workers is not None and scheduler is not None:
-        raise InputError("workers, scheduler: got both; the cluster has its own workers, give one of the two")
-    if workers is not None and workers < 1:
-        raise InputError(f"workers: got {workers}; at least 1")
-    if shard is not None and not 1 <= shard[0] <= shard[1]:
-        raise InputError(f"shard: got {shard[0]}/{shard[1]}; give i/n with 1 <= i <= n")
-    if overwrite and going_on:
-        raise InputError("overwrite: it starts again, resume and shard go on; give one of them")
+                finished = in_workers(list(points), workers, perform)
+            else:
+                finished = in_this_process(list(points), perform)
+            _follow(finished, points, sweeps, stores, names, progress)
+        return sweeps
 
 
 def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
@@ -190,107 +148,67 @@ def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
     return tasks if shard is None else tasks[shard[0] - 1 :: shard[1]]
 
 
-def _found(studies: list[SweepStudy], folder: Path) -> set[str]:
-    """The studies that have a store."""
-    return {study.name for study in studies if store_path(folder, study).exists()}
-
-
 def _stores(
-    config: Config, folder: Path, plans: dict[str, Plan], *, resume: bool, shard: tuple[int, int] | None
-) -> tuple[dict[str, Store], list[str]]:
+    planned: Sequence[tuple[SweepStudy, Plan]],
+    folder: Path,
+    about: Mapping[str, Any],
+    *,
+    going_on: bool,
+    shard: tuple[int, int] | None,
+) -> tuple[dict[str, Store], dict[str, list[str]]]:
     """The stores of all sweeps, made or found, and what was repaired in them."""
-    studies = sweeps_of(config)
-    found = _found(studies, folder)
-    if found and not resume and shard is None:
-        first = next(store_path(folder, study) for study in studies if study.name in found)
+    found = {study.name: store_path(folder, study) for study, _ in planned}
+    found = {name: path for name, path in found.items() if path.exists()}
+    if found and not going_on:
         raise StoreExistsError(
-            f"out: {first} exists already; go on with it with --resume, or choose another folder with --out DIR"
+            f"out: {next(iter(found.values()))} exists already; go on with it with --resume, or choose another folder "
+            "with --out DIR"
         )
     # Everything is checked before anything is made or changed.
-    for study in studies:
+    for study, _ in planned:
         if study.name in found:
-            check_same(Store(store_path(folder, study)), study)
-    stores, repaired = {}, []
-    for study in studies:
+            check_same(Store(found[study.name]), study)
+    stores, repaired = {}, {}
+    for study, plan in planned:
         if shard is None:
             sweep_up(folder, study)
         if study.name in found:
-            stores[study.name] = store = Store(store_path(folder, study))
-            repaired += [f"{study.name}/{what}" for what in repair(store, _share(store.plan, shard))]
+            stores[study.name] = store = Store(found[study.name])
+            repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _share(store.plan, shard))]
         else:
-            stores[study.name] = new_store(folder, study, plans[study.name], config, shared=shard is not None)
+            stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)
+            repaired[study.name] = []
     return stores, repaired
 
 
-def _engine(
-    jobs: list[Job], *, workers: int | None, scheduler: str | None, perform: Perform | None
-) -> Generator[Finished]:
-    if perform is None:
-        from zwidth.sweep.chunks import perform
-    if scheduler is not None:
-        from zwidth.sweep.distributed import on_cluster
-
-        return on_cluster(jobs, scheduler, perform)
-    if workers is not None:
-        from zwidth.sweep.pool import in_workers
-
-        return in_workers(jobs, workers, perform)
-    return in_this_process(jobs, perform)
-
-
-class _Follower:
-    """Keeps count of chunks while an engine works.
-
-    Args:
-        names: the study of each store.
-        points: the points of every chunk that is to be computed.
-        progress: told after every chunk.
-    """
-
-    def __init__(self, names: dict[str, str], points: dict[Job, int], progress: Callable[[SweepEvent], None]) -> None:
-        self.names = names
-        self.points = points
-        self.progress = progress
-        self.done = 0
-        self.failed: dict[Job, str] = {}
-        self.hopeless = ""
-
-    def follow(self, results: Generator[Finished]) -> bool:
-        """Take the results of an engine to the end; returns whether somebody stopped it."""
-        start, ended, computed = time.perf_counter(), 0, 0
-        total = sum(self.points.values())
-        try:
-            for finished in results:
-                self._count(finished)
-                ended += self.points[finished.job]
-                computed += 0 if finished.error else self.points[finished.job]
-                rate = computed / max(time.perf_counter() - start, 1e-9)
-                left = (total - ended) / rate if rate else math.nan
-                name = self.names[finished.job.path]
-                self.progress(
-                    SweepEvent(
-                        name,
-                        self.done + len(self.failed),
-                        len(self.points),
-                        ended,
-                        total,
-                        rate,
-                        left,
-                        finished.error,
-                    )
-                )
-                if finished.hopeless:
-                    self.hopeless = finished.error
-                    break
-        except KeyboardInterrupt:
-            return True
-        finally:
-            # Ends the workers.
-            results.close()
-        return False
-
-    def _count(self, finished: Finished) -> None:
-        if finished.error:
-            self.failed[finished.job] = finished.error
-        else:
-            self.done += 1
+def _follow(
+    results: Generator[Finished],
+    points: dict[Job, int],
+    sweeps: Sweeps,
+    stores: dict[str, Store],
+    names: dict[str, str],
+    progress: Callable[[Progress], None],
+) -> None:
+    """Keep count of chunks while they are computed."""
+    start, ended, computed, total = time.perf_counter(), 0, 0, sum(points.values())
+    try:
+        for number, finished in enumerate(results, start=1):
+            name = names[finished.job.path]
+            sweep = sweeps.results[name]
+            ended += points[finished.job]
+            if finished.error:
+                sweep.failed[f"{name}/{stores[name].plan.describe(finished.job.task)}"] = finished.error
+            else:
+                sweep.computed += 1
+                computed += points[finished.job]
+            rate = computed / max(time.perf_counter() - start, 1e-9)
+            left = (total - ended) / rate if rate else math.nan
+            progress(Progress(name, number, len(points), ended, total, rate, left, finished.error))
+            if finished.hopeless:
+                sweeps.hopeless = finished.error
+                return
+    except KeyboardInterrupt:
+        sweeps.interrupted = True
+    finally:
+        # Ends the workers.
+        results.close()

@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.config.device_table import LABEL
+from zwidth.config.parameters import PARAMETERS, WALL
 from zwidth.scene import normalize
 from zwidth.sweep.outputs import Family
-from zwidth.sweep.parameters import PARAMETERS, WALL
-from zwidth.sweep.sweeps import SweepStudy
-from zwidth.sweep.table import LABEL
+from zwidth.sweep.study import SweepStudy
 
 
 class Block(NamedTuple):

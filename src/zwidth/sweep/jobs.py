@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import NamedTuple, TypeAlias
 
-from zwidth.sweep.files import HOPELESS
+from zwidth.files.whole import hopeless
 from zwidth.sweep.plan import Task
 
 Perform: TypeAlias = Callable[[str, str, int], None]
@@ -41,16 +41,7 @@ def attempt(perform: Perform, job: Job) -> Finished:
 
 def failure_of(job: Job, error: BaseException) -> Finished:
     """What an exception means for a job and the others."""
-    return Finished(job, f"{type(error).__name__}: {error}", _errno_of(error) in HOPELESS)
-
-
-def _errno_of(error: BaseException | None) -> int | None:
-    """The number of the system's error that lies behind an exception."""
-    while error is not None:
-        if isinstance(error, OSError) and error.errno is not None:
-            return error.errno
-        error = error.__cause__ or error.__context__
-    return None
+    return Finished(job, f"{type(error).__name__}: {error}", hopeless(error))
 
 
 def in_this_process(jobs: Iterable[Job], perform: Perform) -> Generator[Finished]:

@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from zwidth.errors import ResourceError
-from zwidth.sweep.files import check_folder, existing
+from zwidth.files.whole import check_folder, existing
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.outputs import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
-from zwidth.sweep.sweeps import SweepStudy
+from zwidth.sweep.study import SweepStudy
 
 MEMORY = 2**28
 """Bytes that one chunk may take while it is computed, beside what an idle worker takes."""

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from zwidth.config.faults import describe
 from zwidth.errors import StoreError
-from zwidth.sweep.document import Config
-from zwidth.sweep.faults import describe
+from zwidth.files.provenance import differences, digest, versions
 from zwidth.sweep.plan import Plan, Task
-from zwidth.sweep.record import differences, digest, versions
 from zwidth.sweep.store import SUFFIX, Store, create
-from zwidth.sweep.sweeps import SweepStudy
+from zwidth.sweep.study import SweepStudy
 
 _SHOWN_DIFFERENCES = 10
 
@@ -24,19 +23,18 @@ def store_path(folder: Path, study: SweepStudy) -> Path:
     return folder / f"{study.name}{SUFFIX}"
 
 
-def new_store(folder: Path, study: SweepStudy, plan: Plan, config: Config, *, shared: bool) -> Store:
+def new_store(folder: Path, study: SweepStudy, plan: Plan, about: Mapping[str, Any], *, shared: bool) -> Store:
     """Make the store of a study; where other runs share it, one of them may have been faster."""
-    whole = _spelled(config)
     attributes = {
-        "title": f"{config.name}: {study.name}",
-        "comment": config.description,
+        "title": f"{about['name']}: {study.name}",
+        "comment": about["description"],
         "source": f"zwidth {versions()['zwidth']}",
         "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} made by zwidth run",
         "precision": "float64",
         "versions": versions(),
-        "config": whole,
-        "config_sha256": digest(whole),
-        "study": _spelled(study),
+        "config": about["config"],
+        "config_sha256": digest(about["config"]),
+        "study": study.model_dump(mode="json", exclude_none=True),
         "plan": plan.as_dict(),
     }
     store = create(store_path(folder, study), attributes, may_exist=shared)
@@ -50,28 +48,42 @@ def check_same(store: Store, study: SweepStudy) -> None:
     Raises:
         StoreError: the message names every key that differs.
     """
-    changed = list(differences(store.attributes["study"], _spelled(study)))
+    now = study.model_dump(mode="json", exclude_none=True)
+    refuse_changes(store.path, study.name, "store", store.attributes["study"], now)
+    refuse_versions(store.path, store.attributes["versions"])
+
+
+def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> None:
+    """Refuse to go on with results that were made from another study.
+
+    Raises:
+        StoreError: the message names every key that differs.
+    """
+    changed = list(differences(old, new))
     if changed:
         lines = [
-            f"{store.path}: studies[{study.name}].{key}: the store was made with {_shown(old)}, the configuration has "
-            f"{_shown(new)}"
-            for key, old, new in changed[:_SHOWN_DIFFERENCES]
+            f"{where}: studies[{name}].{key}: the {what} was made with {_shown(before)}, the configuration has "
+            f"{_shown(after)}"
+            for key, before, after in changed[:_SHOWN_DIFFERENCES]
         ]
         more = len(changed) - _SHOWN_DIFFERENCES
-        lines += [f"{store.path}: {more} more keys differ"] if more > 0 else []
-        remedy = f"{store.path}: change the configuration back, or choose another folder with --out DIR"
+        lines += [f"{where}: {more} more keys differ"] if more > 0 else []
+        remedy = f"{where}: change the configuration back, or choose another folder with --out DIR"
         raise StoreError("\n".join([*lines, remedy]))
-    for key, old, new in differences(store.attributes["versions"], versions()):
-        # A store whose chunks come from two releases is not what either of them would compute.
-        if key != "python":
-            raise StoreError(
-                f"{store.path}: made with {key} {old}, now there is {new}; install the same release, or choose another "
-                "folder with --out DIR"
-            )
 
 
-def _spelled(model: Config | SweepStudy) -> dict[str, Any]:
-    return model.model_dump(mode="json", exclude_none=True)
+def refuse_versions(where: Path, old: dict[str, str]) -> None:
+    """Refuse to go on with results of other releases: together they are not what either of them would compute.
+
+    Raises:
+        StoreError: the message names the first that differs.
+    """
+    now = versions()
+    for key in (key for key in now if key != "python" and old.get(key) != now[key]):
+        raise StoreError(
+            f"{where}: made with {key} {old.get(key)}, now there is {now[key]}; install the same release, or choose "
+            "another folder with --out DIR"
+        )
 
 
 def _shown(value: Any) -> str:

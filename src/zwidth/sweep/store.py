@@ -18,18 +18,19 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.errors import StoreError, StoreExistsError
-from zwidth.sweep.files import checksum, write_whole
+from zwidth.errors import InputError, StoreError, StoreExistsError
+from zwidth.files.provenance import digest
+from zwidth.files.whole import checksum, write_whole
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.sweep.plan import Plan, Task, kept_plan
-from zwidth.sweep.record import digest
-from zwidth.sweep.sweeps import SweepStudy
+from zwidth.sweep.study import SweepStudy
 
 if TYPE_CHECKING:
     import xarray
@@ -40,6 +41,8 @@ FORMAT = 1
 MAX_CSV_POINTS = 1_000_000
 _SEAL = "attributes_sha256"
 _FILES = "file_checksums"
+# Zarr reads the first; the second is a copy of it, for the whole store would be lost with one flipped bit.
+_DESCRIPTIONS = ("zarr.json", "zwidth.json")
 
 
 @contextmanager
@@ -49,6 +52,20 @@ def _quiet() -> Iterator[None]:
         warnings.filterwarnings("ignore", message=".*Zarr", category=UserWarning)
         warnings.filterwarnings("ignore", message=".*Zarr", category=FutureWarning)
         yield
+
+
+def check_installed() -> None:
+    """Say what to install where the libraries that stores are made with are missing.
+
+    Raises:
+        InputError: one of them is.
+    """
+    for name in ("dask", "h5netcdf", "h5py", "xarray", "zarr"):
+        if find_spec(name) is None:
+            raise InputError(
+                f"sweeps are kept in stores, and {name}, which those need, is not installed; install it with "
+                "pip install 'zwidth[store]'"
+            )
 
 
 def _checksums(family: str) -> str:
@@ -67,16 +84,22 @@ class Store:
 
     @cached_property
     def attributes(self) -> dict[str, Any]:
-        """What the store says of itself; raises `StoreError` where that cannot be trusted."""
-        try:
-            attributes = json.loads((self.path / "zarr.json").read_text(encoding="utf-8"))["attributes"]
-            sealed = attributes[_SEAL]
-        except FileNotFoundError as error:
-            raise StoreError(f"{self.path}: no store of a sweep (it has no zarr.json); check the path") from error
-        except (OSError, ValueError, KeyError, TypeError) as error:
-            raise StoreError(f"{self.path}/zarr.json: cannot be read ({error}); start again in a new folder") from error
-        if digest({key: value for key, value in attributes.items() if key != _SEAL}) != sealed:
-            raise StoreError(f"{self.path}/zarr.json: damaged, its checksum is wrong; start again in a new folder")
+        """What the store says of itself, twice; raises `StoreError` where neither can be trusted."""
+        faults = []
+        for name in _DESCRIPTIONS:
+            try:
+                attributes = json.loads((self.path / name).read_text(encoding="utf-8"))["attributes"]
+                if digest({key: value for key, value in attributes.items() if key != _SEAL}) == attributes[_SEAL]:
+                    break
+                faults.append(f"{name} is damaged, its checksum is wrong")
+            except FileNotFoundError:
+                faults.append(f"it has no {name}")
+            except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+                faults.append(f"{name} cannot be read ({error})")
+        else:
+            if not any((self.path / name).exists() for name in _DESCRIPTIONS):
+                raise StoreError(f"{self.path}: no store of a sweep ({faults[0]}); check the path")
+            raise StoreError(f"{self.path}: {'; '.join(faults)}; start again in a new folder")
         if attributes.get("zwidth_format") != FORMAT:
             what = attributes.get("zwidth_format")
             raise StoreError(f"{self.path}: format {what}, this release reads format {FORMAT}; use another release")
@@ -161,7 +184,10 @@ class Store:
     def damaged_files(self) -> list[str]:
         """Files beside the chunks that are not what was written: coordinates and the descriptions of variables."""
         kept = self.attributes[_FILES]
-        return [name for name, expected in kept.items() if checksum(self.path / name) != expected]
+        found = [name for name, expected in kept.items() if checksum(self.path / name) != expected]
+        # Two copies that differ: which of them is damaged, what is made anew from the sound one tells.
+        documents = [(self.path / name).read_bytes() if (self.path / name).exists() else b"" for name in _DESCRIPTIONS]
+        return found if documents[0] == documents[1] else [*_DESCRIPTIONS, *found]
 
     def restore(self, names: list[str]) -> None:
         """Write such files again; they follow from the store's attributes."""
@@ -209,7 +235,8 @@ def _built(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
         described = {key: value for key, value in described.items() if key not in (_FILES, _SEAL)} | {_FILES: sums}
         document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8"))
         document["attributes"] = {**described, _SEAL: digest(described)}
-        write_whole(fresh / "zarr.json", json.dumps(document, indent=2).encode())
+        for name in _DESCRIPTIONS:
+            write_whole(fresh / name, json.dumps(document, indent=2).encode())
         yield fresh
     finally:
         shutil.rmtree(fresh, ignore_errors=True)
@@ -288,21 +315,23 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
 
     Raises:
         StoreError: there is no store, there are several, or its attributes are damaged.
+        InputError: the libraries for stores are not installed.
 
     Example:
         >>> import tempfile, zwidth
-        >>> from zwidth.sweep.engine import Config, run_sweeps
+        >>> from zwidth.studies import Config
         >>> axes = {"alpha": [0.1, 0.9], "beta": 0.1, "delta": 0.1, "d": 1}
         >>> studies = [{"kind": "sweep", "name": "small", "axes": axes}]
         >>> config = Config.model_validate({"version": 1, "name": "example", "studies": studies})
         >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = run_sweeps(config, folder)
+        ...     _ = zwidth.run(config, out=folder)
         ...     zwidth.open_dataset(folder).stable.values
         array([ True, False])
     """
+    store = one_store(path)
+    check_installed()
     import xarray
 
-    store = one_store(path)
     attributes = store.attributes
     with _quiet():
         dataset = xarray.open_zarr(store.path, consolidated=False, chunks={})

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.figures.data import SIScale
+from zwidth.config.scenes import PhysicalScene
 from zwidth.stability.poles import unstable_poles
-from zwidth.studies.boundaries import outline, run_boundary, stable_intervals
-from zwidth.studies.maps import run_map
+from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
+from zwidth.studies.map import MapStudy
 from zwidth.studies.outcome import csv_text, stack
-from zwidth.studies.passivity import passive_edge, run_passivity, stiffest_passive, unit_outline
-from zwidth.studies.ridges import needed_models, ridge_paths, run_ridge, slope_data
-from zwidth.studies.steps import run_step
-from zwidth.sweep.responses import StepStudy
-from zwidth.sweep.studies import BoundaryStudy, MapStudy, PassivityStudy, RidgeStudy
+from zwidth.studies.passivity import PassivityStudy, passive_edge, stiffest_passive, unit_outline
+from zwidth.studies.ridge import RidgeStudy, needed_models, ridge_paths, slope_data
+from zwidth.studies.step import StepStudy
 
 DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])
 DELAYS = np.array([0.0, 0.25, 0.9, 1.0, 4.0])
@@ -79,7 +77,7 @@ def test_a_passive_wall_is_never_stiffer_than_a_stable_one():
     study = PassivityStudy.model_validate(
         {"kind": "passivity", "name": "p", "delta": [0.1, 1.0, 10.0], "d": [0, 0.5, 2]}
     )
-    table = run_passivity(study).table
+    table = study.compute(None, alone=True).table
     assert np.all(table["alpha_max_passive"] < table["alpha_max"])
     np.testing.assert_allclose(table["alpha_max"], zwidth.alpha_max(table["delta"], table["d"]).alpha, rtol=1e-13)
 
@@ -107,14 +105,14 @@ def test_a_ridge_study_tables_every_curve():
     study = RidgeStudy.model_validate(
         {"kind": "ridge", "name": "r", "delta": [0, 1], "d": [0.5, 1], "delay_models": ["held", "fractional_power"]}
     )
-    outcome = run_ridge(study)
+    outcome = study.compute(None, alone=True)
     assert list(outcome.table["delay_model"]) == ["held"] * 4 + ["fractional_power"] * 2
     assert list(outcome.figures) == [""]
 
 
 def test_strong_damping_is_drawn_with_its_limit():
     study = RidgeStudy.model_validate({"kind": "ridge", "name": "r", "delta": [1, 1e4], "d": [0, 1]})
-    outcome = run_ridge(study)
+    outcome = study.compute(None, alone=True)
     assert list(outcome.figures) == ["", "_slope"]
     data = slope_data(tuple(ridge_paths(np.array([1.0, 1e4]), np.array([0.0, 1.0]), "held")[0]))
     assert data.limits == pytest.approx((4.0, 1.0), rel=1e-14)
@@ -132,8 +130,8 @@ def test_a_boundary_study_tables_boundaries_ridge_and_passivity():
     study = BoundaryStudy.model_validate(
         {"kind": "boundary", "name": "b", "delta": [0, 0.5], "d": [0, 1], "ridge_path": True, "passivity": True}
     )
-    table = run_boundary(study, SIScale(1e5, 1e2)).table
-    np.testing.assert_array_equal(table["stiffness_N_per_m"], 1e5 * table["alpha"])
+    table = study.compute(None, alone=True).table
+    assert "stiffness_N_per_m" not in table
     curve = (table["curve"] == "boundary") & (table["piece"] == "complex_pair")
     # The first and last vertex of a lobe lie at alpha = 0 by definition.
     curve &= table["alpha"] > 1e-9
@@ -147,12 +145,22 @@ def test_a_boundary_study_tables_boundaries_ridge_and_passivity():
     assert set(table["delta"][table["curve"] == "passive"]) == {0.5}
 
 
+def test_a_boundary_of_the_scene_alone_is_in_si_units_too():
+    scene = PhysicalScene.model_validate({"mass": 0.1, "damping": 50, "period": "1 ms", "delay": "1 ms"})
+    study = {"kind": "boundary", "name": "b", "delta": scene.delta, "d": scene.d}
+    table = BoundaryStudy.model_validate(study).compute(scene, alone=True).table
+    np.testing.assert_allclose(table["stiffness_N_per_m"], 1e5 * table["alpha"], rtol=1e-15)
+    np.testing.assert_allclose(table["virtual_damping_N_s_per_m"], 1e2 * table["beta"], rtol=1e-15)
+    other = BoundaryStudy.model_validate({**study, "d": 2}).compute(scene, alone=True).table
+    assert "stiffness_N_per_m" not in other
+
+
 def test_step_responses_of_devices_and_walls():
     device = {"mass": 0.1, "damping": "10 N s/m", "period": "1 ms", "delay": "1 periods"}
     study = StepStudy.model_validate(
         {"kind": "step", "name": "s", "devices": [device], "stiffness_fraction": 0.75, "duration": "50 periods"}
     )
-    table = run_step(study).table
+    table = study.compute(None, alone=True).table
     ridge = zwidth.alpha_max(0.1, 1)
     expected = zwidth.step_response(0.75 * float(ridge.alpha), float(ridge.beta), 0.1, 1, periods=50)
     np.testing.assert_allclose(table["position_m"], expected.position * 1e-3**2 / 0.1, rtol=1e-12)
@@ -170,7 +178,7 @@ def test_a_response_that_does_not_settle_is_noted():
             "duration": "20 periods",
         }
     )
-    outcome = run_step(study)
+    outcome = study.compute(None, alone=True)
     assert "stiff" in outcome.notes[0]
     assert "position" in outcome.table
 
@@ -187,7 +195,7 @@ def test_a_map_holds_every_output_on_the_grid():
             "outputs": ["stable", "spectral_radius", "passive"],
         }
     )
-    arrays = run_map(study, None).arrays
+    arrays = study.compute(None, alone=True).arrays
     grid = np.meshgrid(arrays["alpha"], arrays["beta"], arrays["delta"], arrays["d"], indexing="ij")
     radius = np.array([np.nanmax(np.abs(row)) for row in zwidth.poles(*(axis.ravel() for axis in grid))])
     np.testing.assert_allclose(arrays["spectral_radius"].ravel(), radius, rtol=1e-9)

@@ -13,10 +13,10 @@ from sweeping import (
     killed_on_2,
     killed_once_on_2,
     main_of,
+    run_sweeps,
     study,
 )
 from zwidth.errors import InputError
-from zwidth.sweep.engine import run_sweeps
 
 # Closing a cluster leaves sockets to the garbage collector, which pytest then reports in whatever test runs next.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")

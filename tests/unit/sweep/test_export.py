@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 import xarray
 
-from sweeping import config_of, study
+from sweeping import config_of, run_sweeps, study
 from zwidth.errors import StoreError, StoreExistsError
 from zwidth.sweep import store as stores
-from zwidth.sweep.engine import run_sweeps
 from zwidth.sweep.store import open_dataset, to_csv, to_netcdf
 
 AXES = {"devices": {"label": ["a", "b"], "mass": [0.1, 1], "damping": [1, 2]}, "rate": 1000, "stiffness": [10, 20, 1e6]}

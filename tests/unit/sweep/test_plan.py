@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from sweeping import config_of, study
 from zwidth.errors import ResourceError
-from zwidth.sweep.engine import plan_sweeps
+from zwidth.runs import plan_run
 from zwidth.sweep.plan import MEMORY, FamilyPlan, check_resources, chunk_shape, kept_plan, make_plan
 
 HUGE = {
@@ -50,22 +50,22 @@ def test_the_plan_that_a_store_keeps_is_the_plan():
 
 def test_a_map_of_a_thousand_million_points_takes_megabytes():
     axes = {**HUGE, "alpha": {"linear": {"start": 0, "stop": 1, "num": 10_000}}, "delta": 1}
-    (plan,) = plan_sweeps(config_of(study(axes=axes)))
+    (plan,) = plan_run(config_of(study(axes=axes)))
     assert plan.family("wall").shape == (10_000, 100_000)
     assert plan.disk < 256 * 2**20
 
 
 def test_what_does_not_fit_is_refused(tmp_path):
-    plans = plan_sweeps(config_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin"))))
+    plans = plan_run(config_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin"))))
     says = r"free, but the results may take 2\.\d+ TiB, most of them of studies\[map\]\.axes \(.* x beta \d+\)"
     with pytest.raises(ResourceError, match=says):
         check_resources(plans, tmp_path / "not" / "there", workers=1)
     with pytest.raises(ResourceError, match=r"workers: 100000 of them may take .*; choose fewer with --workers"):
-        check_resources(plan_sweeps(config_of()), tmp_path, workers=100_000)
+        check_resources(plan_run(config_of()), tmp_path, workers=100_000)
 
 
 def test_a_plan_tells_what_it_will_do():
-    text = "\n".join(plan_sweeps(config_of(study(outputs=("stable", "alpha_max"))))[0].lines())
+    text = "\n".join(plan_run(config_of(study(outputs=("stable", "alpha_max"))))[0].lines())
     for word in (
         "study map",
         "192,000",

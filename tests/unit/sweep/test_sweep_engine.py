@@ -21,12 +21,12 @@ from sweeping import (
     interrupted_on_2,
     killed_on_2,
     killed_once_on_2,
+    run_sweeps,
     study,
     values_of,
 )
 from zwidth.errors import InputError, StoreError, StoreExistsError
 from zwidth.status import Status
-from zwidth.sweep.engine import run_sweeps
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store, open_dataset
 from zwidth.sweep.verify import verify
@@ -237,7 +237,7 @@ def test_another_configuration_is_refused(finished, change, key, words):
 
 def test_another_release_is_refused(finished, monkeypatch):
     config, folder = finished
-    monkeypatch.setattr("zwidth.sweep.record.__version__", "99.0")
+    monkeypatch.setattr("zwidth.files.provenance.__version__", "99.0")
     with pytest.raises(StoreError, match=r"made with zwidth .*, now there is 99\.0; install the same release"):
         run_sweeps(config, folder, resume=True)
 
@@ -281,13 +281,35 @@ def test_a_damaged_mark_and_damaged_coordinates_are_repaired(finished, tmp_path)
     assert_same(finished[1], tmp_path)
 
 
+@pytest.mark.parametrize("names", [["zarr.json"], ["zwidth.json"]])
+def test_a_damaged_description_is_made_again(finished, tmp_path, names):
+    config, path = copy_of(finished, tmp_path)
+    good = (path / "zarr.json").read_bytes()
+    for name in names:
+        text = (path / name).read_text()
+        (path / name).write_text(text.replace('"precision": "float64"', '"precision": "float32"'))
+    assert verify(tmp_path)[0].damaged
+    assert run_sweeps(config, tmp_path, resume=True).computed == 0
+    assert verify(tmp_path)[0].ok
+    assert (path / "zarr.json").read_bytes() == (path / "zwidth.json").read_bytes() == good
+    assert_same(finished[1], tmp_path)
+
+
 def test_damaged_attributes_are_refused(finished, tmp_path):
     config, path = copy_of(finished, tmp_path)
-    text = (path / "zarr.json").read_text()
-    (path / "zarr.json").write_text(text.replace('"precision": "float64"', '"precision": "float32"'))
+    for name in ("zarr.json", "zwidth.json"):
+        text = (path / name).read_text()
+        (path / name).write_text(text.replace('"precision": "float64"', '"precision": "float32"'))
     assert "damaged, its checksum is wrong" in verify(tmp_path)[0].error
     with pytest.raises(StoreError, match="damaged, its checksum is wrong"):
         run_sweeps(config, tmp_path, resume=True)
+
+
+def test_without_the_libraries_of_stores_a_run_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr("zwidth.sweep.store.find_spec", lambda name: None if name == "zarr" else name)
+    with pytest.raises(InputError, match=r"zarr, which those need, is not installed; .* 'zwidth\[store\]'"):
+        run_sweeps(config_of(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_what_a_killed_run_leaves_behind_is_removed(finished, tmp_path):

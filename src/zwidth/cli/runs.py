@@ -1,0 +1,265 @@
+"""Runs on the command line: ``run``, ``verify``, ``export`` and ``figures``."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from zwidth.cli.options import json_option
+
+if TYPE_CHECKING:
+    from zwidth.runs.result import RunResult
+
+_EXIT_FAILED = 1
+
+
+class Shard(click.ParamType):
+    """One of n runs that share the chunks: ``3/8``."""
+
+    name = "i/n"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Parse one option."""
+        if isinstance(value, tuple):
+            return value
+        first, slash, second = str(value).partition("/")
+        if slash and first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second) <= 10**6:
+            return int(first), int(second)
+        self.fail(f"got {value!r}; write i/n with 1 <= i <= n, as in 3/8", param, ctx)
+
+
+class Size(click.ParamType):
+    """A size of memory: ``512 MiB``."""
+
+    name = "size"
+    _UNITS = ("B", "KiB", "MiB", "GiB")
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Parse one option."""
+        text = str(value).strip()
+        for power, unit in reversed(list(enumerate(self._UNITS))):
+            number = text.removesuffix(unit).strip()
+            if number != text or unit == "B":
+                try:
+                    size = int(float(number) * 1024**power)
+                except (ValueError, OverflowError):
+                    break
+                if 2**27 <= size <= 2**40:
+                    return size
+                break
+        self.fail(f"got {value!r}; write a size from 128 MiB to 1024 GiB, as in '512 MiB'", param, ctx)
+
+
+@click.command()
+@click.argument("path", metavar="CONFIG", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.  [default: runs/NAME]")
+@click.option("--overwrite", is_flag=True, help="Replace a run that the folder already holds.")
+@click.option("--resume", is_flag=True, help="Go on with a run that was stopped; repair what is damaged.")
+@click.option("--workers", type=click.IntRange(min=1), help="Processes for sweeps.  [default: this one]")
+@click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
+@click.option("--shard", type=Shard(), help="Compute every n-th chunk of sweeps only, as one of n jobs.")
+@click.option("--memory", type=Size(), default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
+@click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
+def run(
+    path: Path,
+    out: Path | None,
+    overwrite: bool,
+    resume: bool,
+    workers: int | None,
+    scheduler: str | None,
+    shard: tuple[int, int] | None,
+    memory: int,
+    dry_run: bool,
+) -> None:
+    """Run the studies of a CONFIG file.
+
+    Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
+    Ctrl-C keeps what is done; --resume goes on.
+    """
+    from zwidth.cli.progress import reporter
+    from zwidth.runs.run import run as run_studies
+
+    if dry_run:
+        _print_plan(path, out, memory, workers)
+        return
+    again = _again(path, out, workers, scheduler, shard)
+    with _ending_on_sigterm() as stopped_by, reporter() as progress:
+        result = run_studies(
+            path,
+            out=out,
+            overwrite=overwrite,
+            resume=resume,
+            workers=workers,
+            scheduler=scheduler,
+            shard=shard,
+            memory=memory,
+            progress=progress,
+        )
+    _tell(result, again)
+    if result.interrupted:
+        click.echo(f"zwidth: stopped; what is done is kept, go on with: {again}", err=True)
+        raise SystemExit(128 + (stopped_by[0] if stopped_by else signal.SIGINT))
+    if not result.ok:
+        raise SystemExit(_EXIT_FAILED)
+
+
+@contextmanager
+def _ending_on_sigterm() -> Iterator[list[int]]:
+    """End like with Ctrl-C when told to end; yields the signals that came."""
+    came: list[int] = []
+
+    def end(number: int, frame: Any) -> None:
+        came.append(number)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, end)
+    try:
+        yield came
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _print_plan(path: Path, out: Path | None, memory: int, workers: int | None) -> None:
+    """The plan, or why it does not fit."""
+    from zwidth.runs.run import plan_run
+    from zwidth.studies.document import load_config
+    from zwidth.sweep.plan import Plan, check_resources
+
+    config = load_config(path)
+    folder = out or Path("runs", config.name)
+    steps = plan_run(config, memory=memory)
+    for step in steps:
+        lines = (
+            step.lines()
+            if isinstance(step, Plan)
+            else [f"study {step.name}", f"  {step.points:,} points ({step.extent})"]
+        )
+        for line in lines:
+            click.echo(line)
+    click.echo(f"results go to {folder}")
+    check_resources([step for step in steps if isinstance(step, Plan)], folder, workers or 1)
+
+
+def _again(
+    path: Path, out: Path | None, workers: int | None, scheduler: str | None, shard: tuple[int, int] | None
+) -> str:
+    """The command that goes on with a run, as a shell takes it."""
+    words = ["zwidth", "run", str(path)]
+    words += ["--out", str(out)] if out else []
+    words += ["--resume"]
+    words += ["--shard", f"{shard[0]}/{shard[1]}"] if shard else []
+    words += ["--workers", str(workers)] if workers else []
+    words += ["--scheduler", scheduler] if scheduler else []
+    return shlex.join(words)
+
+
+def _tell(result: RunResult, again: str) -> None:
+    """The end of a run: what was repaired, what is done, what went wrong and what to do."""
+    for found in result.repaired:
+        click.echo(f"repaired {found}", err=True)
+    sweeps = result.sweeps.values()
+    chunks = [sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")]
+    done = sum(study.state in ("done", "kept") for study in result.studies if study.sweep is None)
+    whole = len(result.studies) - len(sweeps)
+    parts = [f"{done} of {whole} done"] if whole else []
+    parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
+    click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
+    if result.hopeless:
+        click.echo(f"zwidth: out: {result.folder}: {result.hopeless}", err=True)
+        click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {again}", err=True)
+        return
+    for study in result.failed:
+        for chunk, error in study.sweep.failed.items() if study.sweep else ():
+            click.echo(f"zwidth: chunk {chunk} failed: {error}", err=True)
+        if not study.sweep:
+            click.echo(f"zwidth: study {study.name!r} failed: {study.error}", err=True)
+    if result.failed and not result.interrupted:
+        click.echo(f"zwidth: try again what failed with: {again}", err=True)
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@json_option
+def verify(folder: Path, as_json: bool) -> None:
+    """Read the sweeps in DIR again and check every file.
+
+    Exit code 1 where something is damaged or missing; `zwidth run --resume` repairs it.
+    """
+    from zwidth.sweep.verify import verify as verify_stores
+
+    found = verify_stores(folder)
+    if as_json:
+        keys = ("chunks", "done", "damaged", "error", "ok")
+        click.echo(
+            json.dumps({store.path.name: {key: getattr(store, key) for key in keys} for store in found}, indent=2)
+        )
+    for store in () if as_json else found:
+        state = store.error or f"{store.done} of {store.chunks} chunks done, {len(store.damaged) or 'none'} damaged"
+        click.echo(f"{store.path.name}: {state}")
+        for damaged in store.damaged:
+            click.echo(f"zwidth: {store.path}: {damaged}", err=True)
+    if not all(store.ok for store in found):
+        raise SystemExit(_EXIT_FAILED)
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--netcdf", type=click.Path(path_type=Path), help="Write a netCDF-4 file.")
+@click.option("--csv", "table", type=click.Path(path_type=Path), help="Write a table, of a million points at most.")
+def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
+    """Write a sweep, a store or a folder DIR with one, as netCDF or CSV."""
+    if netcdf is None and table is None:
+        raise click.UsageError("give --netcdf FILE or --csv FILE")
+    from zwidth.sweep.store import to_csv, to_netcdf
+
+    for write, file in ((to_netcdf, netcdf), (to_csv, table)):
+        if file is not None:
+            write(folder, file)
+            click.echo(f"wrote {file}")
+
+
+class Slice(click.ParamType):
+    """A value of a parameter: ``delta=0.1``."""
+
+    name = "name=value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, str]:
+        """Parse one option."""
+        if isinstance(value, tuple):
+            return value
+        name, equals, wanted = str(value).partition("=")
+        if equals and name.strip() and wanted.strip():
+            return name.strip(), wanted.strip()
+        self.fail(f"got {value!r}; write NAME=VALUE, as in delta=0.1", param, ctx)
+
+
+@click.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--at", multiple=True, type=Slice(), help="Draw this slice, as in --at delta=0.1 --at d=1.")
+@click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
+@json_option
+def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool) -> None:
+    """Draw the sweeps in DIR, as PNG and SVG.
+
+    Stable and passive walls with their boundaries, contours of margins and settling times, surfaces of the stiffest
+    wall. --at chooses slices by the nearest value that the sweep has, in the units of the store; without it up to
+    three values of a parameter have a panel each.
+    """
+    from zwidth.runs.draw import draw_stores
+
+    files = draw_stores(
+        folder, out, at=dict(at), progress=None if as_json else lambda file: click.echo(f"wrote {file}")
+    )
+    if as_json:
+        click.echo(json.dumps({"files": [str(file) for file in files]}, indent=2))
+
+
+COMMANDS = (run, verify, export, figures)
+"""What the command line gets from this module."""

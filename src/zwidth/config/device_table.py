@@ -1,0 +1,303 @@
+"""Parameters that move together: one row a device, written in the file or read from a CSV file."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
+from pydantic_core import PydanticCustomError
+
+from zwidth.config.axes import Entry, entries_of
+from zwidth.config.faults import (
+    LocatedProblem,
+    describe,
+    listing,
+    printable,
+    problem,
+    resembling,
+    suggestion,
+    validation_error,
+)
+from zwidth.config.fields import looks_like_number
+from zwidth.config.parameters import PARAMETERS, delay_entries
+
+LABEL = "label"
+MAX_ROWS = 100_000
+MAX_CSV_BYTES = 2**25
+
+_HEADER = re.compile(r"\s*([^\[(]*?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
+_FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
+
+# Names of files in a configuration are relative to its folder, which no value of it knows.
+_folder: ContextVar[Path] = ContextVar("folder", default=Path())
+
+
+@contextmanager
+def files_relative_to(folder: Path) -> Iterator[None]:
+    """Let the files that a configuration names be looked for in its own folder."""
+    token = _folder.set(folder)
+    try:
+        yield
+    finally:
+        _folder.reset(token)
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of parameters.
+
+    Args:
+        columns: the parameters, in base units, each with one value a row.
+        labels: a name for each row; empty for none.
+        delay_unit: the unit of the column ``delay``, "s" or "periods".
+    """
+
+    columns: dict[str, tuple[float, ...]]
+    labels: tuple[str, ...] = ()
+    delay_unit: str = "s"
+
+    @property
+    def size(self) -> int:
+        """How many rows there are."""
+        return len(next(iter(self.columns.values())))
+
+    def values(self, name: str) -> np.ndarray:
+        """One column as float64."""
+        return np.array(self.columns[name], dtype=np.float64)
+
+    def spelling(self) -> dict[str, Any]:
+        """The table as a configuration file writes it, whether it came from a CSV file or not."""
+        lists: dict[str, Any] = {LABEL: list(self.labels)} if self.labels else {}
+        for name, values in self.columns.items():
+            in_periods = name == "delay" and self.delay_unit == "periods"
+            lists[name] = [f"{value!r} periods" for value in values] if in_periods else list(values)
+        return lists
+
+
+def read_table(raw: Any) -> Table:
+    """A validator for a table in any of its forms."""
+    if isinstance(raw, Table):
+        return raw
+    if not isinstance(raw, dict):
+        raise problem(f"got {describe(raw)}", f"devices are {_FORMS}", "write {csv: devices.csv}")
+    return _from_csv(raw) if "csv" in raw else _from_lists(raw)
+
+
+def _from_lists(raw: dict[str, Any]) -> Table:
+    known = (LABEL, *PARAMETERS)
+    found: list[LocatedProblem] = []
+    columns: dict[str, tuple[float, ...]] = {}
+    labels: tuple[str, ...] = ()
+    delay_unit = "s"
+    for key, cells in raw.items():
+        if key not in known:
+            what = problem("unknown key", f"devices are {_FORMS}", suggestion(key, known, "remove it"), on_key=True)
+            found.append(((key,), what))
+        elif not isinstance(cells, list | tuple):
+            what = problem(f"got {describe(cells)}", "a column of devices is a list", "write [value, value, ...]")
+            found.append(((key,), what))
+        elif key == LABEL:
+            labels, faults = _labels(cells)
+            found += faults
+        else:
+            try:
+                columns[key], delay_unit = _column(key, cells, delay_unit)
+            except (PydanticCustomError, ValueError) as error:
+                found += _below(key, error)
+    if found:
+        raise validation_error("devices", found)
+    return _checked(columns, labels, delay_unit)
+
+
+def _below(key: str, error: Exception) -> Iterator[LocatedProblem]:
+    """The problems of one column with their paths."""
+    from pydantic import ValidationError
+
+    from zwidth.config.faults import problems_of
+
+    if isinstance(error, ValidationError):
+        yield from (((key, *path), what) for path, what in problems_of(error))
+    elif isinstance(error, PydanticCustomError):
+        yield (key,), error
+    else:
+        raise error
+
+
+def _column(key: str, cells: list[Any] | tuple[Any, ...], delay_unit: str) -> tuple[tuple[float, ...], str]:
+    """One column in base units, and the unit of the delays."""
+    if key != "delay":
+        return entries_of(cells, PARAMETERS[key].entry(), distinct=False), delay_unit
+    entry, _, unit = delay_entries()
+    values = entries_of(cells, entry, distinct=False)
+    return values, unit()
+
+
+def _labels(cells: Any) -> tuple[tuple[str, ...], list[LocatedProblem]]:
+    found: list[LocatedProblem] = []
+    for index, cell in enumerate(cells):
+        if not isinstance(cell, str) or not cell.strip():
+            what = problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
+            found.append(((LABEL, index), what))
+    return tuple(str(cell) for cell in cells), found
+
+
+def _checked(columns: dict[str, tuple[float, ...]], labels: tuple[str, ...], delay_unit: str) -> Table:
+    """The table, where its columns are of one length."""
+    if not columns:
+        raise problem("got no parameter", f"devices are {_FORMS}", f"add a column such as {'mass'!r}")
+    lengths = {name: len(values) for name, values in columns.items()}
+    if labels:
+        lengths[LABEL] = len(labels)
+    if len(set(lengths.values())) > 1:
+        sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())
+        raise problem(f"got columns of different length: {sizes}", "all columns have one entry a row", "complete them")
+    rows = next(iter(lengths.values()))
+    if rows > MAX_ROWS:
+        raise problem(f"got {rows} rows", f"at most {MAX_ROWS} devices a study", "split the table")
+    return Table(columns, labels, delay_unit)
+
+
+def _from_csv(raw: dict[str, Any]) -> Table:
+    """A table from a file, whose header names parameters and, in brackets, their units."""
+    for key in raw:
+        if key not in ("csv", "columns"):
+            allowed = "a table from a file has the keys 'csv' and 'columns'"
+            what = problem("unknown key", allowed, suggestion(key, ("csv", "columns"), "remove it"), on_key=True)
+            raise validation_error("devices", [((key,), what)])
+    name = raw["csv"]
+    if not isinstance(name, str) or not name:
+        what = problem(f"got {describe(name)}", "csv is the name of a file", "write 'csv: devices.csv'")
+        raise validation_error("devices", [(("csv",), what)])
+    try:
+        rows = _rows(name)
+        chosen = _chosen(rows[0][1], raw.get("columns"), name)
+        return _parsed(rows, chosen, name)
+    except PydanticCustomError as error:
+        raise validation_error("devices", [(("csv",), error)]) from None
+
+
+def _rows(name: str) -> list[tuple[int, list[str]]]:
+    """The lines of a CSV file that hold something, with their numbers; the first one is the header."""
+    path = _folder.get() / name
+    try:
+        if not path.is_file():
+            raise problem(f"no such file: {printable(str(path))}", "names are relative to this file", "check the path")
+        if path.stat().st_size > MAX_CSV_BYTES:
+            raise problem(f"{printable(name)} is too large", f"at most {MAX_CSV_BYTES} bytes", "split the table")
+        text = path.read_text(encoding="utf-8-sig")
+        lines = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
+        rows = [(lines.line_num, cells) for cells in lines if any(cells) and not cells[0].lstrip().startswith("#")]
+    except (OSError, ValueError, csv.Error) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        remedy = "check the path, and save it as UTF-8 with commas"
+        raise problem(f"{printable(name)} cannot be read ({printable(reason)})", "", remedy) from None
+    if len(rows) < 2:
+        raise problem(f"{printable(name)} has {len(rows)} rows", "a header and one row at least", "fill the file")
+    return rows
+
+
+def _chosen(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
+    """For every parameter that the file holds its column and unit."""
+    if mapping is not None:
+        return _mapped(header, mapping, name)
+    chosen: dict[str, tuple[int, str]] = {}
+    known = (LABEL, *PARAMETERS)
+    for index, title in enumerate(header):
+        match = _HEADER.fullmatch(title)
+        key, unit = (match.group(1), match.group(2) or "") if match else (title, "")
+        if key in chosen:
+            raise problem(f"{printable(name)}: the column {describe(key)} comes twice", "each once", "remove one")
+        if key in known:
+            chosen[key] = index, unit
+        elif resembling(key, known):
+            # A misspelled column must not be taken for a remark; other ones, as a source, are the reader's own.
+            what = f"{printable(name)}: got the column {describe(key)}"
+            raise problem(what, f"columns are {listing(known)}, and others", suggestion(key, known, "rename it"))
+    return chosen
+
+
+def _mapped(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
+    """The same where the configuration says which column is what, as ``mass: "moving mass [g]"``."""
+    known = (LABEL, *PARAMETERS)
+    if not isinstance(mapping, dict) or not mapping:
+        raise problem(f"got columns: {describe(mapping)}", f"a mapping from {listing(known)} to headers", "write one")
+    titles = [title.strip() for title in header]
+    chosen = {}
+    for key, title in mapping.items():
+        if key not in known:
+            raise problem(f"columns: got {describe(key)}", f"the keys are {listing(known)}", suggestion(key, known, ""))
+        if not isinstance(title, str) or title.strip() not in titles:
+            allowed = f"the headers of {printable(name)} are {listing(titles[:20])}"
+            raise problem(f"columns: got {describe(title)}", allowed, suggestion(title, titles, "write one of these"))
+        match = _HEADER.fullmatch(title.strip())
+        chosen[key] = titles.index(title.strip()), (match.group(2) or "") if match else ""
+    return chosen
+
+
+def _parsed(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> Table:
+    """The chosen columns of a file's rows."""
+    columns: dict[str, tuple[float, ...]] = {}
+    labels: tuple[str, ...] = ()
+    delay_unit = "s"
+    for key, (index, unit) in chosen.items():
+        cells = []
+        for line, row in rows[1:]:
+            if index >= len(row) or not row[index].strip():
+                allowed = "every device has a value for every parameter"
+                raise problem(f"{printable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
+            cells.append((line, row[index].strip()))
+        if key == LABEL:
+            labels = tuple(cell for _, cell in cells)
+            continue
+        entry, _, delays_in = delay_entries() if key == "delay" else (PARAMETERS[key].entry(), None, lambda: "s")
+        columns[key] = tuple(_cell(entry, cell, unit, f"{printable(name)}, line {line}: {key}") for line, cell in cells)
+        delay_unit = delays_in() if key == "delay" else delay_unit
+    return _checked(columns, labels, delay_unit)
+
+
+def _cell(entry: Entry, cell: str, unit: str, place: str) -> float:
+    """One value of a CSV file: a number in the header's unit, or a number with a unit of its own."""
+    raw: float | str = cell
+    if looks_like_number(cell):
+        raw = f"{cell} {unit}" if unit else float(cell)
+    try:
+        return entry(raw)
+    except PydanticCustomError as error:
+        context = error.context or {}
+        raise problem(f"{place}: {context['what']}", context["allowed"], context["remedy"]) from None
+
+
+def _schema() -> dict[str, Any]:
+    """The JSON Schema of a table."""
+    column = {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}}
+    labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
+    names = {"type": "object", "additionalProperties": {"type": "string"}}
+    lists = {
+        "type": "object",
+        "properties": {LABEL: labels, **dict.fromkeys(PARAMETERS, column)},
+        "minProperties": 1,
+        "additionalProperties": False,
+    }
+    file = {
+        "type": "object",
+        "properties": {"csv": {"type": "string"}, "columns": names},
+        "required": ["csv"],
+        "additionalProperties": False,
+    }
+    return {"description": f"Devices: {_FORMS}.", "anyOf": [lists, file]}
+
+
+TableField = Annotated[
+    Table,
+    PlainValidator(read_table),
+    PlainSerializer(lambda table: table.spelling(), return_type=Any),
+    WithJsonSchema(_schema()),
+]

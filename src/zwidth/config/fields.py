@@ -1,0 +1,286 @@
+"""Building blocks of the configuration's models: a strict base class and the plain kinds of values."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable
+from typing import Annotated, Any, ClassVar, NamedTuple
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, WithJsonSchema, model_validator
+from pydantic import ModelWrapValidatorHandler as Handler
+
+from zwidth.config.faults import (
+    LocatedProblem,
+    describe,
+    listing,
+    problem,
+    problems_of,
+    resembling,
+    short,
+    suggestion,
+    validation_error,
+)
+
+# One way only to match a run of digits: a second one costs quadratic time on a long run that fails in the end.
+_NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
+_NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
+
+
+class Strict(BaseModel):
+    """A frozen mapping that knows all its keys and reports all its faults at once."""
+
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", use_attribute_docstrings=True)
+
+    what: ClassVar[str] = "a mapping"
+    """What the mapping describes, for messages."""
+
+    @classmethod
+    def known_keys(cls) -> tuple[str, ...]:
+        """Every key that may be written."""
+        return tuple(cls.model_fields)
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        """Hook: fill in what another part of the file supplies."""
+        return raw
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        """Hook: faults that show in the keys alone; ``raw`` may hold anything."""
+        return ()
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        """Hook: what is allowed and the remedy where the required key ``name`` is absent."""
+        return f"{cls.what} needs it", f"add {name!r}"
+
+    @classmethod
+    def unknown(cls, name: str) -> tuple[str, str, str]:
+        """Hook: what is wrong with a key that does not belong here, what is allowed and the remedy."""
+        if name == "<<":
+            return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
+        known = cls.known_keys()
+        return "unknown key", f"{cls.what} has the keys {listing(known)}", suggestion(name, known, "remove it")
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        """Hook: faults that only valid values show."""
+        return ()
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _report_all(cls, raw: Any, handler: Handler[Any]) -> Any:
+        if isinstance(raw, cls):
+            return raw
+        if not isinstance(raw, dict):
+            known = listing(cls.known_keys())
+            allowed = f"{cls.what} is a mapping with the keys {known}"
+            raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines, or {key: value}")
+        raw = cls.prepare(raw)
+        found = list(cls._unusable(raw))
+        skipped = {path[0] for path, _ in found}
+        found.extend(cls.conflicts(raw))
+        try:
+            model = handler({key: value for key, value in raw.items() if key not in skipped})
+        except ValidationError as error:
+            found.extend(cls._with_remedies(error, skipped))
+        else:
+            found.extend(model.limits())
+            if not found:
+                return model
+        raise validation_error(cls.__name__, found)
+
+    @classmethod
+    def _unusable(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        """Keys that do not exist, and keys without a value."""
+        for key, value in raw.items():
+            if key not in cls.known_keys():
+                yield (key,), problem(*cls.unknown(key), on_key=True)
+            elif value is None:
+                yield (key,), problem("got nothing", "a key that is written has a value", "add one or remove the key")
+
+    @classmethod
+    def _with_remedies(cls, error: ValidationError, skipped: set[Any]) -> Iterable[LocatedProblem]:
+        """The problems of an error; a key that is absent is reported with what this class knows of it."""
+        known = cls.known_keys()
+        # Faults of their own: a key without a value, and one that is misspelled.
+        explained = skipped | {resembling(key, known) for key in skipped}
+        details = error.errors(include_url=False, include_input=False, include_context=False)
+        for detail, (path, what) in zip(details, problems_of(error), strict=True):
+            absent = detail["type"] == "missing" or (len(path) == 1 and (what.context or {})["what"] == "missing")
+            if absent and path[0] in explained:
+                continue
+            yield path, problem("missing", *cls.missing(str(path[0]))) if detail["type"] == "missing" else what
+
+
+class Range(NamedTuple):
+    """The admissible values of a number; the ends belong to it unless open."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    low_open: bool = False
+    high_open: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Whether a finite value is admissible."""
+        above = value > self.low if self.low_open else value >= self.low
+        return above and (value < self.high if self.high_open else value <= self.high)
+
+    def __str__(self) -> str:
+        ends = []
+        if self.low > -math.inf:
+            ends.append(f"{'greater than' if self.low_open else 'at least'} {self.low:g}")
+        if self.high < math.inf:
+            ends.append(f"{'less than' if self.high_open else 'at most'} {self.high:g}")
+        return " and ".join(ends)
+
+
+ANY = Range()
+NOT_NEGATIVE = Range(low=0.0)
+POSITIVE = Range(low=0.0, low_open=True)
+FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
+
+
+def looks_like_number(text: str) -> bool:
+    """Whether a text would be a number without its quotes."""
+    return _NUMBER_TEXT.fullmatch(text) is not None
+
+
+def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") -> float:
+    """Return a finite, admissible value or raise a problem."""
+    bounds = str(allowed)
+    needed = f"it must be {bounds}{f' {unit}' if unit else ''}" if bounds else "it must be finite"
+    if not math.isfinite(value):
+        needed = f"it must be finite{f' and {bounds}' if bounds else ''}"
+        raise problem(f"got {describe(value)}", needed, remedy or "write a finite number")
+    if not allowed.holds(value):
+        raise problem(
+            f"got {short(value)}{f' {unit}' if unit else ''}", needed, remedy or "write a number in this range"
+        )
+    return value
+
+
+def to_float(value: float) -> float:
+    """A whole number beyond float64 becomes infinite, which `check_range` then refuses."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
+
+
+def number(allowed: Range = ANY, remedy: str = "") -> Callable[[Any], float]:
+    """A validator for a number without a unit."""
+
+    def validate(value: Any) -> float:
+        if isinstance(value, int | float) and not isinstance(value, bool):
+            return check_range(to_float(value), allowed, remedy=remedy)
+        hint = "write a number such as 0.5"
+        if isinstance(value, str):
+            if looks_like_number(value):
+                hint = "drop the quotes"
+            elif value.lower() in _NOT_FINITE_TEXT:
+                hint = "write a finite number"
+            elif looks_like_number(value.split(" ")[0]):
+                hint = "this field has no unit; write the number alone"
+        raise problem(f"got {describe(value)}", "it must be one number", hint)
+
+    return validate
+
+
+def whole_number(allowed: Range = ANY) -> Callable[[Any], int]:
+    """A validator for a whole number."""
+
+    def validate(value: Any) -> int:
+        if isinstance(value, int) and not isinstance(value, bool):
+            check_range(to_float(value), allowed)
+            return value
+        hint = f"write a whole number such as {max(allowed.low, 10):g}"
+        if isinstance(value, float) and value.is_integer() and abs(value) < 1e15:
+            hint = f"write {value:.0f}"
+        elif isinstance(value, str) and looks_like_number(value):
+            hint = "drop the quotes"
+        raise problem(f"got {describe(value)}", "it must be a whole number", hint)
+
+    return validate
+
+
+def one_of(*names: str) -> Callable[[Any], str]:
+    """A validator for one of a few names."""
+
+    def validate(value: Any) -> str:
+        if isinstance(value, str) and value in names:
+            return value
+        allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
+        raise problem(f"got {describe(value)}", allowed, suggestion(value, names, "write one of these"))
+
+    return validate
+
+
+def _boolean(value: Any) -> bool:
+    if isinstance(value, bool):
+        return value
+    raise problem(f"got {describe(value)}", "it must be true or false", "write true or false, without quotes")
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str):
+        return value
+    raise problem(f"got {describe(value)}", "it must be text", "put the text in quotes")
+
+
+def _name(value: Any) -> str:
+    allowed = "a name is 1 to 64 of the characters a-z, 0-9, '_' and '-', since it names a folder"
+    if not isinstance(value, str):
+        raise problem(f"got {describe(value)}", allowed, "write a name, in quotes where it is all digits")
+    if not re.fullmatch(r"[a-z0-9_-]{1,64}", value):
+        plain = re.sub(r"[^a-z0-9_-]+", "_", value.lower())[:64].strip("_")
+        raise problem(f"got {describe(value)}", allowed, f"write {plain or 'a name'!r}")
+    return value
+
+
+def members(what: str) -> Callable[[Any, Callable[[Any], Any]], Any]:
+    """A wrapping validator for a list that is not empty and names nothing twice."""
+
+    def validate(raw: Any, handler: Callable[[Any], Any]) -> Any:
+        if not isinstance(raw, list | tuple):
+            hint = "write '- ' before each of them"
+            if isinstance(raw, str) and raw.isprintable() and len(raw) < 60:
+                hint = f"write [{raw}]"
+            raise problem(f"got {describe(raw)}", f"it must be a list of {what}", hint)
+        if not raw:
+            raise problem("got an empty list", f"one of the {what} at least is needed", "fill the list")
+        found = list(repeated(raw, "remove it"))
+        try:
+            value = handler(tuple(raw))
+        except ValidationError as error:
+            raise validation_error(what, [*found, *problems_of(error)]) from None
+        if found:
+            raise validation_error(what, found)
+        return value
+
+    return validate
+
+
+def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
+    """A problem for every plain value of a list that an earlier entry already holds."""
+    seen: dict[Any, int] = {}
+    for index, value in enumerate(raw):
+        if isinstance(value, bool) or not isinstance(value, str | int | float):
+            continue
+        if value in seen:
+            what = f"got {describe(value)} twice, here and at [{seen[value]}]"
+            yield (index,), problem(what, "each value once", remedy)
+        else:
+            seen[value] = index
+
+
+Boolean = Annotated[bool, BeforeValidator(_boolean)]
+Text = Annotated[str, BeforeValidator(_text)]
+Name = Annotated[str, BeforeValidator(_name), WithJsonSchema({"type": "string", "pattern": "^[a-z0-9_-]{1,64}$"})]
+Number = Annotated[float, BeforeValidator(number())]
+NonNegative = Annotated[float, BeforeValidator(number(NOT_NEGATIVE)), WithJsonSchema({"type": "number", "minimum": 0})]
+Fraction = Annotated[
+    float,
+    BeforeValidator(number(FRACTION, "write 75 % as 0.75")),
+    WithJsonSchema({"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1}),
+]

@@ -1,0 +1,323 @@
+"""Reading configuration files: strict YAML 1.2, where every fault has its place in the file.
+
+This is the only module that imports yaml. The model that a file is checked against is `zwidth.studies.document`'s.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import stat
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+from yaml.composer import Composer
+from yaml.parser import Parser
+from yaml.reader import Reader
+from yaml.resolver import BaseResolver
+from yaml.scanner import Scanner
+
+from zwidth.config.device_table import files_relative_to
+from zwidth.config.faults import (
+    ConfigFileError,
+    Fault,
+    FieldPath,
+    describe,
+    dotted,
+    locate,
+    printable,
+    problems_of,
+)
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+MAX_FILE_BYTES = 2**20
+MAX_NODES = 50_000
+MAX_DEPTH = 20
+MAX_ALIAS_NODES = 1000
+
+
+def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Model:
+    """Read a file and check all of it against a model.
+
+    Raises:
+        ConfigFileError: the file cannot be read or has faults.
+    """
+    file = os.fsdecode(path)
+    tree = _Tree(file, _read_text(file))
+    problems = []
+    found = None
+    try:
+        with files_relative_to(Path(file).parent):
+            found = model.model_validate(tree.data)
+    except ValidationError as error:
+        problems = problems_of(error)
+    faults = tree.faults + locate(file, problems, tree.values, tree.keys)
+    if found is None or faults:
+        raise ConfigFileError.of(faults)
+    return found
+
+
+def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
+    """An error with a single fault."""
+    line, column = place or (None, None)
+    return ConfigFileError.of([Fault(file, line, column, dotted(path), *parts)])
+
+
+def _read_text(file: str) -> str:
+    """The text of a file, or an error that says why there is none."""
+    try:
+        mode = Path(file).stat().st_mode
+        if stat.S_ISDIR(mode):
+            raise _fail(file, None, "got a folder", "a configuration is one file", "name a .yaml file in it")
+        # A pipe or a device might never end.
+        if not stat.S_ISREG(mode):
+            raise _fail(file, None, "got no regular file", "a configuration is one file", "save it to a file first")
+        with open(file, "rb") as stream:
+            data = stream.read(MAX_FILE_BYTES + 1)
+    except FileNotFoundError as error:
+        raise _fail(file, None, "no such file", "", "check the path") from error
+    except PermissionError as error:
+        raise _fail(file, None, "permission denied", "", "make the file readable") from error
+    except ConfigFileError:
+        raise
+    except (OSError, ValueError) as error:
+        # ValueError: a path with a null character.
+        reason = getattr(error, "strerror", None) or str(error)
+        raise _fail(file, None, f"cannot be read ({reason})", "", "check the path") from error
+    if len(data) > MAX_FILE_BYTES:
+        allowed = f"at most {MAX_FILE_BYTES} bytes"
+        raise _fail(file, None, "the file is too large", allowed, "write long axes as linear or log")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # With a byte order mark, positions count from behind it.
+        good = error.object[: error.start].decode("utf-8")
+        what = f"got the byte 0x{error.object[error.start]:02x}, which is not UTF-8"
+        raise _fail(file, _place(good, len(good)), what, "the file must be UTF-8 text", "save it as UTF-8") from error
+
+
+def _place(text: str, index: int) -> tuple[int, int]:
+    """Line and column, from 1, of a position in a text."""
+    before = re.split(r"\r\n|[\n\r\x85\u2028\u2029]", text[:index])
+    return len(before), len(before[-1]) + 1
+
+
+def _mark_place(mark: yaml.Mark) -> tuple[int, int]:
+    return mark.line + 1, mark.column + 1
+
+
+class _Alias(yaml.Node):
+    """An alias where it stands; the place of its target is the anchor's."""
+
+    id = "alias"
+
+
+class _Resolver(BaseResolver):
+    """The core schema of YAML 1.2, in place of PyYAML's 1.1."""
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    ("bool", r"true|True|TRUE|false|False|FALSE", list("tTfF")),
+    ("int", r"[-+]?[0-9]+|0o[0-7]+|0x[0-9a-fA-F]+", list("-+0123456789")),
+    ("float", r"[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?", list("-+.0123456789")),
+    ("float", r"[-+]?\.(?:inf|Inf|INF)|\.nan|\.NaN|\.NAN", list("-+.")),
+):
+    _Resolver.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
+
+
+class _Loader(Reader, Scanner, Parser, Composer, _Resolver):
+    """PyYAML up to its nodes, with limits on their number and depth; PyYAML itself has none."""
+
+    def __init__(self, file: str, text: str) -> None:
+        Reader.__init__(self, text)
+        Scanner.__init__(self)
+        Parser.__init__(self)
+        Composer.__init__(self)
+        _Resolver.__init__(self)
+        self.file = file
+        self.faults: list[Fault] = []
+        self._path: FieldPath = ()
+        self._depth = 0
+        self._nodes = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
+        """Compose one node, unless it is one too many."""
+        event = self.peek_event()
+        place = _mark_place(event.start_mark)
+        path = (*self._path, *_step(index))
+        self._nodes += 1
+        if self._nodes > MAX_NODES:
+            what, allowed = "too many values", f"at most {MAX_NODES} values a file"
+            raise _fail(self.file, place, what, allowed, "write long axes as linear or log", path=path)
+        if self._depth >= MAX_DEPTH:
+            what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
+            raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
+        if getattr(event, "tag", None) is not None:
+            field = dotted((*path, event.value) if _is_key(parent, index, event) else path)
+            what = f"got the tag {describe(event.tag)}"
+            self.faults.append(Fault(self.file, *place, field, what, "tags are not used", "remove the tag"))
+        above, self._path = self._path, path
+        self._depth += 1
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        self._path = above
+        assert node is not None, "an event begins every node"
+        if isinstance(event, yaml.ScalarEvent) and event.tag is not None:
+            # The tag is a fault of its own; the value is read as if it were not there.
+            node.tag = self.resolve(yaml.ScalarNode, event.value, (event.style is None, True))
+        if isinstance(event, yaml.AliasEvent):
+            return _Alias("", node, event.start_mark, event.end_mark)
+        return node
+
+
+def _step(index: Any) -> FieldPath:
+    """The way from a node to one below it: the place in a list, or the key; nothing where that is no text."""
+    if isinstance(index, int):
+        return (index,)
+    return (index.value,) if isinstance(index, yaml.ScalarNode) else ()
+
+
+def _is_key(parent: yaml.Node | None, index: Any, event: yaml.Event) -> bool:
+    """Whether a node begins that is a key, and text."""
+    return isinstance(parent, yaml.MappingNode) and index is None and isinstance(event, yaml.ScalarEvent)
+
+
+class _Tree:
+    """A file as plain Python values, with the places of all of them.
+
+    Args:
+        file: its name, for messages.
+        text: its content.
+    """
+
+    def __init__(self, file: str, text: str) -> None:
+        self.file = file
+        self.values: dict[FieldPath, tuple[int, int]] = {}
+        self.keys: dict[FieldPath, tuple[int, int]] = {}
+        self.faults: list[Fault] = []
+        self._alias_nodes = 0
+        root = self._compose(text)
+        self.data = self._convert(root, ())
+
+    def _compose(self, text: str) -> yaml.Node:
+        """The one document of the file as PyYAML's nodes."""
+        try:
+            loader = _Loader(self.file, text)
+        except yaml.reader.ReaderError as error:
+            what = f"got the character {describe(text[error.position])}"
+            allowed, remedy = "YAML allows no control characters", "remove it"
+            raise _fail(self.file, _place(text, error.position), what, allowed, remedy) from error
+        self.faults = loader.faults
+        try:
+            loader.get_event()
+            return self._only_document(loader)
+        except yaml.MarkedYAMLError as error:
+            raise self._syntax_error(error) from error
+        except (ValueError, OverflowError) as error:
+            # PyYAML lets these out of chr() and int(), as for "\U00110000" or a version of 5000 digits.
+            if isinstance(error, ConfigFileError):
+                raise
+            what = "an escape or a number that does not exist"
+            raise _fail(self.file, _mark_place(loader.get_mark()), what, "", "correct or remove it") from error
+
+    def _only_document(self, loader: _Loader) -> yaml.Node:
+        if loader.check_event(yaml.StreamEndEvent):
+            allowed = "a configuration has version, name and studies"
+            raise _fail(self.file, (1, 1), "the file is empty", allowed, "start with 'version: 1'")
+        loader.get_event()
+        node = loader.compose_node(None, None)
+        loader.get_event()
+        if not loader.check_event(yaml.StreamEndEvent):
+            place = _mark_place(loader.peek_event().start_mark)
+            what = "a second document begins here"
+            raise _fail(self.file, place, what, "one document a file", "remove the '---' or split the file")
+        return node
+
+    def _syntax_error(self, error: yaml.MarkedYAMLError) -> ConfigFileError:
+        """PyYAML's account of a syntax error, with a remedy."""
+        mark = error.problem_mark or error.context_mark
+        what = printable((error.problem or "unreadable").replace("\n", " "))
+        remedy = "check the indentation, the colons and the quotes here"
+        if r"'\t'" in what:
+            what, remedy = "got a tab where the line is indented", "indent with spaces"
+        elif "undefined alias" in what:
+            remedy = "define it before with '&', or remove the '*'"
+        elif "duplicate anchor" in what:
+            remedy = "give each anchor its own name"
+        elif error.context_mark is not None and "flow" in (error.context or ""):
+            line, column = _mark_place(error.context_mark)
+            remedy = f"close the bracket opened at line {line}, column {column}"
+        elif error.context_mark is not None and "quoted" in (error.context or ""):
+            line, column = _mark_place(error.context_mark)
+            remedy = f"check the quoted text that begins at line {line}, column {column}"
+        place = _mark_place(mark) if mark else (1, 1)
+        return _fail(self.file, place, "not valid YAML", what, remedy)
+
+    def _convert(self, node: yaml.Node, path: FieldPath, in_alias: bool = False) -> Any:
+        """Plain Python values of a node; places go to ``values`` and ``keys``."""
+        # An alias comes before its target, so that a fault of the whole points at the alias.
+        self.values.setdefault(path, _mark_place(node.start_mark))
+        if isinstance(node, _Alias):
+            return self._convert(node.value, path, in_alias=True)
+        if in_alias:
+            self._alias_nodes += 1
+            if self._alias_nodes > MAX_ALIAS_NODES or len(path) > MAX_DEPTH:
+                allowed = f"aliases may stand for at most {MAX_ALIAS_NODES} values, and never for themselves"
+                raise _fail(
+                    self.file, self.values[path], "too many values by alias", allowed, "write them out", path=path
+                )
+        if isinstance(node, yaml.SequenceNode):
+            return [self._convert(item, (*path, index), in_alias) for index, item in enumerate(node.value)]
+        if isinstance(node, yaml.MappingNode):
+            return dict(self._pairs(node, path, in_alias))
+        assert isinstance(node, yaml.ScalarNode), "nodes are aliases, sequences, mappings or scalars"
+        return _scalar(node)
+
+    def _add_fault(self, place: tuple[int, int], path: FieldPath, *parts: str) -> None:
+        self.faults.append(Fault(self.file, *place, dotted(path), *parts))
+
+    def _pairs(self, node: yaml.MappingNode, path: FieldPath, in_alias: bool) -> Iterator[tuple[str, Any]]:
+        """The keys and values of a mapping; a key that is no text or comes twice is a fault and left out."""
+        first: dict[str, int] = {}
+        for key_node, value_node in node.value:
+            key = _scalar(key_node) if isinstance(key_node, yaml.ScalarNode) else None
+            place = _mark_place(key_node.start_mark)
+            if not isinstance(key, str):
+                what = f"got the key {describe(key)}" if isinstance(key_node, yaml.ScalarNode) else "got a complex key"
+                self._add_fault(place, path, what, "keys are text", "write the name of a field")
+            elif key in first:
+                what = f"the key comes twice, first in line {first[key]}"
+                self._add_fault(place, (*path, key), what, "each key once", "remove one of them")
+            else:
+                first[key] = place[0]
+                self.keys[*path, key] = place
+                yield key, self._convert(value_node, (*path, key), in_alias)
+
+
+def _scalar(node: yaml.ScalarNode) -> Any:
+    """The value of a scalar by the core schema; a number beyond float64 becomes infinite."""
+    kind = node.tag.rpartition(":")[2]
+    text = node.value
+    if kind == "null":
+        return None
+    if kind == "bool":
+        return text.lower() == "true"
+    if kind == "float":
+        return _float(text)
+    if kind == "int":
+        if text[:2] in ("0o", "0x"):
+            return int(text, 0)
+        # Python refuses to read integers of thousands of digits; float64 ends at 309.
+        return int(text) if len(text) < 400 else _float(text)
+    return text
+
+
+def _float(text: str) -> float:
+    low = text.lower().lstrip("+")
+    return {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf}.get(low) or float(text)

@@ -1,0 +1,300 @@
+"""Scenes, devices and walls of a configuration, each either in SI units or normalized."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any, ClassVar, TypeAlias
+
+import numpy as np
+from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
+
+from zwidth._types import DELAY_MODELS, DelayModel
+from zwidth.config.axes import MAX_DELAY_PERIODS
+from zwidth.config.faults import LocatedProblem, describe, listing, problem, short
+from zwidth.config.fields import NonNegative, Number, Range, Strict, Text, number, one_of
+from zwidth.config.units import (
+    PERIOD_SCHEMA,
+    RATE,
+    RATE_SCHEMA,
+    TIME,
+    Damping,
+    Delay,
+    Mass,
+    Span,
+    Stiffness,
+    VirtualDamping,
+    quantity,
+)
+from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
+from zwidth.errors import InputError
+from zwidth.scene import Device, Scene, Timing, VirtualWall, normalize
+
+_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping"})
+_NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
+
+# Wide enough for any sampled loop, narrow enough that T^2 and 1/T^2 stay within float64.
+PERIODS = Range(1e-12, 1e9)
+RATES = Range(1e-9, 1e12)
+
+AnyDelayModel = Annotated[DelayModel, BeforeValidator(one_of(*DELAY_MODELS))]
+
+
+class _OneKind(Strict):
+    """Base of what is either physical or normalized: the other kind's keys get a message of their own."""
+
+    foreign: ClassVar[frozenset[str]]
+
+    @classmethod
+    def unknown(cls, name: str) -> tuple[str, str, str]:
+        if name not in cls.foreign:
+            return super().unknown(name)
+        kind, other = ("physical", "normalized") if name in _NORMALIZED else ("normalized", "physical")
+        return (
+            f"{other} key, after {kind} ones",
+            f"{cls.what} is described in SI units or normalized, never both",
+            f"remove it, or write all keys {'normalized' if other == 'normalized' else 'in SI units'}",
+        )
+
+
+def _period(value: Any, info: ValidationInfo) -> float:
+    """The period itself, or one over the rate."""
+    if value is not None:
+        return quantity(TIME, PERIODS)(value)
+    # A rate that failed its own check is absent from the data; that fault is enough.
+    rate = info.data.get("rate", 1.0)
+    if rate is None:
+        raise problem("missing", "the sampling period or its rate is needed", "add 'period: 1 ms' or 'rate: 1 kHz'")
+    return 1.0 / rate
+
+
+class _PhysicalPlant(_OneKind):
+    """A mass with damping, sampled, in SI units."""
+
+    foreign: ClassVar[frozenset[str]] = _NORMALIZED
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        if name != "mass":
+            return super().missing(name)
+        return f"{cls.what} has mass and period or rate, or, normalized, delta", "add 'mass: 0.1 kg'"
+
+    mass: Mass
+    """Moving mass m of the device in kg, > 0."""
+
+    damping: Damping = 0.0
+    """Physical damping b of the device in N s/m, >= 0."""
+
+    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), RATE_SCHEMA] | None = Field(
+        default=None, exclude=True
+    )
+    """Sampling rate 1/T in Hz; give it or the period."""
+
+    period: Annotated[float, BeforeValidator(_period), PERIOD_SCHEMA] = Field(default=None, validate_default=True)
+    """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
+
+    delay: Delay = Span(0.0, "s")
+    """Delay t_d from the sample to the moment its force acts, in s or in periods, >= 0."""
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        if "period" in raw and "rate" in raw:
+            second = [key for key in raw if key in ("period", "rate")][1]
+            allowed = "the sampling period and its rate say the same"
+            yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        delay = self.delay.value / (self.period if self.delay.unit == "s" else 1.0)
+        if not delay <= MAX_DELAY_PERIODS:
+            allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
+            yield ("delay",), problem(f"got {self.delay}, which is {short(delay)} periods", allowed, "check the units")
+            return
+        with np.errstate(all="ignore"):
+            numbers = self.to_scene().normalized
+        for field, name in (("damping", "delta"), ("stiffness", "alpha"), ("virtual_damping", "beta")):
+            least, most = (0.0, LARGEST_DAMPING) if name == "delta" else WALL_RANGE
+            value = float(getattr(numbers, name))
+            if not within(np.float64(value), (least, most)):
+                what = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(value)}"
+                allowed = (
+                    f"{name} must be at most {most:g}" if not least else f"{name} must be 0 or {least:g} to {most:g}"
+                )
+                yield (field,), problem(what, allowed, "check the units and the mass")
+
+    @property
+    def delta(self) -> float:
+        """Normalized damping of the device."""
+        return float(self.to_scene().delta)
+
+    @property
+    def d(self) -> float:
+        """Delay in periods, exact where it is written in periods."""
+        return self.delay.periods(self.period)
+
+    def to_scene(self) -> Scene:
+        """The device and its timing in SI units."""
+        timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
+        return Scene(Device(mass=self.mass, damping=self.damping), timing)
+
+
+class _NormalizedPlant(_OneKind):
+    """The same as two dimensionless numbers."""
+
+    foreign: ClassVar[frozenset[str]] = _PHYSICAL
+
+    delta: NonNegative
+    """Normalized damping b T/m of the device, >= 0."""
+
+    d: Annotated[float, BeforeValidator(number(Range(0.0, MAX_DELAY_PERIODS)))] = 0.0
+    """Delay in periods, whole or not, >= 0."""
+
+
+class PhysicalDevice(_PhysicalPlant):
+    """A device in SI units."""
+
+    what: ClassVar[str] = "a device"
+
+    label: Text | None = None
+    """Name of the device in legends."""
+
+
+class NormalizedDevice(_NormalizedPlant):
+    """A normalized device."""
+
+    what: ClassVar[str] = "a device"
+
+    label: Text | None = None
+    """Name of the device in legends."""
+
+
+class PhysicalScene(_PhysicalPlant):
+    """The file's device, timing and wall in SI units."""
+
+    what: ClassVar[str] = "a scene"
+
+    stiffness: Stiffness | None = None
+    """Stiffness K of the wall in N/m."""
+
+    virtual_damping: VirtualDamping | None = None
+    """Damping B of the wall in N s/m."""
+
+    delay_model: AnyDelayModel = "held"
+    """How a delay that is not whole is modeled."""
+
+    def to_scene(self) -> Scene:
+        """Device, timing and wall; a wall that is not given has no stiffness and no damping."""
+        bare = super().to_scene()
+        wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
+        timing = Timing(period=bare.timing.period, delay=bare.timing.delay, delay_model=self.delay_model)
+        return Scene(bare.device, timing, wall)
+
+    @property
+    def device(self) -> PhysicalDevice:
+        """The scene without its wall."""
+        return PhysicalDevice(mass=self.mass, damping=self.damping, period=self.period, delay=self.delay)
+
+    @property
+    def wall(self) -> PhysicalWall | None:
+        """The scene's wall, where one is given."""
+        if self.stiffness is None and self.virtual_damping is None:
+            return None
+        return PhysicalWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
+
+
+class NormalizedScene(_NormalizedPlant):
+    """The file's device, timing and wall, normalized."""
+
+    what: ClassVar[str] = "a scene"
+
+    alpha: Number | None = None
+    """Normalized stiffness K T^2/m of the wall."""
+
+    beta: Number | None = None
+    """Normalized damping B T/m of the wall."""
+
+    delay_model: AnyDelayModel = "held"
+    """How a delay that is not whole is modeled."""
+
+    @property
+    def device(self) -> NormalizedDevice:
+        """The scene without its wall."""
+        return NormalizedDevice(delta=self.delta, d=self.d)
+
+    @property
+    def wall(self) -> NormalizedWall | None:
+        """The scene's wall, where one is given."""
+        if self.alpha is None and self.beta is None:
+            return None
+        return NormalizedWall(alpha=self.alpha or 0.0, beta=self.beta or 0.0)
+
+
+class PhysicalWall(_OneKind):
+    """A wall in SI units."""
+
+    what: ClassVar[str] = "a wall"
+    foreign: ClassVar[frozenset[str]] = _NORMALIZED
+
+    stiffness: Stiffness
+    """Stiffness K in N/m."""
+
+    virtual_damping: VirtualDamping = 0.0
+    """Damping B in N s/m."""
+
+
+class NormalizedWall(_OneKind):
+    """A normalized wall."""
+
+    what: ClassVar[str] = "a wall"
+    foreign: ClassVar[frozenset[str]] = _PHYSICAL
+
+    alpha: Number
+    """Normalized stiffness K T^2/m."""
+
+    beta: Number = 0.0
+    """Normalized damping B T/m."""
+
+
+def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
+    """``alpha`` and ``beta`` of a wall on a device; a wall in SI units needs a device in SI units."""
+    if isinstance(wall, NormalizedWall):
+        return wall.alpha, wall.beta
+    if isinstance(device, NormalizedDevice):
+        raise InputError("wall: got one in SI units for a normalized device; give alpha and beta")
+    with np.errstate(over="ignore"):
+        plain = normalize(
+            mass=device.mass, period=device.period, stiffness=wall.stiffness, virtual_damping=wall.virtual_damping
+        )
+    return float(plain.alpha), float(plain.beta)
+
+
+def is_normalized(raw: dict[str, Any]) -> bool:
+    """Whether the first key that tells the kinds apart is a normalized one."""
+    telling = [key for key in raw if key in _PHYSICAL | _NORMALIZED]
+    return bool(telling) and telling[0] in _NORMALIZED
+
+
+def _as_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
+    """Read a mapping as the kind that its first telling key belongs to."""
+    if isinstance(raw, physical | normalized):
+        return raw
+    if not isinstance(raw, dict):
+        keys = f"{listing(physical.model_fields)} or, normalized, {listing(normalized.model_fields)}"
+        raise problem(
+            f"got {describe(raw)}", f"{physical.what} is a mapping with the keys {keys}", "write 'key: value' lines"
+        )
+    return (normalized if is_normalized(raw) else physical).model_validate(raw)
+
+
+AnyScene: TypeAlias = PhysicalScene | NormalizedScene
+AnyDevice: TypeAlias = PhysicalDevice | NormalizedDevice
+AnyWall: TypeAlias = PhysicalWall | NormalizedWall
+
+
+def read_scene(raw: Any) -> AnyScene:
+    """A scene of either kind."""
+    return _as_either(raw, PhysicalScene, NormalizedScene)
+
+
+# The handler, which would try one kind after the other and report the faults of both, is never called.
+SceneField = Annotated[AnyScene, WrapValidator(lambda raw, _: read_scene(raw))]
+DeviceField = Annotated[AnyDevice, WrapValidator(lambda raw, _: _as_either(raw, PhysicalDevice, NormalizedDevice))]
+WallField = Annotated[AnyWall, WrapValidator(lambda raw, _: _as_either(raw, PhysicalWall, NormalizedWall))]

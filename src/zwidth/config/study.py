@@ -1,0 +1,101 @@
+"""A study as a configuration describes it: what all kinds have in common."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Annotated, Any, ClassVar, Literal, get_args
+
+from pydantic import BeforeValidator, ConfigDict, WrapValidator
+
+from zwidth._types import DELAY_MODELS
+from zwidth.config.faults import LocatedProblem, describe, problem
+from zwidth.config.fields import Name, Strict, members, one_of
+from zwidth.config.scenes import AnyDelayModel, AnyScene
+
+MAX_POINTS = 150_000_000
+MAX_BYTES = 2**30
+
+
+def _only_held(value: Any) -> str:
+    """A validator for a study that needs poles."""
+    if one_of(*DELAY_MODELS)(value) == "fractional_power":
+        raise problem(
+            f"got {describe(value)}, the study's own or that of scene.delay_model",
+            "poles do not exist in this delay model, only the boundary and the ridge do; allowed is 'held'",
+            "write 'delay_model: held' in this study, or use the kind 'boundary' or 'ridge'",
+        )
+    return str(value)
+
+
+HeldOnly = Annotated[Literal["held"], BeforeValidator(_only_held)]
+DelayModels = Annotated[tuple[AnyDelayModel, ...], WrapValidator(members("delay models"))]
+
+
+def figure_layout(*names: str) -> BeforeValidator:
+    """A validator for the layout of a figure."""
+    return BeforeValidator(one_of(*names))
+
+
+def _drop_supplied(schema: dict[str, Any], model: type[Study]) -> None:
+    """Let an editor's check pass where the scene supplies what a study leaves out."""
+    required = schema.get("required", [])
+    schema["required"] = [name for name in required if name not in model.from_scene]
+
+
+class Study(Strict):
+    """What all studies have."""
+
+    model_config = ConfigDict(json_schema_extra=_drop_supplied)
+
+    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")
+    """Fields that the file's scene supplies where the study leaves them out."""
+
+    remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
+
+    name: Name
+    """Name of the study, unique in the file; its results are stored under it."""
+
+    @classmethod
+    def kind_name(cls) -> str:
+        """The name of the kind: the one literal of the field ``kind``, which every kind of study has."""
+        (name,) = get_args(cls.model_fields["kind"].annotation)
+        return name
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        """Add what the study leaves out and the scene knows."""
+        supplied = {
+            "delta": scene.delta,
+            "d": scene.d,
+            "delay_model": scene.delay_model,
+            "delay_models": [scene.delay_model],
+        }
+        return {**{name: supplied[name] for name in cls.from_scene}, **raw}
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        if name in cls.from_scene:
+            return "a study needs it where the file has no scene to take it from", f"add {name!r}, or a scene"
+        return super().missing(name)
+
+    @property
+    def points(self) -> int:
+        """About how many points are computed."""
+        raise NotImplementedError
+
+    @property
+    def nbytes(self) -> int:
+        """About how many bytes the result has."""
+        raise NotImplementedError
+
+    @property
+    def extent(self) -> str:
+        """What the number of points consists of, for messages."""
+        raise NotImplementedError
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        if self.points <= MAX_POINTS and self.nbytes <= MAX_BYTES:
+            return
+        what = f"{self.extent} is {self.points:.4g} points and {self.nbytes / 2**30:.3g} GiB"
+        allowed = f"at most {MAX_POINTS:.4g} points and {MAX_BYTES / 2**30:g} GiB a study"
+        yield (), problem(what, allowed, self.remedy_if_too_large)

@@ -1,0 +1,80 @@
+"""Files that are whole or absent, whatever kills the program that writes them."""
+
+from __future__ import annotations
+
+import errno
+import os
+import secrets
+import zlib
+from pathlib import Path
+
+from zwidth.errors import InputError
+
+REMEDIES = {
+    errno.ENOSPC: "make room on the disk",
+    errno.EDQUOT: "make room within your quota",
+    errno.EFBIG: "raise the limit on the size of files (ulimit -f)",
+    errno.EROFS: "choose a folder that can be written",
+    errno.EACCES: "choose a folder that you may write",
+    errno.EPERM: "choose a folder that you may write",
+    errno.ENOTDIR: "choose a folder whose path holds no file",
+    errno.ENOENT: "choose a folder that can be made",
+    errno.EEXIST: "choose another name",
+}
+"""What helps against errors of the system; no chunk of a sweep would escape the first six of them."""
+_HOPELESS = frozenset(list(REMEDIES)[:6])
+
+
+def hopeless(error: BaseException | None) -> bool:
+    """Whether an exception comes from an error of the system that everything else would meet as well."""
+    while error is not None:
+        if isinstance(error, OSError) and error.errno is not None:
+            return error.errno in _HOPELESS
+        error = error.__cause__ or error.__context__
+    return False
+
+
+def check_folder(folder: Path) -> None:
+    """Refuse a folder for results that cannot be made or written, as far as can be told without writing.
+
+    Raises:
+        InputError: a file is in its place or in its path, or it is read-only.
+    """
+    nearest = existing(folder)
+    if not nearest.is_dir():
+        where = "is a file" if nearest == folder.absolute() else f"cannot be made, for {nearest} is a file"
+        raise InputError(f"out: {folder} {where}; choose another folder with --out DIR")
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        where = "is read-only" if nearest == folder.absolute() else f"cannot be made, for {nearest} is read-only"
+        raise InputError(f"out: {folder} {where}, at least to you; choose another folder with --out DIR")
+
+
+def existing(folder: Path) -> Path:
+    """The folder itself or the nearest path above it that exists."""
+    folder = folder.absolute()
+    return next(path for path in (folder, *folder.parents) if path.exists())
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file under another name and rename it when all of it is on its way to the disk."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
+    try:
+        with open(partial, "wb") as stream:
+            stream.write(data)
+        os.replace(partial, path)
+    except BaseException:
+        partial.unlink(missing_ok=True)
+        raise
+
+
+def checksum(path: Path) -> int:
+    """The CRC-32 of a file; 0 where there is none."""
+    total = 0
+    try:
+        with open(path, "rb") as stream:
+            while block := stream.read(1 << 22):
+                total = zlib.crc32(block, total)
+    except FileNotFoundError:
+        return 0
+    return total

@@ -1,0 +1,228 @@
+"""The record of a run: what ran, from what, in which versions, and which files are its own.
+
+``run.json`` is written anew after every study, so that a run that ends at any moment leaves a true account. A study's
+files are made in a hidden folder, named in the record, and only then given their names: no file of the run is ever half
+written under its name, and no file that the record does not name is ever replaced or removed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from zwidth.errors import StoreError, StoreExistsError
+from zwidth.files.lock import FOLDER as LOCKS
+from zwidth.files.lock import held_briefly
+from zwidth.files.provenance import versions
+from zwidth.files.whole import check_folder, write_whole
+from zwidth.sweep.resume import refuse_changes, refuse_versions
+from zwidth.sweep.store import SUFFIX
+
+RUN_FILE = "run.json"
+CONFIG_FILE = "config.yaml"
+RUN_FORMAT = 2
+
+# Beside those that can change a result.
+_PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
+
+
+class Record:
+    """The record in one folder.
+
+    Args:
+        folder: the folder of the run, whether it exists or not.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.content: dict[str, Any] = {}
+        self._read()
+
+    def _read(self) -> None:
+        try:
+            content = json.loads((self.folder / RUN_FILE).read_text(encoding="utf-8"))
+        except (FileNotFoundError, NotADirectoryError):
+            return
+        except (OSError, ValueError) as error:
+            raise StoreError(
+                f"{self.folder / RUN_FILE}: cannot be read ({error}); choose another folder with --out DIR, or remove it"
+            ) from error
+        if not isinstance(content, dict) or not isinstance(content.get("studies"), list):
+            raise StoreError(
+                f"{self.folder / RUN_FILE}: no record of a run; choose another folder with --out DIR, or remove it"
+            )
+        self.content = content
+
+    @property
+    def exists(self) -> bool:
+        """Whether the folder holds a run."""
+        return bool(self.content)
+
+    def entry(self, name: str) -> dict[str, Any] | None:
+        """What is recorded of a study."""
+        return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
+
+    def check_free(self, *, overwrite: bool, going_on: bool) -> None:
+        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with.
+
+        Raises:
+            StoreExistsError: the folder holds a run, or something that no run has written.
+            InputError: the folder cannot be made or written.
+        """
+        if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
+            raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
+        check_folder(self.folder)
+        if going_on or not self.folder.is_dir():
+            return
+        if self.exists:
+            if not overwrite:
+                raise StoreExistsError(
+                    f"out: {self.folder} already holds a run; choose another folder with --out DIR, go on with it with "
+                    "--resume, or replace it with --overwrite"
+                )
+            return
+        # Stores are refused or replaced one by one: they say themselves what they are.
+        strange = [path.name for path in self.folder.iterdir() if not _is_of_runs(path.name)]
+        if strange:
+            raise StoreExistsError(
+                f"out: {self.folder} is not empty and holds no run (no {RUN_FILE}); choose another folder with "
+                "--out DIR"
+            )
+
+    def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
+        """Refuse to go on with a run that was made from other studies or by other releases.
+
+        Args:
+            inputs: what each study's results follow from, by its name.
+
+        Raises:
+            StoreError: the message names every key that differs.
+        """
+        if not self.exists:
+            return
+        if self.content.get("format") != RUN_FORMAT:
+            raise StoreError(
+                f"{self.folder}: an earlier release made this run and kept no checksums to go on from; start again with "
+                "--overwrite, or choose another folder with --out DIR"
+            )
+        where = self.folder / RUN_FILE
+        for name, now in inputs.items():
+            entry = self.entry(name)
+            if entry is not None:
+                refuse_changes(where, name, "run", entry["inputs"], now)
+        refuse_versions(where, self.content.get("versions", {}))
+
+    def start(self, **about: Any) -> None:
+        """Write down what the run is about, before its first study."""
+        about |= {"format": RUN_FORMAT, "started": datetime.now(UTC).isoformat(timespec="seconds")}
+        about |= {"precision": "float64", "versions": versions(*_PACKAGES)}
+        self._update({**about, "started": self.content.get("started", about["started"])})
+
+    def note(self, entry: dict[str, Any]) -> None:
+        """Write down how a study went, in place of what was there before."""
+        self._update({}, entry)
+
+    def _update(self, about: dict[str, Any], entry: dict[str, Any] | None = None) -> None:
+        """Change the file; other shards may be writing in it as well."""
+        with held_briefly(self.folder, "record"):
+            self._read()
+            content = {**self.content, **about}
+            studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
+            content["studies"] = [*studies, *([] if entry is None else [entry])]
+            self.content = content
+            write_whole(self.folder / RUN_FILE, (json.dumps(content, indent=2) + "\n").encode())
+
+    def faults(self, name: str) -> list[str]:
+        """The files of a study that are not what was written."""
+        entry = self.entry(name)
+        files = entry["files"] if entry else {}
+        return [
+            f"{file} is {'damaged' if (self.folder / file).exists() else 'missing'}"
+            for file, expected in files.items()
+            if expected is not None and file_hash(self.folder / file) != expected
+        ]
+
+    @contextmanager
+    def staging(self, name: str) -> Iterator[Path]:
+        """A hidden folder for the files of a study; it goes when the block ends."""
+        stage = self.folder / f".{name}.{secrets.token_hex(4)}.partial"
+        stage.mkdir(parents=True)
+        try:
+            yield stage
+        finally:
+            shutil.rmtree(stage, ignore_errors=True)
+
+    def keep(self, stage: Path, entry: dict[str, Any]) -> None:
+        """Give the files in ``stage`` their names, and take away those that the study had before.
+
+        Raises:
+            StoreExistsError: a file of one of these names is there that no run has written.
+        """
+        before = self.entry(entry["name"]) or {}
+        files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}
+        for file in files:
+            if (self.folder / file).exists() and file not in self.files():
+                raise StoreExistsError(
+                    f"out: {self.folder / file} was not written by this run; move it away, or choose another folder "
+                    "with --out DIR"
+                )
+        # First the names, so that a run that is killed between two files still knows them for its own.
+        both = {**dict.fromkeys(before.get("files", ()), ""), **files}
+        self.note({**entry, "state": "open", "files": both})
+        for file in files:
+            os.replace(stage / file, self.folder / file)
+        self._remove(file for file in both if file not in files)
+        self.note({**entry, "files": files})
+
+    def files(self) -> set[str]:
+        """All files that the run has written, by the record."""
+        found = {RUN_FILE, CONFIG_FILE}
+        for entry in self.content.get("studies", ()):
+            found |= {str(file) for file in entry.get("files", ())}
+        # A name that leads out of the folder was not written by a run.
+        return {file for file in found if Path(file).name == file}
+
+    def clear(self) -> None:
+        """Remove what the run has written, the record last; whatever else is in the folder stays."""
+        if self.exists:
+            self._remove(sorted(self.files() - {RUN_FILE}))
+            self._remove([RUN_FILE])
+            self.content = {}
+
+    def _remove(self, names: Iterable[str]) -> None:
+        for name in names:
+            path = self.folder / name
+            if name.endswith(SUFFIX) and (path / "zarr.json").is_file() and not path.is_symlink():
+                shutil.rmtree(path)
+            elif not path.is_dir():
+                path.unlink(missing_ok=True)
+
+    def sweep_up(self) -> None:
+        """Remove what runs that were killed have left half made."""
+        for left in self.folder.glob(".*.partial"):
+            if left.is_dir():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
+
+
+def _is_of_runs(name: str) -> bool:
+    """Whether a run without a record, or one that was killed, leaves something of this name."""
+    return name.endswith((SUFFIX, ".partial")) or name in (LOCKS, CONFIG_FILE, "figures")
+
+
+def file_hash(path: Path) -> str:
+    """The SHA-256 of a file; empty where there is none."""
+    try:
+        with open(path, "rb") as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError:
+        return ""

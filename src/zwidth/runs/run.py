@@ -1,0 +1,326 @@
+"""The one run: every study of a configuration computed, written and drawn, into one folder."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from zwidth.errors import InputError
+from zwidth.files.lock import holding
+from zwidth.files.whole import hopeless, write_whole
+from zwidth.runs.record import CONFIG_FILE, Record
+from zwidth.runs.result import ProgressCallback, RunResult, StudyEvent, StudyResult
+from zwidth.config.study import Study
+from zwidth.studies.document import Config, load_config
+from zwidth.studies.outcome import ComputedStudy, Outcome
+from zwidth.sweep.engine import Progress, compute_sweeps
+from zwidth.sweep.jobs import Perform
+from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
+from zwidth.sweep.resume import remove, store_path
+from zwidth.sweep.store import check_installed
+from zwidth.sweep.study import SweepStudy
+
+AnyConfig = Config | str | os.PathLike[str]
+
+
+@dataclass(frozen=True)
+class Piece:
+    """What a run computes as a whole: a study that is no sweep, or the comparison with the paper's numbers.
+
+    Attributes:
+        inputs: what the results follow from, besides the releases.
+    """
+
+    name: str
+    kind: str
+    inputs: dict[str, Any]
+    compute: Callable[[], Outcome]
+
+
+def run(
+    config: AnyConfig,
+    *,
+    out: str | os.PathLike[str] | None = None,
+    overwrite: bool = False,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    shard: tuple[int, int] | None = None,
+    memory: int = MEMORY,
+    progress: ProgressCallback | None = None,
+    perform: Perform | None = None,
+) -> RunResult:
+    """Run the studies of a configuration and write their results into one folder.
+
+    A sweep is computed chunk by chunk into a store ``<name>.zarr``. Any other study writes a table ``<name>.csv`` (a
+    map: ``<name>.npz``) and a figure as PNG and SVG; ``recommend`` adds a recommendation, and a configuration that
+    repeats figures of the paper adds ``published.md`` and ``published.json``. ``run.json`` tells what ran, in which
+    versions, how long it took, what failed, and which files are the run's own.
+
+    Args:
+        config: a configuration, or the path of one.
+        out: the folder; ``runs/<name of the configuration>`` where left out.
+        overwrite: replace a run that is already there: the files that its record names, and nothing else.
+        resume: go on with a run that is there. What is done and undamaged is kept, what failed or is damaged is
+            computed again; another configuration, or another release, is refused.
+        workers: how many processes compute sweeps on this machine; this process itself where left out. They are
+            spawned: a script that asks for them does its work below ``if __name__ == "__main__":``.
+        scheduler: address of a dask.distributed scheduler whose workers compute sweeps, and see the same folder.
+        shard: (i, n), 1 <= i <= n: compute every n-th chunk of the sweeps only, one of n such runs in the same folder;
+            the other studies are the first one's. A shard goes on with what is there.
+        memory: bytes that a chunk of a sweep may take while it is computed.
+        progress: called with a `StudyEvent` when a study starts and when it ends, and after every chunk.
+        perform: what computes one chunk; for tests.
+
+    Returns:
+        RunResult: ``folder``; ``studies``, how each of them went; ``seconds``. A study that fails is recorded with its
+        error and does not keep the others from running; ``ok`` tells that none did. Ctrl-C ends the run with
+        ``interrupted`` set; what is done by then is kept.
+
+    Raises:
+        ConfigError: the configuration has faults.
+        StoreExistsError: the folder holds a run, and neither ``resume`` nor ``overwrite`` is set; or it holds something
+            else.
+        StoreError: with ``resume``: a store is damaged, or the run was made from another configuration or release.
+        StoreBusyError: another run computes in the folder; shards (i, n) of one n do not exclude each other.
+        ResourceError: the results do not fit on the disk, or the workers not into memory.
+        InputError: options that exclude each other, a folder that cannot be written, a scheduler that does not answer.
+
+    Numerics:
+        Float64. The values do not depend on chunks, workers or engine; on another kind of processor or with another
+        release of JAX the last digits may differ.
+
+    Example:
+        >>> import tempfile, zwidth
+        >>> from zwidth.studies import Config
+        >>> study = {"kind": "map", "name": "m", "delta": 0.1, "d": 0, "alpha": 0.2, "beta": [0.1, 0.5]}
+        >>> config = Config.model_validate({"version": 1, "name": "small", "studies": [study]})
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     zwidth.run(config, out=f"{folder}/small").ok
+        True
+    """
+    going_on = resume or shard is not None
+    _check_options(workers, scheduler, shard, going_on=going_on, overwrite=overwrite)
+    config, text = _read(config)
+    shown = Path("runs", config.name) if out is None else Path(os.fsdecode(out))
+    folder, clock = Path(os.path.abspath(shown)), time.perf_counter()
+    pieces = _pieces(config) if shard is None or shard[0] == 1 else []
+    planned = [(study, make_plan(study, memory=memory)) for study in _sweeps(config)]
+    if planned:
+        check_installed()
+    # What does not fit, or not belong there, is refused before anything is made.
+    Record(folder).check_free(overwrite=overwrite, going_on=going_on)
+    begun = {study.name for study, _ in planned if store_path(folder, study).exists()}
+    check_resources([plan for _, plan in planned], folder, workers or 1, begun=set() if overwrite else begun)
+    with holding(folder, shard):
+        record = Record(folder)
+        record.check_free(overwrite=overwrite, going_on=going_on)
+        inputs = {piece.name: piece.inputs for piece in pieces} | {one.name: _inputs(one) for one, _ in planned}
+        if overwrite:
+            record.clear()
+            for study, _ in planned:
+                remove(folder, study)
+        record.check_same(inputs)
+        if shard is None:
+            record.sweep_up()
+        job = _Run(record, progress or (lambda event: None), len(pieces) + len(planned))
+        digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
+        record.start(name=config.name, description=config.description, config_sha256=digest)
+        write_whole(folder / CONFIG_FILE, text.encode("utf-8"))
+        job.do(pieces)
+        about = {"name": config.name, "description": config.description, "config": _spelled(config)}
+        if planned and not job.over:
+            options = {"resume": resume, "shard": shard, "workers": workers, "scheduler": scheduler}
+            job.sweep(planned, about, perform=perform, **options)
+    seconds = time.perf_counter() - clock
+    return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), job.hopeless, job.interrupted)
+
+
+def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
+    """What `run` would compute: each study, a sweep as its plan; nothing is done.
+
+    Raises:
+        ConfigError: the configuration has faults.
+    """
+    config, _ = _read(config)
+    return [make_plan(study, memory=memory) if isinstance(study, SweepStudy) else study for study in config.studies]
+
+
+class _Run:
+    """A run on its way.
+
+    Args:
+        record: of the run, whose folder is held.
+        tell: called with every event.
+        total: how many studies there are.
+    """
+
+    def __init__(self, record: Record, tell: ProgressCallback, total: int) -> None:
+        self.record = record
+        self.tell = tell
+        self.total = total
+        self.results: list[StudyResult] = []
+        self.repaired: list[str] = []
+        self.hopeless = ""
+        self.interrupted = False
+
+    @property
+    def over(self) -> bool:
+        """Whether nothing more is to be begun."""
+        return bool(self.hopeless) or self.interrupted
+
+    def do(self, pieces: list[Piece]) -> None:
+        """Compute what is not done yet; whatever goes wrong is recorded, for the others do not depend on it."""
+        for index, piece in enumerate(pieces, start=1):
+            entry = self.record.entry(piece.name)
+            faults = self.record.faults(piece.name)
+            if entry is not None and entry["state"] == "done" and not faults:
+                self.results.append(StudyResult(piece.name, piece.kind, "kept", files=tuple(entry["files"])))
+                self.tell(StudyEvent(index, self.total, piece.name, piece.kind, self.results[-1]))
+                continue
+            self.repaired += [f"{piece.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
+            try:
+                self.tell(StudyEvent(index, self.total, piece.name, piece.kind))
+                self.results.append(self._compute(piece))
+                self.tell(StudyEvent(index, self.total, piece.name, piece.kind, self.results[-1]))
+            except KeyboardInterrupt:
+                self.interrupted = True
+            if self.over:
+                return
+
+    def _compute(self, piece: Piece) -> StudyResult:
+        clock = time.perf_counter()
+        entry = {"name": piece.name, "kind": piece.kind, "state": "failed", "inputs": piece.inputs}
+        notes: tuple[str, ...] = ()
+        error: Exception | None = None
+        with self.record.staging(piece.name) as stage:
+            try:
+                outcome = piece.compute()
+                notes = outcome.notes
+                for _ in outcome.write(stage, piece.name):
+                    pass
+            except Exception as caught:
+                error = caught
+            entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes)}
+            entry |= {"error": _in_words(error), "state": "failed" if error else "done"}
+            try:
+                self.record.keep(stage, entry)
+            except Exception as caught:
+                error = error or caught
+                entry |= {"error": _in_words(error), "state": "failed"}
+        if error is not None and hopeless(error):
+            self.hopeless = _in_words(error)
+        kept = self.record.entry(piece.name)
+        return StudyResult(
+            piece.name,
+            piece.kind,
+            "failed" if error else "done",
+            time.perf_counter() - clock,
+            tuple(kept["files"]) if kept else (),
+            notes,
+            _in_words(error),
+            error,
+        )
+
+    def sweep(self, planned: list[tuple[SweepStudy, Plan]], about: dict[str, Any], **options: Any) -> None:
+        """Compute the sweeps, all together, so that workers are started once."""
+        clock, number = time.perf_counter(), {study.name: len(self.results) + k for k, (study, _) in enumerate(planned, 1)}
+        begun: set[str] = set()
+
+        def follow(progress: Progress) -> None:
+            event = StudyEvent(number[progress.study], self.total, progress.study, "sweep", progress=progress)
+            if progress.study not in begun:
+                begun.add(progress.study)
+                self.tell(replace(event, progress=None))
+            self.tell(event)
+
+        for study, _ in planned:
+            # Named before it is made: what a killed run leaves is its own.
+            self.record.note(_sweep_entry(study, "open"))
+        try:
+            sweeps = compute_sweeps(planned, self.record.folder, about, progress=follow, **options)
+        except KeyboardInterrupt:
+            # Before the first chunk began.
+            self.interrupted = True
+            return
+        self.hopeless, self.interrupted = sweeps.hopeless, sweeps.interrupted
+        for study, _ in planned:
+            sweep = sweeps.results[study.name]
+            self.repaired += sweep.repaired
+            state = "failed" if sweep.failed else "done" if sweep.ok and options["shard"] is None else "open"
+            error = next(iter(sweep.failed.values()), "")
+            seconds = time.perf_counter() - clock
+            if not self.hopeless:
+                self.record.note({**_sweep_entry(study, state), "seconds": round(seconds, 3), "error": error})
+            files = (sweep.store.name,)
+            result = StudyResult(study.name, "sweep", state, seconds, files, error=error, sweep=sweep)
+            self.results.append(result)
+            self.tell(StudyEvent(number[study.name], self.total, study.name, "sweep", result))
+
+
+def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
+    """What the record says of a sweep; its store knows by itself which of its files are whole."""
+    files = {store_path(Path(), study).name: None}
+    return {"name": study.name, "kind": "sweep", "state": state, "inputs": _inputs(study), "files": files}
+
+
+def _pieces(config: Config) -> list[Piece]:
+    """The studies that are computed as a whole; where figures of the paper are repeated, its numbers as well."""
+    pieces = []
+    for study in config.studies:
+        if isinstance(study, ComputedStudy):
+            alone = sum(type(other) is type(study) for other in config.studies) == 1
+            inputs = {**_inputs(study), "alone": alone}
+            if study.reads_scene and config.scene is not None:
+                inputs["scene"] = _spelled(config.scene)
+            compute = lambda study=study, alone=alone: study.compute(config.scene, alone)
+            pieces.append(Piece(study.name, study.kind_name(), inputs, compute))
+    if any((getattr(study, "figure", None) or "").startswith("fig") for study in config.studies):
+        from zwidth.studies.published import compare_published
+
+        pieces.append(Piece("published", "report", {}, compare_published))
+    return pieces
+
+
+def _sweeps(config: Config) -> list[SweepStudy]:
+    return [study for study in config.studies if isinstance(study, SweepStudy)]
+
+
+def _inputs(study: Any) -> dict[str, Any]:
+    return _spelled(study)
+
+
+def _spelled(model: Any) -> dict[str, Any]:
+    """A configuration, or a part of it, as JSON has it."""
+    return model.model_dump(mode="json", exclude_none=True)
+
+
+def _read(config: AnyConfig) -> tuple[Config, str]:
+    """A configuration and its text."""
+    if isinstance(config, Config):
+        return config, json.dumps(_spelled(config), indent=2) + "\n"
+    path = Path(os.fsdecode(config))
+    return load_config(path), path.read_text(encoding="utf-8-sig")
+
+
+def _in_words(error: Exception | None) -> str:
+    return f"{type(error).__name__}: {error}" if error else ""
+
+
+def _check_options(
+    workers: int | None, scheduler: str | None, shard: tuple[int, int] | None, *, going_on: bool, overwrite: bool
+) -> None:
+    if workers is not None and scheduler is not None:
+        raise InputError("workers, scheduler: got both; the cluster has its own workers, give one of the two")
+    if workers is not None and workers < 1:
+        raise InputError(f"workers: got {workers}; at least 1")
+    if shard is not None and not 1 <= shard[0] <= shard[1]:
+        raise InputError(f"shard: got {shard[0]}/{shard[1]}; give i/n with 1 <= i <= n")
+    if overwrite and going_on:
+        raise InputError("overwrite: it starts again, resume and shard go on; give one of them")

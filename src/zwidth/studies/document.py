@@ -1,0 +1,248 @@
+"""The configuration as a whole: its top level, the kinds of studies, and what the scene supplies to them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from importlib.metadata import entry_points
+from typing import Annotated, Any, ClassVar, Union
+
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    SerializeAsAny,
+    TypeAdapter,
+    WithJsonSchema,
+    WrapValidator,
+)
+from pydantic_core import CoreSchema, core_schema
+
+from zwidth.config.faults import (
+    LocatedProblem,
+    describe,
+    listing,
+    problem,
+    suggestion,
+    validation_error,
+)
+from zwidth.config.fields import Name, Strict, Text, looks_like_number, members
+from zwidth.config.reader import read_model
+from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
+from zwidth.config.study import Study
+from zwidth.studies.boundary import BoundaryStudy
+from zwidth.studies.map import MapStudy
+from zwidth.studies.passivity import PassivityStudy
+from zwidth.studies.recommend import RecommendStudy
+from zwidth.studies.ridge import RidgeStudy
+from zwidth.studies.step import StepStudy
+from zwidth.sweep.study import SweepStudy
+
+FORMAT_VERSION = 1
+
+KINDS: dict[str, type[Study]] = {}
+"""The models of the studies by the name of their kind."""
+
+
+def register(model: type[Study]) -> type[Study]:
+    """Make a kind of study known; it may stand above the class.
+
+    Args:
+        model: a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal type, the name of the kind.
+
+    Returns:
+        The model.
+    """
+    KINDS[model.kind_name()] = model
+    return model
+
+
+for _model in (BoundaryStudy, MapStudy, RidgeStudy, PassivityStudy, StepStudy, RecommendStudy, SweepStudy):
+    register(_model)
+
+
+def _model_of(kind: Any) -> type[Study] | None:
+    """The model of a kind, which an installed package may bring: an entry point in the group ``zwidth.studies``."""
+    if isinstance(kind, str) and kind not in KINDS:
+        for found in entry_points(group="zwidth.studies", name=kind):
+            register(found.load())
+    return KINDS.get(kind) if isinstance(kind, str) else None
+
+
+def _study(raw: Any) -> Any:
+    """A validator that reads a mapping as the study that its kind names."""
+    if isinstance(raw, Study):
+        return raw
+    kinds = f"a study is a mapping with one of the kinds {listing(KINDS)}"
+    if not isinstance(raw, dict):
+        raise problem(f"got {describe(raw)}", kinds, "write '- kind: boundary' and its fields, or remove the entry")
+    kind = raw.get("kind")
+    if "kind" not in raw:
+        raise validation_error("study", [(("kind",), problem("missing", kinds, "add 'kind: boundary'"))])
+    model = _model_of(kind)
+    if model is None:
+        what = problem(
+            f"got {describe(kind)}",
+            f"the kinds are {listing(KINDS)}",
+            suggestion(kind, KINDS, "write one of these"),
+        )
+        raise validation_error("study", [(("kind",), what)])
+    return model.model_validate(raw)
+
+
+class _OfAnyKind:
+    """Reads a study by its kind; the kinds are looked up when they are needed, so that more may be registered."""
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_plain_validator_function(
+            _study, serialization=core_schema.plain_serializer_function_ser_schema(lambda study: study.model_dump())
+        )
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        every = Annotated[Union[tuple(KINDS.values())], Field(discriminator="kind")]  # noqa: UP007
+        return handler(TypeAdapter[Any](every).core_schema)  # pyright: ignore[reportArgumentType]
+
+
+def _version(value: Any) -> int:
+    if value == FORMAT_VERSION and isinstance(value, int) and not isinstance(value, bool):
+        return value
+    remedy = f"write 'version: {FORMAT_VERSION}'"
+    if isinstance(value, str) and looks_like_number(value):
+        remedy = "drop the quotes"
+    elif isinstance(value, int) and value > FORMAT_VERSION:
+        remedy = "install a newer zwidth, or rewrite the file in version 1"
+    raise problem(f"got {describe(value)}", f"this release reads version {FORMAT_VERSION} of the format", remedy)
+
+
+class Config(Strict):
+    """A configuration file, checked and complete: every study holds the values that it runs with."""
+
+    what: ClassVar[str] = "a configuration"
+
+    version: Annotated[int, BeforeValidator(_version), WithJsonSchema({"const": FORMAT_VERSION})]
+    """Version of the format, 1."""
+
+    name: Name
+    """Name of the configuration; results go to a folder of this name unless told otherwise."""
+
+    description: Text = ""
+    """Free text."""
+
+    scene: SceneField | None = None
+    """Device, timing and wall that supply what a study leaves out."""
+
+    studies: Annotated[tuple[Annotated[SerializeAsAny[Study], _OfAnyKind], ...], WrapValidator(members("studies"))]
+    """What to compute, in this order."""
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        examples = {
+            "version": f"version: {FORMAT_VERSION}",
+            "name": "name: my_run",
+            "studies": "studies: [{kind: boundary, name: first, delta: 0, d: 0}]",
+        }
+        return "every configuration has version, name and studies", f"add {examples[name]!r}"
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        """Let the scene supply what the studies leave out."""
+        studies = raw.get("studies")
+        if "scene" not in raw or not isinstance(studies, list | tuple):
+            return raw
+        scene = _scene_or_stand_in(raw["scene"])
+        return {**raw, "studies": [_filled(study, scene) for study in studies]}
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        """Two studies of one name."""
+        studies = raw.get("studies")
+        first: dict[str, int] = {}
+        for index, study in enumerate(studies if isinstance(studies, list | tuple) else ()):
+            name = study.get("name") if isinstance(study, dict) else None
+            if not isinstance(name, str):
+                continue
+            if name in first:
+                what = problem(
+                    f"got {describe(name)}, the name of studies[{first[name]}] as well",
+                    "results are kept by name, so each study has its own",
+                    "rename one",
+                )
+                yield ("studies", index, "name"), what
+            first.setdefault(name, index)
+
+
+def _scene_or_stand_in(raw: Any) -> AnyScene:
+    """The file's scene; where it is faulty, one that only keeps its faults from repeating in every study."""
+    try:
+        return read_scene(raw)
+    except ValueError:
+        # The same faults are reported where the scene itself is read.
+        pass
+    if isinstance(raw, dict) and is_normalized(raw):
+        return NormalizedScene(delta=0.0, alpha=0.0)
+    return PhysicalScene(mass=1.0, period=1.0, stiffness=0.0)
+
+
+def _filled(study: Any, scene: AnyScene) -> Any:
+    """A study's mapping with what the scene supplies; anything else as it is."""
+    model = _model_of(study.get("kind")) if isinstance(study, dict) else None
+    return study if model is None else model.fill(study, scene)
+
+
+def config_json_schema() -> dict[str, Any]:
+    """Return the JSON Schema of configuration files, for editors.
+
+    An editor's check is a first help: units, conflicts between keys and sizes are checked by
+    `zwidth.load_config` alone.
+
+    Returns:
+        A JSON Schema (draft 2020-12) as a dict that ``json.dumps`` accepts.
+
+    Example:
+        >>> from zwidth.studies.document import config_json_schema
+        >>> sorted(config_json_schema()["required"])
+        ['name', 'studies', 'version']
+    """
+    schema = _without_null(Config.model_json_schema())
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+
+
+def _without_null(schema: Any) -> Any:
+    """The schema without null, which stands for "not given" in the models and is never written in a file."""
+    if isinstance(schema, list):
+        return [_without_null(item) for item in schema if item != {"type": "null"}]
+    if not isinstance(schema, dict):
+        return schema
+    return {key: _without_null(value) for key, value in schema.items() if key != "default" or value is not None}
+
+
+def load_config(path: str | bytes | os.PathLike[str]) -> Config:
+    """Read a configuration file and check all of it.
+
+    The file is YAML 1.2 (core schema): ``1e-3`` is a number, ``no`` and ``on`` are texts. Unknown keys,
+    repeated keys and values in the wrong unit or out of range are faults; nothing is guessed.
+
+    Args:
+        path: the file, at most 1 MiB of UTF-8.
+
+    Returns:
+        The configuration, frozen. What a study leaves out and the scene knows is filled in.
+
+    Raises:
+        ConfigError: the file cannot be read or has faults. The message has one line for each fault, with file,
+            line, column, field, the value received, what is allowed and the remedy; ``.faults`` lists them.
+
+    Example:
+        >>> import pathlib, tempfile
+        >>> from zwidth.studies.document import load_config
+        >>> text = "{version: 1, name: a, studies: [{kind: ridge, name: r, delta: 0.1, d: [0, 1]}]}"
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     file = pathlib.Path(folder, "a.yaml")
+        ...     _ = file.write_text(text)
+        ...     load_config(file).studies[0].d.values()
+        array([0., 1.])
+    """
+    return read_model(path, Config)

@@ -1,0 +1,97 @@
+"""The map study: stability and passivity on a grid of alpha, beta, delta and d."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Annotated, ClassVar, Literal, TypeAlias
+
+import numpy as np
+from pydantic import BeforeValidator, WrapValidator
+
+from zwidth import figures
+from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
+from zwidth.config.fields import members, one_of
+from zwidth.config.scenes import AnyScene
+from zwidth.config.study import HeldOnly
+from zwidth.figures.data import MapData
+from zwidth.stability.labels import is_stable
+from zwidth.stability.passivity import is_passive
+from zwidth.stability.radii import spectral_radius
+from zwidth.studies.outcome import ComputedStudy, Outcome, si_of
+
+MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
+
+_OUTPUT_BYTES = {"stable": 1, "spectral_radius": 8, "passive": 1}
+_TYPES = {"stable": np.bool_, "spectral_radius": np.float64, "passive": np.bool_}
+_FUNCTIONS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": is_passive}
+
+
+class MapStudy(ComputedStudy):
+    """Stability and passivity on a grid of alpha, beta, delta and d."""
+
+    what: ClassVar[str] = "a map study"
+    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_model")
+    reads_scene: ClassVar[bool] = True
+
+    kind: Literal["map"]
+
+    alpha: AnyAxis
+    """Normalized stiffness of the wall, an axis."""
+
+    beta: AnyAxis
+    """Normalized damping of the wall, an axis."""
+
+    delta: DeltaAxis
+    """Normalized damping of the device, a number or an axis; the scene's where left out."""
+
+    d: DelayAxis
+    """Delay in periods, a number or an axis; the scene's where left out."""
+
+    outputs: Annotated[
+        tuple[
+            Annotated[MapOutput, BeforeValidator(one_of("stable", "spectral_radius", "passive"))],
+            ...,
+        ],
+        WrapValidator(members("outputs")),
+    ] = ("stable",)
+    """What is computed at every point."""
+
+    delay_model: HeldOnly = "held"
+    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
+
+    @property
+    def shape(self) -> tuple[int, int, int, int]:
+        """Sizes of alpha, beta, delta and d."""
+        return self.alpha.size, self.beta.size, self.delta.size, self.d.size
+
+    @property
+    def extent(self) -> str:
+        """alpha x beta x delta x d."""
+        return f"alpha x beta x delta x d = {' x '.join(str(size) for size in self.shape)}"
+
+    @property
+    def points(self) -> int:
+        """The product of the four sizes."""
+        a, b, delta, d = self.shape
+        return a * b * delta * d
+
+    @property
+    def nbytes(self) -> int:
+        """All outputs and a status code a point."""
+        return self.points * (1 + sum(_OUTPUT_BYTES[name] for name in self.outputs))
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """The outputs on the grid, as arrays, and a figure of each."""
+        alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
+        outputs = {name: np.empty(self.shape, dtype=_TYPES[name]) for name in self.outputs}
+        # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
+        for delta_index, d_index in np.ndindex(delta.size, d.size):
+            place = (slice(None), slice(None), delta_index, d_index)
+            wall = (alpha[:, None], beta[None, :], float(delta[delta_index]), float(d[d_index]))
+            for name in outputs:
+                outputs[name][place] = np.asarray(_FUNCTIONS[name](*wall))
+        arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
+        if min(alpha.size, beta.size) < 2:
+            return Outcome(arrays=arrays)
+        data = MapData(alpha, beta, delta, d, outputs, si_of(self.delta, self.d, scene))
+        return Outcome(arrays=arrays, figures={f"_{name}": partial(figures.draw_map, data, name) for name in outputs})

@@ -1,0 +1,228 @@
+"""The step study: responses from force to position."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, WrapValidator
+from pydantic_core import PydanticCustomError
+
+from zwidth import figures
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import Fraction, Range, members, whole_number
+from zwidth.config.scenes import (
+    AnyDevice,
+    AnyScene,
+    AnyWall,
+    DeviceField,
+    NormalizedDevice,
+    PhysicalDevice,
+    PhysicalWall,
+    WallField,
+    normalized_wall,
+)
+from zwidth.config.study import HeldOnly, figure_layout
+from zwidth.config.units import Duration, Span
+from zwidth.figures.data import Response, StepData
+from zwidth.formatting import plain, with_unit
+from zwidth.response import step_response
+from zwidth.stability.ridge import alpha_max
+from zwidth.studies.outcome import ComputedStudy, Outcome, stack
+
+
+class ResponseStudy(ComputedStudy):
+    """What the studies that compute responses share."""
+
+    remedy_if_too_large: ClassVar[str] = "shorten the duration, or lower substeps"
+
+    duration: Duration = Span(100.0, "periods")
+    """Length of the response, in s or in periods."""
+
+    substeps: Annotated[int, BeforeValidator(whole_number(Range(1, 10_000)))] = 10
+    """Points computed per period."""
+
+    delay_model: HeldOnly = "held"
+    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
+
+    def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
+        """Each device with its wall; the wall is None where stiffness_fraction decides it."""
+        raise NotImplementedError
+
+    def periods(self, device: AnyDevice) -> float:
+        """Length of the response of a device in sampling periods."""
+        # By plain division: seconds may be many more periods than the rounding of a delay is made for.
+        if self.duration.unit == "s" and isinstance(device, PhysicalDevice):
+            return self.duration.value / device.period
+        return self.duration.value
+
+    @property
+    def extent(self) -> str:
+        """Responses x points a period."""
+        count = len(self.pairs())
+        return f"{count} response{'' if count == 1 else 's'} of {self.duration} with {self.substeps} points a period"
+
+    @property
+    def points(self) -> int:
+        """Points of all responses together."""
+        periods = sum(min(self.periods(device), 1e15) for device, _ in self.pairs())
+        return int(periods * self.substeps) + len(self.pairs())
+
+    @property
+    def nbytes(self) -> int:
+        """Time, position, velocity and force a point."""
+        return self.points * 32
+
+
+class StepStudy(ResponseStudy):
+    """Response of the position to a step of force, for one or more devices."""
+
+    what: ClassVar[str] = "a step study"
+    from_scene: ClassVar[tuple[str, ...]] = ("devices", "delay_model")
+
+    kind: Literal["step"]
+
+    devices: Annotated[tuple[DeviceField, ...], WrapValidator(members("devices"))]
+    """Devices; the scene's where left out."""
+
+    stiffness_fraction: Fraction | None = None
+    """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
+
+    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
+    """Walls, one for all devices or one for each; a single device takes any number of them."""
+
+    figure: Annotated[Literal["fig11"] | None, figure_layout("fig11")] = None
+    """Layout of the figure; a generic one where left out."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        filled = {"delay_model": scene.delay_model, **raw}
+        if "devices" not in raw:
+            filled["devices"] = [scene.device]
+            if scene.wall is not None and "walls" not in raw and "stiffness_fraction" not in raw:
+                filled["walls"] = [scene.wall]
+        return filled
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        given = [key for key in raw if key in ("stiffness_fraction", "walls")]
+        if len(given) == 2:
+            allowed = "the wall is a share of the maximum stiffness or given outright"
+            what = "stiffness_fraction and walls are both given"
+            yield (given[1],), problem(what, allowed, "remove one", on_key=True)
+        elif not given:
+            allowed = "the study needs a wall to respond to"
+            yield (), problem("stiffness_fraction or walls is missing", allowed, "add 'stiffness_fraction: 0.75'")
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        sizes = len(self.devices), len(self.walls or (None,))
+        if min(sizes) > 1 and sizes[0] != sizes[1]:
+            allowed = "one wall for all devices, one for each, or one device for all walls"
+            yield ("walls",), problem(f"got {sizes[1]} walls for {sizes[0]} devices", allowed, "make the numbers equal")
+            return
+        if self.duration.unit == "s" and any(isinstance(device, NormalizedDevice) for device in self.devices):
+            allowed = "a normalized device has no period to measure seconds in"
+            yield ("duration",), problem(f"got {self.duration}", allowed, "write it in periods, as in '100 periods'")
+        yield from self._wall_limits()
+
+    def _wall_limits(self) -> Iterable[LocatedProblem]:
+        """Walls that do not fit their device, each reported once."""
+        several = self.walls is not None and len(self.walls) > 1
+        faulty: dict[int, PydanticCustomError] = {}
+        for index, (device, wall) in enumerate(self.pairs()):
+            if wall is None:
+                continue
+            if isinstance(device, NormalizedDevice) and isinstance(wall, PhysicalWall):
+                allowed = "a wall in SI units needs a device with mass and period"
+                fault = problem("got a wall in SI units", allowed, "write alpha and beta")
+            elif not all(math.isfinite(value) for value in normalized_wall(device, wall)):
+                allowed = "alpha and beta must be finite"
+                fault = problem("got a wall whose normalized values are beyond float64", allowed, "check the units")
+            else:
+                continue
+            faulty[index if several else 0] = fault
+        yield from ((("walls", index), fault) for index, fault in faulty.items())
+
+    def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
+        """Each device with its wall; the wall is None where stiffness_fraction decides it."""
+        walls = self.walls or (None,)
+        count = max(len(self.devices), len(walls))
+        return tuple((self.devices[k % len(self.devices)], walls[k % len(walls)]) for k in range(count))
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """The responses, as a table and a figure."""
+        physical = all(isinstance(device, PhysicalDevice) for device in self.devices)
+        responses, notes = [], []
+        for number, (device, given) in enumerate(self.pairs(), start=1):
+            if given is not None:
+                alpha, beta = normalized_wall(device, given)
+            else:
+                ridge = alpha_max(device.delta, device.d)
+                assert self.stiffness_fraction is not None, "a study without walls has a fraction"
+                alpha, beta = self.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
+            label = device.label or _wall_text(device, alpha, beta) or f"device {number}"
+            times = {"periods": self.periods(device), "substeps": self.substeps}
+            responses.append(respond(device, alpha, beta, label=label, physical=physical, **times))
+            if note := unsettled(responses[-1], physical):
+                notes.append(f"{label}: {note}")
+        data = StepData(tuple(responses), physical)
+        return Outcome(
+            table=stack(response_columns(response, physical) for response in responses),
+            figures={"": partial(figures.draw_step, data)},
+            notes=tuple(notes),
+        )
+
+
+def respond(
+    device: AnyDevice, alpha: float, beta: float, *, label: str, periods: float, substeps: int, physical: bool
+) -> Response:
+    """The response of one device: to 1 N in SI units, or to a unit force in normalized ones."""
+    raw = step_response(alpha, beta, device.delta, device.d, periods=max(1, round(periods)), substeps=substeps)
+    clock = length = 1.0
+    if physical:
+        assert isinstance(device, PhysicalDevice), "only a device with mass and period has SI units"
+        clock, length = device.period, device.period**2 / device.mass
+    return Response(
+        label,
+        alpha,
+        beta,
+        device.delta,
+        device.d,
+        raw.time * clock,
+        raw.position * length,
+        raw.velocity * length / clock,
+        raw.wall_force,
+        raw.final_position * length,
+        raw.settling_time * clock,
+    )
+
+
+def unsettled(response: Response, physical: bool) -> str:
+    """What to say of a response that has not settled at the end of the time shown; nothing otherwise."""
+    if np.isnan(response.settling_time):
+        return "no settling time: the wall is not stable, its poles nearly coincide, or the delay exceeds 500 periods"
+    if response.settles_in_view:
+        return ""
+    after = with_unit(response.settling_time, "s", 3) if physical else f"{plain(response.settling_time)} periods"
+    return f"the response settles after {after}, later than the time shown"
+
+
+def _wall_text(device: AnyDevice, alpha: float, beta: float) -> str:
+    """The wall in SI units, the name of a response whose device has none."""
+    if not isinstance(device, PhysicalDevice):
+        return ""
+    wall = device.to_scene().to_si(alpha=alpha, beta=beta)
+    return f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"
+
+
+def response_columns(response: Response, physical: bool) -> dict[str, object]:
+    """The columns of one response in a data file; SI columns carry their unit."""
+    units = ("_s", "_m", "_m_per_s", "_N") if physical else ("", "", "", "")
+    columns: dict[str, object] = {name: getattr(response, name) for name in ("label", "alpha", "beta", "delta", "d")}
+    for name, unit in zip(("time", "position", "velocity", "wall_force"), units, strict=True):
+        columns[name + unit] = getattr(response, name)
+    return columns

@@ -1,0 +1,285 @@
+"""The sweep study: outputs over any grid of parameters, large or small, kept in a store of its own."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator
+from pydantic_core import PydanticCustomError
+
+from zwidth.config.axes import MAX_DELAY_PERIODS, AnyAxis, Axis, DelayAxis, DeltaAxis, PointAxis
+from zwidth.config.device_table import Table, TableField, read_table
+from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.fields import Range, Strict, members, number, one_of
+from zwidth.config.parameters import (
+    NORMALIZED,
+    PARAMETERS,
+    PHYSICAL,
+    WALL,
+    DampingAxis,
+    DelayValues,
+    MassAxis,
+    PeriodAxis,
+    RateAxis,
+    StiffnessAxis,
+    TimeAxis,
+    VirtualDampingAxis,
+)
+from zwidth.config.scenes import AnyScene, PhysicalScene
+from zwidth.config.study import HeldOnly, Study
+from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
+
+MAX_SWEEP_POINTS = 10**12
+
+OutputName = Annotated[
+    str, BeforeValidator(one_of(*OUTPUTS)), WithJsonSchema({"type": "string", "enum": list(OUTPUTS)})
+]
+# Closer in, the rounding of the two counts that prove a radius would meet.
+_ACCURACY = Range(1e-12, 0.1)
+
+
+class Axes(Strict):
+    """The parameters of a sweep and the values that each of them takes."""
+
+    what: ClassVar[str] = "the axes of a sweep"
+
+    devices: TableField | None = None
+    """Parameters that move together, one row a device: lists of equal length, or a CSV file."""
+
+    alpha: AnyAxis | None = None
+    """Normalized stiffness K T^2/m of the wall."""
+
+    beta: AnyAxis | None = None
+    """Normalized damping B T/m of the wall; 0 where left out."""
+
+    delta: DeltaAxis | None = None
+    """Normalized damping b T/m of the device; the scene's where left out."""
+
+    d: DelayAxis | None = None
+    """Delay in periods; the scene's where left out."""
+
+    stiffness: StiffnessAxis | None = None
+    """Stiffness K of the wall, in N/m or with a unit."""
+
+    virtual_damping: VirtualDampingAxis | None = None
+    """Damping B of the wall, in N s/m or with a unit; 0 where left out."""
+
+    mass: MassAxis | None = None
+    """Moving mass m of the device, in kg or with a unit; the scene's where left out."""
+
+    damping: DampingAxis | None = None
+    """Physical damping b of the device, in N s/m or with a unit; the scene's, or 0, where left out."""
+
+    period: PeriodAxis | None = None
+    """Sampling period T, in s or with a unit; give it or the rate, or leave it to the scene."""
+
+    rate: RateAxis | None = None
+    """Sampling rate 1/T, in Hz or with a unit."""
+
+    delay: TimeAxis | None = None
+    """Delay t_d, in s, with a unit of time, or in periods; the scene's, or 0, where left out."""
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        """Both kinds of parameters, or the period twice."""
+        keys = [key for key in raw if key in PARAMETERS]
+        yield from _mixed(keys, "axes")
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        """A parameter that is both an axis and a column, and kinds that only the table's columns show."""
+        columns = tuple(self.devices.columns) if self.devices else ()
+        own = [name for name in PARAMETERS if getattr(self, name) is not None]
+        for name in own:
+            if name in columns:
+                what = problem(
+                    "given twice, as an axis and as a column of devices", "each parameter once", "remove one"
+                )
+                yield (name,), what
+        if columns and not any(name in columns for name in own):
+            yield from ((("devices",), what) for _, what in _mixed([*own, *columns], "axes and devices together"))
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        """The parameters that are axes or columns, in the order of a store's dimensions."""
+        columns = self.devices.columns if self.devices else {}
+        return tuple(name for name in PARAMETERS if name in columns or getattr(self, name) is not None)
+
+    @property
+    def physical(self) -> bool:
+        """Whether the parameters are SI quantities."""
+        return any(name in PHYSICAL for name in self.given)
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """The dimensions, slow ones first; a single number is none."""
+        sizes = {"device": self.devices.size} if self.devices else {}
+        for name in PARAMETERS:
+            axis = getattr(self, name)
+            if axis is not None and not is_point(axis):
+                sizes[name] = axis.size
+        return sizes
+
+    def end(self, name: str, largest: bool) -> float:
+        """The largest or smallest value of a parameter."""
+        if self.devices and name in self.devices.columns:
+            column = self.devices.columns[name]
+            return max(column) if largest else min(column)
+        axis: Axis = getattr(self, name)
+        return axis.largest if largest else float(axis.values().min())
+
+
+def is_point(axis: Axis) -> bool:
+    """Whether an axis is written as a single number, and thus no dimension of the store."""
+    return isinstance(axis.axis if isinstance(axis, DelayValues) else axis, PointAxis)
+
+
+def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
+    """What is wrong with a set of parameters."""
+    if not keys:
+        return
+    physical = keys[0] in PHYSICAL
+    for key in keys:
+        if (key in PHYSICAL) != physical:
+            kinds = "physical key, after normalized ones" if not physical else "normalized key, after physical ones"
+            allowed = f"{where} are in SI units or normalized, never both"
+            yield (
+                (key,),
+                problem(kinds, allowed, f"choose from {listing(PHYSICAL if physical else NORMALIZED)}", on_key=True),
+            )
+    if "period" in keys and "rate" in keys:
+        second = [key for key in keys if key in ("period", "rate")][1]
+        allowed = "the sampling period and its rate say the same"
+        yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+
+
+class SweepStudy(Study):
+    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
+
+    what: ClassVar[str] = "a sweep study"
+    from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
+
+    kind: Literal["sweep"]
+
+    axes: Axes
+    """The parameters and their values; every combination is computed."""
+
+    outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
+    """What is computed."""
+
+    accuracy: Annotated[float, BeforeValidator(number(_ACCURACY))] = Field(
+        default=1e-9, json_schema_extra={"minimum": _ACCURACY.low, "maximum": _ACCURACY.high}
+    )
+    """Relative error to prove of every spectral radius.
+
+    It is proved by counting the poles inside two circles; most values have nearly all digits whatever is
+    asked for. Where no proof is found, next to double poles above all, the status is NOT_CONVERGED: the value is there
+    if a larger error of at most 0.1 is proved, and NaN otherwise.
+    """
+
+    delay_model: HeldOnly = "held"
+    """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        """Let the scene supply the device and the timing."""
+        raw = super().fill(raw, scene)
+        axes = raw.get("axes")
+        if not isinstance(axes, dict):
+            return raw
+        given = {key for key in axes if key in PARAMETERS} | _columns(axes.get("devices"))
+        if given & set(PHYSICAL):
+            if not isinstance(scene, PhysicalScene):
+                return raw
+            supplied: dict[str, Any] = {"mass": scene.mass, "damping": scene.damping, "delay": str(scene.delay)}
+            supplied |= {} if given & {"period", "rate"} else {"period": scene.period}
+        else:
+            supplied = {"delta": scene.delta, "d": scene.d}
+        return {**raw, "axes": {**axes, **{key: value for key, value in supplied.items() if key not in given}}}
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        """Parameters that are missing or move nothing, delays that are too long, and too many points."""
+        given, physical = self.axes.given, self.axes.physical
+        if "rate" not in given and "period" not in given and physical:
+            yield ("axes",), problem("period missing", "a physical sweep has period or rate", "add 'period: 1 ms'")
+        for name, example in (("mass", "100 g"),) if physical else (("delta", "0.1"), ("d", "1")):
+            if name not in given:
+                kinds = "a sweep has mass and period or rate, or, normalized, delta and d"
+                yield ("axes",), problem(f"{name} missing", kinds, f"add '{name}: {example}', or a scene")
+        yield from self._outputs_limits(given, physical)
+        yield from self._delay_limits(given)
+        if self.points > MAX_SWEEP_POINTS:
+            what = f"{self.extent} is {self.points:.4g} points"
+            yield (), problem(what, f"at most {MAX_SWEEP_POINTS:.4g} points a study", self.remedy_if_too_large)
+
+    def _outputs_limits(self, given: tuple[str, ...], physical: bool) -> Iterable[LocatedProblem]:
+        stiffness = "stiffness" if physical else "alpha"
+        walls = [name for name in self.outputs if OUTPUTS[name].family == "wall"]
+        if walls and stiffness not in given:
+            what = f"{stiffness} missing"
+            yield ("axes",), problem(what, f"{walls[0]} belongs to a wall", f"add {stiffness!r}, or remove the output")
+        if not walls:
+            for name in (name for name in given if name in WALL):
+                allowed = f"{listing(self.outputs)} do not depend on the wall"
+                place = ("axes", "devices") if getattr(self.axes, name) is None else ("axes", name)
+                yield place, problem(f"got {name!r}, which moves no output", allowed, "remove it or add 'stable'")
+        for index, name in enumerate(self.outputs):
+            if OUTPUTS[name].physical_only and not physical:
+                allowed = "it needs a device in SI units"
+                yield ("outputs", index), problem(f"got {name!r}", allowed, "write alpha_max, or mass and period")
+
+    def _delay_limits(self, given: tuple[str, ...]) -> Iterable[LocatedProblem]:
+        if "delay" not in given or not {"period", "rate"} & set(given):
+            return
+        axis = self.axes.delay
+        unit = axis.unit if axis is not None else self.axes.devices.delay_unit if self.axes.devices else "s"
+        longest = self.axes.end("delay", largest=True)
+        if unit == "s":
+            longest *= self.axes.end("rate", True) if "rate" in given else 1.0 / self.axes.end("period", False)
+        if not longest <= MAX_DELAY_PERIODS:
+            place = ("axes", "devices") if axis is None else ("axes", "delay")
+            allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
+            yield (
+                place,
+                problem(f"the longest delay is {longest:.6g} of the shortest periods", allowed, "check the units"),
+            )
+
+    @property
+    def families(self) -> dict[Family, tuple[str, ...]]:
+        """The outputs of walls and those of devices."""
+        groups: dict[Family, tuple[str, ...]] = {
+            family: tuple(name for name in self.outputs if OUTPUTS[name].family == family) for family in STATUS_OF
+        }
+        return {family: names for family, names in groups.items() if names}
+
+    @property
+    def points(self) -> int:
+        """The product of the sizes of all dimensions."""
+        return math.prod(self.axes.sizes.values())
+
+    @property
+    def nbytes(self) -> int:
+        """All outputs and a status code a point, as they are in memory."""
+        return self.points * (1 + 8 * len(self.outputs))
+
+    @property
+    def extent(self) -> str:
+        """The dimensions and their sizes."""
+        sizes = self.axes.sizes
+        return f"{' x '.join(sizes) or 'one point'} = {' x '.join(str(size) for size in sizes.values()) or 1}"
+
+
+def _columns(raw: Any) -> set[str]:
+    """The parameters of a table, as far as it can be read."""
+    if raw is None:
+        return set()
+    if isinstance(raw, Table):
+        return set(raw.columns)
+    if isinstance(raw, dict) and "csv" not in raw:
+        return set(raw) & set(PARAMETERS)
+    try:
+        return set(read_table(raw).columns)
+    except (PydanticCustomError, ValidationError):
+        # Reported where the table itself is read.
+        return set()

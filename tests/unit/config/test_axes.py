@@ -1,0 +1,43 @@
+"""Axes: values, sizes without values, and spellings that lead back to the same axis."""
+
+import numpy as np
+import pytest
+
+from zwidth.config.axes import LinearAxis, ListAxis, LogAxis, PointAxis, axis
+
+
+@pytest.mark.parametrize(
+    "raw, kind, values",
+    [
+        (0.5, PointAxis, [0.5]),
+        (2, PointAxis, [2.0]),
+        ([4, 0, 1.5], ListAxis, [4.0, 0.0, 1.5]),
+        ({"linear": {"start": 0, "stop": 1, "num": 5}}, LinearAxis, [0.0, 0.25, 0.5, 0.75, 1.0]),
+        ({"linear": {"start": 1, "stop": -1, "num": 3}}, LinearAxis, [1.0, 0.0, -1.0]),
+        ({"log": {"start": 0.01, "stop": 100, "num": 5}}, LogAxis, [0.01, 0.1, 1.0, 10.0, 100.0]),
+    ],
+)
+def test_values(raw, kind, values):
+    made = axis()(raw)
+    assert type(made) is kind
+    assert made.values().dtype == np.float64
+    np.testing.assert_allclose(made.values(), values, rtol=1e-15)
+    assert made.size == len(values)
+    assert made.largest == max(values)
+    assert axis()(made.spelling()) == made
+    assert axis()(made) is made
+    assert hash(made) == hash(axis()(raw))
+
+
+def test_size_needs_no_memory():
+    assert axis()({"linear": {"start": 0, "stop": 1, "num": 10_000_000}}).size == 10_000_000
+
+
+def test_ends_too_far_apart_are_refused():
+    with pytest.raises(ValueError, match="must be finite"):
+        axis()({"linear": {"start": -1e308, "stop": 1e308, "num": 3}})
+
+
+def test_steps_below_the_resolution_are_refused():
+    with pytest.raises(ValueError, match="below float64's resolution"):
+        axis()({"linear": {"start": 1.0, "stop": 1.0 + 1e-14, "num": 1000}})

@@ -1,0 +1,216 @@
+"""What a correct configuration turns into: defaults, the scene's values, SI units, YAML 1.2."""
+
+import json
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
+from zwidth.config.units import Span
+from zwidth.scene import Scene
+from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+SHIPPED = sorted(CONFIGS.glob("*.yaml"))
+PHYSICAL = "scene: {mass: 100 g, damping: 10 N s/m, rate: 1 kHz, delay: 1.5 periods}\n"
+RIDGE = "studies: [{kind: ridge, name: r}]\n"
+
+
+@pytest.fixture
+def load(tmp_path):
+    def from_text(text):
+        path = tmp_path / "config.yaml"
+        path.write_text(f"version: 1\nname: test\n{text}", encoding="utf-8")
+        return load_config(path)
+
+    return from_text
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_shipped_configs_are_valid_and_named_after_their_file(path):
+    config = load_config(str(path))
+    assert config.name == path.stem
+    assert all(study.points > 0 and study.nbytes > 0 for study in config.studies)
+
+
+def test_the_paper_is_complete():
+    studies = {study.name: study for study in load_config(CONFIGS / "paper.yaml").studies}
+    assert list(studies) == ["fig5", "fig6", "fig7", "fig8", "fig9", "fig10", "fig11", "passivity_cost"]
+    assert all(study.figure == name for name, study in studies.items())
+    np.testing.assert_array_equal(studies["fig5"].delta.values(), [0, 0.25, 0.5, 0.75, 1])
+    np.testing.assert_array_equal(studies["fig5"].d.values(), [0, 1, 2, 4])
+    np.testing.assert_array_equal(studies["fig6"].d.values(), [0, 0.25, 0.5, 1, 2, 4])
+    np.testing.assert_array_equal(studies["fig10"].d.values(), [0, 0.125, 0.25, 0.5, 1, 2, 4])
+    assert studies["fig10"].delay_models == ("held", "fractional_power")
+    devices = studies["fig11"].devices
+    assert [device.delta for device in devices] == pytest.approx([0, 0.1, 1])
+    assert [device.d for device in devices] == [1, 1, 1]
+
+
+def test_the_scene_supplies_what_a_study_leaves_out(load):
+    config = load(
+        PHYSICAL
+        + "studies:\n"
+        + "  - {kind: ridge, name: r}\n"
+        + "  - {kind: boundary, name: b, d: [0, 1]}\n"
+        + "  - {kind: map, name: m, alpha: 0.1, beta: [0, 1], delta: 3}\n"
+        + "  - {kind: step, name: s, stiffness_fraction: 0.5}\n"
+        + "  - {kind: recommend, name: k}\n"
+    )
+    ridge, boundary, grid, step, recommend = config.studies
+    assert ridge.delta.values() == pytest.approx([0.1])
+    assert ridge.d.values() == [1.5]
+    assert list(boundary.d.values()) == [0, 1]
+    assert grid.delta.values() == [3]
+    assert grid.shape == (1, 2, 1, 1)
+    assert step.devices == (recommend.device,) == (config.scene.device,)
+    assert step.pairs() == ((config.scene.device, None),)
+    assert (recommend.device.mass, recommend.device.period) == (0.1, 1e-3)
+
+
+def test_the_scene_supplies_its_delay_model_to_curves(load):
+    config = load("scene: {delta: 1, d: 0.5, delay_model: fractional_power}\n" + RIDGE)
+    assert config.studies[0].delay_models == ("fractional_power",)
+
+
+def test_the_scene_supplies_its_wall_to_a_step(load):
+    wall = "scene: {mass: 100 g, rate: 1 kHz, stiffness: 10 kN/m, virtual_damping: 40 N s/m}\n"
+    study = load(wall + "studies: [{kind: step, name: s}]\n").studies[0]
+    assert study.walls == (PhysicalWall(stiffness=10e3, virtual_damping=40.0),)
+    assert normalized_wall(*study.pairs()[0]) == pytest.approx((0.1, 0.4))
+    study = load(wall + "studies: [{kind: step, name: s, stiffness_fraction: 0.5}]\n").studies[0]
+    assert study.walls is None
+
+
+def test_a_physical_scene_in_si_units(load):
+    scene = load(PHYSICAL.replace("}", ", stiffness: 10 N/mm}") + RIDGE).scene
+    made = scene.to_scene()
+    assert isinstance(made, Scene)
+    assert (made.device.mass, made.device.damping) == (0.1, 10.0)
+    assert (made.timing.period, made.timing.delay, made.timing.delay_model) == (1e-3, 1.5e-3, "held")
+    assert (made.wall.stiffness, made.wall.virtual_damping) == (10e3, 0.0)
+    assert scene.d == 1.5
+    assert scene.delta == pytest.approx(0.1)
+
+
+def test_delays_in_seconds_are_whole_periods_where_they_can_be(load):
+    scene = load("scene: {mass: 1, period: 0.1 ms, delay: 1.1 ms}\n" + RIDGE).scene
+    assert scene.d == 11.0
+
+
+def test_a_normalized_scene(load):
+    scene = load("scene: {delta: 0.1, alpha: 0.2}\n" + RIDGE).scene
+    assert (scene.delta, scene.d) == (0.1, 0.0)
+    assert scene.wall == NormalizedWall(alpha=0.2, beta=0.0)
+
+
+def test_devices_and_walls_are_paired(load):
+    text = "studies: [{{kind: step, name: s, devices: [{}], walls: [{}]}}]\n"
+    one, two = "{delta: 0}", "{delta: 0}, {delta: 1, d: 2}"
+    for devices, walls, expected in [
+        (two, "{alpha: 0.1}", [(0, 0.1), (1, 0.1)]),
+        (two, "{alpha: 0.1}, {alpha: 0.2, beta: 0.3}", [(0, 0.1), (1, 0.2)]),
+        (one, "{alpha: 0.1}, {alpha: 0.2}, {alpha: 0.3}", [(0, 0.1), (0, 0.2), (0, 0.3)]),
+    ]:
+        pairs = load(text.format(devices, walls)).studies[0].pairs()
+        assert [(device.delta, wall.alpha) for device, wall in pairs] == expected
+
+
+def test_defaults(load):
+    step, grid = load(
+        "studies:\n"
+        "  - {kind: step, name: s, stiffness_fraction: 0.5, devices: [{mass: 1, period: 1}]}\n"
+        "  - {kind: map, name: m, alpha: 0, beta: 0, delta: 0, d: 0}\n"
+    ).studies
+    assert (step.duration, step.substeps, step.figure) == (Span(100.0, "periods"), 10, None)
+    assert step.devices == (PhysicalDevice(mass=1.0, damping=0.0, period=1.0, delay=Span(0.0, "s")),)
+    assert grid.outputs == ("stable",)
+    assert grid.delay_model == "held"
+
+
+@pytest.mark.parametrize(
+    "text, value",
+    [("1e-3", 1e-3), ("1e6", 1e6), ("+.5", 0.5), ("0x10", 16.0), ("0o17", 15.0), ("017", 17.0), ("1.", 1.0)],
+)
+def test_numbers_of_yaml_1_2(load, text, value):
+    assert load(f"studies: [{{kind: ridge, name: r, d: 0, delta: {text}}}]\n").studies[0].delta.values() == [value]
+
+
+@pytest.mark.parametrize("text", ["no", "on", "12:30:45", "1_000", "2001-01-01"])
+def test_texts_of_yaml_1_2(load, text):
+    config = load(f"description: {text}\nscene: {{delta: 0}}\n{RIDGE}")
+    assert config.description == text
+
+
+def test_aliases_and_a_byte_order_mark(tmp_path):
+    path = tmp_path / "config.yaml"
+    text = "version: 1\nname: a\nstudies:\n  - {kind: ridge, name: r, delta: &x [0, 1], d: 0}\n"
+    path.write_text(text + "  - {kind: passivity, name: p, delta: *x, d: 0}\n", encoding="utf-8-sig")
+    first, second = load_config(path).studies
+    assert first.delta == second.delta
+
+
+def test_configs_are_frozen_and_travel_between_processes():
+    config = load_config(CONFIGS / "phantom.yaml")
+    with pytest.raises(ValueError, match="frozen"):
+        config.name = "other"
+    assert pickle.loads(pickle.dumps(config)) == config
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_a_dump_leads_back_to_the_same_config(path):
+    dump = load_config(path).model_dump(mode="json", exclude_none=True)
+    again = Config.model_validate(json.loads(json.dumps(dump)))
+    assert again.model_dump(mode="json", exclude_none=True) == dump
+
+
+def conforms(value, schema, root):
+    """Whether a value conforms to a JSON Schema, as far as this one uses the language."""
+    if "$ref" in schema:
+        return conforms(value, root["$defs"][schema["$ref"].rsplit("/", 1)[1]], root)
+    options = schema.get("anyOf") or schema.get("oneOf")
+    if options and not any(conforms(value, option, root) for option in options):
+        return False
+    if ("const" in schema and value != schema["const"]) or value not in schema.get("enum", [value]):
+        return False
+    kinds = {"object": dict, "array": list, "string": str, "boolean": bool, "integer": int, "number": (int, float)}
+    if "type" in schema and not isinstance(value, kinds[schema["type"]]):
+        return False
+    if isinstance(value, dict):
+        known = schema.get("properties", {})
+        return (
+            set(schema.get("required", [])) <= set(value)
+            and (set(value) <= set(known) or schema.get("additionalProperties", True))
+            and all(conforms(item, known.get(key, {}), root) for key, item in value.items())
+        )
+    if isinstance(value, list):
+        return all(conforms(item, schema.get("items", {}), root) for item in value)
+    return isinstance(value, str | bool) or value >= schema.get("minimum", value)
+
+
+@pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
+def test_the_schema_fits_the_shipped_configs(path):
+    schema = json.loads(json.dumps(config_json_schema()))
+    raw = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert conforms(raw, schema, schema)
+    raw["studies"][0]["colour"] = "red"
+    assert not conforms(raw, schema, schema)
+
+
+def test_the_schema_describes_every_field():
+    schema = config_json_schema()
+    assert set(schema["$defs"]) >= {model.__name__ for model in KINDS.values()}
+    for model in [schema, *schema["$defs"].values()]:
+        for name, field in model["properties"].items():
+            assert name == "kind" or field.get("description"), (model["title"], name)
+
+
+def test_reading_a_config_needs_no_jax():
+    code = "import sys, zwidth.studies.document; print('jax' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert result.stdout.strip() == "False"

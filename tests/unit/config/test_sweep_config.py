@@ -1,0 +1,178 @@
+"""Sweep studies in a configuration: axes with units, devices in tables and CSV files, and what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from zwidth.errors import ConfigError
+from zwidth.scene import normalize
+from zwidth.studies.document import Config, config_json_schema, load_config
+from zwidth.sweep.grid import Grid
+
+ROOT = Path(__file__).parents[3]
+SCENE = "scene: {mass: 100 g, damping: 10 N s/m, rate: 1 kHz, delay: 1 ms}\n"
+CSV = """label, mass [g], damping (N s/m), source
+# remarks are skipped
+
+small, 50, 1, a guess
+large, 2 kg, 3e1, another
+"""
+
+
+@pytest.fixture
+def load(tmp_path):
+    def from_text(text):
+        path = tmp_path / "config.yaml"
+        path.write_text(f"version: 1\nname: test\n{text}", encoding="utf-8")
+        return load_config(path)
+
+    return from_text
+
+
+def sweep(axes, rest=""):
+    return f"studies: [{{kind: sweep, name: s, axes: {{{axes}}}{rest}}}]\n"
+
+
+def test_physical_axes_with_units(load):
+    axes = "stiffness: [1 N/mm, 2e3], virtual_damping: {linear: {start: 0, stop: 20 N s/m, num: 3}}, mass: 100 g, "
+    axes += "damping: {log: {start: 1 N s/m, stop: 100, num: 3}}, rate: [1 kHz, 500], delay: [0 periods, 1 periods]"
+    study = load(sweep(axes)).studies[0]
+    grid = Grid(study)
+    assert grid.sizes == {"rate": 2, "delay": 2, "damping": 3, "stiffness": 2, "virtual_damping": 3}
+    assert grid.device_dims == ("rate", "delay", "damping")
+    block = grid.block(tuple(slice(None) for _ in grid.dims))
+    period = 1 / np.array([1000.0, 500.0])
+    damping, stiffness = np.array([1.0, 10.0, 100.0]), np.array([1000.0, 2000.0])
+    at = np.ix_(range(2), range(2), range(3))
+    device = normalize(mass=0.1, damping=damping, period=period[:, None, None] + np.zeros((1, 2, 1)))
+    np.testing.assert_array_equal(block.delta.reshape(2, 2, 3), device.delta)
+    np.testing.assert_array_equal(block.d.reshape(2, 2, 3), at[1] + np.zeros((2, 1, 3)))
+    wall = normalize(mass=0.1, period=period[:, None], stiffness=stiffness, virtual_damping=stiffness / 100.0)
+    np.testing.assert_array_equal(block.alpha.reshape(2, 2, 3, 2)[:, 1, 2], wall.alpha)
+    np.testing.assert_array_equal(block.beta.reshape(2, 2, 3, 3)[:, 0, 0, 1:], wall.beta)
+
+
+def test_delays_in_seconds_are_whole_periods_where_they_can_be(load):
+    study = load(sweep("stiffness: 1, mass: 1, period: 0.1 ms, delay: [0.3 ms, 1.1 ms]")).studies[0]
+    assert list(Grid(study).block((slice(None),)).d) == [3.0, 11.0]
+
+
+def test_the_scene_supplies_the_device(load):
+    study = load(SCENE + sweep("stiffness: [1, 2]")).studies[0]
+    assert set(study.axes.given) == {"period", "delay", "mass", "damping", "stiffness"}
+    study = load(SCENE + sweep("alpha: [1, 2], d: 3")).studies[0]
+    assert set(study.axes.given) == {"alpha", "delta", "d"}
+    assert study.axes.delta.values() == pytest.approx([0.1])
+
+
+def test_devices_move_together(load):
+    study = load(sweep("devices: {label: [a, b], mass: [100 g, 1], delay: [1 ms, 3]}, rate: 1 Hz, stiffness: [1, 2]"))
+    grid = Grid(study.studies[0])
+    assert grid.sizes == {"device": 2, "stiffness": 2}
+    block = grid.block((slice(0, 2), slice(1, 2)))
+    assert list(block.d) == [0.001, 3.0]
+    assert block.alpha[:, 0] == pytest.approx([20.0, 2.0])
+    assert list(grid.coordinates()["device"][1]) == ["a", "b"]
+
+
+def test_devices_from_a_csv_file_beside_the_configuration(load, tmp_path, monkeypatch):
+    (tmp_path / "devices.csv").write_text(CSV, encoding="utf-8")
+    config = load(SCENE + sweep("devices: {csv: devices.csv}, stiffness: 10"))
+    table = config.studies[0].axes.devices
+    assert table.labels == ("small", "large")
+    assert table.columns == {"mass": (0.05, 2.0), "damping": (1.0, 30.0)}
+    # The dump stands for itself: whoever reads it needs no file.
+    dump = config.model_dump(mode="json", exclude_none=True)
+    assert dump["studies"][0]["axes"]["devices"] == {
+        "label": ["small", "large"],
+        "mass": [0.05, 2.0],
+        "damping": [1.0, 30.0],
+    }
+    assert Config.model_validate(dump).model_dump(mode="json", exclude_none=True) == dump
+
+
+def test_columns_of_a_csv_file_can_be_named(load, tmp_path):
+    (tmp_path / "d.csv").write_text("Moving mass [g],b\n100,2\n", encoding="utf-8")
+    text = 'devices: {csv: d.csv, columns: {mass: "Moving mass [g]", damping: b}}, rate: 1, stiffness: 1'
+    assert load(sweep(text)).studies[0].axes.devices.columns == {"mass": (0.1,), "damping": (2.0,)}
+
+
+NORMAL = "alpha: 1, delta: 1, d: 1"
+
+
+@pytest.mark.parametrize(
+    "axes, rest, place, words",
+    [
+        (NORMAL + ", mass: 1 kg", "", "axes.mass", "never both"),
+        (NORMAL + ", rate: 1", "", "axes.rate", "never both"),
+        ("alpha: 1, d: 1", "", "axes", "delta missing"),
+        ("stiffness: 1, mass: 1", "", "axes", "period missing"),
+        ("stiffness: 1, rate: 1", "", "axes", "mass missing"),
+        ("delta: 1, d: 1", "", "axes", "alpha missing"),
+        (NORMAL, ", outputs: [alpha_max]", "axes.alpha", "moves no output"),
+        ("delta: 1, d: 1", ", outputs: [stiffness_max]", "outputs[0]", "SI units"),
+        (NORMAL, ", outputs: [stabel]", "outputs[0]", "did you mean 'stable'?"),
+        (NORMAL, ", accuracy: 0", "accuracy", "at least"),
+        (NORMAL, ", accuracy: 1e-13", "accuracy", "at least 1e-12"),
+        (NORMAL, ", accuracy: tight", "accuracy", "one number"),
+        (NORMAL + ", betta: 1", "", "axes.betta", "did you mean 'beta'?"),
+        (NORMAL + ", d: 1", "", "axes.d", "comes twice"),
+        ("stiffness: 1, mass: 1, rate: 1, period: 1", "", "axes.period", "both given"),
+        ("stiffness: 1, mass: 1, rate: 1, delay: [1 s, 1 periods]", "", "axes.delay[1]", "all in seconds"),
+        ("stiffness: [1 N/m, 1], mass: 1, rate: 1", "", "axes.stiffness[1]", "twice"),
+        ("stiffness: 1 kg, mass: 1, rate: 1", "", "axes.stiffness", "units allowed"),
+        ("stiffness: 1, mass: 1, rate: 1 kHz, delay: 11", "", "axes.delay", "longest delay"),
+        ("devices: {mass: [1, 2], damping: [1]}, stiffness: 1, rate: 1", "", "axes.devices", "different length"),
+        ("devices: {mass: [1, 0]}, stiffness: 1, rate: 1", "", "axes.devices.mass[1]", "greater than 0"),
+        ("devices: {mas: [1]}, stiffness: 1, rate: 1", "", "axes.devices.mas", "did you mean 'mass'?"),
+        ("devices: {mass: 1}, stiffness: 1, rate: 1", "", "axes.devices.mass", "is a list"),
+        ("devices: {label: [a]}, stiffness: 1", "", "axes.devices", "no parameter"),
+        ("devices: {mass: [1]}, mass: 2, stiffness: 1, rate: 1", "", "axes.mass", "given twice"),
+        ("devices: {mass: [1]}, alpha: 1, d: 1", "", "axes.devices", "never both"),
+        ("devices: 3", "", "axes.devices", "lists of equal length"),
+        ("devices: {csv: missing.csv}, stiffness: 1", "", "axes.devices.csv", "no such file"),
+        ("devices: {csv: wrong.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "line 3: mass: got -1 kg"),
+        ("devices: {csv: short.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "line 2: damping is missing"),
+        ("devices: {csv: typo.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "did you mean 'damping'?"),
+        ("devices: {csv: empty.csv}, stiffness: 1, rate: 1", "", "axes.devices.csv", "0 rows"),
+        ("devices: {csv: wrong.csv, colums: {}}, stiffness: 1", "", "axes.devices.colums", "did you mean 'columns'?"),
+        ("devices: {csv: wrong.csv, columns: {mass: m}}, stiffness: 1", "", "axes.devices.csv", "headers"),
+        (
+            "alpha: {linear: {start: 0, stop: 1, num: 9999999}}, beta: {linear: {start: 0, stop: 1, num: 9999999}}, "
+            "delta: 1, d: 1",
+            "",
+            "studies[0]",
+            "at most 1e+12 points",
+        ),
+    ],
+)
+def test_faults_have_their_place(load, tmp_path, axes, rest, place, words):
+    (tmp_path / "wrong.csv").write_text("mass\n1\n-1\n", encoding="utf-8")
+    (tmp_path / "short.csv").write_text("mass,damping\n1\n", encoding="utf-8")
+    (tmp_path / "typo.csv").write_text("mass,dampng\n1,2\n", encoding="utf-8")
+    (tmp_path / "empty.csv").write_text("", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(sweep(axes, rest))
+    fields = [fault.field.removeprefix("studies[0].") for fault in caught.value.faults]
+    assert place in fields, str(caught.value)
+    assert words in str(caught.value)
+    for fault in caught.value.faults:
+        assert fault.line is not None
+        assert fault.remedy, str(fault)
+
+
+def test_the_shipped_schema_is_what_zwidth_schema_prints():
+    shipped = (ROOT / "src" / "zwidth" / "config" / "schema.json").read_text(encoding="utf-8")
+    assert shipped == json.dumps(config_json_schema(), indent=2) + "\n", (
+        "run: zwidth schema > src/zwidth/config/schema.json"
+    )
+
+
+@pytest.mark.parametrize("path", sorted((ROOT / "configs").glob("*.yaml")), ids=lambda path: path.stem)
+def test_every_shipped_configuration_names_its_schema(path):
+    first = path.read_text(encoding="utf-8").splitlines()[0]
+    marker = "# yaml-language-server: $schema="
+    assert first.startswith(marker)
+    assert (path.parent / first.removeprefix(marker)).resolve() == ROOT / "src" / "zwidth" / "config" / "schema.json"

@@ -1,0 +1,74 @@
+"""Quantities: every spelling of a unit, exact conversion, and spans in periods."""
+
+import pytest
+from pydantic_core import PydanticCustomError
+
+from zwidth.config.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Span, quantity
+
+
+@pytest.mark.parametrize(
+    "dimension, text, value",
+    [
+        (MASS, "0.1 kg", 0.1),
+        (MASS, "100g", 0.1),
+        (MASS, "  2.5e2   g ", 0.25),
+        (MASS, 0.1, 0.1),
+        (MASS, 2, 2.0),
+        (DAMPING, "10 N s/m", 10.0),
+        (DAMPING, "10 N*s/m", 10.0),
+        (DAMPING, "10 N·s/m", 10.0),
+        (DAMPING, "10 Ns/m", 10.0),
+        (DAMPING, "10 N s / m", 10.0),
+        (DAMPING, "10 kg/s", 10.0),
+        (DAMPING, "3 mN s/mm", 3.0),
+        (DAMPING, "3 mNs/m", 0.003),
+        (DAMPING, "3 N s/mm", 3000.0),
+        (TIME, "1 ms", 0.001),
+        (TIME, "0.3 ms", 0.0003),
+        (TIME, "7 us", 7e-6),
+        (TIME, "7 µs", 7e-6),
+        (TIME, "7 μs", 7e-6),
+        (STIFFNESS, "10 kN/m", 10e3),
+        (STIFFNESS, "-1.1 N/mm", -1100.0),
+        (RATE, "1.5 kHz", 1500.0),
+        (RATE, ".5e-3 MHz", 500.0),
+    ],
+)
+def test_a_quantity_is_the_number_nearest_to_what_is_written(dimension, text, value):
+    assert quantity(dimension)(text) == value
+
+
+@pytest.mark.parametrize(
+    "dimension, value",
+    [
+        (MASS, "0.1"),
+        (MASS, "kg"),
+        (MASS, "0.1 kg kg"),
+        (MASS, "0,1 kg"),
+        (MASS, "٣ kg"),
+        (MASS, "1e99999999 kg"),
+        (MASS, "1e999 kg"),
+        (MASS, "nan kg"),
+        (MASS, True),
+        (MASS, None),
+        (MASS, [1]),
+        (MASS, 10**400),
+        (TIME, "1 periods"),
+        (TIME, "1 m s"),
+        (TIME, "1 Ms"),
+        (STIFFNESS, "10 N s/m"),
+        (DAMPING, "10 N m/s"),
+    ],
+)
+def test_what_is_no_quantity(dimension, value):
+    with pytest.raises(PydanticCustomError):
+        quantity(dimension)(value)
+
+
+def test_spans():
+    assert Span(3.0, "periods").periods(1e-4) == 3.0
+    assert Span(3.0, "periods").seconds(0.5) == 1.5
+    assert Span(1.1e-3, "s").periods(1e-4) == 11.0
+    assert Span(1.1e-3, "s").seconds(1e-4) == 1.1e-3
+    assert str(Span(100.0, "periods")) == "100 periods"
+    assert str(Span(0.1 + 0.2, "s")) == "0.30000000000000004 s"

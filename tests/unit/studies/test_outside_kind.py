@@ -1,0 +1,87 @@
+"""A kind of study that the package does not know: one class, from outside, and it is run like every other."""
+
+import json
+from importlib.metadata import EntryPoint
+from typing import ClassVar, Literal
+
+import numpy as np
+import pytest
+
+import zwidth
+from sweeping import main_of
+from zwidth.config.axes import DeltaAxis
+from zwidth.errors import ConfigError, StoreError
+from zwidth.studies import ComputedStudy, Outcome, document, register
+
+
+class RatioStudy(ComputedStudy):
+    """How much stiffer the stiffest stable wall is than the stiffest passive one, without delay."""
+
+    what: ClassVar[str] = "a ratio study"
+    from_scene: ClassVar[tuple[str, ...]] = ("delta",)
+
+    kind: Literal["ratio"]
+
+    delta: DeltaAxis
+    """Normalized damping of the device, an axis; the scene's where left out."""
+
+    @property
+    def points(self):
+        return self.delta.size
+
+    @property
+    def nbytes(self):
+        return 16 * self.points
+
+    @property
+    def extent(self):
+        return f"delta = {self.points}"
+
+    def compute(self, scene, alone):
+        delta = self.delta.values()
+        # Eq. (21) of the paper: without delay the stiffest passive wall has alpha = 2 delta.
+        return Outcome(table={"delta": delta, "ratio": zwidth.alpha_max(delta, 0.0).alpha / (2 * delta)})
+
+
+CONFIG = "{version: 1, name: outside, scene: {delta: 0.5, d: 0}, studies: [{kind: ratio, name: r}]}"
+
+
+@pytest.fixture
+def config(tmp_path, monkeypatch):
+    monkeypatch.setattr(document, "KINDS", dict(document.KINDS))
+    file = tmp_path / "outside.yaml"
+    file.write_text(CONFIG, encoding="utf-8")
+    return file
+
+
+def test_it_is_run_resumed_and_refused_like_every_other(config, tmp_path, capsys):
+    register(RatioStudy)
+    out = tmp_path / "out"
+    assert main_of("run", config, "--dry-run", "--out", out) == 0
+    assert "study r\n  1 points (delta = 1)" in capsys.readouterr().out
+    assert main_of("run", config, "--out", out) == 0
+    header, row = (out / "r.csv").read_text(encoding="utf-8").split()
+    assert header == "delta,ratio"
+    np.testing.assert_allclose([float(text) for text in row.split(",")], [0.5, zwidth.alpha_max(0.5, 0).alpha / 1.0])
+    entry = json.loads((out / "run.json").read_text(encoding="utf-8"))["studies"][0]
+    assert (entry["kind"], entry["state"], list(entry["files"])) == ("ratio", "done", ["r.csv"])
+    assert [study.state for study in zwidth.run(config, out=out, resume=True).studies] == ["kept"]
+    config.write_text(CONFIG.replace("0.5", "0.6"), encoding="utf-8")
+    with pytest.raises(StoreError, match=r"studies\[r\]\.delta: the run was made with 0.5, the configuration has 0.6"):
+        zwidth.run(config, out=out, resume=True)
+
+
+def test_its_faults_are_told_and_its_schema_is_known(config):
+    register(RatioStudy)
+    config.write_text(CONFIG.replace("name: r", "name: r, delta: -1"), encoding="utf-8")
+    with pytest.raises(ConfigError, match=r"studies\[0\]\.delta: got -1"):
+        zwidth.load_config(config)
+    assert "RatioStudy" in document.config_json_schema()["$defs"]
+
+
+def test_a_package_brings_it_by_its_entry_point(config, monkeypatch):
+    with pytest.raises(ConfigError, match="got 'ratio'; the kinds are"):
+        zwidth.load_config(config)
+    found = EntryPoint("ratio", f"{__name__}:RatioStudy", "zwidth.studies")
+    monkeypatch.setattr(document, "entry_points", lambda group, name: [found] if name == "ratio" else [])
+    assert zwidth.load_config(config).studies[0].kind == "ratio"
