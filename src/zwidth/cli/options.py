@@ -7,29 +7,28 @@ from typing import Any
 
 import click
 
+from zwidth.quantities import PARAMETERS
+
 
 class Quantity(click.ParamType):
-    """A number in the SI base unit, or a number with a unit, as in configuration files."""
+    """A parameter of the loop: a number in its SI unit, or a number with a unit, as in configuration files."""
 
-    def __init__(self, dimension: str, *, positive: bool = False, negative: bool = False) -> None:
-        self.name = dimension.lower()
-        self.dimension = dimension
-        self.positive = positive
-        self.negative = negative
+    def __init__(self, name: str) -> None:
+        self.parameter = PARAMETERS[name]
+        self.name = self.parameter.unit
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Parse one option."""
         from pydantic_core import PydanticCustomError
 
-        from zwidth.config import fields, units
+        from zwidth.config.parameters import entry_of
 
-        allowed = fields.ANY if self.negative else (fields.POSITIVE if self.positive else fields.NOT_NEGATIVE)
         try:
             number: float | str = float(value)
         except ValueError:
             number = value
         try:
-            return units.quantity(getattr(units, self.dimension), allowed)(number)
+            return entry_of(self.parameter.name)(number)
         except PydanticCustomError as error:
             # The parts that a message leaves out stand as empty text between separators.
             self.fail("; ".join(part for part in error.message().split("; ") if part), param, ctx)
@@ -37,27 +36,18 @@ class Quantity(click.ParamType):
 
 def physical_options(*, wall: bool, required: bool) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """The options that describe a device, its timing and, where one is judged, its wall."""
-    options = [
-        click.option("--mass", type=Quantity("MASS", positive=True), required=required, help="m, in kg."),
-        click.option("--damping", type=Quantity("DAMPING"), default=0.0, show_default=True, help="b, in N s/m."),
-        click.option("--period", type=Quantity("TIME", positive=True), required=required, help="T, in s."),
-        click.option("--delay", type=Quantity("TIME"), default=0.0, show_default=True, help="t_d, in s."),
-    ]
-    if wall:
-        options[:0] = [
-            click.option("--stiffness", type=Quantity("STIFFNESS", negative=True), required=True, help="K, in N/m."),
-            click.option(
-                "--virtual-damping",
-                type=Quantity("DAMPING", negative=True),
-                default=0.0,
-                show_default=True,
-                help="B, in N s/m.",
-            ),
-        ]
+    names = (*(("stiffness", "virtual_damping") if wall else ()), "mass", "damping", "period", "delay")
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(options):
-            function = option(function)
+        for name in reversed(names):
+            parameter = PARAMETERS[name]
+            given: dict[str, Any] = {"type": Quantity(name), "help": f"{parameter.symbol}, in {parameter.unit}."}
+            # Without damping and delay a device is still one.
+            if name in ("damping", "delay", "virtual_damping"):
+                given |= {"default": 0.0, "show_default": True}
+            else:
+                given |= {"required": required or name == "stiffness"}
+            function = click.option(f"--{name.replace('_', '-')}", **given)(function)
         return function
 
     return decorate

@@ -17,21 +17,12 @@ from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonS
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, describe, problem, problems_of, short, suggestion, validation_error
-from zwidth.config.fields import (
-    ANY,
-    NOT_NEGATIVE,
-    Range,
-    Strict,
-    ValidationError,
-    number,
-    repeated,
-    whole_number,
-)
+from zwidth.config.fields import Strict, ValidationError, number, repeated, whole_number
+from zwidth.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
 
 LONGEST_AXIS = 10_000_000
 """More values than any result could use, few enough to be laid out in memory."""
 
-MAX_DELAY_PERIODS = 10_000.0
 """A loop has as many poles as its delay has periods, and a few more."""
 
 Entry: TypeAlias = Callable[[Any], float]

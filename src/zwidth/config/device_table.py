@@ -27,7 +27,8 @@ from zwidth.config.faults import (
     validation_error,
 )
 from zwidth.config.fields import looks_like_number
-from zwidth.config.parameters import PARAMETERS, delay_entries
+from zwidth.config.parameters import delay_entries, entry_of
+from zwidth.quantities import PARAMETERS
 
 LABEL = "label"
 MAX_ROWS = 100_000
@@ -134,7 +135,7 @@ def _below(key: str, error: Exception) -> Iterator[LocatedProblem]:
 def _column(key: str, cells: list[Any] | tuple[Any, ...], delay_unit: str) -> tuple[tuple[float, ...], str]:
     """One column in base units, and the unit of the delays."""
     if key != "delay":
-        return entries_of(cells, PARAMETERS[key].entry(), distinct=False), delay_unit
+        return entries_of(cells, entry_of(key), distinct=False), delay_unit
     entry, _, unit = delay_entries()
     values = entries_of(cells, entry, distinct=False)
     return values, unit()
@@ -257,7 +258,7 @@ def _parsed(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]
         if key == LABEL:
             labels = tuple(cell for _, cell in cells)
             continue
-        entry, _, delays_in = delay_entries() if key == "delay" else (PARAMETERS[key].entry(), None, lambda: "s")
+        entry, _, delays_in = delay_entries() if key == "delay" else (entry_of(key), None, lambda: "s")
         columns[key] = tuple(_cell(entry, cell, unit, f"{printable(name)}, line {line}: {key}") for line, cell in cells)
         delay_unit = delays_in() if key == "delay" else delay_unit
     return _checked(columns, labels, delay_unit)

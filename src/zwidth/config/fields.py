@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, Any, ClassVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, WithJsonSchema, model_validator
 from pydantic import ModelWrapValidatorHandler as Handler
@@ -21,6 +21,7 @@ from zwidth.config.faults import (
     suggestion,
     validation_error,
 )
+from zwidth.quantities import ANY, FRACTION, NOT_NEGATIVE, Range
 
 # One way only to match a run of digits: a second one costs quadratic time on a long run that fails in the end.
 _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
@@ -111,34 +112,6 @@ class Strict(BaseModel):
             if absent and path[0] in explained:
                 continue
             yield path, problem("missing", *cls.missing(str(path[0]))) if detail["type"] == "missing" else what
-
-
-class Range(NamedTuple):
-    """The admissible values of a number; the ends belong to it unless open."""
-
-    low: float = -math.inf
-    high: float = math.inf
-    low_open: bool = False
-    high_open: bool = False
-
-    def holds(self, value: float) -> bool:
-        """Whether a finite value is admissible."""
-        above = value > self.low if self.low_open else value >= self.low
-        return above and (value < self.high if self.high_open else value <= self.high)
-
-    def __str__(self) -> str:
-        ends = []
-        if self.low > -math.inf:
-            ends.append(f"{'greater than' if self.low_open else 'at least'} {self.low:g}")
-        if self.high < math.inf:
-            ends.append(f"{'less than' if self.high_open else 'at most'} {self.high:g}")
-        return " and ".join(ends)
-
-
-ANY = Range()
-NOT_NEGATIVE = Range(low=0.0)
-POSITIVE = Range(low=0.0, low_open=True)
-FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
 
 
 def looks_like_number(text: str) -> bool:

@@ -1,4 +1,4 @@
-"""The parameters that a sweep can vary, each described once: for the reader of the file, the store and the docs."""
+"""The parameters of `zwidth.quantities` as values and axes of a configuration."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 
-from zwidth.config.axes import MAX_DELAY_PERIODS, Axis, Entry, axis_of, axis_schema
+from zwidth.config.axes import Axis, Entry, axis_of, axis_schema
 from zwidth.config.faults import describe, problem
-from zwidth.config.fields import ANY, NOT_NEGATIVE, POSITIVE, Range, number
-from zwidth.config.scenes import PERIODS, RATES
+from zwidth.config.fields import number
 from zwidth.config.units import (
     DAMPING,
     MASS,
@@ -20,57 +19,20 @@ from zwidth.config.units import (
     STIFFNESS,
     TIME,
     Dimension,
+    dimension_of,
     quantity,
     span,
     unit_schema,
 )
+from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
 
 
-@dataclass(frozen=True)
-class Parameter:
-    """One quantity of the loop as a sweep knows it.
-
-    Args:
-        name: its name in files and stores.
-        long_name: what it is, for people.
-        dimension: its units; None for a normalized quantity.
-        allowed: its admissible values, in the base unit.
-    """
-
-    name: str
-    long_name: str
-    dimension: Dimension | None
-    allowed: Range
-
-    @property
-    def units(self) -> str:
-        """The unit that the store states."""
-        return "1" if self.dimension is None else self.dimension.base
-
-    def entry(self) -> Entry:
-        """A validator for one value."""
-        return number(self.allowed) if self.dimension is None else quantity(self.dimension, self.allowed)
-
-
-# In the order of a store's dimensions: a plane of walls lies together, at the end.
-_ALL = (
-    Parameter("period", "sampling period T", TIME, PERIODS),
-    Parameter("rate", "sampling rate 1/T", RATE, RATES),
-    Parameter("delay", "delay t_d from a sample to the moment its force acts", TIME, NOT_NEGATIVE),
-    Parameter("mass", "mass m of the device", MASS, POSITIVE),
-    Parameter("damping", "physical damping b of the device", DAMPING, NOT_NEGATIVE),
-    Parameter("d", "delay in sampling periods, t_d/T", None, Range(0.0, MAX_DELAY_PERIODS)),
-    Parameter("delta", "normalized damping of the device, b T/m", None, NOT_NEGATIVE),
-    Parameter("stiffness", "stiffness K of the virtual wall", STIFFNESS, ANY),
-    Parameter("alpha", "normalized stiffness of the virtual wall, K T^2/m", None, ANY),
-    Parameter("virtual_damping", "damping B of the virtual wall", DAMPING, ANY),
-    Parameter("beta", "normalized damping of the virtual wall, B T/m", None, ANY),
-)
-PARAMETERS = {parameter.name: parameter for parameter in _ALL}
-
-NORMALIZED = ("alpha", "beta", "delta", "d")
-PHYSICAL = tuple(name for name in PARAMETERS if name not in NORMALIZED)
-WALL = ("alpha", "beta", "stiffness", "virtual_damping")
+def entry_of(name: str) -> Entry:
+    """A validator for one value of a parameter."""
+    parameter = PARAMETERS[name]
+    if parameter.unit == "1":
+        return number(parameter.allowed)
+    return quantity(dimension_of(parameter.unit), parameter.allowed)
 
 
 @dataclass(frozen=True)
@@ -142,11 +104,10 @@ def _delays(raw: Any) -> DelayValues:
 
 def _reader(name: str) -> Callable[[Any], Axis]:
     """A validator for an axis of a parameter in SI units."""
-    parameter = PARAMETERS[name]
-    dimension, allowed = parameter.dimension, parameter.allowed
-    assert dimension is not None, "a normalized parameter has an annotation already"
+    allowed = PARAMETERS[name].allowed
     low = max(allowed.low, 0.0)
-    return axis_of(parameter.entry(), quantity(dimension, Range(low, allowed.high, low_open=low == 0.0)))
+    positive = Range(low, allowed.high, low_open=low == 0.0)
+    return axis_of(entry_of(name), quantity(dimension_of(PARAMETERS[name].unit), positive))
 
 
 def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:

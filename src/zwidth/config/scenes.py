@@ -9,9 +9,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DELAY_MODELS, DelayModel
-from zwidth.config.axes import MAX_DELAY_PERIODS
 from zwidth.config.faults import LocatedProblem, describe, listing, problem, short
-from zwidth.config.fields import NonNegative, Number, Range, Strict, Text, number, one_of
+from zwidth.config.fields import NonNegative, Number, Strict, Text, number, one_of
 from zwidth.config.units import (
     PERIOD_SCHEMA,
     RATE,
@@ -27,14 +26,12 @@ from zwidth.config.units import (
 )
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.errors import InputError
+from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
 from zwidth.scene import Device, Scene, Timing, VirtualWall, normalize
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping"})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
 
-# Wide enough for any sampled loop, narrow enough that T^2 and 1/T^2 stay within float64.
-PERIODS = Range(1e-12, 1e9)
-RATES = Range(1e-9, 1e12)
 
 AnyDelayModel = Annotated[DelayModel, BeforeValidator(one_of(*DELAY_MODELS))]
 

@@ -10,8 +10,9 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
 
 from zwidth.config.faults import describe, problem, short, suggestion
-from zwidth.config.fields import ANY, NOT_NEGATIVE, POSITIVE, Range, check_range, looks_like_number, to_float
+from zwidth.config.fields import check_range, looks_like_number, to_float
 from zwidth.domain import SI_RANGE
+from zwidth.quantities import ANY, NOT_NEGATIVE, POSITIVE, Range
 from zwidth.scene import normalize
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
@@ -37,8 +38,14 @@ DAMPING = Dimension(
     {"N s/m": 0, "mN s/m": -3, "kN s/m": 3, "N s/mm": 3, "mN s/mm": 0, "N s/cm": 2, "kg/s": 0}, "10 N s/m"
 )
 STIFFNESS = Dimension({"N/m": 0, "mN/m": -3, "kN/m": 3, "MN/m": 6, "N/mm": 3, "kN/mm": 6, "N/cm": 2}, "10 kN/m")
+_OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS)}
 
 _PERIODS = ("periods", "period")
+
+
+def dimension_of(unit: str) -> Dimension:
+    """The units beside an SI base unit."""
+    return _OF_UNIT[unit]
 
 
 class Span(NamedTuple):

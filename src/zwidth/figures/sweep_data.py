@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 
-Look = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
-"""Truth values; numbers with a good and a bad side; numbers; positive ones; and those that grow without end."""
+from zwidth.quantities import Look
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from zwidth.figures.curves import draw_curves, draw_outlines
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.style import si_unit
 from zwidth.figures.sweep_data import CurvesData, Panel, PlaneData, Quantity, Scale
-from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF
-from zwidth.config.parameters import WALL
+from zwidth.quantities import PARAMETERS
+from zwidth.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF
+from zwidth.quantities import WALL
 from zwidth.sweep.store import SUFFIX, find_stores, open_dataset
 
 if TYPE_CHECKING:
@@ -36,39 +37,8 @@ _MANY_PANELS = 9
 _SURFACE = 6
 _OUTLINES = 9
 
-# parameter -> words, symbol
-_AXES = {
-    "alpha": ("normalized stiffness", r"\alpha"),
-    "beta": ("normalized virtual damping", r"\beta"),
-    "delta": ("normalized physical damping", r"\delta"),
-    "d": ("delay in periods", "d"),
-    "stiffness": ("stiffness", "K"),
-    "virtual_damping": ("virtual damping", "B"),
-    "mass": ("mass", "m"),
-    "damping": ("physical damping", "b"),
-    "period": ("sampling period", "T"),
-    "rate": ("sampling rate", "1/T"),
-    "delay": ("delay", "t_d"),
-}
-_DEFINITIONS = {"alpha": r"K\,T^2\!/m", "beta": r"B\,T/m", "delta": r"b\,T/m", "d": "t_d/T"}
 # What an axis of a plane is, rather than a choice of panels: the first two that vary.
 _ORDER = ("alpha", "stiffness", "beta", "virtual_damping", "delta", "damping", "d", "delay", "rate", "period", "mass")
-# output -> words, symbol, and how it is drawn
-_QUANTITIES = {
-    "spectral_radius": ("spectral radius", r"\rho", "diverging", 1.0, True),
-    "margin": ("margin", r"1 - \rho", "diverging", 0.0, False),
-    "decay_rate": ("rate of decay", r"-\ln\rho", "diverging", 0.0, False),
-    "gain_margin": ("gain margin", "g_m", "logarithmic", 0.0, False),
-    "phase_margin": ("phase margin", r"\varphi_m", "diverging", 0.0, False),
-    "delay_margin": ("delay margin", r"\tau_m", "logarithmic", 0.0, False),
-    "modulus_margin": ("modulus margin", "s_m", "sequential", 0.0, False),
-    "passivity_margin": ("passivity margin, in units of", r"\delta", "diverging", 0.0, False),
-    "settling_time": ("settling time to 2 %", r"t_s", "steep", 0.0, False),
-    "alpha_max": ("maximum stable stiffness", r"\alpha_{\max}", "logarithmic", 0.0, False),
-    "beta_at_max": ("virtual damping of that wall", r"\beta", "sequential", 0.0, False),
-    "stiffness_max": ("maximum stable stiffness", r"K_{\max}", "logarithmic", 0.0, False),
-    "virtual_damping_at_max": ("virtual damping of that wall", "B", "sequential", 0.0, False),
-}
 # The boundary by the first of these that a store has: a number gives a smoother line than a truth value.
 _BOUNDARIES = (("margin", 0.0), ("spectral_radius", 1.0), ("stable", 0.5))
 
@@ -180,22 +150,24 @@ class _View:
 
     def _scale(self, name: str) -> Scale:
         """A parameter as an axis."""
-        words, symbol = _AXES[name]
+        parameter = PARAMETERS[name]
         values = np.asarray(self.data[name].values, dtype=float)
         unit = str(self.data[name].attrs.get("units", "1"))
         factor, unit = _readable(values, unit)
-        label = f"{words}  ${symbol}{f' = {_DEFINITIONS[name]}' if name in _DEFINITIONS else ''}$"
+        definition = f" = {parameter.definition}" if parameter.definition else ""
+        label = f"{parameter.words}  ${parameter.symbol}{definition}$"
         steps = values[1:] / values[:-1] if values.ndim and values.size > 2 and (values > 0).all() else np.empty(0)
         spaced = bool(steps.size and np.allclose(steps, steps[0], rtol=1e-6) and not np.isclose(steps[0], 1.0))
         plain_unit = "periods" if unit == "sampling periods" else unit
-        return Scale(name, symbol, label + (f"  in {unit}" if unit else ""), plain_unit, values * factor, spaced)
+        return Scale(name, parameter.symbol, label + (f"  in {unit}" if unit else ""), plain_unit, values * factor, spaced)
 
     def _quantity(self, name: str) -> Quantity:
-        if name not in _QUANTITIES:
+        output = OUTPUTS[name]
+        if output.look == "truth":
             return Quantity(name, name, "truth")
-        words, symbol, look, center, below = _QUANTITIES[name]
         unit = self._factor(name)[1]
-        return Quantity(name, f"{words}  ${symbol}$" + (f"  in {unit}" if unit else ""), look, center, below)  # pyright: ignore[reportArgumentType]
+        label = f"{output.words}  ${output.symbol}$" + (f"  in {unit}" if unit else "")
+        return Quantity(name, label, output.look, output.center, output.below)
 
     def _factor(self, name: str) -> tuple[float, str]:
         """The unit that a variable is drawn in."""

@@ -12,7 +12,7 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
-    SerializeAsAny,
+    SerializationInfo,
     TypeAdapter,
     WithJsonSchema,
     WrapValidator,
@@ -96,9 +96,11 @@ class _OfAnyKind:
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return core_schema.no_info_plain_validator_function(
-            _study, serialization=core_schema.plain_serializer_function_ser_schema(lambda study: study.model_dump())
-        )
+        def spelled(study: Study, info: SerializationInfo) -> dict[str, Any]:
+            return study.model_dump(mode=info.mode, exclude_none=info.exclude_none)
+
+        serialization = core_schema.plain_serializer_function_ser_schema(spelled, info_arg=True)
+        return core_schema.no_info_plain_validator_function(_study, serialization=serialization)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -134,7 +136,7 @@ class Config(Strict):
     scene: SceneField | None = None
     """Device, timing and wall that supply what a study leaves out."""
 
-    studies: Annotated[tuple[Annotated[SerializeAsAny[Study], _OfAnyKind], ...], WrapValidator(members("studies"))]
+    studies: Annotated[tuple[Annotated[Study, _OfAnyKind], ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
 
     @classmethod

@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Fraction, Range, members, whole_number
+from zwidth.config.fields import Fraction, members, whole_number
 from zwidth.config.scenes import (
     AnyDevice,
     AnyScene,
@@ -29,6 +29,7 @@ from zwidth.config.study import HeldOnly, figure_layout
 from zwidth.config.units import Duration, Span
 from zwidth.figures.data import Response, StepData
 from zwidth.formatting import plain, with_unit
+from zwidth.quantities import Range
 from zwidth.response import step_response
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.outcome import ComputedStudy, Outcome, stack

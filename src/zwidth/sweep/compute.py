@@ -16,6 +16,7 @@ from typing import TypeAlias
 import numpy as np
 
 from zwidth.batching import FEW
+from zwidth.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.decay import decay_rate
 from zwidth.stability.margins import margins
@@ -24,7 +25,6 @@ from zwidth.stability.proved import proved_radii
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
-from zwidth.sweep.outputs import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 Columns: TypeAlias = tuple[np.ndarray, ...]
 

@@ -9,9 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.config.device_table import LABEL
-from zwidth.config.parameters import PARAMETERS, WALL
+from zwidth.quantities import PARAMETERS, WALL, Family
 from zwidth.scene import normalize
-from zwidth.sweep.outputs import Family
 from zwidth.sweep.study import SweepStudy
 
 
@@ -84,7 +83,7 @@ class Grid:
             labels = table.labels or tuple(str(row) for row in range(1, table.size + 1))
             found["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
         for name, values in self._values.items():
-            units = "sampling periods" if name == "delay" and self.delay_in_periods else PARAMETERS[name].units
+            units = "sampling periods" if name == "delay" and self.delay_in_periods else PARAMETERS[name].unit
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
             if table is not None and name in table.columns:
                 found[name] = (("device",), values, attributes)

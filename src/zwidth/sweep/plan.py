@@ -14,8 +14,8 @@ import numpy as np
 
 from zwidth.errors import ResourceError
 from zwidth.files.whole import check_folder, existing
+from zwidth.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.sweep.grid import Grid
-from zwidth.sweep.outputs import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.sweep.study import SweepStudy
 
 MEMORY = 2**28

@@ -27,8 +27,8 @@ import numpy as np
 from zwidth.errors import InputError, StoreError, StoreExistsError
 from zwidth.files.provenance import digest
 from zwidth.files.whole import checksum, write_whole
+from zwidth.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.sweep.grid import Grid
-from zwidth.sweep.outputs import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.study import SweepStudy
 

@@ -9,15 +9,11 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import MAX_DELAY_PERIODS, AnyAxis, Axis, DelayAxis, DeltaAxis, PointAxis
+from zwidth.config.axes import AnyAxis, Axis, DelayAxis, DeltaAxis, PointAxis
 from zwidth.config.device_table import Table, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Range, Strict, members, number, one_of
+from zwidth.config.fields import Strict, members, number, one_of
 from zwidth.config.parameters import (
-    NORMALIZED,
-    PARAMETERS,
-    PHYSICAL,
-    WALL,
     DampingAxis,
     DelayValues,
     MassAxis,
@@ -29,7 +25,17 @@ from zwidth.config.parameters import (
 )
 from zwidth.config.scenes import AnyScene, PhysicalScene
 from zwidth.config.study import HeldOnly, Study
-from zwidth.sweep.outputs import OUTPUTS, STATUS_OF, Family
+from zwidth.quantities import (
+    MAX_DELAY_PERIODS,
+    NORMALIZED,
+    OUTPUTS,
+    PARAMETERS,
+    PHYSICAL,
+    STATUS_OF,
+    WALL,
+    Family,
+    Range,
+)
 
 MAX_SWEEP_POINTS = 10**12
 
