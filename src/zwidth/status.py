@@ -27,7 +27,7 @@ class Status(IntEnum):
 
 
 class Method(IntEnum):
-    """What decided a point, as the code in `zwidth.stability_of` and, below `zwidth.stability`, `radius_of`, `poles_of`."""
+    """What decided a point, in `zwidth.stability_of`, `zwidth.stability.radii.radius_of` and `.poles.poles_of`."""
 
     COMPANION = 0
     CROSSOVER = 1

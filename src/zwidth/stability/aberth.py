@@ -42,14 +42,12 @@ class ProductForm(NamedTuple):
         return self.power + 2
 
 
-def product_form(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool, axis: int
-) -> ProductForm:
-    """The polynomial of every wall, with a new axis for its poles; of walls with ``spring`` beta is 0."""
+def product_form(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> ProductForm:
+    """The polynomial of every wall, with a new first axis for its poles; of walls with ``spring`` beta is 0."""
     xp = namespace(alpha, beta, delta, d)
     plant = plant_of(delta, d, degree)
     n = (plant.a2, plant.a1, plant.a0)[: 3 if degree.fractional else 2]
-    c, alpha, beta, *n = (xp.expand_dims(xp.asarray(part), axis) for part in (plant.c, alpha, beta, *n))
+    c, alpha, beta, *n = (xp.asarray(part)[None] for part in (plant.c, alpha, beta, *n))
     return ProductForm(degree.poles - 2 - spring, c, tuple(n), alpha, None if spring else beta)
 
 
@@ -156,7 +154,7 @@ def _start(form: ProductForm) -> Array:
     around = form.power
     last = form.alpha if form.beta is None else form.beta
     r = xp.clip(xp.abs(form.n[-1] * last) ** (1.0 / max(around, 1)), 0.02, 3.0)
-    # No two are each other's conjugates: a set that is symmetric stays so, and could not change its number of real ones.
+    # No two are each other's conjugates: a symmetric set stays so, and could not change how many of it are real.
     circle = np.exp(1j * (2.0 * np.pi * np.arange(around) / max(around, 1) + 0.4)).reshape(-1, *[1] * (r.ndim - 1))
     return xp.concatenate([r * circle, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
 
@@ -185,7 +183,7 @@ def discs(z: Array, form: ProductForm) -> tuple[Array, Array, Array]:
 
 
 def aberth(form: ProductForm) -> tuple[Array, Array, Array]:
-    """All poles along a first axis, how far off each is at most, and whether that is proved and all digits are there."""
+    """All poles along a first axis, how far off each is at most, and whether that is proved and no digit is missing."""
     xp = namespace(form.c)
     z = repeat(_FIRST_STEPS + form.poles // 2, lambda z: _step(z, form), _start(form), xp)
     within, proved, settled = discs(z, form)

@@ -81,10 +81,10 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
 
 
 def _polished(z: Array, alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
-    """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays as it is."""
+    """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
     walls, spoiled = _in_range(alpha, beta, delta, d, degree)
-    form = product_form(*walls, degree, spring, axis=0)
+    form = product_form(*walls, degree, spring)
 
     def step(z: Array) -> Array:
         here = split(z)
@@ -104,11 +104,14 @@ def _square(z: Any) -> Array:
     return z.re * z.re + z.im * z.im
 
 
-def _in_range(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> tuple[tuple[Array, ...], Array]:
+def _in_range(
+    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree
+) -> tuple[tuple[Array, Array, Array, Array], Array]:
     """Walls that can be computed, and what to add to the results of those that could not."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d)
-    inside = (*(xp.where(ok, value, 0.0) for value in (alpha, beta, delta)), xp.where(ok, d, float(degree.whole)))
+    alpha_in, beta_in, delta_in = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    inside = (alpha_in, beta_in, delta_in, xp.where(ok, d, float(degree.whole)))
     return inside, poison(ok, alpha, beta, delta, d)
 
 
@@ -159,8 +162,21 @@ def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ...]) -> 
     _check(values)
     static = (is_spring(values[1]),)
     if is_traced(*values):
-        return by_degree(kernel, values, static=(*static, pole_kernel))
+        return by_degree(_inside_jax(kernel), values, static=(*static, pole_kernel))
     return by_degree(_by_companion, values, static=(*static, kernel), few=lambda degree: sys.maxsize)
+
+
+@cache
+def _inside_jax(kernel: Callable[..., Any]) -> Any:
+    """The kernel as one program: differentiated outside `jit`, every operation would be compiled alone."""
+    import jax
+
+    return jax.jit(kernel, static_argnums=(4, 5, 6))
+
+
+def _found_poles(*arguments: Any) -> Array:
+    *wall, find = arguments
+    return find(*wall)
 
 
 def _by_companion(*arguments: Any) -> Any:
@@ -254,7 +270,7 @@ def poles(
             "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"
         )
     if method == "companion" or is_traced(*values):
-        return _of_all_poles(lambda *arguments: arguments[-1](*arguments[:-1]), values)
+        return _of_all_poles(_found_poles, values)
     return _found(values, method).z
 
 
@@ -278,8 +294,8 @@ def poles_of(
         delay: only "held" has poles.
 
     Returns:
-        Poles: ``z`` as `zwidth.poles` has it; ``within``, of the same shape: where the status is OK, in the disc of this
-        radius round each pole lies exactly one pole of the loop, rounding errors included. ``status``: INVALID_INPUT
+        Poles: ``z`` as `zwidth.poles` has it; ``within``, of the same shape: where the status is OK, exactly one pole
+        of the loop lies in the disc of this radius round each, rounding errors included. ``status``: INVALID_INPUT
         or OUT_OF_RANGE with NaN; NOT_CONVERGED where the discs are not disjoint (next to multiple poles): all poles
         lie in their union, and ``within`` says no more. ``method``: the `Method` of each wall.
 
@@ -308,15 +324,16 @@ def _found(values: tuple[ArrayLike, ...], method: str) -> Poles:
 
 def _found_on_host(*arguments: Any) -> Poles:
     """Poles of NumPy columns of one degree, by Aberth's iteration where it pays and by eigenvalues where it must."""
-    *columns, degree, spring, method = arguments
-    of_input = wall_status(*columns)
+    alpha, beta, delta, d, degree, spring, method = arguments
+    columns = [alpha, beta, delta, d]
+    of_input = wall_status(alpha, beta, delta, d)
     few = of_input.size <= few_poles(degree)
     if method == "companion" or (method == "auto" and (few or degree.poles > _MOST_AT_ONE_TIME)):
         z, within, proved = _by_companion(*columns, degree, spring, _disc_kernel)
         used = np.full_like(of_input, Method.COMPANION)
     else:
         if few:
-            z, within, proved = _aberth_kernel(*columns, degree, spring)
+            z, within, proved = _aberth_kernel(alpha, beta, delta, d, degree, spring)
         else:
             block = _block(_NUMBERS // degree.poles)
             z, within, proved = in_blocks(_compiled(_aberth_kernel, degree, spring), columns, block)
@@ -330,21 +347,24 @@ def _found_on_host(*arguments: Any) -> Poles:
     return Poles(z, within, status, used)
 
 
-def _disc_kernel(*arguments: Any) -> tuple[Array, Array, Array]:
+def _disc_kernel(
+    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool, find: Any
+) -> tuple[Array, Array, Array]:
     """Poles, their discs, and whether these are disjoint."""
-    *columns, degree, spring, find = arguments
-    z = find(*columns, degree, spring)
+    z = find(alpha, beta, delta, d, degree, spring)
     xp = namespace(z)
-    walls, spoiled = _in_range(*columns, degree)
-    within, proved, _ = discs(xp.moveaxis(z[..., :-1] if spring else z, -1, 0), product_form(*walls, degree, spring, 0))
+    walls, spoiled = _in_range(alpha, beta, delta, d, degree)
+    first = xp.moveaxis(z[..., :-1] if spring else z, -1, 0)
+    within, proved, _ = discs(first, product_form(*walls, degree, spring))
     return z, _with_zero(xp.moveaxis(within, 0, -1), spring) + spoiled[..., None], proved
 
 
-def _aberth_kernel(*arguments: Any) -> tuple[Array, Array, Array]:
+def _aberth_kernel(
+    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool
+) -> tuple[Array, Array, Array]:
     """Poles of columns of walls, their discs, and whether these are proved to hold one each."""
-    *columns, degree, spring = arguments
-    walls, spoiled = _in_range(*columns, degree)
-    z, within, proved = aberth(product_form(*walls, degree, spring, axis=0))
+    walls, spoiled = _in_range(alpha, beta, delta, d, degree)
+    z, within, proved = aberth(product_form(*walls, degree, spring))
     xp = namespace(z)
     z, within = (_with_zero(xp.moveaxis(part, 0, -1), spring) + spoiled[:, None] for part in (z, within))
     return z, within, proved
@@ -384,12 +404,12 @@ def _bound_kernel(
     poles = find(alpha, beta, delta, d, degree, spring)
     size = xp.abs(poles)
     largest = xp.argmax(xp.where(xp.isnan(size), 0.0, size), axis=-1)[..., None]
-    z = split(xp.take_along_axis(poles, largest, axis=-1))
+    z = split(xp.take_along_axis(poles, largest, axis=-1)[..., 0][None])
     radius = xp.where(alpha == 0, xp.maximum(xp.max(size, axis=-1), 1.0), xp.max(size, axis=-1))
-    form = product_form(alpha, beta, delta, d, degree, spring, axis=-1)
+    form = product_form(alpha, beta, delta, d, degree, spring)
     value, slope = evaluate(z, form)
     off = xp.sqrt(_square(value)) + rounding(z, form, 2.2e-16)
-    error = (degree.poles * off / xp.sqrt(_square(slope)))[..., 0] + 4e-16 * radius
+    error = (degree.poles * off / xp.sqrt(_square(slope)))[0] + 4e-16 * radius
     status = wall_status(alpha, beta, delta, d)
     bounded = xp.isfinite(error)
     status = xp.where((status == Status.OK) & ~bounded, np.int32(Status.NOT_CONVERGED), status)
