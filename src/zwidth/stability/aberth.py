@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.grouping import Degree
-from zwidth.loop import plant_of
+from zwidth.loop import plant_of, poison, valid_wall
 from zwidth.stability.pole_derivative import Complex
 from zwidth.xp import epsilon, namespace, repeat
 
@@ -182,12 +182,35 @@ def discs(z: Array, form: ProductForm) -> tuple[Array, Array, Array]:
     return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
 
 
-def aberth(form: ProductForm) -> tuple[Array, Array, Array]:
-    """All poles along a first axis, how far off each is at most, and whether that is proved and no digit is missing."""
+def in_range(
+    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree
+) -> tuple[tuple[Array, Array, Array, Array], Array]:
+    """Walls that can be computed, and what to add to the results of those that could not."""
+    xp = namespace(alpha, beta, delta, d)
+    ok = valid_wall(alpha, beta, delta, d)
+    alpha_in, beta_in, delta_in = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    inside = (alpha_in, beta_in, delta_in, xp.where(ok, d, float(degree.whole)))
+    return inside, poison(ok, alpha, beta, delta, d)
+
+
+def with_zero(poles: Array, spring: bool) -> Array:
+    """The pole 0 of walls without virtual damping, which is not computed."""
+    xp = namespace(poles)
+    return xp.concatenate([poles, xp.zeros_like(poles[..., :1])], axis=-1) if spring else poles
+
+
+def aberth_kernel(
+    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool
+) -> tuple[Array, Array, Array]:
+    """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
+    walls, spoiled = in_range(alpha, beta, delta, d, degree)
+    form = product_form(*walls, degree, spring)
     xp = namespace(form.c)
     z = repeat(_FIRST_STEPS + form.poles // 2, lambda z: _step(z, form), _start(form), xp)
     within, proved, settled = discs(z, form)
     # A disc on the real axis that holds one pole holds a real one, unless the pole's conjugate is in a disc close by.
     real = xp.abs(z.imag) <= within
     within = within + xp.where(real, xp.abs(z.imag), 0.0)
-    return join(z.real, xp.where(real, 0.0, z.imag)), within, proved & settled
+    z = join(z.real, xp.where(real, 0.0, z.imag))
+    z, within = (with_zero(xp.moveaxis(part, 0, -1), spring) + spoiled[..., None] for part in (z, within))
+    return z, within, proved & settled

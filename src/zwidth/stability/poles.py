@@ -14,13 +14,22 @@ from zwidth.batching import as_float64, in_blocks, is_traced
 from zwidth.domain import LONGEST_DELAY, check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES, Degree, by_degree, degree_of, few_poles
-from zwidth.loop import check_has_poles, coefficients, poison, valid_wall
-from zwidth.stability.aberth import aberth, discs, evaluate, join, product_form, rounding, split
+from zwidth.loop import check_has_poles, coefficients
+from zwidth.stability.aberth import (
+    aberth_kernel,
+    discs,
+    evaluate,
+    in_range,
+    join,
+    product_form,
+    rounding,
+    split,
+    with_zero,
+)
 from zwidth.status import Method, Status
 from zwidth.xp import namespace, repeat
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
-POLE_METHODS: tuple[str, ...] = get_args(PoleMethod)
 
 # The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
 _POLISHING_STEPS = 3
@@ -60,13 +69,12 @@ def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degre
     """
     matrices = _matrices(alpha, beta, delta, d, degree, spring)
     xp = namespace(matrices)
-    return _polished(
-        _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices), alpha, beta, delta, d, degree, spring
-    )
+    z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
+    return _polished(z, alpha, beta, delta, d, degree, spring)
 
 
 def _matrices(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
-    monic = coefficients(*_in_range(alpha, beta, delta, d, degree)[0], degree)
+    monic = coefficients(*in_range(alpha, beta, delta, d, degree)[0], degree)
     return companion(monic[..., :-1] if spring else monic)
 
 
@@ -83,7 +91,7 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
 def _polished(z: Array, alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
     """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
-    walls, spoiled = _in_range(alpha, beta, delta, d, degree)
+    walls, spoiled = in_range(alpha, beta, delta, d, degree)
     form = product_form(*walls, degree, spring)
 
     def step(z: Array) -> Array:
@@ -97,28 +105,11 @@ def _polished(z: Array, alpha: Array, beta: Array, delta: Array, d: Array, degre
     first = xp.moveaxis(z, -1, 0)
     last = repeat(_POLISHING_STEPS, step, first, xp)
     better = _square(evaluate(split(last), form)[0]) < _square(evaluate(split(first), form)[0])
-    return _with_zero(xp.moveaxis(xp.where(better, last, first), 0, -1), spring) + spoiled[..., None]
+    return with_zero(xp.moveaxis(xp.where(better, last, first), 0, -1), spring) + spoiled[..., None]
 
 
 def _square(z: Any) -> Array:
     return z.re * z.re + z.im * z.im
-
-
-def _in_range(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree
-) -> tuple[tuple[Array, Array, Array, Array], Array]:
-    """Walls that can be computed, and what to add to the results of those that could not."""
-    xp = namespace(alpha, beta, delta, d)
-    ok = valid_wall(alpha, beta, delta, d)
-    alpha_in, beta_in, delta_in = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
-    inside = (alpha_in, beta_in, delta_in, xp.where(ok, d, float(degree.whole)))
-    return inside, poison(ok, alpha, beta, delta, d)
-
-
-def _with_zero(poles: Array, spring: bool) -> Array:
-    """The pole 0 of walls without virtual damping, which is not computed."""
-    xp = namespace(poles)
-    return xp.concatenate([poles, xp.zeros_like(poles[..., :1])], axis=-1) if spring else poles
 
 
 def radius_kernel(
@@ -152,7 +143,7 @@ def check_degree(d: ArrayLike) -> None:
 
 def _check(values: tuple[ArrayLike, ...], delay: str = "held", method: str = "companion") -> None:
     check_has_poles(delay)
-    check_choice("method", method, POLE_METHODS)
+    check_choice("method", method, get_args(PoleMethod))
     check_scalars(**dict(zip(NAMES, values, strict=True)))
     check_degree(values[3])
 
@@ -213,7 +204,7 @@ def _block(most: int) -> int:
 
 def companion_chunk(degree: Degree) -> int:
     """How many companion matrices fit into about 32 MiB."""
-    return max(1, 1 << ((1 << 22) // degree.poles**2).bit_length() - 1)
+    return _block((1 << 22) // degree.poles**2)
 
 
 def poles(
@@ -333,10 +324,10 @@ def _found_on_host(*arguments: Any) -> Poles:
         used = np.full_like(of_input, Method.COMPANION)
     else:
         if few:
-            z, within, proved = _aberth_kernel(alpha, beta, delta, d, degree, spring)
+            z, within, proved = aberth_kernel(alpha, beta, delta, d, degree, spring)
         else:
             block = _block(_NUMBERS // degree.poles)
-            z, within, proved = in_blocks(_compiled(_aberth_kernel, degree, spring), columns, block)
+            z, within, proved = in_blocks(_compiled(aberth_kernel, degree, spring), columns, block)
         used = np.full_like(of_input, Method.ABERTH)
         left = np.flatnonzero(~proved & (of_input == Status.OK))
         if left.size:
@@ -353,21 +344,10 @@ def _disc_kernel(
     """Poles, their discs, and whether these are disjoint."""
     z = find(alpha, beta, delta, d, degree, spring)
     xp = namespace(z)
-    walls, spoiled = _in_range(alpha, beta, delta, d, degree)
+    walls, spoiled = in_range(alpha, beta, delta, d, degree)
     first = xp.moveaxis(z[..., :-1] if spring else z, -1, 0)
     within, proved, _ = discs(first, product_form(*walls, degree, spring))
-    return z, _with_zero(xp.moveaxis(within, 0, -1), spring) + spoiled[..., None], proved
-
-
-def _aberth_kernel(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool
-) -> tuple[Array, Array, Array]:
-    """Poles of columns of walls, their discs, and whether these are proved to hold one each."""
-    walls, spoiled = _in_range(alpha, beta, delta, d, degree)
-    z, within, proved = aberth(product_form(*walls, degree, spring))
-    xp = namespace(z)
-    z, within = (_with_zero(xp.moveaxis(part, 0, -1), spring) + spoiled[:, None] for part in (z, within))
-    return z, within, proved
+    return z, with_zero(xp.moveaxis(within, 0, -1), spring) + spoiled[..., None], proved
 
 
 def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
