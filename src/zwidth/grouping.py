@@ -40,7 +40,9 @@ def groups(d: np.ndarray) -> Iterator[tuple[Degree, np.ndarray]]:
     defined = np.where((d >= 0) & (d <= LONGEST_DELAY), d, 0.0)
     # Twice the whole part, plus one where a fraction remains, orders the degrees.
     code = 2.0 * np.floor(defined) + (defined != np.floor(defined))
-    for value in np.unique(code):
+    # One degree is the common case, and to sort a million codes takes as long as some kernels.
+    alike = code.size > 0 and code.min() == code.max()
+    for value in code[:1] if alike else np.unique(code):
         yield Degree(int(value // 2), bool(value % 2)), np.flatnonzero(code == value)
 
 
@@ -70,7 +72,7 @@ def by_degree(
     columns = [array.ravel() for array in arrays]
     parts, places = [], []
     for degree, index in groups(columns[-1]):
-        picked = [column[index] for column in columns]
+        picked = columns if index.size == columns[-1].size else [column[index] for column in columns]
         if few is not None and index.size <= few(degree):
             with np.errstate(all="ignore"):
                 parts.append(kernel(*picked, degree, *static))
@@ -83,7 +85,7 @@ def by_degree(
     shape = arrays[0].shape
 
     def gather(*leaves: np.ndarray) -> np.ndarray:
-        joined = np.concatenate(_same_length(list(leaves), lead, np))[order]
+        joined = leaves[0] if len(leaves) == 1 else np.concatenate(_same_length(list(leaves), lead, np))[order]
         return joined.reshape(shape + joined.shape[1:])
 
     return batching.to_caller(batching.tree_map(gather, *parts), values)

@@ -63,23 +63,6 @@ def coefficients(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degr
     return parts.D + alpha[..., None] * parts.N1 + beta[..., None] * parts.N2
 
 
-def evaluate(z: Array, alpha: Array, beta: Array, plant: Plant, degree: Degree) -> tuple[Array, Array]:
-    """P(z) and P'(z) in the factored form, whose rounding errors stay small where the coefficients cancel."""
-    power = degree.whole + (2 if degree.fractional else 1)
-    lag = z ** (power - 1)
-    quadratic = (z - 1.0) * (z - plant.c)
-    if degree.fractional:
-        n = (plant.a2 * z + plant.a1) * z + plant.a0
-        dn = 2.0 * plant.a2 * z + plant.a1
-    else:
-        n = plant.a2 * z + plant.a1
-        dn = plant.a2
-    wall = alpha * z + beta * (z - 1.0)
-    value = z * lag * quadratic + n * wall
-    slope = lag * (power * quadratic + z * (2.0 * z - (1.0 + plant.c))) + dn * wall + n * (alpha + beta)
-    return value, slope
-
-
 class BoundaryCurve(NamedTuple):
     """A point of the boundary curve: the wall whose loop has a pole pair at e^(+-j omega)."""
 

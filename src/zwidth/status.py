@@ -27,12 +27,13 @@ class Status(IntEnum):
 
 
 class Method(IntEnum):
-    """What decided a point, as the code in `zwidth.stability_of` and `zwidth.stability.radii.radius_of`."""
+    """What decided a point, in `zwidth.stability_of`, `zwidth.stability.radii.radius_of` and `.poles.poles_of`."""
 
     COMPANION = 0
     CROSSOVER = 1
     CERTIFIED = 2
     NEWTON = 3
+    ABERTH = 4
 
 
 _MESSAGES = {

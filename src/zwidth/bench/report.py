@@ -85,7 +85,8 @@ _QUESTIONS = {
     "stable or not, each label proved": ("stable", "certified", "map"),
     "passive or not": ("passive", "worst frequency", "map"),
     "the largest pole, to 1e-9, proved": ("spectral_radius", "newton", "map"),
-    "all poles": ("spectral_radius", "companion", "map"),
+    "all poles": ("spectral_radius", "aberth", "map"),
+    "all poles, by eigenvalues": ("spectral_radius", "companion", "map"),
     "the stiffest wall of as many devices": ("alpha_max", "newton", "scattered"),
 }
 

@@ -17,14 +17,15 @@ from zwidth.stability import balls
 from zwidth.stability.certified import certified_stable
 from zwidth.stability.labels import StabilityMethod, is_stable
 from zwidth.stability.passivity import is_passive, passivity_margin
-from zwidth.stability.radii import RadiusMethod, spectral_radius
+from zwidth.stability.poles import poles
+from zwidth.stability.radii import spectral_radius
 from zwidth.stability.ridge import RidgeMethod, alpha_max
 
 # A measurement is repeated until it has taken this long, and at least this often.
 _SECONDS = 0.4
 _LEAST, _MOST = 3, 40
 # Beyond these delays a method takes minutes to compile, or days to run.
-_LONGEST = {"companion": 50, "kkt": 50}
+_LONGEST = {"companion": 50, "aberth": 21, "kkt": 50}
 _LONGEST_BASELINE = 50
 
 
@@ -140,6 +141,11 @@ def radius_error(radius: Callable[[Walls], Any], d: float, points: int) -> Error
     return float(np.max(np.abs(np.asarray(radius(walls)) - exact) / exact)), 0, exact.size
 
 
+def largest(z: Any) -> np.ndarray:
+    """The largest modulus of each wall's poles."""
+    return np.abs(z).max(axis=-1)
+
+
 def passive_error(d: float, points: int) -> Error:
     """The largest relative error of the damping that a passive wall needs."""
     walls, exact = problems.with_needed_damping(d, points)
@@ -178,16 +184,17 @@ def _labels(d: float, sizes: Sizes) -> Iterator[Row]:
 
 
 def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
-    methods: tuple[RadiusMethod, ...] = ("newton", "companion")
-    for method in methods:
+    few, many = _fewer(20_000, d), min(sizes.map_points // 4, 200_000)
+    some = min(many, 8 * few)
+    cases: tuple[tuple[str, Callable[[Walls], Any], dict[str, int]], ...] = (
+        ("newton", lambda walls: spectral_radius(*walls, method="newton"), {"map": many, "scattered": many, "one": 1}),
+        ("companion", lambda walls: spectral_radius(*walls, method="companion"), {"map": few, "scattered": few}),
+        # All poles, as by the companion matrix; their largest modulus is what has a reference.
+        ("aberth", lambda walls: largest(poles(*walls, method="aberth")), {"map": some, "scattered": some}),
+    )
+    for method, radius, points in cases:
         if not _possible(method, d):
             continue
-
-        def radius(walls: Walls, method: RadiusMethod = method) -> Any:
-            return spectral_radius(*walls, method=method)
-
-        few, many = _fewer(20_000, d), min(sizes.map_points // 4, 200_000)
-        points = {"map": few, "scattered": few} if method == "companion" else {"map": many, "scattered": many, "one": 1}
         yield from _timed("spectral_radius", method, d, radius_error(radius, d, sizes.roots), radius, points)
     for name, tool in available().items():
         if d > _LONGEST_BASELINE or (tool.only_whole and d != int(d)):

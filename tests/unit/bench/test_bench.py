@@ -55,7 +55,7 @@ def test_a_tiny_run_measures_every_method(rows):
     methods = {(row.quantity, row.method) for row in rows if not row.baseline}
     assert methods == {
         *(("stable", name) for name in ("crossover", "companion", "certified")),
-        *(("spectral_radius", name) for name in ("newton", "companion")),
+        *(("spectral_radius", name) for name in ("newton", "companion", "aberth")),
         ("passive", "worst frequency"),
         ("alpha_max", "newton"),
     }

@@ -12,7 +12,8 @@ import oracles
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
-from zwidth.stability.poles import companion, radius_by_companion, unstable_poles
+from zwidth.stability.poles import _eigenvalues, companion, poles_of, radius_by_companion, unstable_poles
+from zwidth.status import Method, Status
 
 LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
 
@@ -167,3 +168,99 @@ def test_derivatives_of_a_pole(x64):
     difference = (radius_by_companion(0.2 + h, 0.4, 0.3, 1) - radius_by_companion(0.2 - h, 0.4, 0.3, 1)) / (2 * h)
     assert float(jax.grad(slowest)(0.2)) == pytest.approx(difference, rel=1e-8)
     assert np.isnan(jax.grad(slowest)(np.nan))
+
+
+def many_walls(count=600):
+    """Random walls of every kind, corner cases among them: delta 0 and 1e6, beta next to -delta, alpha near 1e-12."""
+    rng = np.random.default_rng(9)
+    d = rng.choice([0.0, 1.0, 2.0, 4.0, 8.0, 0.125, 2.5, 5.3], count)
+    delta = rng.choice([0.0, 1e-12, 1e-8, 0.1, 1.0, 4.0, 50.0, 1e4, 1e6], count)
+    size = np.maximum(1.0, np.where(rng.random(count) < 0.4, delta, 1.0))
+    beta = rng.uniform(-0.5, 1.5, count) * size
+    near = -delta * (1.0 + 10.0 ** rng.uniform(-14, -1, count) * rng.choice([-1.0, 1.0], count))
+    return 10.0 ** rng.uniform(-13, 1, count) * size, np.where(rng.random(count) < 0.25, near, beta), delta, d
+
+
+def test_the_iteration_is_right_to_the_last_digits_wherever_eigenvalues_are():
+    walls = many_walls()
+    found, peer = (poles_of(*walls, method=method) for method in ("aberth", "companion"))
+    assert (found.status == Status.OK).mean() > 0.99
+    assert (found.method == Method.ABERTH).mean() > 0.8
+    wrong, checked = [], 0
+    for k in range(0, 600, 6):
+        with mp.workdps(oracles.DIGITS):
+            polynomial = oracles.polynomial(*(column[k] for column in walls))
+            try:
+                exact = mp.polyroots(polynomial[::-1], maxsteps=200, extraprec=400, asc=True)
+            except mp.NoConvergence:
+                continue
+            checked += 1
+            errors = [max(pair_up(z[k][np.isfinite(z[k])], exact)) for z in (found.z, peer.z)]
+            wrong += [k] if errors[0] > 10 * errors[1] + 100 * np.finfo(float).eps else []
+            if found.status[k] == Status.OK:
+                inside = [
+                    sum(
+                        abs(root - mp.mpc(z)) <= r + mp.mpf(10) ** -50
+                        for z, r in zip(found.z[k], found.within[k], strict=True)
+                    )
+                    for root in exact
+                ]
+                assert inside == [1] * len(exact)
+    assert checked > 85
+    assert wrong == []
+
+
+@pytest.mark.parametrize(("d", "beta"), [(0.0, None), (2.5, None), (2.0, 0.0), (2.5, 0.0)])
+def test_compiled_and_not_compiled_walls_have_the_same_poles(d, beta):
+    rng = np.random.default_rng(4)
+    count = 5000
+    walls = (rng.uniform(0, 0.5, count), rng.uniform(0, 0.6, count) if beta is None else beta, 0.3, d)
+    found, peer = poles_of(*walls), poles_of(*walls, method="companion")
+    assert (found.method == Method.ABERTH).mean() > 0.99
+    assert (peer.method == Method.COMPANION).all()
+    for k in (0, 7, 4999):
+        few = poles_of(walls[0][k], walls[1] if beta is not None else walls[1][k], 0.3, d, method="aberth").z
+        for z in (peer.z[k], few):
+            np.testing.assert_allclose(np.sort_complex(found.z[k].round(9)), np.sort_complex(z.round(9)), atol=1e-8)
+    proved = (found.status == Status.OK) & (peer.status == Status.OK)
+    assert proved.mean() > 0.99
+    # Each disc of one method meets exactly one of the other's: the same poles, whatever their order.
+    distance = np.abs(found.z[proved][:, :, None] - peer.z[proved][:, None, :])
+    meet = distance <= found.within[proved][:, :, None] + peer.within[proved][:, None, :]
+    assert (meet.sum(-1) == 1).all()
+    assert (meet.sum(-2) == 1).all()
+
+
+@pytest.mark.parametrize("method", ["aberth", "companion"])
+def test_discs_do_not_claim_two_poles_that_are_one(method):
+    # At beta = 0, delta = 0, d = 0 two poles are those of z^2 - (2 - alpha/2) z + 1 + alpha/2: double at alpha = 16.
+    found = poles_of([16.0, 15.0], 0.0, 0.0, 0.0, method=method)
+    np.testing.assert_array_equal(found.status, [Status.NOT_CONVERGED, Status.OK])
+    np.testing.assert_allclose(np.sort(found.z[0].real), [-3, -3, 0], rtol=tol.DOUBLE_POLE.float64)
+    assert found.method[0] == Method.COMPANION
+
+
+def test_a_bad_wall_leaves_its_neighbors_alone():
+    for method in ("aberth", "companion"):
+        found = poles_of([0.1, np.nan, 0.1, 1e300], 0.2, [0.3, 0.3, -1.0, 0.3], 1, method=method)
+        np.testing.assert_array_equal(
+            found.status, [0, Status.INVALID_INPUT, Status.INVALID_INPUT, Status.OUT_OF_RANGE]
+        )
+        assert np.isnan(found.z[1:]).all()
+        assert np.isfinite(found.z[0]).all()
+
+
+def test_a_matrix_without_eigenvalues_leaves_its_neighbors_alone():
+    matrices = np.stack([np.eye(3), np.full((3, 3), np.nan), 2 * np.eye(3)])
+    got = _eigenvalues(matrices)
+    np.testing.assert_array_equal(got[[0, 2]].real, [[1, 1, 1], [2, 2, 2]])
+    assert np.isnan(got[1]).all()
+
+
+def test_what_cannot_be_asked_for_is_refused():
+    with pytest.raises(InputError, match="method: got 'eig'"):
+        zwidth.poles(0.1, 0.1, 0.1, 1, method="eig")
+    with pytest.raises(InputError, match="aberth"):
+        jax.jit(lambda alpha: zwidth.poles(alpha, 0.1, 0.1, 1, method="aberth"))(0.1)
+    with pytest.raises(InputError, match="traced"):
+        jax.jit(lambda alpha: poles_of(alpha, 0.1, 0.1, 1).z)(0.1)
