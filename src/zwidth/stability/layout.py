@@ -44,6 +44,10 @@ class Points(NamedTuple):
         """How many points there are."""
         return int(np.prod(self.shape))
 
+    def columns(self) -> list[np.ndarray]:
+        """The points listed, one array each; what is the same for all of them stays a single value."""
+        return [a.reshape(1) if a.size == 1 else np.broadcast_to(a, self.shape).reshape(-1) for a in self]
+
     @property
     def is_dense(self) -> bool:
         """Whether the points form a map large enough to be compiled in its own shape, row by row."""
