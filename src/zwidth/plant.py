@@ -40,11 +40,24 @@ class Plant(NamedTuple):
     gap: Array  # N(-1) = a2 - a1 + a0 without cancellation
 
 
-def held_plant(delta: Array, fraction: Array, functions: Functions = phi.phi_functions) -> Plant:
+def held_plant(delta: Array, fraction: Array) -> Plant:
     """Discretize for a delay whose fractional part is ``fraction``, in [0, 1)."""
+    return discretized(delta, fraction, phi.phi_functions)
+
+
+def undelayed_plant(delta: Array) -> Plant:
+    """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
+    return discretized(delta, None, phi.phi_functions)
+
+
+def discretized(delta: Any, fraction: Any, functions: Functions) -> Plant:
+    """The plant in any arithmetic whose phi-functions are given; ``fraction`` is None for whole delays."""
+    at = functions(delta)
+    if fraction is None:
+        return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
     f = fraction
     t = 1.0 - f
-    at, at_t, at_f = functions(delta), functions(delta * t), functions(delta * f)
+    at_t, at_f = functions(delta * t), functions(delta * f)
     e_t = at_t.c
     a2 = t * t * at_t.phi2
     a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
@@ -53,12 +66,6 @@ def held_plant(delta: Array, fraction: Array, functions: Functions = phi.phi_fun
         t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
     )
     return Plant(at.c, delta * at.phi1, a2, a1, a0, gap)
-
-
-def undelayed_plant(delta: Array, functions: Functions = phi.phi_functions) -> Plant:
-    """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
-    at = functions(delta)
-    return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:

@@ -90,7 +90,7 @@ def enclosed_device(delta: Array, d: Array, kind: Kind) -> Device:
         return here._replace(**exact, c=within(here.c, 18.0), a2=a2, a1=a1, a0=None, gap=gap)
     a2, a1 = within(here.a2, 42.0), within(here.a1, 78.0)
     a0 = Ball(here.a0, UNIT * (62.0 * here.a0 + 2.0 * here.a1) + TINY)
-    late = {"p1_t": within(here.p1_t, 35.0), "psi_t": within(here.psi_t, 36.0)}
+    late = {"p1_t": within(here.p1_t, 35.0), "psi_t": within(here.psi_t, 36.0)} if kind.short else {}
     return here._replace(**exact, **late, c=within(here.c, 18.0), a2=a2, a1=a1, a0=a0, gap=a2 - a1 + a0)
 
 

@@ -6,8 +6,8 @@ Notation, on ``z = e^(j w)`` with ``u = 1 - cos w``, ``y = u/2``, and the plant 
     B = M(z) ((alpha + beta) z - beta)        wall;  M = a2 z + a1 + a0/z
 
 Their sizes are equal where a cubic in u vanishes (a quadratic for whole d). It has one zero in (0, 2) or none
-(docs/theory/one-crossover.md, Theorem 1). With it ``W = alpha + beta u + j beta sin w`` of the wall has the same size as
-that of the boundary curve at this w, and the wall is stable exactly if its argument is larger (Theorem 2):
+(docs/theory/one-crossover.md, Theorem 1). There ``W = alpha + beta u + j beta sin w`` of the wall has the same size as that of
+the boundary curve at this w, and the wall is stable exactly if its argument is larger (Corollary to Theorem 2):
 ``beta alpha_w > alpha beta_w``, or ``beta > beta_w``, (alpha_w, beta_w) being the curve in the form of
 `zwidth.stability.row_limit`. Below one period the crossover is eliminated: the end of each row is in closed form.
 
@@ -110,8 +110,9 @@ def gain_cubic(alpha: Any, beta: Any, here: Any) -> tuple[Any, ...]:
 def long_verdict(alpha: Any, beta: Any, whole: Any, here: Any, solve: Solve, take_lag: TakeLag) -> Verdict:
     """The verdict for d >= 1, alpha > 0 and beta > -delta: the curve where the gain is one.
 
-    At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta``: with ``P = (z - 1) R``, R is stable
-    exactly if P is for every small alpha > 0, because the pole at 1 then moves inside, and all below is continuous.
+    At alpha = 0, where a pole is at z = 1, it is on the others, for ``beta > delta``: with ``P = (z - 1) R``, R is
+    stable exactly if P is for every small alpha > 0, because the pole at 1 then moves inside, and all below is
+    continuous.
     """
     cubic = gain_cubic(alpha, beta, here)
     u, found = solve(cubic)
@@ -121,17 +122,20 @@ def long_verdict(alpha: Any, beta: Any, whole: Any, here: Any, solve: Solve, tak
     g, h, v, base = long_curve(here)
     E, F = horner(y, g), sine * cosine * horner(y, h) * 2.0
     # Times V cos(w/2): alpha_w = 2 sin(w/2) across, beta_w = turned - cosine E; and b V cos(w/2) without cancellation.
-    across = (lag.sine * cosine + lag.cosine * sine) * E + (lag.cosine * cosine - lag.sine * sine) * F
+    ahead = lag.cosine * cosine - lag.sine * sine  # cos((n + 1) w)
+    across = (lag.sine * cosine + lag.cosine * sine) * E + ahead * F
     turned = lag.sine * F
-    ahead = across * beta * sine * 2.0 - (turned - lag.cosine * E) * alpha
+    wider = across * beta * sine * 2.0 - (turned - lag.cosine * E) * alpha
     low = cosine * y * horner(y, base) + E * (lag.rise * 2.0 - y / (cosine + 1.0)) + turned
     above = (beta + here.delta) * cosine * horner(y, v) - low
+    # On the lobe (n + 1) w and the argument of E + j F, both above 0, have a sum below pi; its sine is ``across``.
+    inside = found & lag.within & (across > 0) & ((E > 0) | (ahead > 0))
     # Both differences have one sign. The first one is exact where the lobe falls, the second one next to beta = -delta.
     steep = sine * cosine * beta * 2.0 > alpha
-    stable = found & lag.within & (across > 0) & ((steep & (ahead > 0)) | ((steep ^ True) & (above > 0)))
+    stable = inside & ((steep & (wider > 0)) | ((steep ^ True) & (above > 0)))
     # w > pi/2, or no crossover at all.
     late = sum(cubic[1:], cubic[0]) > 0
-    return Verdict(stable, late | (found & (lag.beyond | (lag.within & ((across < 0) | (ahead < 0) | (above < 0))))))
+    return Verdict(stable, late | (found & (lag.beyond | (across < 0) | (wider < 0) | (above < 0))))
 
 
 def first_zero(cubic: tuple[Array, ...]) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from zwidth import phi
 from zwidth._types import Array
 from zwidth.loop import tilt_at_minus_one, valid_device
-from zwidth.plant import Functions, held_plant, split_delay, undelayed_plant
+from zwidth.plant import Functions, discretized, split_delay
 from zwidth.xp import namespace
 
 
@@ -60,7 +60,7 @@ def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.
     whole, f = split_delay(d)
     at = functions(delta)
     late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
-    plant = held_plant(delta, f, functions) if kind.fractional else undelayed_plant(delta, functions)
+    plant = discretized(delta, f if kind.fractional else None, functions)
     tilt = tilt_at_minus_one(plant, whole)
     return Device(
         *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),

@@ -50,7 +50,7 @@ def _sin_cos(x: Array) -> tuple[Array, Array]:
 
 
 def short_curve(here: Any) -> tuple[tuple[Any, Any], tuple[Any, Any, Any], tuple[Any, Any, Any]]:
-    """The lobe for a held d < 1 by powers of y, for numbers of any kind: ``V b = y (u0 + u1 y)``, V, ``alpha V/(4 y)``."""
+    """The lobe for a held d < 1 by powers of y, in any arithmetic: ``V b = y (u0 + u1 y)``, V, ``alpha V/(4 y)``."""
     p1, em, a2, a1, a0, f = here.p1, here.em, here.a2, here.a1, here.a0, here.f
     t = 1.0 - f
     # Both coefficients of b are sums of terms of one sign.
@@ -92,7 +92,7 @@ def _finish(limit: Array, b: Array) -> Array:
 
 
 def long_curve(here: Any) -> tuple[tuple, tuple, tuple, tuple]:
-    """E, H, V and ``(delta V - E)/y`` rearranged, by powers of y, for numbers of any kind; a0 is None for whole d."""
+    """E, H, V and ``(delta V - E)/y`` rearranged, by powers of y, in any arithmetic; a0 is None for whole d."""
     p1, em, a2, a1, a0 = here.p1, here.em, here.a2, here.a1, here.a0
     if a0 is None:
         return (em * p1, (here.gap - em * a2) * 2.0), (p1 * p1,), (p1 * p1, a1 * a2 * -4.0), (p1 * here.gap * -2.0,)
