@@ -33,6 +33,8 @@ FEW = 1 << 12
 BLOCK = 1 << 16
 # Within a block in pieces whose intermediates stay next to the processor.
 _STRIP = 1 << 12
+# The compiler treats shorter arrays differently, to the last place.
+_LEAST = 1 << 4
 
 
 @contextmanager
@@ -210,8 +212,9 @@ def in_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: in
     """Apply a compiled elementwise function to equally long columns, block by block on every processor.
 
     One array of a million points would be up to five times slower: what the function holds meanwhile leaves the cache.
+    Columns of one value are handed over as they are.
     """
-    return _in_pieces(function, columns, _padded_size(max(column.size for column in columns), block, 1), threads)
+    return _in_pieces(function, columns, _padded_size(_length(columns), block, _LEAST), threads)
 
 
 # Kernels that iterate over long formulas compile 2 to 5 times faster without XLA's fusion, and run no slower:
@@ -232,9 +235,11 @@ def _padded_size(count: int, chunk: int, least: int) -> int:
     return min(chunk, 1 << max(count - 1, least - 1, 0).bit_length())
 
 
+def _length(columns: list[np.ndarray]) -> int:
+    return np.broadcast_shapes(*(column.shape for column in columns))[0]
+
+
 def _piece(column: np.ndarray, start: int, size: int) -> np.ndarray:
-    if column.size == 1:
-        return column
     part = column[start : start + size]
     missing = size - part.size
     if not missing:
@@ -262,11 +267,13 @@ def map_flat(
 
 
 def _in_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None) -> Any:
-    count = max(column.size for column in columns)
+    count = _length(columns)
+    flagged = [(column, column.size == 1 < count) for column in columns]
 
     def run(start: int) -> Any:
         with concretely():
-            return tree_map(np.asarray, function(*(_piece(column, start, size) for column in columns)))
+            parts = (column if shared else _piece(column, start, size) for column, shared in flagged)
+            return tree_map(np.asarray, function(*parts))
 
     first = run(0)
     # A copy, because JAX's own memory is read-only.

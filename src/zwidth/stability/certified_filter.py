@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import BLOCK, FEW, in_blocks, in_strips
+from zwidth.batching import BLOCK, FEW, in_blocks, in_strips, stored
 from zwidth.domain import WALL_RANGE, wall_status
 from zwidth.phi import phi_functions
 from zwidth.stability.boundary_map import row_limits
@@ -80,6 +80,9 @@ def functions(x: Array) -> Any:
 def enclosed_device(delta: Array, d: Array, kind: Kind) -> Device:
     """The device of exact delta and d in balls, NaN where they are out of range."""
     here = device(delta, d, kind, functions)
+    if kind.fractional and kind.long:
+        # Several loops of the compiler use it.
+        here = stored(here, delta)
 
     def within(mid: Array, units: float) -> Ball:
         return Ball(mid, (units * UNIT) * abs(mid) + TINY)

@@ -6,9 +6,9 @@ Notation, on ``z = e^(j w)`` with ``u = 1 - cos w``, ``y = u/2``, and the plant 
     B = M(z) ((alpha + beta) z - beta)        wall;  M = a2 z + a1 + a0/z
 
 Their sizes are equal where a cubic in u vanishes (a quadratic for whole d). It has one zero in (0, 2) or none
-(docs/theory/one-crossover.md, Theorem 1). There ``W = alpha + beta u + j beta sin w`` of the wall has the same size as that of
-the boundary curve at this w, and the wall is stable exactly if its argument is larger (Corollary to Theorem 2):
-``beta alpha_w > alpha beta_w``, or ``beta > beta_w``, (alpha_w, beta_w) being the curve in the form of
+(docs/theory/one-crossover.md, Theorem 1). There ``W = alpha + beta u + j beta sin w`` of the wall is as large as that
+of the boundary curve at this w, and the wall is stable exactly if its argument is larger (S15a):
+``beta alpha_w > alpha beta_w``, or ``beta > beta_w``, where (alpha_w, beta_w) is the curve in the form of
 `zwidth.stability.row_limit`. Below one period the crossover is eliminated: the end of each row is in closed form.
 
 One text serves arrays of NumPy and JAX, float64 balls (`zwidth.stability.enclosure`), affine forms and python-flint's
@@ -24,6 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.batching import stored
 from zwidth.domain import WALL_RANGE, within
 from zwidth.stability.devices import ANY, Device, Kind, device
 from zwidth.stability.row_limit import long_curve, short_curve
@@ -207,7 +208,9 @@ def gain_crossover(alpha: Array, beta: Array, here: Device) -> Crossover:
 
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind = ANY) -> Array:
     """Whether each wall is stable, elementwise; False for what is NaN."""
-    return stable_at(alpha, beta, device(delta, d, kind), kind)
+    here = device(delta, d, kind)
+    # With a fraction several loops of the compiler use it.
+    return stable_at(alpha, beta, stored(here, delta) if kind.fractional and kind.long else here, kind)
 
 
 def stable_at(alpha: Array, beta: Array, here: Device, kind: Kind) -> Array:

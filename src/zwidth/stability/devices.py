@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -66,12 +65,3 @@ def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.
         *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),
         *(plant.a2, plant.a1, plant.a0, plant.gap, tilt),
     )
-
-
-@cache
-def compiled_device() -> Any:
-    """`device` as one array, the fields along a new first axis; compiled once for every method and degree."""
-    import jax
-    import jax.numpy as jnp
-
-    return jax.jit(lambda delta, d: jnp.stack(device(delta, d)))
