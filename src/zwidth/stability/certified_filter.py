@@ -142,12 +142,12 @@ def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) ->
     xp = namespace(alpha, beta, delta)
     here = enclosed_device(delta, d, kind)
     wall = Ball(alpha), Ball(beta)
-    early = short_verdict(*wall, here) if kind.short else None
-    late = long_verdict(*wall, here.whole, here, enclose_zero, take_lag) if kind.long else None
-    if early is not None and late is not None:
-        stable, unstable = (xp.where(here.whole < 1, one, other) for one, other in zip(early, late, strict=True))
-    else:
-        stable, unstable = early or late or ()
+    found = []
+    if kind.short:
+        found.append(short_verdict(*wall, here))
+    if kind.long:
+        found.append(long_verdict(*wall, here.whole, here, enclose_zero, take_lag))
+    stable, unstable = (xp.where(here.whole < 1, *pair) for pair in zip(found[0], found[-1], strict=True))
     code = xp.where((stable | unstable) & (beta + delta > 0), stable.astype(xp.uint8), xp.uint8(OPEN))
     # P(1) = phi1 alpha < 0: a real pole beyond 1. The lobe lies above beta = -delta.
     code = xp.where((alpha < 0) | ((alpha > 0) & (beta <= -delta)), xp.uint8(UNSTABLE), code)
@@ -163,7 +163,8 @@ def each_code(points: Points) -> np.ndarray:
     if points.size <= FEW:
         # NumPy is several times faster with scalars than with arrays without axes.
         with np.errstate(all="ignore"):
-            return np.broadcast_to(wall_codes(*(array[()] for array in points), kind), shape).copy()
+            alpha, beta, delta, d = (array[()] for array in points)
+            return np.broadcast_to(wall_codes(alpha, beta, delta, d, kind), shape).copy()
     code = in_blocks(in_strips(wall_codes, (kind,)), points.columns(), BLOCK).reshape(shape)
     if np.signbit(points.delta).any() or np.signbit(points.d).any():
         code |= np.where((points.delta < 0) | (points.d < 0), SPECIAL, 0).astype(np.uint8)

@@ -216,9 +216,13 @@ def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind 
 def stable_at(alpha: Array, beta: Array, here: Device, kind: Kind) -> Array:
     """The same on a discretized device."""
     xp = namespace(alpha, here.c)
+    plain = here._replace(a0=None)
     if not kind.fractional:
-        here = here._replace(a0=None)
+        here = plain
     early = short_verdict(alpha, beta, here).stable if kind.short else None
+    if early is not None and kind.fractional:
+        # At its corner the lobe of d = 0 is better known by its own formula.
+        early = xp.where(here.f == 0, short_verdict(alpha, beta, plain).stable, early)
     late = long_verdict(alpha, beta, here.whole, here, _solve, _take_lag).stable if kind.long else early
     stable = late if early is None else xp.where(here.whole < 1, early, late)
     return stable & (alpha > 0) & (beta + here.delta > 0) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
