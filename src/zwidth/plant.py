@@ -16,13 +16,17 @@ force to sampled position that is
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from zwidth import phi
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
 from zwidth.scene import normalize
 from zwidth.xp import namespace
+
+# x -> `zwidth.phi.PhiFunctions`, in any arithmetic
+Functions = Callable[[Any], Any]
 
 
 class Plant(NamedTuple):
@@ -38,9 +42,22 @@ class Plant(NamedTuple):
 
 def held_plant(delta: Array, fraction: Array) -> Plant:
     """Discretize for a delay whose fractional part is ``fraction``, in [0, 1)."""
+    return discretized(delta, fraction, phi.phi_functions)
+
+
+def undelayed_plant(delta: Array) -> Plant:
+    """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
+    return discretized(delta, None, phi.phi_functions)
+
+
+def discretized(delta: Any, fraction: Any, functions: Functions) -> Plant:
+    """The plant in any arithmetic whose phi-functions are given; ``fraction`` is None for whole delays."""
+    at = functions(delta)
+    if fraction is None:
+        return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
     f = fraction
     t = 1.0 - f
-    at, at_t, at_f = phi.phi_functions(delta), phi.phi_functions(delta * t), phi.phi_functions(delta * f)
+    at_t, at_f = functions(delta * t), functions(delta * f)
     e_t = at_t.c
     a2 = t * t * at_t.phi2
     a1 = t * t * at_t.psi + t * f * e_t * at_f.phi1 + f * f * at_f.phi2 + t * f * at_t.phi1 * at_f.phi1
@@ -49,12 +66,6 @@ def held_plant(delta: Array, fraction: Array) -> Plant:
         t * t * at_t.gap - t * f * at_f.phi1 * (e_t + at_t.phi1) - f * f * (at_f.gap + delta * t * at_t.phi1 * at_f.psi)
     )
     return Plant(at.c, delta * at.phi1, a2, a1, a0, gap)
-
-
-def undelayed_plant(delta: Array) -> Plant:
-    """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
-    at = phi.phi_functions(delta)
-    return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
 
 
 def split_delay(d: Array) -> tuple[Array, Array]:

@@ -7,7 +7,7 @@ with ``xp.where``. Importing this imports no JAX.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -64,9 +64,14 @@ def epsilon(value: Any) -> float:
     return float(np.finfo(getattr(value, "dtype", np.float64)).eps)
 
 
-def horner(x: Any, coefficients: list[float]) -> Any:
+def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     """A polynomial, lowest power first, by Horner's rule."""
     total = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         total = total * x + coefficient
     return total
+
+
+def root(x: Any) -> Any:
+    """The square root of an array, or of a number of another arithmetic."""
+    return x.sqrt() if hasattr(x, "sqrt") else namespace(x).sqrt(x)

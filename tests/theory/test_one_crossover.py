@@ -238,6 +238,22 @@ class _Wall:
         turn = mpc(mp.sqrt(1 - u / 2), mp.sqrt(u / 2)) * z**self.n
         return product.imag > 0 and (product * mp.conj(turn)).imag > 0
 
+    def by_curve(self) -> tuple[bool, bool]:
+        """S15a, for n >= 1, with either of its comparisons."""
+        if self.alpha <= 0 or self.u is None:
+            return False, False
+        _, numerator, _, z = self.factors()
+        w, turns = mp.arg(z), self.n + 1
+        curve = abs(numerator) ** 2 * (z - self.c) / numerator
+        first = mp.sin(turns * w) * curve.real + mp.cos(turns * w) * curve.imag
+        if (turns - mpf(1) / 2) * w > mp.pi or first <= 0 or (curve.real <= 0 and mp.cos(turns * w) <= 0):
+            return False, False
+        # alpha + beta (1 - 1/z) = -z^(n+1) (z - 1)(z - c)/(z M) on the curve
+        wanted = -(z**self.n) * (z - 1) * (z - self.c) / numerator
+        beta = wanted.imag / z.imag
+        alpha = wanted.real - beta * self.u
+        return self.beta * alpha > self.alpha * beta, self.beta > beta
+
 
 def _radius(alpha, beta, delta, n, f) -> mpf:
     """The largest pole, from the model's polynomial."""
@@ -266,6 +282,20 @@ def test_theorem_2_against_poles() -> None:
         assert (wall[1] > -wall[2] and found.by_products()) == (radius < 1), wall
         stable += radius < 1
     assert 80 < stable < 320
+
+
+def test_s15a_the_curve_tells_what_the_phase_tells() -> None:
+    rng, seen = random.Random(7), [0, 0]
+    for _ in range(500):
+        delta, f, n = 10 ** rng.uniform(-3, 2), rng.choice([0.0, rng.random(), 1 - 1e-9]), rng.choice([1, 1, 2, 3, 9])
+        # Stiff and soft walls, also far beyond the lobe and next to beta = -delta.
+        alpha = 10 ** rng.uniform(-3, 1) * (1 + delta) / (1 + n)
+        beta = rng.choice([-delta * (1 - 10 ** rng.uniform(-9, 0)), rng.uniform(-1.2, 1.2) * delta, rng.uniform(0, 1)])
+        found = _Wall(alpha, beta, delta, n, f)
+        stable = found.by_phase()
+        assert found.by_curve() == (stable, stable), (alpha, beta, delta, n, f)
+        seen[stable] += 1
+    assert min(seen) > 100
 
 
 def test_theorem_2_at_its_edge() -> None:

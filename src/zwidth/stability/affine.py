@@ -5,7 +5,7 @@ arithmetic (Comba, Stolfi 1993). What depends on the same quantity cancels, so t
 with the square of the box, where that of a plain interval shrinks with the box itself. Every operation bounds its own
 rounding by some ``u = 2^-53`` of its terms and by `TINY`, as in `zwidth.stability.enclosure`; NumPy's sine, cosine and
 arcsine are trusted to 2^-45. Over arrays of boxes; the operators are those of the verdict's one text,
-`zwidth.stability.enclosed_verdict`.
+`zwidth.stability.crossover`.
 """
 
 from __future__ import annotations
@@ -14,15 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.stability.crossover import first_zero
-from zwidth.stability.enclosed_plant import Plant, phi
-from zwidth.stability.enclosed_verdict import (
-    Lag,
-    long_device,
-    long_verdict,
-    short_device,
-    short_verdict,
-)
+from zwidth.stability.certified_filter import functions
+from zwidth.stability.crossover import Lag, first_zero, long_verdict, short_verdict
+from zwidth.stability.devices import Device
 from zwidth.stability.enclosure import TINY, UNIT
 
 # What the rounding of radii may have lost.
@@ -152,9 +146,9 @@ def chord(x: Form, ends: tuple[np.ndarray, np.ndarray], bend: np.ndarray, error:
 def _phi_forms(x: Form) -> tuple[Form, Form, Form]:
     """c, phi2 and psi: integrals of e^(-x t) over weights, so that all derivatives fall in size with x."""
     low, high = x.lower(), x.upper()
-    # The series behind `phi` is right for slightly negative arguments too, which a box round 0 has.
+    # The series behind them are right for slightly negative arguments too, which a box round 0 has.
     low = np.where(low > -1.0, low, np.nan)
-    first, last = phi(low), phi(high)
+    first, last = ((at.c, at.phi2, at.psi) for at in map(functions, (low, high)))
     size = np.maximum(low, 1e-3)
     at_low = first[2]
     bends = (first[0], np.minimum(0.25 * at_low, 2.0 / size**3), np.minimum(at_low, 6.0 / size**4))
@@ -165,20 +159,21 @@ def _phi_forms(x: Form) -> tuple[Form, Form, Form]:
     return forms[0], forms[1], forms[2]
 
 
-def plant(delta: Form, f: Form) -> Plant:
-    """The devices of boxes, as `zwidth.stability.enclosed_plant.plant`."""
+def plant(delta: Form, f: Form) -> Device:
+    """The devices of boxes, in the form of `zwidth.plant.held_plant`."""
     t = 1.0 - f
     x_t, x_f = delta * t, delta * f
     (e_t, phi2_t, psi_t), (_, phi2_f, psi_f), (c, phi2, psi) = _phi_forms(x_t), _phi_forms(x_f), _phi_forms(delta)
     p1_t, p1_f, p1 = phi2_t + psi_t, phi2_f + psi_f, phi2 + psi
     a1 = t * t * psi_t + t * f * (e_t + p1_t) * p1_f + f * f * phi2_f
-    return Plant(delta, c, delta * p1, p1, t * t * phi2_t, a1, e_t * (f * f * psi_f), f, p1_t, psi_t)
+    a2, a0 = t * t * phi2_t, e_t * (f * f * psi_f)
+    return Device(delta, None, f, c, delta * p1, p1, phi2, psi, p1_t, psi_t, a2, a1, a0, a2 - a1 + a0, None)
 
 
 def enclose_zero(cubic: tuple[Form, Form, Form, Form]) -> tuple[Form, np.ndarray]:
     """The crossover as a form: first order by the implicit function, proved by the signs of H on both sides of it."""
-    h0, h1, h2, h3 = (h.mid for h in cubic)
-    u = first_zero(h0, h1, h2, h3, True, np)
+    _, h1, h2, h3 = mids = tuple(h.mid for h in cubic)
+    u = first_zero(mids)
     slope = h1 + u * (2.0 * h2 + 3.0 * u * h3)
     lin = -(cubic[0].lin + u * (cubic[1].lin + u * (cubic[2].lin + u * cubic[3].lin))) / slope
     form = Form(u, lin, np.zeros_like(u))
@@ -196,7 +191,7 @@ def _horner(x: Form, coefficients: tuple[Form, ...]) -> Form:
     return total
 
 
-def take_lag(u: Form, q: Form, whole: np.ndarray) -> Lag:
+def take_lag(u: Form, whole: np.ndarray) -> Lag:
     """Cosine and sine of ``(n + 1/2) w``: w(u) by its chord, concave for u < 1; then to first order, |sin|'' <= 1."""
     low, high = u.lower(), u.upper()
     good = (low > 0) & (high < 1.0)
@@ -210,7 +205,8 @@ def take_lag(u: Form, q: Form, whole: np.ndarray) -> Lag:
     beyond = good & ((angle.mid - spread) * (whole + 1.0) > np.pi * turns * (1.0 + 1e-15))
     sine, cosine = np.sin(angle.mid), np.cos(angle.mid)
     left = angle.rad + 0.5 * spread * spread + 2.0**-45
-    return Lag(Form(cosine, -sine * angle.lin, left), Form(sine, cosine * angle.lin, left), within, beyond)
+    turned = Form(cosine, -sine * angle.lin, left)
+    return Lag(turned, Form(sine, cosine * angle.lin, left), (1.0 - turned) * 0.5, within, beyond)
 
 
 def stable_everywhere(alpha: Form, beta: Form, delta: Form, d: Form) -> np.ndarray:
@@ -233,7 +229,7 @@ def _stable_behind(alpha: Form, beta: Form, delta: Form, d: Form, whole: np.ndar
     short = whole == 0
     stable = np.zeros(whole.shape, bool)
     if short.any():
-        stable = short & short_verdict(alpha, beta, short_device(here)).stable
+        stable = short & short_verdict(alpha, beta, here).stable
     if not short.all():
-        stable |= ~short & long_verdict(alpha, beta, whole, long_device(here), enclose_zero, take_lag).stable
+        stable |= ~short & long_verdict(alpha, beta, whole, here, enclose_zero, take_lag).stable
     return stable

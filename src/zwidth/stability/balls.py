@@ -1,6 +1,6 @@
 """Ball arithmetic for the points that the floating-point filter of the certified method leaves open.
 
-The text is that of `zwidth.stability.enclosed_verdict`; its numbers are balls of python-flint around inputs taken as
+The text is that of `zwidth.stability.crossover`; its numbers are balls of python-flint around inputs taken as
 exact, and the precision doubles until a verdict is certain. Loaded only when needed: python-flint is optional.
 
 What no precision decides is a pair of poles exactly on the unit circle. For delta > 0 and alpha > 0 no such point is
@@ -13,24 +13,14 @@ from __future__ import annotations
 from functools import lru_cache
 from importlib.util import find_spec
 from itertools import pairwise
-from math import frexp
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.stability.crossover import first_zero
-from zwidth.stability.enclosed_plant import Plant
-from zwidth.stability.enclosed_verdict import (
-    Lag,
-    Long,
-    Short,
-    Verdict,
-    gain_cubic,
-    long_device,
-    long_verdict,
-    short_device,
-    short_verdict,
-)
+from zwidth.phi import PhiFunctions
+from zwidth.plant import discretized
+from zwidth.stability.crossover import Lag, Verdict, first_zero, gain_cubic, long_verdict, short_verdict
+from zwidth.stability.devices import Device
 from zwidth.status import Status
 from zwidth.xp import horner
 
@@ -38,8 +28,7 @@ if TYPE_CHECKING:
     import flint
 
 FIRST_BITS = 128
-# Enough for the exact product of a float64 and 1 - f; what its rounding lost, the phi-functions would multiply.
-_EXACT_BITS = 1200
+_EXTRA_BITS = 64
 # Points that this many bits leave open are looked at exactly where delta = 0, up to this many whole periods.
 _DOUBTFUL_BITS = 512
 _LONGEST_EXACT = 512
@@ -80,65 +69,48 @@ def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Ver
     import flint
 
     with flint.ctx.workprec(bits):
-        device = _device(delta, d, bits)
-        stiffness, damping = flint.arb(alpha), flint.arb(beta)
-        if isinstance(device, Short):
-            return short_verdict(stiffness, damping, device)
-        return long_verdict(stiffness, damping, int(d), device, _enclose_zero, _take_lag)
+        here, wall = device(delta, d, bits), (flint.arb(alpha), flint.arb(beta))
+        return short_verdict(*wall, here) if d < 1 else long_verdict(*wall, int(d), here, _enclose_zero, _take_lag)
 
 
 @lru_cache(maxsize=64)
-def _device(delta: float, d: float, bits: int) -> Short | Long:
-    """The device in balls; whole maps share it."""
+def device(delta: float, d: float, bits: int) -> Device:
+    """The device of exact delta and d in balls; whole maps share it."""
     import flint
 
-    with flint.ctx.workprec(bits):
-        here = plant(delta, d - int(d), bits)
-        return short_device(here) if d < 1 else long_device(here)
+    # What the rounding of delta (1 - f) loses, the phi-functions multiply.
+    with flint.ctx.workprec(bits + _EXTRA_BITS):
+        x, f = flint.arb(delta), flint.arb(d - int(d))
+        late = _phi(x * (1 - f))
+        p = discretized(x, f if f != 0 else None, _phi)
+        a0 = p.a0 if f != 0 else None
+        at = _phi(x)
+        phis = at.phi1, at.phi2, at.psi, late.phi1, late.psi
+        return Device(x, None, f, p.c, p.em, *phis, p.a2, p.a1, a0, p.gap, None)
 
 
-def plant(delta: float, f: float, bits: int) -> Plant:
-    """The device of exact delta and f."""
-    import flint
-
-    with flint.ctx.workprec(bits):
-        ball = flint.arb(delta)
-        c, p1, phi2, psi = _phi(ball, frexp(delta)[1], bits)
-        if f == 0:
-            return Plant(ball, c, ball * p1, p1, phi2, psi)
-        f_ball = flint.arb(f)
-        with flint.ctx.workprec(_EXACT_BITS):
-            t = 1 - f_ball
-            x_t, x_f = ball * t, ball * f_ball
-        # Of a product's exponent, the sum of the factors' is off by one at most.
-        e_t, p1_t, phi2_t, psi_t = _phi(x_t, frexp(delta)[1] + frexp(1 - f)[1] - 1, bits)
-        _, p1_f, phi2_f, psi_f = _phi(x_f, frexp(delta)[1] + frexp(f)[1] - 1, bits)
-        a2, a0 = t * t * phi2_t, e_t * f_ball * f_ball * psi_f
-        a1 = t * t * psi_t + t * f_ball * (e_t + p1_t) * p1_f + f_ball * f_ball * phi2_f
-        return Plant(ball, c, ball * p1, p1, a2, a1, a0, f_ball, p1_t, psi_t)
-
-
-def _phi(x: flint.arb, exponent: int, bits: int) -> tuple[flint.arb, flint.arb, flint.arb, flint.arb]:
-    """c, phi1, phi2 and psi of x >= 2^(exponent - 1), or of 0, with as many bits more as the quotients cancel."""
+def _phi(x: flint.arb) -> PhiFunctions:
+    """The phi-functions of x >= 0, with as many bits more as the quotients cancel."""
     import flint
 
     if x == 0:
-        return flint.arb(1), flint.arb(1), flint.arb(0.5), flint.arb(0.5)
-    with flint.ctx.workprec(bits + 16 + max(0, -2 * exponent)):
+        one, half = flint.arb(1), flint.arb(0.5)
+        return PhiFunctions(one, one, half, half, flint.arb(0))
+    man, exponent = x.mid().man_exp()
+    with flint.ctx.workprec(flint.ctx.prec + 16 + max(0, -3 * (int(exponent) + int(man).bit_length()))):
         c = (-x).exp()
         p1 = -(-x).expm1() / x
-        return c, p1, (1 - p1) / x, (p1 - c) / x
+        p2, psi = (1 - p1) / x, (p1 - c) / x
+        return PhiFunctions(c, p1, p2, psi, p2 - psi)
 
 
 def _enclose_zero(cubic: tuple[Any, ...]) -> tuple[flint.arb, bool]:
-    """`zwidth.stability.enclosed_verdict.enclose_zero`: Newton's method on the midpoints, then the signs beside it."""
+    """Newton's method on the midpoints, then the signs beside it."""
     import flint
 
-    balls = [h for h in cubic if h is not None]
-    mids = [h.mid() for h in balls]
-    rough = [np.float64(h) for h in mids]
+    mids = [h.mid() for h in cubic]
     with np.errstate(all="ignore"):
-        guess = first_zero(rough[0], rough[1], rough[2], rough[3] if len(rough) == 4 else 0.0, len(rough) == 4, np)
+        guess = first_zero(tuple(map(np.float64, mids)))
     u = flint.arb(float(guess) if 0 < guess < 2 else 1.0)
     smallest = flint.arb(2) ** (8 - flint.ctx.prec)
     slopes = [k * h for k, h in enumerate(mids)][1:]
@@ -149,20 +121,21 @@ def _enclose_zero(cubic: tuple[Any, ...]) -> tuple[flint.arb, bool]:
             return u, False
         if abs(step) < u * smallest * 16:
             break
-    error, slope = abs(horner(u, balls)), abs(horner(u, slopes))
+    error, slope = abs(horner(u, cubic)), abs(horner(u, slopes))
     reach = (error * 3 / slope + u * smallest).upper()
     low, high = u - reach, u + reach
-    found = low > 0 and high < 2 and horner(low, balls) > 0 and horner(high, balls) < 0
+    found = low > 0 and high < 2 and horner(low, cubic) > 0 and horner(high, cubic) < 0
     return flint.arb(u, reach), bool(found)
 
 
-def _take_lag(u: flint.arb, _: Any, whole: int) -> Lag:
+def _take_lag(u: flint.arb, whole: int) -> Lag:
     import flint
 
     w = (u / 2).sqrt().asin() * 2
     lag, turn = w * (whole + 0.5), flint.arb.pi()
     sine, cosine = lag.sin_cos()
-    return Lag(cosine, sine, lag < turn, w * (whole + 1) > turn)
+    half = (lag / 2).sin()
+    return Lag(cosine, sine, half * half, lag < turn, w * (whole + 1) > turn)
 
 
 def _exact(alpha: float, beta: float, d: float) -> tuple[Any, Any, int, Any]:
@@ -210,14 +183,12 @@ def _rational(alpha: Any, beta: Any, f: Any) -> tuple[list[Any], Any, int]:
 
     half, t = flint.fmpq(1, 2), 1 - f
     a2, a1, a0 = t * t * half, (1 + 2 * t * f) * half, f * f * half
-    zero, one = flint.fmpq(0), flint.fmpq(1)
-    if f == 0:
-        here = Plant(zero, one, zero, one, half, half)
-        numerator, lead = [half, half], 1
-    else:
-        here = Plant(zero, one, zero, one, a2, a1, a0)
-        numerator, lead = [a0, a1, a2], 2
-    cubic = [h for h in gain_cubic(alpha, beta, long_device(here)) if h is not None]
+    numerator, lead = ([a0, a1, a2], 2) if f != 0 else ([a1, a2], 1)
+    nothing: dict[str, Any] = dict.fromkeys(Device._fields)
+    here = Device(**nothing)._replace(
+        delta=flint.fmpq(0), c=flint.fmpq(1), p1=flint.fmpq(1), a2=a2, a1=a1, a0=a0 if f != 0 else None
+    )
+    cubic = list(gain_cubic(alpha, beta, here))
     return cubic, flint.fmpq_poly(numerator) * flint.fmpq_poly([-beta, alpha + beta]), lead
 
 
@@ -251,7 +222,7 @@ def polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> 
     import flint
 
     with flint.ctx.workprec(bits):
-        here = plant(delta, d - int(d), bits)
+        here = device(delta, d, bits)
         n = [a for a in (here.a0, here.a1, here.a2) if a is not None]
         stiffness, damping = flint.arb(alpha), flint.arb(beta)
         s = stiffness + damping

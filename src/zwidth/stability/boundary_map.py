@@ -11,10 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.batching import concretely
+from zwidth._types import Array
+from zwidth.batching import BLOCK, concretely, in_blocks, in_strips
 from zwidth.domain import WALL_RANGE, within
-from zwidth.stability.devices import Device, compiled_device, device, kind_of
-from zwidth.stability.layout import DeviceWork, Points, assemble, per_device, split
+from zwidth.stability.devices import device
+from zwidth.stability.layout import Points, assemble, split
 from zwidth.stability.row_limit import long_device, long_row, short_row
 
 # Smaller maps are compared by NumPy, with nothing to compile.
@@ -44,16 +45,6 @@ def boundary_map(points: Points) -> np.ndarray:
 
 
 @cache
-def _rows(short: bool) -> DeviceWork:
-    import jax
-
-    if short:
-        return DeviceWork(compiled_device(), jax.jit(lambda beta, fields: short_row(beta, Device(*fields))), np.float64)
-    solved = jax.jit(lambda fields: long_device(Device(*fields)))
-    return DeviceWork(lambda delta, d: solved(compiled_device()(delta, d)), jax.jit(long_row), np.float64)
-
-
-@cache
 def _compiled(name: str) -> Any:
     import jax
     import jax.numpy as jnp
@@ -70,18 +61,25 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0)
     shape = np.broadcast_shapes(beta.shape, delta.shape, d.shape)
     here = int(np.prod(shape)) <= few
 
-    def of(long: bool, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
-        return _solved_here(long, beta, delta, d) if here else per_device(_rows(not long), [beta], delta, d)
+    def of(long: bool, *points: np.ndarray) -> np.ndarray:
+        kernel = _long_limit if long else _short_limit
+        if here:
+            # Each device is computed once.
+            with np.errstate(all="ignore"):
+                return np.asarray(kernel(points[0], *np.broadcast_arrays(*points[1:])))
+        whole = np.broadcast_arrays(*points)
+        limits = in_blocks(in_strips(kernel), [array.reshape(-1) for array in whole], BLOCK)
+        return limits.reshape(whole[0].shape)
 
     return assemble(split((beta, delta, d), d >= 1), shape, np.float64, of)
 
 
-def _solved_here(long: bool, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """The same by NumPy, each device computed once."""
-    with np.errstate(all="ignore"):
-        delta, d = np.broadcast_arrays(delta, d)
-        here = device(delta, d, kind_of(d))
-        return long_row(beta, long_device(here)) if long else short_row(beta, here)
+def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
+    return short_row(beta, device(delta, d))
+
+
+def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
+    return long_row(beta, long_device(device(delta, d)))
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:

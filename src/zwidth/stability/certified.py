@@ -10,8 +10,7 @@ from zwidth._types import ArrayLike
 from zwidth.domain import wall_status
 from zwidth.errors import InputError
 from zwidth.stability import balls
-from zwidth.stability.certified_filter import filtered
-from zwidth.stability.certified_rows import OPEN, STABLE, UNSTABLE
+from zwidth.stability.certified_filter import OPEN, STABLE, UNSTABLE, filtered
 from zwidth.stability.layout import Points, lay_out
 from zwidth.status import Status
 
@@ -31,7 +30,7 @@ def certified_stable(
 
     ``stable`` means ``max |z| < 1`` over the zeros of `zwidth.char_poly`, held delay. The verdict is the phase at the
     one gain crossover, below one period the end of the row; both are sums, products, quotients and roots of the
-    inputs, and are computed with a bound of every rounding (`zwidth.stability.enclosed_verdict`). Where the bound
+    inputs, and are computed with a bound of every rounding (`zwidth.stability.certified_filter`). Where the bound
     leaves the sign open, the same lines run in ball arithmetic (python-flint), doubling the precision.
 
     Args:

@@ -1,135 +1,217 @@
-"""Floating-point filter of the certified method: the verdict in float64 balls over arrays of walls."""
+"""The verdict in float64 balls over arrays of walls: the certified method's first step, which settles nearly all.
+
+The text is that of `zwidth.stability.crossover`. Here are the numbers that go into it: device, crossover and lag, with
+proved errors. ``u = 2^-53``. No library's exp is trusted.
+
+- ``exp``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 14 terms below 3u: together
+  below 8u. Below x = -700 it is off by 1e-304 at most.
+- `zwidth.phi.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have positive
+  terms only, 4u: phi1 and gap are within 14u, phi2 15u, and psi, in which phi1 and gap share the error of the
+  exponential, 8u + 12u. Above, where c < 0.083, phi1 is within 5u, phi2 7u, psi 14u, gap 20u. All are within 30u.
+- Held fraction: t = 1 - f is off by u, and x = delta t by 2u. phi1 and phi2 amplify that at most once and psi twice,
+  e^-x x times; as ``x e^-x <= phi1(x)`` and ``<= 1/2``, that error is below 2u of another term of a1, and of a0 below u
+  of a1. Term by term, sums included, a2 is within 40u, a1 within 75u, a0 within 60u (and u of a1).
+"""
 
 from __future__ import annotations
 
-from functools import cache
+from math import factorial
 from typing import Any
 
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import BLOCK, FEW, in_blocks
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
-from zwidth.stability.certified_rows import OPEN, UNSTABLE, by_rows, has_rows
-from zwidth.stability.devices import Kind, kind_of
-from zwidth.stability.enclosed_plant import plant
-from zwidth.stability.enclosed_verdict import (
-    Long,
-    Short,
-    Verdict,
-    enclose_zero,
-    long_device,
-    long_verdict,
-    short_device,
-    short_verdict,
-    take_lag,
-)
-from zwidth.stability.enclosure import Ball
-from zwidth.stability.layout import Points
-from zwidth.xp import namespace
+from zwidth.batching import BLOCK, FEW, in_blocks, in_strips, stored
+from zwidth.domain import WALL_RANGE, wall_status
+from zwidth.phi import phi_functions
+from zwidth.stability.boundary_map import row_limits
+from zwidth.stability.crossover import COSINE, SINE, Lag, first_zero, long_verdict, short_verdict
+from zwidth.stability.devices import Device, Kind, device, kind_of
+from zwidth.stability.enclosure import TINY, UNIT, Ball
+from zwidth.stability.layout import Points, picked
+from zwidth.status import Status
+from zwidth.xp import horner, namespace
 
+UNSTABLE, STABLE, OPEN = 0, 1, 2
 # Added to the code where alpha or beta is 0 or a value is out of range: XLA takes numbers below 2^-1022 for zero, and
 # at alpha = 0 the verdict is not on the pole at z = 1.
 SPECIAL = 4
 
+_LOG2_E = 1.4426950408889634
+# The first part has 32 significant bits: its products with whole numbers below 2^21 are exact.
+_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_EXP_TERMS = [1.0 / factorial(k) for k in range(14)]
+_EXP_LIMIT = -700.0
 
-def filtered(points: Points) -> np.ndarray:
-    """The code of every point, of the broadcast shape."""
-    return by_rows(points, _each) if has_rows(points) else _each(points)
+# asin(sqrt y)/sqrt y by powers of 4 y - 1, within 2^-46 of itself for 0 <= y <= 0.5002, rounding included.
+ARCSINE = [
+    *(1.0471975511965939, 0.053751493591325285, 0.007798902239476116, 0.001519668539770706, 0.0003408637129203685),
+    *(8.302317447211976e-05, 2.1345635825394298e-05, 5.701810038289938e-06, 1.5666403429672824e-06),
+    *(4.400955991598038e-07, 1.2651766241163793e-07, 3.670228515702153e-08, 9.938877829363156e-09),
+    *(2.9355657831219474e-09, 1.3880931000501491e-09, 4.2073851086352364e-10),
+]
+_LARGEST_U = 1.0002
+# Of both series, on [0, 1.6], the first term left out and the rounding are below 2^-43 (of the angle for the sine).
+_LARGEST_ANGLE = 1.6
+_HALF_PI_BELOW, _HALF_PI_ABOVE = 1.570796326794896, 1.570796326794897
 
 
-def _each(points: Points) -> np.ndarray:
-    """The same, point by point."""
+def exp(x: Array) -> Array:
+    """``e^x``, x <= 0, within 8u, and 1e-304 below -700."""
+    xp = namespace(x)
+    x = xp.maximum(x, _EXP_LIMIT)
+    k = xp.round(x * _LOG2_E)
+    return horner((x - k * _LN2_HIGH) - k * _LN2_LOW, _EXP_TERMS) * _power_of_two(k, xp)
+
+
+def _power_of_two(k: Array, xp: Any) -> Array:
+    if xp is np:
+        return np.ldexp(1.0, np.nan_to_num(k).astype(np.int64))
+    from jax.lax import bitcast_convert_type
+
+    return bitcast_convert_type((1023 + k.astype(xp.int64)) << 52, xp.float64)
+
+
+def functions(x: Array) -> Any:
+    """The phi-functions, each within 30u."""
+    return phi_functions(x, exp)
+
+
+def enclosed_device(delta: Array, d: Array, kind: Kind) -> Device:
+    """The device of exact delta and d in balls, NaN where they are out of range."""
+    here = device(delta, d, kind, functions)
+    if kind.fractional and kind.long:
+        # Several loops of the compiler use it.
+        here = stored(here, delta)
+
+    def within(mid: Array, units: float) -> Ball:
+        return Ball(mid, (units * UNIT) * abs(mid) + TINY)
+
+    exact = {"delta": Ball(here.delta), "f": Ball(here.f), "em": within(here.em, 32.0), "p1": within(here.p1, 31.0)}
+    if not kind.fractional:
+        a2, a1, gap = within(here.a2, 31.0), within(here.a1, 31.0), within(here.gap, 31.0)
+        return here._replace(**exact, c=within(here.c, 18.0), a2=a2, a1=a1, a0=None, gap=gap)
+    a2, a1 = within(here.a2, 42.0), within(here.a1, 78.0)
+    a0 = Ball(here.a0, UNIT * (62.0 * here.a0 + 2.0 * here.a1) + TINY)
+    late = {"p1_t": within(here.p1_t, 35.0), "psi_t": within(here.psi_t, 36.0)} if kind.short else {}
+    return here._replace(**exact, **late, c=within(here.c, 18.0), a2=a2, a1=a1, a0=a0, gap=a2 - a1 + a0)
+
+
+def enclose_zero(cubic: tuple[Ball, ...]) -> tuple[Ball, Array]:
+    """Around the zero of the midpoints, as wide as the radii make it; the signs of H at both ends are the proof."""
+    mids, radii = zip(*((h.mid, h.radius) for h in cubic), strict=True)
+    u = first_zero(mids)
+    value, slope = horner(u, mids), horner(u, [k * h for k, h in enumerate(mids)][1:])
+    error = _horner_error(u, mids, radii)
+    reach = 1.5 * (2.0 * error + abs(value)) / abs(slope) + (8.0 * UNIT) * u
+    low, high = u - reach, u + reach
+    bound = _horner_error(high, mids, radii)
+    found = (low > 0) & (high < _LARGEST_U) & (horner(low, mids) > bound) & (horner(high, mids) < -bound)
+    return Ball(u, reach + (4.0 * UNIT) * u), found
+
+
+def _horner_error(u: Array, mids: tuple[Array, ...], radii: tuple[Array, ...]) -> Array:
+    """Of H at up to u >= 0: the radii of its coefficients, and 7u of the absolute terms for Horner's rule."""
+    return horner(u, [radius + (8.0 * UNIT) * abs(mid) for mid, radius in zip(mids, radii, strict=True)]) + TINY
+
+
+def take_lag(u: Ball, whole: Array) -> Lag:
+    """The lag by series of half its angle, ``(n + 1/2) w/2``."""
+    xp = namespace(u.mid)
+    safe = xp.where((u.mid > 0) & (u.mid < _LARGEST_U), u.mid, 0.5)
+    half = (whole + 0.5) * (xp.sqrt(0.5 * safe) * horner(2.0 * safe - 1.0, ARCSINE))
+    # dw/du = 1/sqrt(u (2 - u))
+    error = 0.5 * (whole + 0.5) * u.radius / xp.sqrt(xp.maximum((u * (2 - u)).lower(), 0.0)) + 2.0**-45 * half
+    within = half + error < _HALF_PI_BELOW
+    beyond = (half - error) * (whole + 1.0) > (_HALF_PI_ABOVE * (whole + 0.5)) * (1.0 + 4.0 * UNIT)
+    angle = xp.minimum(half, _LARGEST_ANGLE)
+    square = angle * angle
+    sine, cosine = angle * horner(square, SINE), horner(square, COSINE)
+    # The derivative of both by half of the angle is at most 2, that of the square of its sine at most twice the angle.
+    return Lag(
+        Ball((cosine - sine) * (cosine + sine), 2.0 * error + 2.0**-40),
+        Ball(2.0 * sine * cosine, 2.0 * error + 2.0**-40 * angle),
+        Ball(sine * sine, 2.0 * error * (angle + error) + 2.0**-40 * square),
+        within,
+        beyond,
+    )
+
+
+def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) -> Array:
+    """The codes of walls, elementwise."""
+    xp = namespace(alpha, beta, delta)
+    here = enclosed_device(delta, d, kind)
+    wall = Ball(alpha), Ball(beta)
+    found = []
+    if kind.short:
+        found.append(short_verdict(*wall, here))
+    if kind.long:
+        found.append(long_verdict(*wall, here.whole, here, enclose_zero, take_lag))
+    stable, unstable = (xp.where(here.whole < 1, *pair) for pair in zip(found[0], found[-1], strict=True))
+    code = xp.where((stable | unstable) & (beta + delta > 0), stable.astype(xp.uint8), xp.uint8(OPEN))
+    # P(1) = phi1 alpha < 0: a real pole beyond 1. The lobe lies above beta = -delta.
+    code = xp.where((alpha < 0) | ((alpha > 0) & (beta <= -delta)), xp.uint8(UNSTABLE), code)
+    least, most = WALL_RANGE
+    stiffness, damping = abs(alpha), abs(beta)
+    plain = (stiffness >= least) & (stiffness <= most) & (damping >= least) & (damping <= most)
+    return code + xp.where(plain & (here.delta.mid == delta), xp.uint8(0), xp.uint8(SPECIAL))
+
+
+def each_code(points: Points) -> np.ndarray:
+    """The code of every point, point by point."""
     shape, kind = points.shape, kind_of(points.d)
     if points.size <= FEW:
         # NumPy is several times faster with scalars than with arrays without axes.
-        alpha, beta, delta, d = (array[()] for array in points)
         with np.errstate(all="ignore"):
-            return np.broadcast_to(wall_codes(alpha, beta, device_fields(delta, d, kind), kind), shape).copy()
-    if points.delta.size == points.d.size == 1:
-        with np.errstate(all="ignore"):
-            fields = device_fields(points.delta.reshape(()), points.d.reshape(()), kind)
-        columns = [np.broadcast_to(array, shape).reshape(-1) for array in points[:2]]
-        shared = _compiled(kind, True)
-        return in_blocks(lambda alpha, beta: shared(alpha, beta, fields), columns, BLOCK).reshape(shape)
-    columns = [np.broadcast_to(array, shape).reshape(-1) for array in points]
-    code = in_blocks(_compiled(kind, False), columns, BLOCK).reshape(shape)
+            alpha, beta, delta, d = (array[()] for array in points)
+            return np.broadcast_to(wall_codes(alpha, beta, delta, d, kind), shape).copy()
+    code = in_blocks(in_strips(wall_codes, (kind,)), points.columns(), BLOCK).reshape(shape)
     if np.signbit(points.delta).any() or np.signbit(points.d).any():
         code |= np.where((points.delta < 0) | (points.d < 0), SPECIAL, 0).astype(np.uint8)
     return code
 
 
-@cache
-def _compiled(kind: Kind, shared: bool) -> Any:
-    import jax
-
-    if shared:
-        return jax.jit(lambda alpha, beta, fields: wall_codes(alpha, beta, fields, kind))
-    return jax.jit(lambda alpha, beta, delta, d: wall_codes(alpha, beta, device_fields(delta, d, kind), kind))
+# Of each row a wall so far below its end is tried, and one as far above.
+_ASIDE = 1e-9
 
 
-def device_fields(delta: Array, d: Array, kind: Kind) -> list[Array]:
-    """What the verdict needs of each device: whether it is in range, the whole periods, midpoints and radii."""
-    xp = namespace(delta, d)
-    ok = (delta >= 0) & (delta <= LARGEST_DAMPING) & (d >= 0) & (d <= LONGEST_DELAY)
-    delta, d = xp.where(ok, delta, 1.0), xp.where(ok, d, 0.0)
-    whole = xp.floor(d)
-    here = plant(delta, d - whole if kind.fractional else None)
-    fields = [ok, whole]
-    for wanted, device in ((kind.short, short_device), (kind.long, long_device)):
-        if wanted:
-            fields += _numbers(device(here))
-    return fields
+def filtered(points: Points) -> np.ndarray:
+    """The code of every point, of the broadcast shape.
 
-
-def _numbers(tree: Any) -> list[Array]:
-    """Midpoints and radii of all balls of a device, in order."""
-    if isinstance(tree, Ball):
-        return [tree.mid] if tree.rad is None else [tree.mid, tree.rad]
-    return [number for part in tree or () for number in _numbers(part)]
-
-
-@cache
-def _shapes(kind: Kind) -> tuple[Any, Any]:
-    """One short and one long device, for the places of their balls."""
-    here = plant(np.float64(1.0), np.float64(0.5) if kind.fractional else None)
-    return short_device(here) if kind.short else None, long_device(here) if kind.long else None
-
-
-def _rebuilt(tree: Any, numbers: Any) -> Any:
-    """`_numbers` undone."""
-    if isinstance(tree, Ball):
-        return Ball(next(numbers), None if tree.rad is None else next(numbers))
-    if tree is None:
-        return None
-    parts = [_rebuilt(part, numbers) for part in tree]
-    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-
-
-def wall_codes(alpha: Array, beta: Array, fields: list[Array], kind: Kind) -> Array:
-    """The codes of walls on given devices, elementwise."""
-    ok, whole, *numbers = fields
-    rest = iter(numbers)
-    short, long = (_rebuilt(shape, rest) for shape in _shapes(kind))
-    delta = (short or long).plant.delta.mid
-    xp = namespace(alpha, beta, delta)
-    verdict = _verdict(Ball(alpha), Ball(beta), whole, short, long, xp)
-    above = beta + delta > 0
-    sure = verdict.stable | verdict.unstable
-    code = xp.where(sure & above, verdict.stable.astype(xp.uint8), xp.uint8(OPEN))
-    # P(1) = phi1 alpha < 0: a real pole beyond 1. The lobe lies above beta = -delta.
-    code = xp.where((alpha < 0) | ((alpha > 0) & (beta <= -delta)), xp.uint8(UNSTABLE), code)
+    On every row (beta, delta, d) the stable walls are one interval, 0 < alpha < limit (docs/theory/one-lobe.md): what
+    lies below a wall proved stable is stable, what lies above one proved unstable is not. Which two walls does not
+    matter for the proof, so those next to the limit as computed are taken. What they leave is asked point by point.
+    """
+    if not has_rows(points):
+        return each_code(points)
+    # A wall of moderate stiffness stands for the row: what is special about it is special about all.
+    usual = (wall_status(np.ones(()), *points[1:]) == Status.OK) & (points.beta != 0)
     least, most = WALL_RANGE
-    stiffness, damping = abs(alpha), abs(beta)
-    plain = ok & (stiffness >= least) & (stiffness <= most) & (damping >= least) & (damping <= most)
-    return code + xp.where(plain, xp.uint8(0), xp.uint8(SPECIAL))
+    size = np.abs(points.alpha)
+    known = (size >= least) & (size <= most)
+    stiffness = np.unique(points.alpha[known & (points.alpha > 0)])
+    limit = row_limits(*points[1:])
+    ends = np.concatenate([[0.0], stiffness, [np.inf]])
+    below = ends[np.searchsorted(stiffness, limit * (1.0 - _ASIDE))]
+    above = ends[np.searchsorted(stiffness, limit * (1.0 + _ASIDE)) + 1]
+    tried = [each_code(Points(np.clip(alpha, least, most), *points[1:])) for alpha in (below, above)]
+    stable, unstable = np.where(tried[0] == STABLE, below, 0.0), np.where(tried[1] == UNSTABLE, above, np.inf)
+    # Walls without or with negative stiffness: P(1) < 0 is a real pole beyond 1.
+    alpha = np.where(points.alpha < 0, np.inf, points.alpha)
+    over = alpha > stable
+    between = over & (alpha < unstable)
+    code = 1 - over.view(np.uint8)
+    code += OPEN * between.view(np.uint8)
+    if not (known.all() and usual.all()):
+        code[~np.broadcast_to(known & usual, points.shape)] = OPEN
+    rest = code == OPEN
+    if rest.any():
+        code[rest] = each_code(picked(points, rest))
+    return code
 
 
-def _verdict(alpha: Ball, beta: Ball, whole: Array, short: Short | None, long: Long | None, xp: Any) -> Verdict:
-    late = None if long is None else long_verdict(alpha, beta, whole, long, enclose_zero, take_lag)
-    early = None if short is None else short_verdict(alpha, beta, short)
-    if early is None or late is None:
-        found = early or late
-        assert found is not None
-        return found
-    return Verdict(*(xp.where(whole < 1, one, other) for one, other in zip(early, late, strict=True)))
+def has_rows(points: Points) -> bool:
+    """Whether alpha varies along axes of its own, and along enough values for two trials a row to pay."""
+    rows = np.broadcast_shapes(*(array.shape for array in points[1:]))
+    apart = all(along == 1 or across == 1 for along, across in zip(points.alpha.shape, rows, strict=True))
+    return points.is_dense and apart and points.alpha.size >= 64

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ import numpy as np
 from zwidth import phi
 from zwidth._types import Array
 from zwidth.loop import tilt_at_minus_one, valid_device
-from zwidth.plant import held_plant, split_delay, undelayed_plant
+from zwidth.plant import Functions, discretized, split_delay
 from zwidth.xp import namespace
 
 
@@ -49,29 +48,20 @@ class Device(NamedTuple):
     a1: Array
     a0: Array
     gap: Array  # N(-1) = a2 - a1 + a0
-    excess: Array  # phi1^2 - c
     tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
 
 
-def device(delta: Array, d: Array, kind: Kind = ANY) -> Device:
+def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.phi_functions) -> Device:
     """The `Device` of one (delta, d), or of arrays of one shape."""
     xp = namespace(delta, d)
     ok = valid_device(delta, d)
-    delta, d = xp.where(ok, delta, 1.0), xp.where(ok, d, 0.0)
+    delta, d = xp.where(ok, delta, np.nan), xp.where(ok, d, np.nan)
     whole, f = split_delay(d)
-    at = phi.phi_functions(delta)
-    late = phi.phi_functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
-    plant = held_plant(delta, f) if kind.fractional else undelayed_plant(delta)
+    at = functions(delta)
+    late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
+    plant = discretized(delta, f if kind.fractional else None, functions)
     tilt = tilt_at_minus_one(plant, whole)
-    plant_fields = (plant.a2, plant.a1, plant.a0, plant.gap, at.excess, tilt)
-    fields = (delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi, *plant_fields)
-    return Device(*(xp.where(ok, field, np.nan) for field in fields))
-
-
-@cache
-def compiled_device() -> Any:
-    """`device` as one array, the fields along a new first axis; compiled once for every method and degree."""
-    import jax
-    import jax.numpy as jnp
-
-    return jax.jit(lambda delta, d: jnp.stack(device(delta, d)))
+    return Device(
+        *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),
+        *(plant.a2, plant.a1, plant.a0, plant.gap, tilt),
+    )

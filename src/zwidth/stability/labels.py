@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from functools import cache, partial
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import BLOCK, FEW, elementwise, in_blocks, is_number, to_caller
+from zwidth.batching import BLOCK, FEW, elementwise, in_blocks, in_strips, is_number, to_caller
 from zwidth.domain import check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.boundary_map import boundary_map
-from zwidth.stability.crossover import stable_at, stable_kernel
-from zwidth.stability.devices import ANY, Device, Kind, device, kind_of
+from zwidth.stability.crossover import stable_kernel
+from zwidth.stability.devices import ANY, kind_of
 from zwidth.stability.layout import Points, lay_out
 from zwidth.stability.poles import unstable_poles
 from zwidth.status import Method, Status
@@ -174,26 +173,4 @@ def _by_crossover(points: Points) -> np.ndarray:
     if points.size <= FEW:
         with np.errstate(all="ignore"):
             return np.broadcast_to(stable_kernel(*points, kind), shape)
-    if points.delta.size == points.d.size == 1:
-        # One device for all walls: discretized once.
-        here = np.stack(device(points.delta.reshape(1), points.d.reshape(1), kind))
-        columns = [np.broadcast_to(column, shape).reshape(-1) for column in (points.alpha, points.beta)]
-        stable = in_blocks(partial(_one_device(kind), here), columns, BLOCK)
-    else:
-        columns = [np.broadcast_to(column, shape).reshape(-1) for column in points]
-        stable = in_blocks(_scattered(kind), columns, BLOCK)
-    return stable.reshape(shape)
-
-
-@cache
-def _one_device(kind: Kind) -> Any:
-    import jax
-
-    return jax.jit(lambda here, alpha, beta: stable_at(alpha, beta, Device(*here), kind))
-
-
-@cache
-def _scattered(kind: Kind) -> Any:
-    import jax
-
-    return jax.jit(lambda alpha, beta, delta, d: stable_kernel(alpha, beta, delta, d, kind))
+    return in_blocks(in_strips(stable_kernel, (kind,)), points.columns(), BLOCK).reshape(shape)

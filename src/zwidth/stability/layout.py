@@ -7,21 +7,17 @@ an argument only repeats itself (broadcast views, `numpy.meshgrid`) are folded b
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.batching import as_float64, concretely
+from zwidth.batching import as_float64
 from zwidth.errors import InputError
-from zwidth.grouping import NAMES, Degree
+from zwidth.grouping import NAMES
 
 # Below this many values an argument is too small for looking for repetition to pay.
 _WORTH_FOLDING = 2048
-# Compiled sizes are powers of two up to this many points; larger batches run in pieces of it.
-PIECE = 1 << 17
-
-
 # Smaller maps are listed point by point, in padded pieces that share their compilations.
 _WORTH_OWN_SHAPE = 1 << 16
 
@@ -43,6 +39,10 @@ class Points(NamedTuple):
     def size(self) -> int:
         """How many points there are."""
         return int(np.prod(self.shape))
+
+    def columns(self) -> list[np.ndarray]:
+        """The points listed, one array each; what is the same for all of them stays a single value."""
+        return [a.reshape(1) if a.size == 1 else np.broadcast_to(a, self.shape).reshape(-1) for a in self]
 
     @property
     def is_dense(self) -> bool:
@@ -134,116 +134,11 @@ def split(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> list[Part]:
     return parts
 
 
-def split_by_degree(points: Points) -> list[Part]:
-    """Group points by the `Degree` of their polynomial; an impossible delay counts as 0."""
-    defined = np.where(np.isfinite(points.d) & (points.d >= 0), points.d, 0.0)
-    whole = np.floor(defined)
-    # Twice the whole part, plus one where a fraction remains, names a degree.
-    code = 2 * whole + (defined != whole)
-    return [
-        Part(Degree(int(value // 2), bool(value % 2)), arrays, place) for value, arrays, place in split(points, code)
-    ]
-
-
-def assemble(
-    parts: list[Part], shape: tuple[int, ...], dtype: Any, work: Callable[..., np.ndarray], several: int = 0
-) -> np.ndarray:
-    """Put the results of ``work(value, *arrays)`` where they belong; ``several`` of them lie along an axis in front."""
+def assemble(parts: list[Part], shape: tuple[int, ...], dtype: Any, work: Callable[..., np.ndarray]) -> np.ndarray:
+    """Put the results of ``work(value, *arrays)`` where they belong."""
     if len(parts) == 1:
         return work(parts[0].value, *parts[0].arrays)
-    out = np.empty((several, *shape) if several else shape, dtype)
-    front = (slice(None),) if several else ()
+    out = np.empty(shape, dtype)
     for value, arrays, place in parts:
-        out[front + place] = work(value, *arrays)
+        out[place] = work(value, *arrays)
     return out
-
-
-def device_ok(points: Points) -> np.ndarray:
-    """Where delta and d are in range, of their common shape."""
-    delta, d = points.delta, points.d
-    return np.isfinite(delta) & np.isfinite(d) & (delta >= 0) & (d >= 0)
-
-
-def point_ok(points: Points) -> np.ndarray:
-    """Where all four arguments are in range, of the shape they have before they are broadcast to the caller's."""
-    return np.isfinite(points.alpha) & np.isfinite(points.beta) & device_ok(points)
-
-
-def pieces(count: int, piece: int = PIECE, least: int = 1) -> Iterator[tuple[slice, int]]:
-    """Slices that cover ``count`` values, each with the compiled size to which it is padded, not below ``least``."""
-    for start in range(0, count, piece):
-        stop = min(start + piece, count)
-        yield slice(start, stop), min(piece, max(least, 1 << max(stop - start - 1, 0).bit_length()))
-
-
-def padded(column: np.ndarray, size: int) -> np.ndarray:
-    """Repeat the last value up to ``size``: it is as harmless as the point it came from."""
-    if column.size == size:
-        return column
-    filled = np.empty(size, column.dtype)
-    filled[: column.size] = column
-    filled[column.size :] = column[-1]
-    return filled
-
-
-class DeviceWork(NamedTuple):
-    """A compiled function of (delta, d) and one of points with its result: what is shared, and what is not."""
-
-    device: Callable[[Any, Any], Any]  # (delta, d) -> fields along a new first axis
-    kernel: Callable[..., Any]  # (*columns, fields) -> one value a point, or several along a new first axis
-    dtype: Any
-    piece: int = PIECE
-    several: int = 0
-    least: int = 1  # a shorter batch is filled up: the compiler treats very short ones differently, to the last place
-
-
-def per_device(work: DeviceWork, columns: list[np.ndarray], delta: np.ndarray, d: np.ndarray) -> np.ndarray:
-    """Apply ``work`` to columns that broadcast with delta and d; the result has their broadcast shape.
-
-    Each device is computed once, unless there are about as many devices as points: then both go through the cache in
-    small pieces.
-    """
-    shape = np.broadcast_shapes(delta.shape, d.shape, *(column.shape for column in columns))
-    device_shape = np.broadcast_shapes(delta.shape, d.shape)
-    deltas, delays = (np.broadcast_to(array, device_shape).reshape(-1) for array in (delta, d))
-    flat = [np.broadcast_to(column, shape).reshape(-1) for column in columns]
-    if not flat[0].size:
-        return np.empty((work.several, *shape) if work.several else shape, work.dtype)
-    owner = None
-    if deltas.size > 1:
-        owner = np.broadcast_to(np.arange(deltas.size).reshape(device_shape), shape).reshape(-1)
-    values = _in_pieces(work, flat, deltas, delays, owner)
-    return values.reshape((work.several, *shape) if work.several else shape)
-
-
-def _in_pieces(
-    work: DeviceWork, flat: list[np.ndarray], delta: np.ndarray, d: np.ndarray, owner: np.ndarray | None
-) -> np.ndarray:
-    count = flat[0].size
-    shared = 4 * delta.size <= count or delta.size == 1
-    out = np.empty((work.several, count) if work.several else count, work.dtype)
-    with concretely():
-        fields = fields_of(work, delta, d) if shared else None
-        for part, size in pieces(count, work.piece, work.least):
-            if fields is None:
-                # Not shared, so there are several devices, each point with its own.
-                rows = np.asarray(owner)[part]
-                here = work.device(*(padded(device[rows], size) for device in (delta, d)))
-            elif owner is None:
-                here = fields
-            else:
-                here = np.asarray(fields)[:, padded(owner[part], size)]
-            values = work.kernel(*(padded(column[part], size) for column in flat), here)
-            out[..., part] = np.asarray(values)[..., : part.stop - part.start]
-    return out
-
-
-def fields_of(work: DeviceWork, delta: np.ndarray, d: np.ndarray) -> Any:
-    """The fields of every device of two flat arrays; call it with float64 enabled."""
-    if delta.size == 1:
-        return work.device(delta, d)
-    parts = []
-    for part, size in pieces(delta.size, work.piece):
-        values = work.device(padded(delta[part], size), padded(d[part], size))
-        parts.append(np.asarray(values)[:, : part.stop - part.start])
-    return parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)

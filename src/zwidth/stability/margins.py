@@ -101,7 +101,7 @@ def _margins_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Margin
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
     here = device(delta, d)
-    crossover = gain_crossover(alpha, beta, here, ANY)
+    crossover = gain_crossover(alpha, beta, here)
     crosses = crossover.exists
     w = xp.where(crosses, angle_of(crossover), 1.0)
     decisive = crosses & (beta > -delta)
@@ -225,6 +225,6 @@ def _undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array
     """Below one period of delay: the phase at the crossover, the crossover, and whether there is one."""
     xp = namespace(f, alpha)
     here = device(delta, f)
-    crossover = gain_crossover(alpha, beta, here, ANY)
+    crossover = gain_crossover(alpha, beta, here)
     w = xp.where(crossover.exists, angle_of(crossover), 1.0)
     return size_and_phase(w, alpha, beta, here)[1], w, crossover.exists

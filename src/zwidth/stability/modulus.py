@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.stability.crossover import gain_crossover
-from zwidth.stability.devices import ANY, Device
+from zwidth.stability.devices import Device
 from zwidth.stability.open_loop import along, angle_of, size_and_phase
 from zwidth.xp import frozen, namespace, repeat
 
@@ -64,7 +64,7 @@ def _lowest(alpha: Array, beta: Array, here: Device, xp: Any) -> Array:
 
     def at(level: Array) -> Array:
         """Where |L| has a value; pi if it is larger everywhere."""
-        found = gain_crossover(alpha / level, beta / level, here, ANY)
+        found = gain_crossover(alpha / level, beta / level, here)
         return xp.where(found.exists, angle_of(found), np.pi)
 
     def distance(w: Array) -> Array:

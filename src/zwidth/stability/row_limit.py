@@ -20,7 +20,7 @@ rearranged below so that nothing cancels, for every damping.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -49,33 +49,38 @@ def _sin_cos(x: Array) -> tuple[Array, Array]:
     return x * horner(square, _SIN), horner(square, _COS)
 
 
+def short_curve(here: Any) -> tuple[tuple[Any, Any], tuple[Any, Any, Any], tuple[Any, Any, Any]]:
+    """The lobe for a held d < 1 by powers of y, in any arithmetic: ``V b = y (u0 + u1 y)``, V, ``alpha V/(4 y)``."""
+    p1, em, a2, a1, a0, f = here.p1, here.em, here.a2, here.a1, here.a0, here.f
+    t = 1.0 - f
+    # Both coefficients of b are sums of terms of one sign.
+    slack = f * (f * em + p1) + t * (f * here.p1_t + t * here.psi_t) + a0
+    by_b = p1 * slack * 4.0, a0 * (f + t * here.p1_t) * -16.0
+    size = p1 * p1, (a1 * (a2 + a0) + a2 * a0 * 4.0) * -4.0, a2 * a0 * 16.0
+    return by_b, size, (p1 * (em + f * em + p1), (a1 + a0 * 3.0 + a0 * em) * -4.0, a0 * 16.0)
+
+
 def short_row(beta: Array, device: Device) -> Array:
     """The limit for d < 1, where the lobe is a quadratic in y; 0 where no alpha is stable, NaN for bad input.
 
     Beyond the corner, the double pole at z = -1, only the line bounds the row.
     """
-    delta, _, f, _, em, p1, p2, psi, p1_t, psi_t, a2, a1, a0, _, _, tilt = device
-    xp = namespace(beta, delta)
-    b = beta + delta
+    p1, psi, tilt = device.p1, device.psi, device.tilt
+    xp = namespace(beta, device.delta)
+    b = beta + device.delta
     # For d = 0 the row ends at phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
-    whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + p2 * b))
-    # V b = y (u0 + u1 y): both coefficients are sums of terms of one sign.
-    t = 1.0 - f
-    u0 = 4.0 * p1 * (f * f * em + f * p1 + t * (f * p1_t + t * psi_t) + a0)
-    u1 = -16.0 * a0 * (f + t * p1_t)
-    v1 = -4.0 * (a1 * (a2 + a0) + 4.0 * a2 * a0)
-    v2 = 16.0 * a2 * a0
-    linear = u0 - b * v1
-    square = linear * linear + 4.0 * b * p1 * p1 * (u1 - b * v2)
+    whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + device.p2 * b))
+    (u0, u1), size, shape = short_curve(device)
+    linear = u0 - b * size[1]
+    square = linear * linear + 4.0 * b * p1 * p1 * (u1 - b * size[2])
     y = 2.0 * b * p1 * p1 / (linear + xp.sqrt(xp.maximum(square, 0.0)))
-    start, slope = p1 * ((1.0 + f) * em + p1), -4.0 * (a1 + (3.0 + em) * a0)
     # V = |N|^2 vanishes where the curve runs to infinity; rounding must not turn its sign there.
-    curve = 4.0 * y * (start + y * (slope + 16.0 * a0 * y)) / xp.abs(p1 * p1 + y * (v1 + v2 * y))
-    corner_reached = (tilt > 0) & (start + slope + 16.0 * a0 > 0)
+    curve = 4.0 * y * horner(y, shape) / xp.abs(horner(y, size))
+    corner_reached = (tilt > 0) & (shape[0] + shape[1] + shape[2] > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
     # Behind the lobe the curve comes from infinity with b < 0: a row above all of the lobe must not end there.
     fractional = xp.where((square >= 0) & (y <= 1) & (u0 + u1 * y > 0), curve, beyond)
-    limit = xp.where(f == 0, whole, fractional)
+    limit = xp.where(device.f == 0, whole, fractional)
     line = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
     limit = xp.where(tilt > 0, xp.minimum(limit, line), limit)
     return _finish(limit, b)
@@ -86,17 +91,22 @@ def _finish(limit: Array, b: Array) -> Array:
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
 
 
+def long_curve(here: Any) -> tuple[tuple, tuple, tuple, tuple]:
+    """E, H, V and ``(delta V - E)/y`` rearranged, by powers of y, in any arithmetic; a0 is None for whole d."""
+    p1, em, a2, a1, a0 = here.p1, here.em, here.a2, here.a1, here.a0
+    if a0 is None:
+        return (em * p1, (here.gap - em * a2) * 2.0), (p1 * p1,), (p1 * p1, a1 * a2 * -4.0), (p1 * here.gap * -2.0,)
+    sigma, mu, corner = a2 + a0, a2 - a0, a2 * a0 * 4.0
+    g = em * p1, (p1 + sigma * em - mu * 2.0) * -2.0, a0 * 8.0
+    b1 = p1 * 2.0 - mu * 4.0 + here.delta * (sigma * (sigma - a1) - corner * 2.0) * 2.0
+    b2 = a0 * (1.0 - here.delta * a2 * 2.0) * -8.0
+    return g, (p1 * (p1 + here.f * em), a0 * -4.0), (p1 * p1, (a1 * sigma + corner) * -4.0, corner * 4.0), (b1, b2)
+
+
 def long_fields(device: Device) -> list[Array]:
     """The curve alone: the first of `LONG_FIELDS`, up to the lobe's end."""
-    delta, whole, f, _, em, p1, _, _, _, _, a2, a1, a0, _, _, _ = device
-    k = whole + 0.5
-    sigma, mu = a2 + a0, a2 - a0
-    g = (em * p1, -2.0 * (p1 + sigma * em - 2.0 * mu), 8.0 * a0)
-    h = (p1 * (p1 + f * em), -4.0 * a0)
-    v = (p1 * p1, -4.0 * (a1 * sigma + 4.0 * a2 * a0), 16.0 * a2 * a0)
-    b1 = 2.0 * p1 - 4.0 * mu + 2.0 * delta * (sigma * (sigma - a1) - 8.0 * a2 * a0)
-    b2 = -8.0 * a0 * (1.0 - 2.0 * delta * a2)
-    return [delta, k, *g, *h, *v, b1, b2]
+    g, h, v, base = long_curve(device)
+    return [device.delta, device.whole + 0.5, *g, *h, *v, *base]
 
 
 def long_device(device: Device) -> Array:

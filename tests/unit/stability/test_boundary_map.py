@@ -1,12 +1,13 @@
 """Maps by the closed-form boundary: each way of comparing alpha with the ends of the rows gives the same labels."""
 
-import jax
 import numpy as np
 import pytest
 
 from zwidth.stability import boundary_map as maps
 from zwidth.stability.boundary_map import row_limits
+from zwidth.stability.devices import device
 from zwidth.stability.labels import is_stable
+from zwidth.stability.row_limit import LONG_FIELDS, long_device, long_row
 
 ROWS, COLUMNS = 331, 400
 LIMITS = np.concatenate([np.linspace(-0.1, 1.1, ROWS - 5), [np.nan, np.inf, -np.inf, 0.0, 0.25]])[:, None]
@@ -79,17 +80,10 @@ def test_a_map_and_its_points_one_by_one_agree(d):
 @pytest.mark.parametrize("d", [1.0, 2.5, 8.0, 60.0, 500.0])
 @pytest.mark.parametrize("delta", [0.0, 1e-8, 0.3, 4.0, 1e3, 1e6])
 def test_rows_are_solved_to_the_last_digits(d, delta, monkeypatch):
-    device = row_limits(np.array([0.0]), np.array([delta]), np.array([d]))
-    assert np.isfinite(device).all()
-    fields = maps._rows(False).device
-    with jax.enable_x64(True):
-        top = float(np.asarray(fields(np.array([delta]), np.array([d])))[13, 0])
-    beta = np.linspace(0.0, 0.999, 500)[1:] * top - delta
+    fields = long_device(device(np.float64(delta), np.float64(d)))
+    beta = np.linspace(0.0, 0.999, 500)[1:] * fields[LONG_FIELDS.index("top")] - delta
     limit = row_limits(beta, np.array([delta]), np.array([d]))
-    with jax.enable_x64(True):
-        monkeypatch.setattr("zwidth.stability.row_limit._ROW_STEPS", 6)
-        # A function of its own: the compiled one knows the number of steps it was made with.
-        exact = jax.jit(lambda *values: maps.long_row(*values))
-        more = np.asarray(exact(beta, fields(np.array([delta]), np.array([d]))))
+    monkeypatch.setattr("zwidth.stability.row_limit._ROW_STEPS", 6)
+    more = long_row(beta, fields)
     # beta itself is known to an ulp of delta, which near the lobe's end is more of the limit.
     np.testing.assert_allclose(limit, more, rtol=1e-13, atol=2e-13 * more.max())

@@ -14,9 +14,8 @@ from zwidth.domain import wall_status
 from zwidth.errors import InputError
 from zwidth.stability import balls
 from zwidth.stability.certified import certified_stable
-from zwidth.stability.certified_filter import SPECIAL, _each, filtered
-from zwidth.stability.certified_rows import OPEN, has_rows
-from zwidth.stability.enclosed_verdict import Verdict
+from zwidth.stability.certified_filter import OPEN, SPECIAL, each_code, filtered, has_rows
+from zwidth.stability.crossover import Verdict
 from zwidth.stability.layout import lay_out
 from zwidth.status import Status
 
@@ -186,7 +185,7 @@ def test_rows_of_a_map_are_labelled_as_point_by_point(delta, d):
     beta = np.append(scale * np.linspace(-1.1, 3.0, 120), [0.0, -delta, 1e70, np.nan])
     points = lay_out((alpha, beta[:, None], delta, d)).points
     assert has_rows(points)
-    by_row, alone = filtered(points), _each(points)
+    by_row, alone = filtered(points), each_code(points)
     np.testing.assert_array_equal(by_row >= SPECIAL, alone >= SPECIAL)
     decided = ((by_row & 3) != OPEN) & ((alone & 3) != OPEN)
     np.testing.assert_array_equal(by_row[decided], alone[decided])
@@ -199,7 +198,7 @@ def test_rows_of_several_devices_are_kept_apart():
     delta, d = np.array([0.0, 0.1, 3.0])[:, None, None], np.array([0.0, 0.5, 1.0, 3.0])[:, None, None, None]
     points = lay_out((alpha, beta, delta, d)).points
     assert has_rows(points)
-    np.testing.assert_array_equal(filtered(points), _each(points))
+    np.testing.assert_array_equal(filtered(points), each_code(points))
 
 
 def test_no_search_where_alpha_shares_its_axis():

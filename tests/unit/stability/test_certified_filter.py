@@ -8,20 +8,13 @@ import pytest
 from mpmath import mp, mpf
 
 import oracles
-from zwidth.stability import balls, enclosed_plant, enclosed_verdict, enclosure
+from zwidth.stability import balls, certified_filter, enclosure
 from zwidth.stability.certified import certified_stable
-from zwidth.stability.enclosed_plant import phi, plant
-from zwidth.stability.enclosed_verdict import (
-    enclose_zero,
-    gain_cubic,
-    long_device,
-    long_verdict,
-    loop_vector,
-    short_device,
-    short_verdict,
-    take_lag,
-)
+from zwidth.stability.certified_filter import enclose_zero, enclosed_device, exp, functions, take_lag
+from zwidth.stability.crossover import gain_cubic, long_verdict, short_verdict
+from zwidth.stability.devices import kind_of
 from zwidth.stability.enclosure import Ball
+from zwidth.stability.row_limit import long_curve, short_curve
 
 flint = pytest.importorskip("flint")
 BITS = 400
@@ -29,20 +22,22 @@ UNIT = 2.0**-53
 DELTAS = np.array([0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-3, 0.3, 1.0, 1.4999, 1.5, 1.51, 7.0, 50.0, 699.0, 750.0, 1e12])
 
 
-def leaves(tree):
-    """Every number of a device, in order."""
-    if tree is None:
-        return []
-    if not isinstance(tree, tuple):
-        return [tree]
-    return [leaf for part in tree for leaf in leaves(part)]
+def numbers(here, exact):
+    """The balls of a device beside their true values, and those of its curve."""
+    names = [name for name, value in here._asdict().items() if isinstance(value, Ball)]
+    curve = short_curve if isinstance(here.p1_t, Ball) else None
+    pairs = [(getattr(here, name), getattr(exact, name)) for name in names]
+    for of in (long_curve, curve):
+        if of is not None:
+            pairs += [pair for parts in zip(of(here), of(exact), strict=True) for pair in zip(*parts, strict=True)]
+    return zip(*pairs, strict=True)
 
 
 def escaped(found, exact, index):
     """How many balls of one point miss the numbers in the balls of arb."""
     count = 0
     with flint.ctx.workprec(BITS):
-        for ball, truth in zip(leaves(found), leaves(exact), strict=True):
+        for ball, truth in zip(found, exact, strict=True):
             mid, rad = (
                 float(np.broadcast_to(x, index + 1 if np.ndim(x) == 0 else x.shape)[index])
                 for x in (ball.mid, ball.radius)
@@ -63,33 +58,29 @@ def walls(count, seed, d):
 @pytest.mark.parametrize("d", [1.0, 2.0, 7.0, 500.0, 1.5, 3.25, 60.7, np.nextafter(2.0, 1.0), 1.0 + 1e-12, 99999.5])
 def test_every_intermediate_of_the_crossover_is_enclosed(d):
     alpha, beta, delta, d = walls(60, 11, d)
-    fraction = d - np.floor(d)
     a, b = Ball(alpha), Ball(beta)
     with np.errstate(all="ignore"):
-        here = long_device(plant(delta, fraction if fraction.any() else None))
+        here = enclosed_device(delta, d, kind_of(d))
         cubic = gain_cubic(a, b, here)
         u, found = enclose_zero(cubic)
-        q = u * (2 - u)
-        lag, vector = take_lag(u, q, np.floor(d)), loop_vector(a, b, u, q, here)
+        lag = take_lag(u, np.floor(d))
     seen = 0
     for index in range(alpha.size):
         with flint.ctx.workprec(BITS):
             x, y = flint.arb(alpha[index]), flint.arb(beta[index])
-            device = balls._device(delta[index], d[index], BITS)
+            device = balls.device(delta[index], d[index], BITS)
             truth = gain_cubic(x, y, device)
-            assert escaped(here, device, index) == 0
+            assert escaped(*numbers(here, device), index) == 0
             assert escaped(cubic, truth, index) == 0
             if not found[index]:
                 continue
             root, sure = balls._enclose_zero(truth)
             assert sure
-            square = root * (2 - root)
-            exact = balls._take_lag(root, square, int(d[index]))
-            assert escaped((u, q), (root, square), index) == 0
-            assert escaped(vector, loop_vector(x, y, root, square, device), index) == 0
+            exact = balls._take_lag(root, int(d[index]))
+            assert escaped((u,), (root,), index) == 0
             if exact.within:
                 seen += 1
-                assert escaped(tuple(lag[:2]), tuple(exact[:2]), index) == 0
+                assert escaped(lag[:3], exact[:3], index) == 0
             assert not lag.within[index] or exact.within
             assert not lag.beyond[index] or exact.beyond
     assert seen > 15
@@ -98,29 +89,30 @@ def test_every_intermediate_of_the_crossover_is_enclosed(d):
 @pytest.mark.parametrize("d", [0.0, 0.5, 1e-9, 5e-324, 0.125, 0.93, 1.0 - 2.0**-53])
 def test_every_number_of_a_short_device_is_enclosed(d):
     with np.errstate(all="ignore"):
-        here = short_device(plant(DELTAS, np.full(DELTAS.size, d) if d else None))
+        here = enclosed_device(DELTAS, np.full(DELTAS.size, d), kind_of(d))
     for index, delta in enumerate(DELTAS):
-        assert escaped(here, balls._device(float(delta), d, 1600), index) == 0
+        assert escaped(*numbers(here, balls.device(float(delta), d, 1600)), index) == 0
 
 
 def test_bounds_too_small_are_noticed(monkeypatch):
-    _, _, delta, d = walls(60, 11, [1.0, 4.0, 2.5])
+    _, _, delta, d = walls(60, 11, [1.5, 4.2, 2.5])
     monkeypatch.setattr(enclosure, "UNIT", 2.0**-58)
-    monkeypatch.setattr(enclosed_plant, "UNIT", 2.0**-58)
-    here = long_device(plant(delta, d - np.floor(d)))
-    missed = sum(escaped(here, balls._device(delta[i], d[i], BITS), i) for i in range(60) if d[i] % 1)
-    assert missed > 10
+    monkeypatch.setattr(certified_filter, "UNIT", 2.0**-58)
+    here = enclosed_device(delta, d, kind_of(d))
+    assert sum(escaped(*numbers(here, balls.device(delta[i], d[i], BITS)), i) for i in range(60)) > 10
 
 
 def test_phi_errors_are_as_stated():
     x = np.concatenate([np.random.default_rng(5).uniform(0, 4, 1500), DELTAS])
-    c, phi2, psi = phi(x)
+    found, power = functions(x), exp(-x)
     for index, value in enumerate(x):
         with mp.workdps(oracles.digits_for(value)):
             exact = oracles.phi(value)
-            assert oracles.relative_error(c[index], exact.c, floor=1e-280) <= 8 * UNIT
-            assert oracles.relative_error(phi2[index], exact.phi2) <= 20 * UNIT
-            assert oracles.relative_error(psi[index], exact.psi) <= 20 * UNIT
+            assert oracles.relative_error(power[index], exact.c, floor=1e-280) <= 8 * UNIT
+            assert oracles.relative_error(found.c[index], exact.c, floor=1e-280) <= 17 * UNIT
+            pairs = (found.phi1, exact.phi1), (found.phi2, exact.phi2), (found.psi, exact.psi)
+            for value_of, truth in (*pairs, (found.gap, exact.phi2 - exact.psi)):
+                assert oracles.relative_error(value_of[index], truth, floor=1e-300) <= 30 * UNIT
 
 
 def test_device_is_that_of_the_printed_formulas():
@@ -128,7 +120,7 @@ def test_device_is_that_of_the_printed_formulas():
         for f in (0.0, 1e-7, 0.4, 0.999):
             with mp.workdps(oracles.digits_for(delta)):
                 exact = oracles.numerator(delta, f)[: 3 if f else 2]
-                here = plant(np.float64(delta), np.float64(f) if f else None)
+                here = enclosed_device(np.float64(delta), np.float64(f), kind_of(f))
                 for ball, value in zip((here.a2, here.a1, here.a0), exact, strict=False):
                     assert abs(mpf(float(ball.mid)) - value) <= mpf(float(ball.radius))
                 assert abs(mpf(float(here.c.mid)) - mp.exp(-mpf(delta))) <= mpf(float(here.c.radius))
@@ -138,7 +130,7 @@ def test_arcsine_series_is_as_close_as_stated():
     # Over boxes that cover [0, 0.5002], by Taylor polynomials of the difference with a bounded remainder.
     pieces, order, worst = 200, 8, 0.0
     with flint.ctx.workprec(200):
-        fit = flint.arb_poly([flint.arb(c) for c in enclosed_verdict._ARCSINE])(flint.arb_poly([-1, 4]))
+        fit = flint.arb_poly([flint.arb(c) for c in certified_filter.ARCSINE])(flint.arb_poly([-1, 4]))
         half = flint.arb(0.5002) / (2 * pieces)
         offset = flint.arb(0, (half * 1.0001).upper())
         for piece in range(pieces):
@@ -171,13 +163,12 @@ def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
     alpha, beta, delta, _ = walls(400, 19, d)
     width = 10.0 ** rng.uniform(-5, -1, 400)
     boxes = [Ball(x, 1.001 * width * np.abs(x)) for x in (alpha, beta)]
-    f = d % 1
     with np.errstate(all="ignore"):
-        here = plant(delta, np.full(400, f) if f else None)
+        here = enclosed_device(delta, np.full(400, d), kind_of(d))
         if d < 1:
-            verdict = short_verdict(*boxes, short_device(here))
+            verdict = short_verdict(*boxes, here)
         else:
-            verdict = long_verdict(*boxes, d // 1, long_device(here), enclose_zero, take_lag)
+            verdict = long_verdict(*boxes, here.whole, here, enclose_zero, take_lag)
         meant = (boxes[0] > 0) & (boxes[1] + delta > 0)
     stable, unstable = verdict.stable & meant, verdict.unstable & meant
     assert stable.sum() > 20
