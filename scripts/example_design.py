@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.optimize import minimize
 
-from zwidth.design import max_stiffness, sensitivities
+from zwidth import max_stiffness, sensitivities
 
 MASS = 0.1  # kg
 WANTED = 20e3  # N/m

@@ -19,9 +19,8 @@ class Quantity(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Parse one option."""
-        from pydantic_core import PydanticCustomError
 
-        from zwidth.config.parameters import entry_of
+        from zwidth.config.units import entry_of
 
         try:
             number: float | str = float(value)
@@ -29,9 +28,9 @@ class Quantity(click.ParamType):
             number = value
         try:
             return entry_of(self.parameter.name)(number)
-        except PydanticCustomError as error:
-            # The parts that a message leaves out stand as empty text between separators.
-            self.fail("; ".join(part for part in error.message().split("; ") if part), param, ctx)
+        except ValueError as error:
+            # A problem of a configuration's; the parts that it leaves out stand as empty text between separators.
+            self.fail("; ".join(part for part in str(error).split("; ") if part), param, ctx)
 
 
 def physical_options(*, wall: bool, required: bool) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

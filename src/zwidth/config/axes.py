@@ -17,7 +17,8 @@ from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonS
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, describe, problem, problems_of, short, suggestion, validation_error
-from zwidth.config.fields import Strict, ValidationError, number, repeated, whole_number
+from zwidth.config.fields import Strict, ValidationError, repeated
+from zwidth.config.numbers import number, whole_number
 from zwidth.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
 
 LONGEST_AXIS = 10_000_000

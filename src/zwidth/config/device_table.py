@@ -26,8 +26,9 @@ from zwidth.config.faults import (
     suggestion,
     validation_error,
 )
-from zwidth.config.fields import looks_like_number
-from zwidth.config.parameters import delay_entries, entry_of
+from zwidth.config.numbers import looks_like_number
+from zwidth.config.parameters import delay_entries
+from zwidth.config.units import entry_of
 from zwidth.quantities import PARAMETERS
 
 LABEL = "label"

@@ -10,15 +10,15 @@ import difflib
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeAlias
-
-from pydantic import ValidationError
-from pydantic_core import InitErrorDetails, PydanticCustomError
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from zwidth.errors import ConfigError
 
+if TYPE_CHECKING:
+    from pydantic_core import PydanticCustomError, ValidationError
+
 FieldPath: TypeAlias = tuple[str | int, ...]
-LocatedProblem: TypeAlias = tuple[FieldPath, PydanticCustomError]
+LocatedProblem: TypeAlias = "tuple[FieldPath, PydanticCustomError]"
 
 _LONGEST_VALUE = 60
 
@@ -76,6 +76,9 @@ class ConfigFileError(ConfigError):
 def problem(what: str, allowed: str = "", remedy: str = "", *, on_key: bool = False) -> PydanticCustomError:
     """What a validator raises; ``on_key`` points at the key of the field instead of its value."""
     context = {"what": what, "allowed": allowed, "remedy": remedy, "on_key": on_key}
+    # Only a fault loads pydantic: the command line, which reads numbers alone, has no other use for it.
+    from pydantic_core import PydanticCustomError
+
     return PydanticCustomError("zwidth", "{what}; {allowed}; {remedy}", context)
 
 
@@ -92,6 +95,8 @@ def problems_of(error: ValidationError) -> list[LocatedProblem]:
 
 def validation_error(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:
     """Put located problems into one pydantic error; raised in a validator, it keeps all of them apart."""
+    from pydantic_core import InitErrorDetails, ValidationError
+
     details = [InitErrorDetails(type=what, loc=path, input=None) for path, what in problems]
     return ValidationError.from_exception_data(title, details)
 

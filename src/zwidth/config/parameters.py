@@ -11,28 +11,9 @@ from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
 
 from zwidth.config.axes import Axis, Entry, axis_of, axis_schema
 from zwidth.config.faults import describe, problem
-from zwidth.config.fields import number
-from zwidth.config.units import (
-    DAMPING,
-    MASS,
-    RATE,
-    STIFFNESS,
-    TIME,
-    Dimension,
-    dimension_of,
-    quantity,
-    span,
-    unit_schema,
-)
+from zwidth.config.fields import unit_schema
+from zwidth.config.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, dimension_of, entry_of, quantity, span
 from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
-
-
-def entry_of(name: str) -> Entry:
-    """A validator for one value of a parameter."""
-    parameter = PARAMETERS[name]
-    if parameter.unit == "1":
-        return number(parameter.allowed)
-    return quantity(dimension_of(parameter.unit), parameter.allowed)
 
 
 @dataclass(frozen=True)

@@ -10,20 +10,22 @@ from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DELAY_MODELS, DelayModel
 from zwidth.config.faults import LocatedProblem, describe, listing, problem, short
-from zwidth.config.fields import NonNegative, Number, Strict, Text, number, one_of
-from zwidth.config.units import (
+from zwidth.config.fields import (
     PERIOD_SCHEMA,
-    RATE,
     RATE_SCHEMA,
-    TIME,
     Damping,
     Delay,
     Mass,
-    Span,
+    NonNegative,
+    Number,
     Stiffness,
+    Strict,
+    Text,
     VirtualDamping,
-    quantity,
+    one_of,
 )
+from zwidth.config.numbers import number
+from zwidth.config.units import RATE, TIME, Span, quantity
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.errors import InputError
 from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range

@@ -5,14 +5,12 @@ from __future__ import annotations
 import re
 import unicodedata
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, NamedTuple
-
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema
+from typing import Any, Literal, NamedTuple
 
 from zwidth.config.faults import describe, problem, short, suggestion
-from zwidth.config.fields import check_range, looks_like_number, to_float
+from zwidth.config.numbers import check_range, looks_like_number, number, to_float
 from zwidth.domain import SI_RANGE
-from zwidth.quantities import ANY, NOT_NEGATIVE, POSITIVE, Range
+from zwidth.quantities import ANY, PARAMETERS, Range
 from zwidth.scene import normalize
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
@@ -40,7 +38,7 @@ DAMPING = Dimension(
 STIFFNESS = Dimension({"N/m": 0, "mN/m": -3, "kN/m": 3, "MN/m": 6, "N/mm": 3, "kN/mm": 6, "N/cm": 2}, "10 kN/m")
 _OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS)}
 
-_PERIODS = ("periods", "period")
+PERIOD_WORDS = ("periods", "period")
 
 
 def dimension_of(unit: str) -> Dimension:
@@ -78,7 +76,7 @@ def _canonical(unit: str) -> str:
 
 def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, str]:
     """The number in the base unit and that unit, or the number and "periods"."""
-    units = (*dimension.units, *_PERIODS) if periods else tuple(dimension.units)
+    units = (*dimension.units, *PERIOD_WORDS) if periods else tuple(dimension.units)
     names = ", ".join(units)
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
@@ -92,7 +90,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     if match is None:
         raise problem(f"got {describe(value)}", allowed, remedy)
     mantissa, exponent, unit = match.groups()
-    if periods and unit in _PERIODS:
+    if periods and unit in PERIOD_WORDS:
         return float(f"{mantissa}e{exponent or 0}"), "periods"
     powers = {_canonical(name): power for name, power in dimension.units.items()}
     power = powers.get(_canonical(unit))
@@ -132,31 +130,9 @@ def span(allowed: Range) -> Callable[[Any], Span]:
     return validate
 
 
-def unit_schema(dimension: Dimension, *more: str) -> WithJsonSchema:
-    units = ", ".join((*dimension.units, *more))
-    text = f"A number in {dimension.base}, or a number with one of the units {units}."
-    pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
-    return WithJsonSchema(
-        {
-            "description": text,
-            "examples": [dimension.example],
-            "anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}],
-        }
-    )
-
-
-Mass = Annotated[float, BeforeValidator(quantity(MASS, POSITIVE)), unit_schema(MASS)]
-Damping = Annotated[float, BeforeValidator(quantity(DAMPING, NOT_NEGATIVE)), unit_schema(DAMPING)]
-VirtualDamping = Annotated[float, BeforeValidator(quantity(DAMPING)), unit_schema(DAMPING)]
-Stiffness = Annotated[float, BeforeValidator(quantity(STIFFNESS)), unit_schema(STIFFNESS)]
-Delay = Annotated[
-    Span,
-    PlainValidator(span(NOT_NEGATIVE)),
-    PlainSerializer(str, return_type=str),
-    unit_schema(TIME, *_PERIODS),
-]
-Duration = Annotated[
-    Span, PlainValidator(span(POSITIVE)), PlainSerializer(str, return_type=str), unit_schema(TIME, *_PERIODS)
-]
-PERIOD_SCHEMA = unit_schema(TIME)
-RATE_SCHEMA = unit_schema(RATE)
+def entry_of(name: str) -> Callable[[Any], float]:
+    """A validator for one value of a parameter."""
+    parameter = PARAMETERS[name]
+    if parameter.unit == "1":
+        return number(parameter.allowed)
+    return quantity(dimension_of(parameter.unit), parameter.allowed)

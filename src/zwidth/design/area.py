@@ -45,7 +45,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, section V.
 
     Example:
-        >>> from zwidth.design import stable_area
+        >>> from zwidth import stable_area
         >>> print(f"{stable_area(0.0, 0):.4f}")
         0.9096
     """

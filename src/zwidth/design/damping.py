@@ -67,7 +67,7 @@ def fastest_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Damping
         Hulin, Preusche, Hirzinger 2006, section VIII.
 
     Example:
-        >>> from zwidth.design import fastest_damping
+        >>> from zwidth import fastest_damping
         >>> choice = fastest_damping(0.1, 0.0, 0)
         >>> print(f"{choice.beta:.3f} {choice.achieved:.3f}")
         0.452 0.609
@@ -129,7 +129,7 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
         Landau 1990 (modulus margin).
 
     Example:
-        >>> from zwidth.design import most_robust_damping
+        >>> from zwidth import most_robust_damping
         >>> choice = most_robust_damping(0.1, 0.0, 0)
         >>> 0 < choice.achieved < 1
         np.True_
@@ -222,7 +222,7 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
 
     Example:
-        >>> from zwidth.design import fastest_wall
+        >>> from zwidth import fastest_wall
         >>> wall = fastest_wall(0.0, 0)
         >>> print(f"{wall.alpha:.2f} {wall.beta:.2f} {wall.spectral_radius:.2f}")
         0.07 0.41 0.59

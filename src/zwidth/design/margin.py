@@ -39,7 +39,7 @@ def modulus_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Array
         Landau 1990 (modulus margin); Hulin, Preusche, Hirzinger 2006, eq. (15) for the loop.
 
     Example:
-        >>> from zwidth.design import modulus_margin
+        >>> from zwidth import modulus_margin
         >>> print(f"{modulus_margin(0.1, 0.2, 0.1, 0):.4f}")
         0.5898
     """

@@ -55,7 +55,7 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
         Colgate, Brown 1994 (Z-width); Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.
 
     Example:
-        >>> from zwidth.design import passive_area
+        >>> from zwidth import passive_area
         >>> print(f"{passive_area(0.5, 0):.4f}")
         0.5000
     """

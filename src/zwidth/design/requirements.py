@@ -142,7 +142,7 @@ def required_damping(
         Hulin, Preusche, Hirzinger 2006, section VII.
 
     Example:
-        >>> from zwidth.design import required_damping
+        >>> from zwidth import required_damping
         >>> print(f"{required_damping(20e3, mass=0.1, period=1e-3, delay=1e-3).value:.2f} N s/m")
         10.24 N s/m
     """
@@ -202,7 +202,7 @@ def required_period(
         Hulin, Preusche, Hirzinger 2006, section VII.
 
     Example:
-        >>> from zwidth.design import required_period
+        >>> from zwidth import required_period
         >>> print(f"{1 / required_period(20e3, mass=0.1, damping=10, delay_periods=1).value:.0f} Hz")
         1004 Hz
     """
@@ -276,7 +276,7 @@ def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike =
         Hulin, Preusche, Hirzinger 2006, section VII.
 
     Example:
-        >>> from zwidth.design import allowed_delay
+        >>> from zwidth import allowed_delay
         >>> print(f"{allowed_delay(20e3, mass=0.1, damping=10, period=1e-3).value * 1e3:.3f} ms")
         0.993 ms
     """
@@ -330,7 +330,7 @@ def required_mass(
         Hulin, Preusche, Hirzinger 2006, section VII.
 
     Example:
-        >>> from zwidth.design import required_mass
+        >>> from zwidth import required_mass
         >>> print(f"{required_mass(20e3, damping=10, period=1e-3, delay=1e-3).value:.4f} kg")
         0.1010 kg
     """

@@ -104,7 +104,7 @@ def robust_max_stiffness(
         Hulin, Preusche, Hirzinger 2006, section VII; Comba, Stolfi 1993; docs/theory/one-lobe.md (rows and columns).
 
     Example:
-        >>> from zwidth.design import Interval, robust_max_stiffness
+        >>> from zwidth import Interval, robust_max_stiffness
         >>> worst = robust_max_stiffness(mass=Interval(0.08, 0.12), damping=10, period=1e-3, delay=1e-3)
         >>> print(worst.is_vertex, worst.mass, f"{worst.stiffness:.0f} N/m")
         True 0.08 17051 N/m
@@ -138,7 +138,7 @@ def robust_wall(*, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain,
         Hulin, Preusche, Hirzinger 2006, sections V, VII; Comba, Stolfi 1993.
 
     Example:
-        >>> from zwidth.design import Interval, robust_wall
+        >>> from zwidth import Interval, robust_wall
         >>> wall = robust_wall(mass=Interval(0.08, 0.12), damping=10, period=1e-3, delay=Interval(0, 1e-3))
         >>> print(f"{wall.stiffness:.0f} N/m, {wall.virtual_damping:.1f} N s/m")
         17051 N/m, 33.1 N s/m

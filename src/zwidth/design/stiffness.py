@@ -65,7 +65,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         Hulin, Preusche, Hirzinger 2006, section VII.
 
     Example:
-        >>> from zwidth.design import max_stiffness
+        >>> from zwidth import max_stiffness
         >>> print(f"{max_stiffness(mass=0.1, damping=10, period=1e-3, delay=1e-3):.0f} N/m")
         19865 N/m
     """
@@ -127,7 +127,7 @@ def sensitivities(
         Hulin, Preusche, Hirzinger 2006, section VII.
 
     Example:
-        >>> from zwidth.design import sensitivities
+        >>> from zwidth import sensitivities
         >>> gain = sensitivities(mass=0.1, damping=10, period=1e-3, delay=1e-3)
         >>> print(f"{gain.per_damping:.0f} N/m per N s/m")
         572 N/m per N s/m
@@ -184,7 +184,7 @@ def sensitivity_lines(
         InputError: an argument is no single number in range.
 
     Example:
-        >>> from zwidth.design import sensitivity_lines
+        >>> from zwidth.design.stiffness import sensitivity_lines
         >>> print(sensitivity_lines(mass=0.1, damping=10, period=1e-3, delay=1e-3)[0])
         one more N s/m of damping buys 572 N/m
     """

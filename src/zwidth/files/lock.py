@@ -13,16 +13,13 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import json
 import os
 import socket
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 from zwidth.errors import StoreBusyError
 from zwidth.files.whole import check_folder
@@ -34,20 +31,6 @@ FOLDER = ".locks"
 _PATIENCE = 1.0
 _PAUSE = 0.02
 _UNKNOWN_TO_FILE_SYSTEM = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.ENOLCK, errno.EBADF})
-
-
-@dataclass(frozen=True)
-class Holder:
-    """Who holds a lock: process, machine, since when (UTC), and which shard where it is one."""
-
-    process: int
-    host: str
-    since: str
-    shard: str = ""
-
-    def __str__(self) -> str:
-        shard = f"shard {self.shard}, " if self.shard else ""
-        return f"{shard}process {self.process} on {self.host}, since {self.since} UTC"
 
 
 @contextmanager
@@ -64,161 +47,96 @@ def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None
     """
     check_folder(folder)
     (folder / FOLDER).mkdir(parents=True, exist_ok=True)
-    common = _File(folder / FOLDER / "run")
-    own = common if shard is None else _File(folder / FOLDER / f"shard-{shard[0]}")
-    try:
-        if shard is not None:
-            _join(common, folder, shard)
-        if not own.lock(fcntl.LOCK_EX):
-            raise StoreBusyError(_told(folder, shard))
-        own.write(asdict(_this_process(shard)))
-        yield
-    finally:
-        own.close()
-        common.close()
+    with _opened(folder / FOLDER / "run") as run:
+        if shard is None:
+            if not _lock(run, fcntl.LOCK_EX):
+                raise _busy(folder, "another run computes in this folder")
+            _write(run, _this_process())
+            yield
+            return
+        number, count = shard
+        # The first shard to come says how many there are to be.
+        if _lock(run, fcntl.LOCK_EX, patience=0.0):
+            _write(run, f"{count} shards")
+        # From alone to shared the kernel may let another in between: what is written counts only from here on.
+        if not _lock(run, fcntl.LOCK_SH):
+            raise _busy(folder, "another run computes in this folder")
+        said = _read(run)
+        if said.endswith(" shards") and said != f"{count} shards":
+            raise _busy(folder, f"{said} compute in this folder, not {count}")
+        with _opened(folder / FOLDER / f"shard-{number}") as own:
+            if not _lock(own, fcntl.LOCK_EX):
+                raise _busy(folder, f"shard {number} computes in this folder already")
+            _write(own, f"shard {number}/{count}, {_this_process()}")
+            yield
 
 
 @contextmanager
 def held_briefly(folder: Path, name: str) -> Iterator[None]:
     """Hold a lock of that name in a folder for as long as it takes to write a small file."""
-    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
-    file = _File(folder / FOLDER / name)
-    try:
+    with _opened(folder / FOLDER / name) as file:
         # Where another holds it for so long, it hangs: the file is written whole in any case.
-        file.lock(fcntl.LOCK_EX, patience=10.0)
+        _lock(file, fcntl.LOCK_EX, patience=10.0)
         yield
-    finally:
-        file.close()
 
 
-def _join(common: _File, folder: Path, shard: tuple[int, int]) -> None:
-    """Share the folder with the other shards; the first to come says how many there are to be."""
-    if common.lock(fcntl.LOCK_EX, patience=0.0):
-        common.write({"shards": shard[1]})
-    # From alone to shared the kernel may let another in between, so what is written counts only from here on.
-    if not common.lock(fcntl.LOCK_SH):
-        raise StoreBusyError(_told(folder, None))
-    count = common.read().get("shards", shard[1])
-    if count != shard[1]:
-        raise StoreBusyError(
-            f"out: {folder}: {count} shards compute in this folder, not {shard[1]}{_of(_holders(folder))}; give "
-            f"--shard i/{count}, wait until they end, or choose another folder with --out DIR"
-        )
-
-
-def _told(folder: Path, shard: tuple[int, int] | None) -> str:
-    """Why a folder cannot be had, and what to do."""
-    if shard is not None:
-        found = _File.holder_of(folder / FOLDER / f"shard-{shard[0]}")
-        holders = [found] if found else []
-        what = f"shard {shard[0]} computes in this folder already"
-    else:
-        holders = _holders(folder)
-        what = "another run computes in this folder"
-    remedy = "wait until it ends, or stop it"
-    if len(holders) == 1:
-        remedy += f" with 'kill {holders[0].process}'"
-        if holders[0].host != socket.gethostname():
-            remedy += f" on {holders[0].host}"
-    return f"out: {folder}: {what}{_of(holders)}; {remedy}, or choose another folder with --out DIR"
-
-
-def _of(holders: list[Holder]) -> str:
+def _busy(folder: Path, what: str) -> StoreBusyError:
+    """Why a folder cannot be had, who has it, and what to do."""
+    holders = []
+    for path in sorted((folder / FOLDER).glob("*")):
+        with suppress(OSError), _opened(path) as file:
+            held = not _lock(file, fcntl.LOCK_SH, patience=0.0)
+            holders += [_read(file)] if held and "process" in _read(file) else []
     more = f", and {len(holders) - 1} more" if len(holders) > 1 else ""
-    return f" ({holders[0]}{more})" if holders else ""
+    who = f" ({holders[0]}{more})" if holders else ""
+    return StoreBusyError(
+        f"out: {folder}: {what}{who}; wait until it ends, stop that process, or choose another folder with --out DIR"
+    )
 
 
-def _holders(folder: Path) -> list[Holder]:
-    """Who holds a folder: the run, or each shard that runs."""
-    files = [folder / FOLDER / "run", *sorted((folder / FOLDER).glob("shard-*"))]
-    return [holder for file in files if (holder := _File.holder_of(file))]
-
-
-def _this_process(shard: tuple[int, int] | None) -> Holder:
+def _this_process() -> str:
     since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S")
-    return Holder(os.getpid(), socket.gethostname(), since, f"{shard[0]}/{shard[1]}" if shard else "")
+    return f"process {os.getpid()} on {socket.gethostname()}, since {since} UTC"
 
 
-class _File:
-    """A file that is locked, and says who did it.
+@contextmanager
+def _opened(path: Path) -> Iterator[int]:
+    """A file to lock; made where it is missing, and closed, which frees it, when the block ends."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+    except PermissionError:
+        # Another user's: to lock it, local file systems want no more than this.
+        file = os.open(path, os.O_RDONLY)
+    try:
+        yield file
+    finally:
+        os.close(file)
 
-    Args:
-        path: the file; made where it is missing.
-    """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.file = self._open()
-
-    def _open(self) -> int:
+def _lock(file: int, how: int, patience: float | None = None) -> bool:
+    """Take or change the lock; False where another holds it all the time."""
+    deadline = time.monotonic() + (_PATIENCE if patience is None else patience)
+    while True:
         try:
-            return os.open(self.path, os.O_RDWR | os.O_CREAT, 0o666)
-        except PermissionError:
-            # Another user's: to lock it, local file systems want no more than this.
-            return os.open(self.path, os.O_RDONLY)
-
-    def lock(self, how: int, patience: float = _PATIENCE) -> bool:
-        """Take or change the lock; False where another holds it all the time."""
-        deadline = time.monotonic() + patience
-        while True:
-            try:
-                fcntl.flock(self.file, how | fcntl.LOCK_NB)
-            except OSError as error:
-                if error.errno in _UNKNOWN_TO_FILE_SYSTEM:
-                    return True
-                if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
-                    raise
-            else:
-                if self._is_in_place():
-                    return True
-                os.close(self.file)
-                self.path.parent.mkdir(parents=True, exist_ok=True)
-                self.file = self._open()
-                continue
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(_PAUSE)
-
-    def _is_in_place(self) -> bool:
-        """Whether the file has not been replaced, with its folder, by a run that overwrites."""
-        try:
-            return os.path.samestat(os.fstat(self.file), os.stat(self.path))
-        except FileNotFoundError:
+            fcntl.flock(file, how | fcntl.LOCK_NB)
+            return True
+        except OSError as error:
+            if error.errno in _UNKNOWN_TO_FILE_SYSTEM:
+                return True
+            if error.errno not in (errno.EWOULDBLOCK, errno.EACCES):
+                raise
+        if time.monotonic() > deadline:
             return False
+        time.sleep(_PAUSE)
 
-    def write(self, content: dict[str, Any]) -> None:
-        """Say something; where the file is another user's, nothing."""
-        try:
-            os.ftruncate(self.file, 0)
-            os.pwrite(self.file, json.dumps(content).encode(), 0)
-        except OSError:
-            # It is for messages alone: neither a full disk nor a foreign file may end a run here.
-            return
 
-    def read(self) -> dict[str, Any]:
-        """What the file says; nothing where that is not to be read."""
-        try:
-            content = json.loads(os.pread(self.file, 4096, 0))
-        except (OSError, ValueError):
-            return {}
-        return content if isinstance(content, dict) else {}
+def _write(file: int, text: str) -> None:
+    # It is for messages alone: neither a full disk nor a file of another user's may end a run here.
+    with suppress(OSError):
+        os.ftruncate(file, 0)
+        os.pwrite(file, text.encode(), 0)
 
-    def close(self) -> None:
-        """Let go."""
-        if self.file >= 0:
-            os.close(self.file)
-            self.file = -1
 
-    @classmethod
-    def holder_of(cls, path: Path) -> Holder | None:
-        """Who holds a file, if anyone does and has said who it is."""
-        try:
-            file = cls(path)
-        except OSError:
-            return None
-        try:
-            return None if file.lock(fcntl.LOCK_SH, patience=0.0) else Holder(**file.read())
-        except TypeError:
-            return None
-        finally:
-            file.close()
+def _read(file: int) -> str:
+    return os.pread(file, 200, 0).decode(errors="replace")

@@ -27,7 +27,8 @@ from zwidth.config.faults import (
     suggestion,
     validation_error,
 )
-from zwidth.config.fields import Name, Strict, Text, looks_like_number, members
+from zwidth.config.fields import Name, Strict, Text, members
+from zwidth.config.numbers import looks_like_number
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import Study

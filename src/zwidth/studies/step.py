@@ -13,7 +13,8 @@ from pydantic_core import PydanticCustomError
 
 from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Fraction, members, whole_number
+from zwidth.config.fields import Duration, Fraction, members
+from zwidth.config.numbers import whole_number
 from zwidth.config.scenes import (
     AnyDevice,
     AnyScene,
@@ -26,7 +27,7 @@ from zwidth.config.scenes import (
     normalized_wall,
 )
 from zwidth.config.study import HeldOnly, figure_layout
-from zwidth.config.units import Duration, Span
+from zwidth.config.units import Span
 from zwidth.figures.data import Response, StepData
 from zwidth.formatting import plain, with_unit
 from zwidth.quantities import Range

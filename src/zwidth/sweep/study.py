@@ -12,7 +12,8 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.axes import AnyAxis, Axis, DelayAxis, DeltaAxis, PointAxis
 from zwidth.config.device_table import Table, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Strict, members, number, one_of
+from zwidth.config.fields import Strict, members, one_of
+from zwidth.config.numbers import number
 from zwidth.config.parameters import (
     DampingAxis,
     DelayValues,

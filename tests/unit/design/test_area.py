@@ -7,7 +7,7 @@ from mpmath import mp, mpf
 
 import oracles
 import zwidth
-from zwidth.design import passive_area, stable_area
+from zwidth import passive_area, stable_area
 from zwidth.stability.poles import unstable_poles
 
 # Undamped; cut by the line of z = -1 before and after the corner becomes the ridge; delayed; held.

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.design import fastest_damping, fastest_wall, modulus_margin, most_robust_damping
+from zwidth import fastest_damping, fastest_wall, modulus_margin, most_robust_damping
 from zwidth.design.lowest import lowest
 from zwidth.stability.poles import radius_by_companion
 from zwidth.status import Status

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.design import allowed_delay, max_stiffness, required_damping, required_mass, required_period, sensitivities
+from zwidth import allowed_delay, max_stiffness, required_damping, required_mass, required_period, sensitivities
 from zwidth.status import Status
 
 BEYOND = [

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import zwidth
-from zwidth.design import max_stiffness
+from zwidth import max_stiffness
 
 ROOT = Path(__file__).resolve().parents[3]
 

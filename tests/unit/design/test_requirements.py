@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.design import allowed_delay, max_stiffness, required_damping, required_mass, required_period, sensitivities
+from zwidth import allowed_delay, max_stiffness, required_damping, required_mass, required_period, sensitivities
 from zwidth.status import Status
 
 # The search takes a logarithm of K_max/K within 1e-14 for 0; the forward model adds a few rounding errors.

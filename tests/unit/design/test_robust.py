@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 import zwidth
-from zwidth.design import Interval, max_stiffness, robust_max_stiffness, robust_wall
+from zwidth import Interval, max_stiffness, robust_max_stiffness, robust_wall
 from zwidth.status import Status
 
 BOX = {"mass": Interval(0.08, 0.12), "damping": Interval(5.0, 15.0), "period": 1e-3, "delay": Interval(0.5e-3, 1e-3)}

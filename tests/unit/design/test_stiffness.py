@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.design import max_stiffness, sensitivities, sensitivity_lines
+from zwidth import max_stiffness, sensitivities
+from zwidth.design.stiffness import sensitivity_lines
 
 NAMES = ("mass", "damping", "period", "delay")
 # Device by device: light, damped, slow; whole, fractional and no delay; the last two corners.

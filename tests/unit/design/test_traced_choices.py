@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.design import fastest_damping, fastest_wall, most_robust_damping
+from zwidth import fastest_damping, fastest_wall, most_robust_damping
 from zwidth.design.column import column, lobe
 from zwidth.status import Status
 

@@ -2,7 +2,6 @@
 
 import errno
 import fcntl
-import json
 import os
 import signal
 import socket
@@ -67,23 +66,14 @@ def test_a_second_run_is_refused_and_told_who_holds_the_folder(holder, tmp_path)
     message = str(caught.value)
     assert message.startswith(f"out: {tmp_path}: another run computes in this folder (process {process.pid} on ")
     assert f" on {socket.gethostname()}, since 20" in message
-    assert message.endswith(
-        f" UTC); wait until it ends, or stop it with 'kill {process.pid}', or choose another folder with --out DIR"
-    )
+    assert message.endswith(" UTC); wait until it ends, stop that process, or choose another folder with --out DIR")
     assert list(tmp_path.glob("*.zarr")) == []
-
-
-def test_another_machine_is_named(holder, tmp_path, monkeypatch):
-    process = holder(tmp_path)
-    monkeypatch.setattr(socket, "gethostname", lambda: "elsewhere")
-    with pytest.raises(StoreBusyError, match=f"stop it with 'kill {process.pid}' on (?!elsewhere)"), holding(tmp_path):
-        pass
 
 
 def test_a_killed_holder_does_not_block_a_run(holder, tmp_path):
     kill(holder(tmp_path))
     # Its files are still there.
-    assert json.loads((tmp_path / ".locks" / "run").read_text(encoding="utf-8"))["host"] == socket.gethostname()
+    assert f" on {socket.gethostname()}, since " in (tmp_path / ".locks" / "run").read_text(encoding="utf-8")
     assert run_sweeps(config_of(), tmp_path, resume=True).ok
 
 
@@ -105,7 +95,7 @@ def test_shards_share_a_folder(holder, tmp_path):
     with pytest.raises(StoreBusyError) as caught:
         run_sweeps(config_of(), tmp_path, resume=True)
     assert f"(shard 1/3, process {first.pid} on " in str(caught.value)
-    assert "UTC, and 1 more); wait until it ends, or stop it, or" in str(caught.value)
+    assert "UTC, and 1 more); wait until it ends, stop that process, or" in str(caught.value)
     kill(first)
     kill(third)
     assert run_sweeps(config_of(), tmp_path, resume=True).ok
@@ -124,7 +114,7 @@ def test_one_shard_runs_only_once_at_a_time(holder, tmp_path):
 
 def test_shards_of_another_number_are_refused_while_the_first_run(holder, tmp_path):
     process = holder(tmp_path, 2, 3)
-    says = rf"3 shards compute in this folder, not 4 \(shard 2/3, process {process.pid} .*; give --shard i/3, wait"
+    says = rf"3 shards compute in this folder, not 4 \(shard 2/3, process {process.pid} .*; wait until it ends, stop"
     with pytest.raises(StoreBusyError, match=says):
         run_sweeps(config_of(), tmp_path, shard=(1, 4))
     kill(process)
@@ -191,19 +181,6 @@ def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch, numbe
     monkeypatch.setattr(fcntl, "flock", refused)
     with holding(tmp_path), holding(tmp_path, (1, 2)):
         pass
-
-
-def test_a_lock_on_a_folder_that_was_replaced_does_not_count(tmp_path):
-    out, old = tmp_path / "out", tmp_path / "old"
-    file = None
-    with holding(out):
-        file = lock._File(out / ".locks" / "run")
-        out.rename(old)
-    with holding(out):
-        # It would be free where the old folder went.
-        assert not file.lock(fcntl.LOCK_EX)
-    assert file.lock(fcntl.LOCK_EX)
-    file.close()
 
 
 def test_a_damaged_file_of_a_lock_costs_only_the_name_of_its_holder(holder, tmp_path):

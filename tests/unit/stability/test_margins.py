@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.design import modulus_margin
+from zwidth import modulus_margin
 from zwidth.errors import InputError
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import device
