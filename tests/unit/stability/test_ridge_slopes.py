@@ -97,8 +97,10 @@ def test_gradient_and_hessian_outside_jit_against_60_digits(model, x64):
 
         p = jnp.array([delta, d])
         np.testing.assert_allclose(jax.grad(alpha)(p), exact, rtol=1e-13, atol=1e-14 * size)
-        curvature = np.array(hessian, dtype=float)
-        np.testing.assert_allclose(jax.hessian(alpha)(p), curvature, rtol=1e-10, atol=1e-11 * size)
+        # Compiled for 11 s each: the Hessians of both models are held to 160 digits in test_ridge.py.
+        if model == "held":
+            curvature = np.array(hessian, dtype=float)
+            np.testing.assert_allclose(jax.hessian(alpha)(p), curvature, rtol=1e-10, atol=1e-11 * size)
 
 
 def test_grad_vmap_and_jit_agree(x64):
