@@ -209,7 +209,7 @@ def _margins(columns: Columns) -> Columns:
         found = margins(*piece)
         return tuple(np.asarray(getattr(found, name)) for name in _MARGINS)
 
-    return in_pieces(of_piece, columns, _WALL_PIECE)
+    return in_pieces(of_piece, columns, _PIECE)
 
 
 def _all_devices(d: np.ndarray) -> Iterator[np.ndarray]:

@@ -13,6 +13,7 @@ from mpmath import mp, mpf
 import oracles
 import tolerances as tol
 import zwidth
+from compiling import SOON
 from zwidth.batching import map_flat
 from zwidth.errors import InputError
 from zwidth.loop import line_at_minus_one
@@ -156,7 +157,7 @@ def along(delay):
         (first, second), (_, third) = jax.jvp(slope, (0.0,), (1.0,))
         return first, second, third
 
-    return jax.jit(jax.vmap(jax.vmap(derivatives, (None, 0)), (0, None)))
+    return jax.jit(jax.vmap(jax.vmap(derivatives, (None, 0)), (0, None)), compiler_options=SOON)
 
 
 @pytest.mark.parametrize("delay", ["held", "fractional_power"])
@@ -180,7 +181,9 @@ def test_derivatives(delay, x64):
 
 def test_derivatives_in_omega_beside_pi(x64):
     # Both parts are even about pi: the slope is the second derivative times the distance.
-    slope = jax.jit(jax.jacfwd(lambda omega, delta, d: jnp.stack(zwidth.boundary(omega, delta, d)), 0))
+    slope = jax.jit(
+        jax.jacfwd(lambda omega, delta, d: jnp.stack(zwidth.boundary(omega, delta, d)), 0), compiler_options=SOON
+    )
     for delta, d in ((0.5, 0.0), (0.0, 0.5), (0.3, 0.5), (0.7, 1.0), (0.2, 4.0), (2.0, 37.25)):
         with mp.workdps(80):
             h = mpf(10) ** -12
@@ -376,7 +379,8 @@ def test_derivatives_of_a_point(x64):
         return found.alpha, found.omega
 
     points = np.array([(0.1, 1.0, 0.3), (0.7, 2.4, 0.1), (0.0, 0.0, 0.5), (np.nan, 1.0, 0.1), (0.1, 1.0, 50.0)])
-    (value, omega), slope = jax.jit(jax.vmap(jax.value_and_grad(stiffest, has_aux=True)))(jnp.asarray(points))
+    gradient = jax.jit(jax.vmap(jax.value_and_grad(stiffest, has_aux=True)), compiler_options=SOON)
+    (value, omega), slope = gradient(jnp.asarray(points))
     np.testing.assert_array_equal(np.isnan(value), [False, False, False, True, True])
     assert np.isnan(slope[3:]).all()
     h = mpf(10) ** -25

@@ -12,6 +12,7 @@ import pytest
 from flint import acb, acb_poly, arb, ctx
 
 import zwidth
+from compiling import SOON
 from zwidth.errors import InputError
 from zwidth.stability import counting
 from zwidth.stability.counting import count_poles
@@ -359,8 +360,10 @@ def test_traced_counts_are_the_direct_ones(x64):
     direct = count_poles(zeros, poles, gain, lag, radius)
     assert (direct[40:50] == -1)[radius[40:50] == 1].all()
     assert direct[65] == -1
-    np.testing.assert_array_equal(jax.jit(jax.vmap(count_poles))(zeros, poles, gain, lag, radius), direct)
-    np.testing.assert_array_equal(jax.jit(count_poles)(zeros, poles, gain, lag, radius), direct)
+    np.testing.assert_array_equal(
+        jax.jit(jax.vmap(count_poles), compiler_options=SOON)(zeros, poles, gain, lag, radius), direct
+    )
+    np.testing.assert_array_equal(jax.jit(count_poles, compiler_options=SOON)(zeros, poles, gain, lag, radius), direct)
 
 
 def test_traced_numbers_in_lists_and_plain_numbers_alone(x64):
@@ -368,7 +371,7 @@ def test_traced_numbers_in_lists_and_plain_numbers_alone(x64):
         return count_poles([gain], [1.0], 0.1 * gain, 3), count_poles([0.2], [1.0, 0.9], 0.01, 3)
 
     gain = np.linspace(-2, 2, 20)
-    traced, plain = jax.jit(jax.vmap(mixed))(gain)
+    traced, plain = jax.jit(jax.vmap(mixed), compiler_options=SOON)(gain)
     assert traced.tolist() == [count_poles([g], [1.0], 0.1 * g, 3) for g in gain]
     assert (plain == count_poles([0.2], [1.0, 0.9], 0.01, 3)).all()
 
@@ -377,7 +380,10 @@ def test_single_precision_is_traced_with_its_own_rounding():
     # JAX's default: of values that float32 holds, no count may be wrong, only more of them undecided.
     rng = np.random.default_rng(90)
     zeros, poles, gain = (rng.normal(size=shape).astype(np.float32) for shape in ((1000, 2), (1000, 3), (1000,)))
-    direct, single = count_poles(zeros, poles, gain, 4), jax.jit(count_poles)(zeros, poles, gain, 4)
+    direct, single = (
+        count_poles(zeros, poles, gain, 4),
+        jax.jit(count_poles, compiler_options=SOON)(zeros, poles, gain, 4),
+    )
     assert single.dtype == np.int32
     told = np.asarray(single) >= 0
     np.testing.assert_array_equal(np.asarray(single)[told], direct[told])

@@ -9,6 +9,7 @@ import pytest
 
 import tolerances as tol
 import zwidth
+from compiling import SOON
 from zwidth.errors import InputError
 from zwidth.stability.slope import slope_kernel, stiffness_slope
 
@@ -66,7 +67,7 @@ def test_is_the_limit_of_the_ridge(model):
 
 @cache
 def compiled_slopes(model):
-    return jax.jit(jax.vmap(jax.value_and_grad(lambda d: slope_kernel(d, model))))
+    return jax.jit(jax.vmap(jax.value_and_grad(lambda d: slope_kernel(d, model))), compiler_options=SOON)
 
 
 def slopes_of_slope(d, model):

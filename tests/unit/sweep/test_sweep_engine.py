@@ -102,7 +102,9 @@ MANY_ROWS = {"alpha": [0.1], "beta": {"linear": {"start": -0.1, "stop": 0.5, "nu
 
 @pytest.mark.parametrize("axes, target", [(FEW, 1), (FEW, 7), (MANY_ROWS, 11), (MANY_ROWS, 100)])
 def test_values_do_not_depend_on_chunks(tmp_path, monkeypatch, axes, target):
-    monkeypatch.setattr("zwidth.sweep.compute._PIECE", 16)
+    # Each of the many chunks fills up one piece of every size.
+    for size in ("_PIECE", "_WALL_PIECE", "_RADIUS_PIECE"):
+        monkeypatch.setattr(f"zwidth.sweep.compute.{size}", 64)
     config = config_of(study(axes=axes, outputs=(*WALLS, *DEVICES)))
     run_sweeps(config, tmp_path / "whole")
     cut(monkeypatch, target, 2)
