@@ -1,5 +1,6 @@
 """Runs that are killed or stopped at any moment, and what becomes of them."""
 
+import json
 import os
 import random
 import shlex
@@ -121,13 +122,58 @@ def group_lives(group):
     return True
 
 
+def test_every_kind_of_study_survives_kills_at_any_moment(tmp_path):
+    studies = [
+        {"kind": "ridge", "name": "ridge", "delta": {"linear": {"start": 0, "stop": 2, "num": 50}}, "d": [0, 1]},
+        {"kind": "boundary", "name": "boundary", "delta": [0, 0.5], "d": [0, 2]},
+        {"kind": "map", "name": "map", "alpha": [0.1, 0.2, 0.9], "beta": [0.1, 0.4], "delta": 0.1, "d": [0, 0.5]},
+        study("swept", {**AXES, "delta": [0.0, 0.5], "d": [1]}),
+    ]
+    config, out = tmp_path / "all.yaml", tmp_path / "out"
+    config.write_text(yaml.safe_dump({"version": 1, "name": "all", "studies": studies}), encoding="utf-8")
+    started = time.monotonic()
+    assert zwidth("run", config, "--out", tmp_path / "undisturbed").returncode == 0
+    whole = time.monotonic() - started
+    out.mkdir()
+    (out / ".mine").write_text("not the run's", encoding="utf-8")
+    moments, kept = random.Random(20062), {}
+    for _ in range(2 * MOMENTS):
+        process = start("run", config, "--out", out, "--resume")
+        time.sleep(moments.uniform(0.2, 1.0) * whole)
+        kill_group(process)
+        for name, before in kept.items():
+            path = out / name
+            assert (path.stat().st_ino, path.stat().st_mtime_ns) == before, f"{name} was made again"
+        kept = done_files(out)
+    result = zwidth("run", config, "--out", out, "--resume")
+    assert result.returncode == 0, result.stderr
+    expected = set(os.listdir(tmp_path / "undisturbed"))
+    assert set(os.listdir(out)) == expected | {".mine"}
+    for name in expected:
+        if name.endswith((".csv", ".npz")):
+            assert (out / name).read_bytes() == (tmp_path / "undisturbed" / name).read_bytes(), name
+    assert_same(tmp_path / "undisturbed", out)
+    assert (out / ".mine").read_text(encoding="utf-8") == "not the run's"
+
+
+def done_files(out):
+    """The files of the studies that the record calls done, each with what would change if it were written again."""
+    if not (out / "run.json").is_file():
+        return {}
+    entries = json.loads((out / "run.json").read_text(encoding="utf-8"))["studies"]
+    names = [
+        name for entry in entries if entry["state"] == "done" and entry["kind"] != "sweep" for name in entry["files"]
+    ]
+    return {name: ((out / name).stat().st_ino, (out / name).stat().st_mtime_ns) for name in names}
+
+
 @pytest.mark.parametrize("number, options", [(signal.SIGINT, ["--workers", "1"]), (signal.SIGTERM, [])])
 def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number, options):
     process = start("run", config, "--out", tmp_path / "an out", *options)
     wait_for_chunks(process, tmp_path / "an out", 1)
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
     _, errors = process.communicate(timeout=60)
-    assert process.returncode == 130, errors
+    assert process.returncode == 128 + number, errors
     again = shlex.join(["zwidth", "run", str(config), "--out", str(tmp_path / "an out"), "--resume", *options])
     assert errors.endswith(f"zwidth: stopped; what is done is kept, go on with: {again}\n")
     assert "Traceback" not in errors

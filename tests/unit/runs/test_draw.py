@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from sweeping import run_sweeps, config_of, failing_on_2, main_of, study
+from sweeping import config_of, failing_on_2, main_of, run_sweeps, study
 from zwidth.errors import InputError, StoreError
 from zwidth.figures.curves import draw_curves
 from zwidth.figures.plane import draw_plane

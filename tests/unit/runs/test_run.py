@@ -1,5 +1,6 @@
 """The one run: folders, events, failures, the record, and going on with what is there."""
 
+import contextlib
 import json
 import os
 import shutil
@@ -166,9 +167,12 @@ def test_repeated_figures_of_the_paper_bring_its_numbers():
 
 
 # A sweep as well: what holds for one kind of study holds for every other.
-BOTH = SMALL + """
+BOTH = (
+    SMALL
+    + """
   - {kind: sweep, name: swept, axes: {alpha: [0.1, 0.9], beta: [0.1, 0.4], delta: 0.1, d: [0, 1]}}
 """
+)
 
 
 @pytest.fixture
@@ -183,7 +187,9 @@ def finished(both, tmp_path):
     """The folder of a run that nothing disturbed."""
     result = run(both, out=tmp_path / "out")
     assert result.ok
-    assert [(study.name, study.state) for study in result.studies] == [(name, "done") for name in ("one", "two", "swept")]
+    assert [(study.name, study.state) for study in result.studies] == [
+        (name, "done") for name in ("one", "two", "swept")
+    ]
     return result.folder
 
 
@@ -226,7 +232,9 @@ def test_a_strangers_file_in_the_place_of_a_result_is_not_replaced(both, tmp_pat
     (out / "thesis.npz").write_bytes(b"years of work")
     result = run(both, out=out, resume=True)
     (failed,) = result.failed
-    assert failed.error.startswith(f"StoreExistsError: out: {out / 'thesis.npz'} was not written by this run; move it away")
+    assert failed.error.startswith(
+        f"StoreExistsError: out: {out / 'thesis.npz'} was not written by this run; move it away"
+    )
     assert (out / "thesis.npz").read_bytes() == b"years of work"
     (out / "thesis.npz").unlink()
     assert run(both, out=out, resume=True).ok
@@ -322,7 +330,9 @@ def test_a_study_that_is_added_is_computed_and_one_that_is_removed_stays(finishe
 
 def test_another_release_is_refused(finished, both, monkeypatch):
     monkeypatch.setattr("zwidth.files.provenance.__version__", "99.0")
-    with pytest.raises(StoreError, match=r"run\.json: made with zwidth .*, now there is 99\.0; install the same release"):
+    with pytest.raises(
+        StoreError, match=r"run\.json: made with zwidth .*, now there is 99\.0; install the same release"
+    ):
         run(both, out=finished, resume=True)
 
 
@@ -383,10 +393,8 @@ def test_a_run_that_ends_at_any_file_is_gone_on_with(both, tmp_path, monkeypatch
     for moment in range(0, 40, 3):
         out = tmp_path / str(moment)
         left = moment
-        try:
+        with contextlib.suppress(SystemExit):
             run(both, out=out)
-        except SystemExit:
-            pass
         left = 10**6
         with monkeypatch.context() as whole:
             whole.setattr(shutil, "rmtree", remove)
