@@ -1,9 +1,9 @@
 """Spectral radii of maps: the outermost pole of one node a cell is found by itself and followed to the cell's points.
 
-The derivatives of the node's pole with respect to alpha and beta, up to the second, place the pole of every point; two
-Newton steps finish it and the proof of `zwidth.stability.quick` accepts it. What is not accepted (another pole is the
-outermost there, or two are about to meet) is left to the search for single points. Cells are computed in lists of one
-length, so that maps of any size, and of any number of devices, share one compilation.
+The derivatives of the node's pole by alpha and beta place the pole of every point; a step of Halley's method, one of
+Newton's and the proof of `zwidth.stability.radius` finish it. What is not proved (another pole is the outermost there,
+or two are about to meet) is left to the methods for single points. Cells are computed in lists of one length, so that
+maps of any size, and of any number of devices, share one compilation.
 """
 
 from __future__ import annotations
@@ -17,18 +17,17 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import concretely, processors
 from zwidth.domain import wall_status
-from zwidth.stability.circle import Loop, loop_of
+from zwidth.stability.circle import loop_of
 from zwidth.stability.layout import Points
-from zwidth.stability.quick import certified, moved, stepped
-from zwidth.stability.radius import Found
+from zwidth.stability.pole_step import halley_step, moved, value_at
+from zwidth.stability.radius import Found, certified
 
 # Points along each side of a cell.
-_CELL = 16
+_CELL = 8
 # Cells computed at one time: what their points hold stays in the cache.
-_LIST = 64
+_LIST = 256
 # Smaller maps are not worth a compilation of their own.
 SMALLEST_MAP = 1 << 14
-_STEPS = 2
 
 
 class Map(NamedTuple):
@@ -80,58 +79,25 @@ def as_map(points: Points) -> Map | None:
     return Map(points.alpha.reshape(-1), points.beta.reshape(-1), delta, d, order, whole)
 
 
-def _taylor(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) -> np.ndarray:
-    """``w = log z`` of the nodes and its derivatives, from those of P(e^w; alpha, beta) = 0."""
-    power = loop.turns + 1.0 if fractional else loop.turns
-    w = re + 1j * im
-    # e^w - 1 without cancellation
-    sine = np.sin(0.5 * im)
-    gap = np.expm1(re) - 2.0 * np.exp(re) * sine * sine + 1j * np.exp(re) * np.sin(im)
-    z = 1.0 + gap
-    scale = np.maximum(power * re, 0.0)
-    lag, down = np.exp(power * w - scale), np.exp(-scale)
-    # Values, first and second derivatives by w of T = z^p A, N = N(z) and of alpha + s (z - 1).
-    a = gap * (gap + loop.em)
-    a1 = z * (2.0 * gap + loop.em)
-    a2 = a1 + 2.0 * z * z
-    t1, t2 = lag * (power * a + a1), lag * (power * power * a + 2.0 * power * a1 + a2)
-    n, n1, n2 = loop.h + loop.a2 * z, loop.a2 * z, loop.a2 * z
-    if fractional:
-        late = z + loop.q
-        n, n1, n2 = n * late, n1 * late + n * z, n2 * late + 2.0 * n1 * z + n * z
-    n, n1, n2 = n * down, n1 * down, n2 * down
-    wall, wall1 = loop.alpha + loop.s * gap, loop.s * z
-    p1 = t1 + n1 * wall + n * wall1
-    p2 = t2 + n2 * wall + 2.0 * n1 * wall1 + n * wall1
-    # By alpha and by beta P changes by N z and N (z - 1).
-    by_a, by_a1 = n * z, n1 * z + n * z
-    by_b, by_b1 = n * gap, n1 * gap + n * z
-    w_a, w_b = -by_a / p1, -by_b / p1
-    w_aa = -(2.0 * by_a1 * w_a + p2 * w_a * w_a) / p1
-    w_ab = -(by_a1 * w_b + by_b1 * w_a + p2 * w_a * w_b) / p1
-    w_bb = -(2.0 * by_b1 * w_b + p2 * w_b * w_b) / p1
-    return np.stack([w, w_a, w_b, 0.5 * w_aa, w_ab, 0.5 * w_bb])
-
-
 @cache
 def _cells(fractional: bool) -> Any:
-    """The compiled work on a list of cells: arrays (cells, points of beta, points of alpha)."""
+    """The compiled work on a list of cells: arrays (points of beta, points of alpha, cells)."""
     import jax
 
-    def kernel(alpha: Array, beta: Array, middle: Array, re: Array, im: Array, device: Array, tolerance: Array) -> Any:
-        alpha, beta = alpha[:, None, :], beta[:, :, None]
-        middle, re, im, device = (part[..., None, None] for part in (middle, re, im, device))
-        da, db = alpha - middle[0], beta - middle[1]
-        z_re, z_im = (
-            part[0] + da * (part[1] + da * part[3] + db * part[4]) + db * (part[2] + db * part[5]) for part in (re, im)
+    def kernel(alpha: Array, beta: Array, node: Array, re: Array, im: Array, tolerance: Array) -> Found:
+        node, re, im = node[:, None, None, :], re[None, None, :], im[None, None, :]
+        middle = value_at(re, im, loop_of(*node, fractional), fractional)
+        back = middle.first.conjugate() * (-1.0 / (middle.first.real**2 + middle.first.imag**2))
+        by_alpha, by_beta = middle.by_alpha * back, middle.by_beta * back
+        alpha, beta = alpha[None, :, :], beta[:, None, :]
+        da, db = alpha - node[0], beta - node[1]
+        nothing = 0.0 * node[2]
+        device = loop_of(nothing, nothing, node[2], node[3], fractional)
+        loop = device._replace(alpha=alpha, beta=beta, s=alpha + beta)
+        start = moved(
+            re + (da * by_alpha.real + db * by_beta.real), im, 0.0, da * by_alpha.imag + db * by_beta.imag
         )
-        z_re, z_im = moved(z_re, z_im, 0.0, 0.0)
-        nothing = 0.0 * device[0]
-        loop = loop_of(nothing, nothing, device[0], device[1], fractional)
-        loop = loop._replace(alpha=alpha, beta=beta, s=alpha + beta)
-        for _ in range(_STEPS):
-            z_re, z_im = stepped(z_re, z_im, loop, fractional, limit=False)
-        return certified(Found(z_re, z_im), tolerance, loop, fractional)
+        return certified(*halley_step(*start, loop, fractional), tolerance, loop, fractional, True)
 
     return jax.jit(kernel)
 
@@ -152,33 +118,26 @@ def nodes_of(area: Map) -> list[np.ndarray]:
 
 def followed_poles(
     area: Map, nodes: list[np.ndarray], re: np.ndarray, im: np.ndarray, tolerance: float, fractional: bool
-) -> tuple[np.ndarray, ...]:
-    """The pole of every point and whether it is proved to be the outermost, from those of the nodes."""
-    across, down = _cut(area.alpha), _cut(area.beta)
-    with np.errstate(all="ignore"):
-        alpha, beta, delta, d = nodes
-        taylor: Any = _taylor(re, im, loop_of(alpha, beta, delta, d, fractional), fractional)
-    # A real pole stays real.
-    real = (im == 0) | (im == np.pi)
-    parts = np.stack([taylor.real, np.where(real & (np.arange(6)[:, None] > 0), 0.0, taylor.imag)])
-    parts = np.where(np.isfinite(parts), parts, 0.0)
-    grid = (area.delta.size, len(down), len(across))
-    count = int(np.prod(grid))
-    shape = (area.delta.size, len(down) * _CELL, len(across) * _CELL)
-    out = tuple(np.empty(shape, kind) for kind in (np.float64, np.float64, np.bool_))
-    tiles = [leaf.reshape(area.delta.size, len(down), _CELL, len(across), _CELL) for leaf in out]
+) -> Found:
+    """The pole of every point, and whether it is proved to be the outermost, from those of the nodes."""
+    across, down = _cut(area.alpha).T, _cut(area.beta).T
+    grid = (area.delta.size, down.shape[1], across.shape[1])
+    count = re.size
+    shape = (area.delta.size, grid[1] * _CELL, grid[2] * _CELL)
+    out = Found(*(np.empty(shape, np.bool_ if name == "proved" else np.float64) for name in Found._fields))
+    tiles = [leaf.reshape(grid[0], grid[1], _CELL, grid[2], _CELL) for leaf in out]
     run = _cells(fractional)
 
     def piece(start: int) -> None:
         index = np.minimum(np.arange(start, start + _LIST), count - 1)
         at = np.unravel_index(index, grid)
-        middle, device = np.stack([c[index] for c in nodes[:2]]), np.stack([c[index] for c in nodes[2:]])
+        node = np.stack([column[index] for column in nodes])
         with concretely():
-            found = run(across[at[2]], down[at[1]], middle, parts[0][:, index], parts[1][:, index], device, tolerance)
+            found = run(across[:, at[2]], down[:, at[1]], node, re[index], im[index], tolerance)
             for tile, leaf in zip(tiles, found, strict=True):
-                tile[at[0], at[1], :, at[2], :] = np.asarray(leaf)
+                tile[at[0], at[1], :, at[2], :] = np.asarray(leaf).transpose(2, 0, 1)
 
     piece(0)
     with ThreadPoolExecutor(processors()) as pool:
         list(pool.map(piece, range(_LIST, count, _LIST)))
-    return tuple(leaf[:, : area.beta.size, : area.alpha.size] for leaf in out)
+    return Found(*(leaf[:, : area.beta.size, : area.alpha.size] for leaf in out))

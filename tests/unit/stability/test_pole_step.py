@@ -6,7 +6,7 @@ from mpmath import mp
 
 import oracles
 from zwidth.stability.circle import loop_of
-from zwidth.stability.pole_step import pole_step, ratio_step
+from zwidth.stability.pole_step import newton_step
 
 
 def walls(d, count=12):
