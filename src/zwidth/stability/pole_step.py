@@ -73,7 +73,8 @@ class Value(NamedTuple):
 def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
     """Sine and cosine for |x| <= pi/2; several times faster than the compiler's, which serve every argument."""
     if xp is np:
-        return np.sin(x), np.cos(x)
+        # Python's numbers stay Python's.
+        return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))
     square = x * x
     return x * horner(square, _SINE), horner(square, _COSINE)
 
@@ -81,9 +82,11 @@ def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
 def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     """Evaluate at ``e^(re + j im)``, |im| <= pi."""
     xp = namespace(re, loop.alpha)
-    number: Any = complex if isinstance(re, np.float64) else Pair
+    number: Any = Pair
+    if xp is np and not np.ndim(re):
+        number, re, im, loop = complex, float(re), float(im), Loop(*map(float, loop))
     power = loop.turns + 1.0 if fractional else loop.turns
-    size = xp.expm1(re)
+    size = xp.expm1(re) if number is Pair else float(np.expm1(re))
     r = 1.0 + size
     sine, cosine = _half_turn(0.5 * im, xp)
     gap = number(size - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
@@ -93,7 +96,10 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     less = xp.exp(xp.where(growth < 0, growth, -growth))
     up, down = xp.where(growth < 0, less, 1.0), xp.where(growth < 0, 1.0, less)
     phase = power * im
-    phase = phase - 2.0 * np.pi * xp.round(phase / (2.0 * np.pi))
+    whole = xp.round(phase / (2.0 * np.pi))
+    if number is complex:
+        up, down, whole = float(up), float(down), float(whole)
+    phase = phase - 2.0 * np.pi * whole
     turned, level = _half_turn(0.5 * phase, xp)
     lag = number(up * (1.0 - 2.0 * turned * turned), 2.0 * up * turned * level)
     a, slope = gap * (gap + loop.em), z * (gap * 2.0 + loop.em)
@@ -112,7 +118,10 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     t2 = lag * ((a * power + slope * 2.0) * power + slope + z * z * 2.0)
     turning = power * (xp.abs(re) + xp.abs(im))
     rounding = up * width * (width + loop.em) * (_ROUNDING + turning) + _ROUNDING * sizes
-    return Value(lag * a + d, t1 + d1, t2 + d2, lead * z, lead * gap, epsilon(re) * rounding)
+    parts = (lag * a + d, t1 + d1, t2 + d2, lead * z, lead * gap)
+    # Unlike Python's numbers, NumPy's may be divided by zero.
+    parts = map(np.complex128, parts) if number is complex else parts
+    return Value(*parts, epsilon(re) * rounding)
 
 
 class Step(NamedTuple):

@@ -16,7 +16,7 @@ from zwidth.stability.circle import loop_of
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import kind_of
 from zwidth.stability.layout import Points, fold
-from zwidth.stability.radius import Found, bounded, certified, quick_kernel, search
+from zwidth.stability.radius import WIDE, Found, bounded, certified, quick_kernel, search
 from zwidth.stability.radius_map import SMALLEST_MAP, Map, as_map, followed_poles, nodes_of
 from zwidth.status import Status
 
@@ -43,7 +43,7 @@ class Poles(NamedTuple):
 def _compiled(fractional: bool) -> Any:
     import jax
 
-    return jax.jit(lambda *columns: quick_kernel(*columns, fractional))
+    return jax.jit(lambda *columns: quick_kernel(*columns, fractional), compiler_options=WIDE)
 
 
 def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW) -> Poles:
@@ -78,10 +78,9 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: in
 def _finished(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool) -> Poles:
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
     error = np.where(found.proved, accuracy, np.inf)
-    for start in range(0, error.size, BLOCK):
-        left = start + np.flatnonzero(~found.proved[start : start + BLOCK])
-        for first in range(0, left.size, FEW):
-            _patiently(columns, found, error, left[first : first + FEW], accuracy, kind)
+    left = np.flatnonzero(~found.proved)
+    for first in range(0, left.size, FEW):
+        _patiently(columns, found, error, left[first : first + FEW], accuracy, kind)
     return Poles(found.re, found.im, error, found.doubt)
 
 
@@ -113,40 +112,38 @@ def _stored(
     return left[~new.proved], type(loop)(*(part[~new.proved] for part in loop))
 
 
-def _map_poles(area: Map, accuracy: float) -> Poles:
-    """The outermost poles of a map of devices whose delays are all whole, or none; axes as in the map."""
-    kind = bool((area.d != np.floor(area.d)).any())
-    nodes = nodes_of(area)
-    start = outermost_poles(nodes, accuracy)
-    found = followed_poles(area, nodes, start.re, start.im, accuracy, kind)
-    poles = Poles(found.re, found.im, np.where(found.proved, accuracy, np.inf), found.doubt)
-    left = np.nonzero(~found.proved)
-    if left[0].size:
-        columns = [area.alpha[left[2]], area.beta[left[1]], area.delta[left[0]], area.d[left[0]]]
-        for whole, leaf in zip(poles, outermost_poles(columns, accuracy), strict=True):
-            whole[left] = leaf
-    return poles
-
-
-def _by_map(area: Map, accuracy: float) -> Poles:
-    """The outermost poles in the order of the axes that the caller gave."""
+def _by_map(area: Map, accuracy: float) -> tuple[np.ndarray, np.ndarray]:
+    """The logarithms of radii and their errors in the order of the axes that the caller gave."""
     fractional = area.d != np.floor(area.d)
-    found = Poles(*(np.empty((area.d.size, area.beta.size, area.alpha.size)) for _ in Poles._fields))
-    for part in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
+    found = tuple(np.empty((area.d.size, area.beta.size, area.alpha.size)) for _ in range(2))
+    for kind in (False, True):
+        part = np.flatnonzero(fractional == kind)
         if part.size:
-            for whole, leaf in zip(found, _map_poles(area.of(part), accuracy), strict=True):
-                whole[part] = leaf
+            piece = area.of(part)
+            nodes = nodes_of(piece)
+            start = outermost_poles(nodes, accuracy)
+            re, proved = followed_poles(piece, nodes, start.re, start.im, accuracy, kind)
+            error = np.where(proved, accuracy, np.inf)
+            left = np.nonzero(~proved)
+            columns = [piece.alpha[left[2]], piece.beta[left[1]], piece.delta[left[0]], piece.d[left[0]]]
+            late = outermost_poles(columns, accuracy)
+            re[left], error[left] = late.re, late.error
+            found[0][part], found[1][part] = re, error
     back = np.argsort(area.order)
-    return Poles(*(leaf.reshape(area.shape).transpose(back).reshape(-1) for leaf in found))
+    re, error = (leaf.reshape(area.shape).transpose(back).reshape(-1) for leaf in found)
+    return re, error
 
 
-def poles_of(arrays: list[np.ndarray], accuracy: float) -> tuple[Poles, np.ndarray]:
-    """The outermost poles of arrays of one shape, flat, and the status of the walls."""
+def radii_of(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Radii, relative errors (infinite where none is proved) and status of arrays of one shape, flat."""
     area = as_map(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
     if area is not None and area.good():
-        return _by_map(area, accuracy), np.zeros(arrays[0].size, np.int32)
-    columns, status = usable([array.reshape(-1) for array in arrays])
-    return outermost_poles(columns, accuracy), status
+        (re, error), status = _by_map(area, accuracy), np.zeros(arrays[0].size, np.int32)
+    else:
+        columns, status = usable([array.reshape(-1) for array in arrays])
+        found = outermost_poles(columns, accuracy)
+        re, error = found.re, np.where(status == Status.OK, found.error, np.inf)
+    return radius_at(re, error, arrays), error, status
 
 
 def usable(columns: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
@@ -158,11 +155,11 @@ def usable(columns: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
     return columns, status
 
 
-def radius_of_poles(found: Poles, status: np.ndarray, arrays: list[np.ndarray]) -> np.ndarray:
+def radius_at(re: np.ndarray, error: np.ndarray, arrays: list[np.ndarray]) -> np.ndarray:
     """Radii on the verdict's side of the circle, which the proved error alone may not tell."""
-    radius = np.exp(found.re)
-    radius[np.flatnonzero((status != Status.OK) | np.isinf(found.error))] = np.nan
-    near = np.flatnonzero(np.abs(found.re) <= _DOUBTFUL)
+    radius = np.exp(re)
+    radius[np.isinf(error)] = np.nan
+    near = np.flatnonzero(np.abs(re) <= _DOUBTFUL)
     if near.size:
         alpha, beta, delta, d = (array.reshape(-1)[near] for array in arrays)
         with np.errstate(all="ignore"):

@@ -13,7 +13,7 @@ from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.poles import radius_and_bound, radius_by_companion
-from zwidth.stability.proved import poles_of, radius_of_poles
+from zwidth.stability.proved import radii_of
 from zwidth.stability.radius import traced_kernel
 from zwidth.status import Method, Status
 
@@ -92,8 +92,7 @@ def spectral_radius(
     if is_traced(*values):
         return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
     arrays = broadcast(NAMES, values)
-    radius = radius_of_poles(*poles_of(arrays, wanted), arrays)
-    return to_caller(radius.reshape(arrays[0].shape), values)
+    return to_caller(radii_of(arrays, wanted)[0].reshape(arrays[0].shape), values)
 
 
 def _exp(value: Array) -> Array:
@@ -159,11 +158,11 @@ def radius_of(
     if method == "companion":
         return Radius(*radius_and_bound(*values))
     arrays = broadcast(NAMES, values)
-    found, status = poles_of(arrays, wanted)
-    radius, ok = radius_of_poles(found, status, arrays), status == Status.OK
+    radius, proved, status = radii_of(arrays, wanted)
+    ok = status == Status.OK
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
-    error = np.where(np.isinf(found.error), np.inf, (np.expm1(found.error) + 2e-16) * radius)
-    certified = ok & (found.error <= wanted)
+    error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
+    certified = ok & (proved <= wanted)
     status = np.where(ok & ~certified, np.int32(Status.NOT_CONVERGED), status).astype(np.int32)
     leaves = (radius, np.where(ok, error, np.nan), certified, status, np.full(status.size, Method.NEWTON, np.int32))
     return to_caller(Radius(*(leaf.reshape(arrays[0].shape) for leaf in leaves)), values)

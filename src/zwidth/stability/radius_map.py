@@ -1,6 +1,6 @@
 """Spectral radii of maps: the outermost pole of one node a cell is found by itself and followed to the cell's points.
 
-The derivatives of the node's pole by alpha and beta place the pole of every point; a step of Halley's method, one of
+The derivatives of the node's pole by alpha and beta place the pole of every point; steps of Halley's method, one of
 Newton's and the proof of `zwidth.stability.radius` finish it. What is not proved (another pole is the outermost there,
 or two are about to meet) is left to the methods for single points. Cells are computed in lists of one length, so that
 maps of any size, and of any number of devices, share one compilation.
@@ -17,15 +17,17 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import concretely, processors
 from zwidth.domain import wall_status
-from zwidth.stability.circle import loop_of
+from zwidth.stability.circle import Loop, loop_of
 from zwidth.stability.layout import Points
 from zwidth.stability.pole_step import halley_step, moved, value_at
-from zwidth.stability.radius import Found, certified
+from zwidth.stability.radius import WIDE, certified
 
 # Points along each side of a cell.
-_CELL = 8
+_CELL = 16
 # Cells computed at one time: what their points hold stays in the cache.
-_LIST = 256
+_LIST = 64
+# Of Halley's method.
+_STEPS = 2
 # Smaller maps are not worth a compilation of their own.
 SMALLEST_MAP = 1 << 14
 
@@ -84,22 +86,28 @@ def _cells(fractional: bool) -> Any:
     """The compiled work on a list of cells: arrays (points of beta, points of alpha, cells)."""
     import jax
 
-    def kernel(alpha: Array, beta: Array, node: Array, re: Array, im: Array, tolerance: Array) -> Found:
-        node, re, im = node[:, None, None, :], re[None, None, :], im[None, None, :]
-        middle = value_at(re, im, loop_of(*node, fractional), fractional)
-        back = middle.first.conjugate() * (-1.0 / (middle.first.real**2 + middle.first.imag**2))
-        by_alpha, by_beta = middle.by_alpha * back, middle.by_beta * back
+    def kernel(alpha: Array, beta: Array, fields: Array, tolerance: Array) -> tuple[Array, Array]:
+        middle, beside, re, im, re_alpha, im_alpha, re_beta, im_beta, *device = fields[:, None, None, :]
         alpha, beta = alpha[None, :, :], beta[:, None, :]
-        da, db = alpha - node[0], beta - node[1]
-        nothing = 0.0 * node[2]
-        device = loop_of(nothing, nothing, node[2], node[3], fractional)
-        loop = device._replace(alpha=alpha, beta=beta, s=alpha + beta)
-        start = moved(
-            re + (da * by_alpha.real + db * by_beta.real), im, 0.0, da * by_alpha.imag + db * by_beta.imag
-        )
-        return certified(*halley_step(*start, loop, fractional), tolerance, loop, fractional, True)
+        loop = Loop(alpha, beta, alpha + beta, *device)
+        da, db = alpha - middle, beta - beside
+        start = moved(re + (da * re_alpha + db * re_beta), im, 0.0, da * im_alpha + db * im_beta)
+        for _ in range(_STEPS):
+            start = halley_step(*start, loop, fractional)
+        found = certified(*start, tolerance, loop, fractional, True)
+        return found.re, found.proved
 
-    return jax.jit(kernel)
+    return jax.jit(kernel, compiler_options=WIDE)
+
+
+def _fields(nodes: list[np.ndarray], re: np.ndarray, im: np.ndarray, fractional: bool) -> np.ndarray:
+    """What the cells need of their nodes: the pole, how it moves with alpha and beta, the device."""
+    with np.errstate(all="ignore"):
+        loop = loop_of(*nodes, fractional)
+        at = value_at(re, im, loop, fractional)
+        back = at.first.conjugate() * (-1.0 / (at.first.real**2 + at.first.imag**2))
+    alpha, beta = at.by_alpha * back, at.by_beta * back
+    return np.stack([*nodes[:2], re, im, alpha.real, alpha.imag, beta.real, beta.imag, *loop[3:]])
 
 
 def _cut(values: np.ndarray) -> np.ndarray:
@@ -118,26 +126,23 @@ def nodes_of(area: Map) -> list[np.ndarray]:
 
 def followed_poles(
     area: Map, nodes: list[np.ndarray], re: np.ndarray, im: np.ndarray, tolerance: float, fractional: bool
-) -> Found:
-    """The pole of every point, and whether it is proved to be the outermost, from those of the nodes."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """The logarithm of every point's radius, and whether it is proved, from the poles of the nodes."""
     across, down = _cut(area.alpha).T, _cut(area.beta).T
     grid = (area.delta.size, down.shape[1], across.shape[1])
-    count = re.size
-    shape = (area.delta.size, grid[1] * _CELL, grid[2] * _CELL)
-    out = Found(*(np.empty(shape, np.bool_ if name == "proved" else np.float64) for name in Found._fields))
+    out = tuple(np.empty((grid[0], grid[1] * _CELL, grid[2] * _CELL), kind) for kind in (np.float64, np.bool_))
     tiles = [leaf.reshape(grid[0], grid[1], _CELL, grid[2], _CELL) for leaf in out]
-    run = _cells(fractional)
+    run, fields = _cells(fractional), _fields(nodes, re, im, fractional)
 
     def piece(start: int) -> None:
-        index = np.minimum(np.arange(start, start + _LIST), count - 1)
+        index = np.minimum(np.arange(start, start + _LIST), re.size - 1)
         at = np.unravel_index(index, grid)
-        node = np.stack([column[index] for column in nodes])
         with concretely():
-            found = run(across[:, at[2]], down[:, at[1]], node, re[index], im[index], tolerance)
+            found = run(across[:, at[2]], down[:, at[1]], fields[:, index], tolerance)
             for tile, leaf in zip(tiles, found, strict=True):
                 tile[at[0], at[1], :, at[2], :] = np.asarray(leaf).transpose(2, 0, 1)
 
     piece(0)
     with ThreadPoolExecutor(processors()) as pool:
-        list(pool.map(piece, range(_LIST, count, _LIST)))
-    return Found(*(leaf[:, : area.beta.size, : area.alpha.size] for leaf in out))
+        list(pool.map(piece, range(_LIST, re.size, _LIST)))
+    return out[0][:, : area.beta.size, : area.alpha.size], out[1][:, : area.beta.size, : area.alpha.size]

@@ -19,7 +19,7 @@ from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.decay import rates
 from zwidth.stability.margins import margins
 from zwidth.stability.passivity import margin_at_one_delay
-from zwidth.stability.proved import outermost_poles, radius_of_poles, usable
+from zwidth.stability.proved import outermost_poles, radius_at, usable
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
@@ -192,12 +192,11 @@ def _radius_columns(accuracy: float, columns: Columns) -> Columns:
     walls, status = usable(list(columns))
     # Always compiled, however few they are: a value must not depend on the size of its chunk.
     found = outermost_poles(walls, accuracy, few=0)
-    rate = rates(found, walls)
+    rate, error = rates(found, walls), np.where(status == Status.OK, found.error, np.inf)
     rate[status != Status.OK] = np.nan
     # The rate has more digits of the radius.
-    radius = np.where(np.isfinite(rate), np.exp(-rate), radius_of_poles(found, status, walls))
-    proved = (status == Status.OK) & (found.error <= accuracy)
-    return radius, proved.astype(np.float64), rate
+    radius = np.where(np.isfinite(rate), np.exp(-rate), radius_at(found.re, error, walls))
+    return radius, (error <= accuracy).astype(np.float64), rate
 
 
 def _margins(columns: Columns) -> Columns:
