@@ -9,10 +9,11 @@ from zwidth.batching import BLOCK, broadcast, elementwise, is_traced, to_caller
 from zwidth.domain import check_scalars
 from zwidth.double_double import Complex, Double, chosen, phi_pair, single, two_sum
 from zwidth.grouping import NAMES
+from zwidth.stability.circle import loop_of
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import kind_of
 from zwidth.stability.proved import Poles, outermost_poles, usable
-from zwidth.stability.radius import traced_kernel
+from zwidth.stability.radius import both_poles, traced_kernel
 from zwidth.status import Status
 
 # A bound of rounding errors over the rate, many times what they are: smaller ones leave the digits promised.
@@ -21,6 +22,8 @@ _STEPS = 8
 # An error of the radius this small beside the rate leaves no doubt which pole decays most slowly.
 _SURELY = 1e-3
 _ACCURACY = 1e-9
+# Steps of Halley's method with poles that may be the slowest; that at -1 begins close enough.
+_FOLLOWED = 8
 # Farther from the unit circle (in the logarithm of the radius) the sign of the rate is proved with the radius.
 _DOUBTFUL = 1e-8
 
@@ -81,16 +84,27 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
             rate[part] = refined_rate(*(column[part] for column in columns), found.re[part], found.im[part])
     near = np.flatnonzero(~(np.abs(found.re) > _DOUBTFUL))
     if near.size:
-        # The two agree but for walls within rounding of the circle: there the verdict's side is kept.
-        alpha, beta, delta, d = (column[near] for column in columns)
+        walls = [column[near] for column in columns]
         with np.errstate(all="ignore"):
-            stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
-        beside = rate[near]
-        beside = np.where(stable & (beside <= 0), np.finfo(float).tiny, np.where(~stable & (beside > 0), 0.0, beside))
-        rate[near] = beside
-    known = (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
+            rate[near] = _beside_circle(rate[near], *walls)
+    # The steps must have stayed at the pole whose size is proved.
+    known = np.abs(rate + found.re) <= 2.0 * found.error
+    known &= (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
     rate[~known] = np.nan
     return rate
+
+
+def _beside_circle(rate: Array, alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """The rates of poles next to the unit circle: the slowest motion, on the verdict's side."""
+    # The proof of the radius does not tell apart poles that are all so near.
+    fractional = bool(np.any(d != np.floor(d)))
+    both = both_poles(_FOLLOWED, loop_of(alpha, beta, delta, d, fractional), fractional)
+    for re, im in (both[:2], both[2:], (0.0 * rate, 0.0 * rate + np.pi)):
+        other = refined_rate(alpha, beta, delta, d, re, im)
+        rate = np.where((other < rate) & (alpha != 0), other, rate)
+    stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
+    # The two agree but for walls within rounding of the circle.
+    return np.where(stable & (rate <= 0), np.finfo(float).tiny, np.where(~stable & (rate > 0), 0.0, rate))
 
 
 def refined_rate(alpha: Array, beta: Array, delta: Array, d: Array, re: Array, im: Array) -> Array:

@@ -22,8 +22,9 @@ _BOTH, _LARGER = 2, 3
 # A step after which a pole is within so much of where it began may be taken without looking again: N |P/P'| bounds
 # the distance before the step, N >= 3, and the step is an N-th of it.
 _AFTER = 1.4
-# From the smallest radius that float64 has, to where a few steps do the rest.
-_SMALLEST, _HALVINGS, _POLISHING = -690.0, 40, 6
+# From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
+# crossovers depend on it.
+_SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
 
 # Long formulas of few numbers gain a third from the widest registers; without such registers nothing changes.
 WIDE = {"xla_cpu_prefer_vector_width": 512}
@@ -82,14 +83,19 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     return xp.maximum(0.5 * xp.log(body * wall / (sizes[0] * sizes[1])) / turns, -1.0), im
 
 
-def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
-    """The larger of two poles, nearly."""
-    xp = namespace(loop.alpha)
+def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
+    """The slow pole and the pair, after so many steps from their starts."""
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
         return (*halley_step(*state[:2], loop, fractional), *halley_step(*state[2:], loop, fractional))
 
-    slow_re, slow_im, re, im = repeat(_BOTH, step, (*_slow_pole(loop), *_pair(loop, fractional)), xp)
+    return repeat(steps, step, (*_slow_pole(loop), *_pair(loop, fractional)), namespace(loop.alpha))
+
+
+def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The larger of the two, nearly."""
+    xp = namespace(loop.alpha)
+    slow_re, slow_im, re, im = both_poles(_BOTH, loop, fractional)
     first = (slow_re >= re) | xp.isnan(re)
     state = xp.where(first, slow_re, re), xp.where(first, slow_im, im)
     return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), state, xp)
@@ -110,7 +116,7 @@ def certified(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bo
 def quick_kernel(alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool) -> Found:
     """The outermost pole of most points."""
     loop = loop_of(alpha, beta, delta, d, fractional)
-    return certified(*candidate(loop, fractional), tolerance, loop, fractional, True)
+    return certified(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
 def bounded(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:

@@ -94,7 +94,7 @@ def _cells(fractional: bool) -> Any:
         start = moved(re + (da * re_alpha + db * re_beta), im, 0.0, da * im_alpha + db * im_beta)
         for _ in range(_STEPS):
             start = halley_step(*start, loop, fractional)
-        found = certified(*start, tolerance, loop, fractional, True)
+        found = certified(*start, tolerance, loop, fractional, fractional)
         return found.re, found.proved
 
     return jax.jit(kernel, compiler_options=WIDE)
