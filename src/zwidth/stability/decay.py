@@ -81,7 +81,7 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
     for start in range(0, refine.size, BLOCK):
         part = refine[start : start + BLOCK]
         with np.errstate(all="ignore"):
-            rate[part] = refined_rate(*(column[part] for column in columns), found.re[part], found.im[part])
+            rate[part] = refined_rate(*(column[part] for column in (*columns, found.re, found.im)))
     near = np.flatnonzero(~(np.abs(found.re) > _DOUBTFUL))
     if near.size:
         walls = [column[near] for column in columns]

@@ -118,10 +118,13 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     t2 = lag * ((a * power + slope * 2.0) * power + slope + z * z * 2.0)
     turning = power * (xp.abs(re) + xp.abs(im))
     rounding = up * width * (width + loop.em) * (_ROUNDING + turning) + _ROUNDING * sizes
-    parts = (lag * a + d, t1 + d1, t2 + d2, lead * z, lead * gap)
+    found = Value(lag * a + d, t1 + d1, t2 + d2, lead * z, lead * gap, epsilon(re) * rounding)
+    if number is Pair:
+        return found
     # Unlike Python's numbers, NumPy's may be divided by zero.
-    parts = map(np.complex128, parts) if number is complex else parts
-    return Value(*parts, epsilon(re) * rounding)
+    return found._replace(
+        p=np.complex128(found.p), first=np.complex128(found.first), second=np.complex128(found.second)
+    )
 
 
 class Step(NamedTuple):

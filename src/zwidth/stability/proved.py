@@ -43,42 +43,47 @@ class Poles(NamedTuple):
 def _compiled(fractional: bool) -> Any:
     import jax
 
-    return jax.jit(lambda *columns: quick_kernel(*columns, fractional), compiler_options=WIDE)
+    return jax.jit(lambda a, b, c, d, accuracy: quick_kernel(a, b, c, d, accuracy, fractional), compiler_options=WIDE)
 
 
-def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW) -> Poles:
-    """The outermost poles of equally long columns of alpha, beta, delta and d; up to ``few`` without a compiler."""
+def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW, patient: bool = True) -> Poles:
+    """The outermost poles of equally long columns of alpha, beta, delta and d; up to ``few`` without a compiler.
+
+    Without patience some are not proved that could be.
+    """
     fractional = columns[3] != np.floor(columns[3])
     if not fractional.any() or fractional.all():
-        return _of_one_kind(columns, accuracy, bool(fractional.any()), few)
+        return _of_one_kind(columns, accuracy, bool(fractional.any()), few, patient)
     # A mixed batch pays for the cubic only where it must.
     whole = Poles(*(np.empty(fractional.size) for _ in Poles._fields))
     for part in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
-        for leaf, found in zip(whole, outermost_poles([c[part] for c in columns], accuracy, few), strict=True):
+        for leaf, found in zip(whole, outermost_poles([c[part] for c in columns], accuracy, few, patient), strict=True):
             leaf[part] = found
     return whole
 
 
-def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int) -> Poles:
+def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int, patient: bool) -> Poles:
     size = columns[0].size
     with np.errstate(all="ignore"):
         if size == 1:
             # Plain numbers are several times faster than arrays of one.
-            found = [np.reshape(leaf, 1) for leaf in quick_kernel(*(c[0] for c in columns), accuracy, kind)]
+            alpha, beta, delta, d = (column[0] for column in columns)
+            found = [np.reshape(leaf, 1) for leaf in quick_kernel(alpha, beta, delta, d, accuracy, kind)]
         elif size <= few:
-            found = quick_kernel(*columns, accuracy, kind)
+            alpha, beta, delta, d = columns
+            found = quick_kernel(alpha, beta, delta, d, np.full(size, accuracy), kind)
         else:
             # Always of one size: other batches may round differently.
             short = max(0, PIECE - size)
             padded = [np.pad(c, (0, short), mode="edge") for c in (*columns, np.full(size, accuracy))]
             found = [leaf[:size] for leaf in in_blocks(_compiled(kind), padded, PIECE)]
-    return _finished(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind)
+    return _finished(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind, patient)
 
 
-def _finished(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool) -> Poles:
+def _finished(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool, patient: bool) -> Poles:
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
     error = np.where(found.proved, accuracy, np.inf)
-    left = np.flatnonzero(~found.proved)
+    left = np.flatnonzero(~found.proved & patient)
     for first in range(0, left.size, FEW):
         _patiently(columns, found, error, left[first : first + FEW], accuracy, kind)
     return Poles(found.re, found.im, error, found.doubt)
@@ -88,7 +93,8 @@ def _patiently(
     columns: list[np.ndarray], found: Found, error: np.ndarray, left: np.ndarray, accuracy: float, kind: bool
 ) -> None:
     with np.errstate(all="ignore"):
-        loop = loop_of(*(column[left] for column in columns), kind)
+        alpha, beta, delta, d = (column[left] for column in columns)
+        loop = loop_of(alpha, beta, delta, d, kind)
         again = certified(found.re[left], found.im[left], accuracy, loop, kind, False)
         left, loop = _stored(found, error, left, loop, again, again.proved, accuracy)
         if left.size:
@@ -115,22 +121,27 @@ def _stored(
 def _by_map(area: Map, accuracy: float) -> tuple[np.ndarray, np.ndarray]:
     """The logarithms of radii and their errors in the order of the axes that the caller gave."""
     fractional = area.d != np.floor(area.d)
-    found = tuple(np.empty((area.d.size, area.beta.size, area.alpha.size)) for _ in range(2))
-    for kind in (False, True):
-        part = np.flatnonzero(fractional == kind)
-        if part.size:
-            piece = area.of(part)
-            nodes = nodes_of(piece)
-            start = outermost_poles(nodes, accuracy)
-            re, proved = followed_poles(piece, nodes, start.re, start.im, accuracy, kind)
-            error = np.where(proved, accuracy, np.inf)
-            left = np.nonzero(~proved)
-            columns = [piece.alpha[left[2]], piece.beta[left[1]], piece.delta[left[0]], piece.d[left[0]]]
-            late = outermost_poles(columns, accuracy)
-            re[left], error[left] = late.re, late.error
-            found[0][part], found[1][part] = re, error
+    if fractional.all() or not fractional.any():
+        found = _map_poles(area, accuracy, bool(fractional.any()))
+    else:
+        found = tuple(np.empty((area.d.size, area.beta.size, area.alpha.size)) for _ in range(2))
+        for kind in (False, True):
+            part = np.flatnonzero(fractional == kind)
+            found[0][part], found[1][part] = _map_poles(area.of(part), accuracy, kind)
     back = np.argsort(area.order)
     re, error = (leaf.reshape(area.shape).transpose(back).reshape(-1) for leaf in found)
+    return re, error
+
+
+def _map_poles(area: Map, accuracy: float, kind: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The same of devices whose delays are all whole, or none; axes as in the map."""
+    nodes = nodes_of(area)
+    start = outermost_poles(nodes, accuracy, patient=False)
+    re, proved = followed_poles(area, nodes, start.re, start.im, accuracy, kind)
+    error = np.where(proved, accuracy, np.inf)
+    left = np.nonzero(~proved)
+    late = outermost_poles([area.alpha[left[2]], area.beta[left[1]], area.delta[left[0]], area.d[left[0]]], accuracy)
+    re[left], error[left] = late.re, late.error
     return re, error
 
 

@@ -86,8 +86,9 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
 def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
     """The slow pole and the pair, after so many steps from their starts."""
 
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        return (*halley_step(*state[:2], loop, fractional), *halley_step(*state[2:], loop, fractional))
+    def step(state: Any) -> Any:
+        slow_re, slow_im, re, im = state
+        return (*halley_step(slow_re, slow_im, loop, fractional), *halley_step(re, im, loop, fractional))
 
     return repeat(steps, step, (*_slow_pole(loop), *_pair(loop, fractional)), namespace(loop.alpha))
 

@@ -103,7 +103,7 @@ def _cells(fractional: bool) -> Any:
 def _fields(nodes: list[np.ndarray], re: np.ndarray, im: np.ndarray, fractional: bool) -> np.ndarray:
     """What the cells need of their nodes: the pole, how it moves with alpha and beta, the device."""
     with np.errstate(all="ignore"):
-        loop = loop_of(*nodes, fractional)
+        loop = loop_of(nodes[0], nodes[1], nodes[2], nodes[3], fractional)
         at = value_at(re, im, loop, fractional)
         back = at.first.conjugate() * (-1.0 / (at.first.real**2 + at.first.imag**2))
     alpha, beta = at.by_alpha * back, at.by_beta * back
