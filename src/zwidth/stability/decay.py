@@ -88,7 +88,7 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
         with np.errstate(all="ignore"):
             rate[near] = _beside_circle(rate[near], *walls)
     # The steps must have stayed at the pole whose size is proved.
-    known = np.abs(rate + found.re) <= 2.0 * found.error
+    known = np.abs(rate + found.re) <= found.error
     known &= (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
     rate[~known] = np.nan
     return rate
