@@ -97,8 +97,8 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
 def _beside_circle(rate: Array, alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     """The rates of poles next to the unit circle: the slowest motion, on the verdict's side."""
     # The proof of the radius does not tell apart poles that are all so near.
-    fractional = bool(np.any(d != np.floor(d)))
-    both = both_poles(_FOLLOWED, loop_of(alpha, beta, delta, d, fractional), fractional)
+    # Whole delays as fractions, too: what is alone must not be computed otherwise than among neighbors.
+    both = both_poles(_FOLLOWED, loop_of(alpha, beta, delta, d, True), True)
     for re, im in (both[:2], both[2:], (0.0 * rate, 0.0 * rate + np.pi)):
         other = refined_rate(alpha, beta, delta, d, re, im)
         rate = np.where((other < rate) & (alpha != 0), other, rate)
