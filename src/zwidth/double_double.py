@@ -37,7 +37,7 @@ class Double(NamedTuple):
         high, low = two_product(self.high, other.high)
         return _normal(high, low + (self.high * other.low + self.low * other.high))
 
-    def scaled(self, power: float) -> Double:
+    def scaled(self, power: Array) -> Double:
         """Times a power of two."""
         return Double(self.high * power, self.low * power)
 
@@ -48,6 +48,11 @@ class Double(NamedTuple):
         second = rest.high / other.high
         rest = rest.minus(other.times(single(second)))
         return _normal(*_normal(first, second)).plus(single(rest.high / other.high))
+
+
+def chosen(which: Array, new: Double, old: Double) -> Double:
+    """One pair or the other, place by place."""
+    return Double(np.where(which, new.high, old.high), np.where(which, new.low, old.low))
 
 
 def single(value: Array) -> Double:
@@ -110,12 +115,7 @@ class Complex(NamedTuple):
         while True:
             odd = (left & 1) == 1
             product = result.times(square)
-            result = Complex(
-                *(
-                    Double(*(np.where(odd, n, o) for n, o in zip(new, old, strict=True)))
-                    for new, old in zip(product, result, strict=True)
-                )
-            )
+            result = Complex(*(chosen(odd, new, old) for new, old in zip(product, result, strict=True)))
             left = left >> 1
             if not np.any(left):
                 return result
@@ -142,8 +142,7 @@ _SMALL = 2.0**-6
 
 def phi_pair(x: Double) -> PhiPair:
     """The functions of `zwidth.phi` at x >= 0: Taylor's series at x/2^k, then doubled k times without cancellation."""
-    largest = float(np.max(x.high, initial=0.0))
-    halvings = max(0, int(np.ceil(np.log2(largest / _SMALL)))) if largest > 0 else 0
+    halvings = np.ceil(np.log2(np.maximum(x.high, _SMALL) / _SMALL))
     y = x.scaled(0.5**halvings)
     one = single(1.0 + 0.0 * y.high)
     # phi2(y) = sum (-y)^k/(k + 2)!, phi1 = 1 - y phi2, em = y phi1
@@ -154,8 +153,9 @@ def phi_pair(x: Double) -> PhiPair:
     phi1 = one.minus(y.times(phi2))
     em = y.times(phi1)
     two = one.scaled(2.0)
-    for _ in range(halvings):
-        phi2 = phi1.times(phi1).plus(phi2.scaled(2.0)).scaled(0.25)
+    for done in range(int(np.max(halvings, initial=0.0))):
         rest = two.minus(em)
-        phi1, em = phi1.times(rest).scaled(0.5), em.times(rest)
+        doubled = em.times(rest), phi1.times(rest).scaled(0.5), phi1.times(phi1).plus(phi2.scaled(2.0)).scaled(0.25)
+        left = done < halvings
+        em, phi1, phi2 = (chosen(left, *pair) for pair in zip(doubled, (em, phi1, phi2), strict=True))
     return PhiPair(em, phi1, phi2)

@@ -18,9 +18,7 @@ from zwidth.figures.curves import draw_curves, draw_outlines
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.style import si_unit
 from zwidth.figures.sweep_data import CurvesData, Panel, PlaneData, Quantity, Scale
-from zwidth.quantities import PARAMETERS
-from zwidth.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF
-from zwidth.quantities import WALL
+from zwidth.quantities import NOT_COMPUTED, OUTPUTS, PARAMETERS, STATUS_OF, WALL
 from zwidth.sweep.store import SUFFIX, find_stores, open_dataset
 
 if TYPE_CHECKING:
@@ -159,7 +157,8 @@ class _View:
         steps = values[1:] / values[:-1] if values.ndim and values.size > 2 and (values > 0).all() else np.empty(0)
         spaced = bool(steps.size and np.allclose(steps, steps[0], rtol=1e-6) and not np.isclose(steps[0], 1.0))
         plain_unit = "periods" if unit == "sampling periods" else unit
-        return Scale(name, parameter.symbol, label + (f"  in {unit}" if unit else ""), plain_unit, values * factor, spaced)
+        label += f"  in {unit}" if unit else ""
+        return Scale(name, parameter.symbol, label, plain_unit, values * factor, spaced)
 
     def _quantity(self, name: str) -> Quantity:
         output = OUTPUTS[name]

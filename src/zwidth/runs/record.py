@@ -53,7 +53,8 @@ class Record:
             return
         except (OSError, ValueError) as error:
             raise StoreError(
-                f"{self.folder / RUN_FILE}: cannot be read ({error}); choose another folder with --out DIR, or remove it"
+                f"{self.folder / RUN_FILE}: cannot be read ({error}); choose another folder with --out DIR, or remove "
+                "it"
             ) from error
         if not isinstance(content, dict) or not isinstance(content.get("studies"), list):
             raise StoreError(
@@ -110,8 +111,8 @@ class Record:
             return
         if self.content.get("format") != RUN_FORMAT:
             raise StoreError(
-                f"{self.folder}: an earlier release made this run and kept no checksums to go on from; start again with "
-                "--overwrite, or choose another folder with --out DIR"
+                f"{self.folder}: an earlier release made this run and kept no checksums to go on from; start again "
+                "with --overwrite, or choose another folder with --out DIR"
             )
         where = self.folder / RUN_FILE
         for name, now in inputs.items():

@@ -8,15 +8,16 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from zwidth.config.study import Study
 from zwidth.errors import InputError
 from zwidth.files.lock import holding
 from zwidth.files.whole import hopeless, write_whole
 from zwidth.runs.record import CONFIG_FILE, Record
 from zwidth.runs.result import ProgressCallback, RunResult, StudyEvent, StudyResult
-from zwidth.config.study import Study
 from zwidth.studies.document import Config, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, compute_sweeps
@@ -230,7 +231,8 @@ class _Run:
 
     def sweep(self, planned: list[tuple[SweepStudy, Plan]], about: dict[str, Any], **options: Any) -> None:
         """Compute the sweeps, all together, so that workers are started once."""
-        clock, number = time.perf_counter(), {study.name: len(self.results) + k for k, (study, _) in enumerate(planned, 1)}
+        clock = time.perf_counter()
+        number = {study.name: len(self.results) + k for k, (study, _) in enumerate(planned, start=1)}
         begun: set[str] = set()
 
         def follow(progress: Progress) -> None:
@@ -279,8 +281,7 @@ def _pieces(config: Config) -> list[Piece]:
             inputs = {**_inputs(study), "alone": alone}
             if study.reads_scene and config.scene is not None:
                 inputs["scene"] = _spelled(config.scene)
-            compute = lambda study=study, alone=alone: study.compute(config.scene, alone)
-            pieces.append(Piece(study.name, study.kind_name(), inputs, compute))
+            pieces.append(Piece(study.name, study.kind_name(), inputs, partial(study.compute, config.scene, alone)))
     if any((getattr(study, "figure", None) or "").startswith("fig") for study in config.studies):
         from zwidth.studies.published import compare_published
 

@@ -6,21 +6,26 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import BLOCK, broadcast, elementwise, is_traced, to_caller
-from zwidth.domain import check_scalars, wall_status
-from zwidth.double_double import Complex, Double, phi_pair, single, two_sum
+from zwidth.domain import check_scalars
+from zwidth.double_double import Complex, Double, chosen, phi_pair, single, two_sum
 from zwidth.grouping import NAMES
+from zwidth.stability.circle import loop_of
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import kind_of
-from zwidth.stability.proved import outermost_poles
-from zwidth.stability.radius import traced_kernel
+from zwidth.stability.proved import Poles, outermost_poles, usable
+from zwidth.stability.radius import both_poles, traced_kernel
 from zwidth.status import Status
 
-# Faster decay is far from a radius of 1, and float64 knows it to all its digits.
-_SLOW = 2.0
+# A bound of rounding errors over the rate, many times what they are: smaller ones leave the digits promised.
+_EXACT = 5e-12
 _STEPS = 8
 # An error of the radius this small beside the rate leaves no doubt which pole decays most slowly.
 _SURELY = 1e-3
 _ACCURACY = 1e-9
+# Steps of Halley's method with poles that may be the slowest; that at -1 begins close enough.
+_FOLLOWED = 8
+# Farther from the unit circle (in the logarithm of the radius) the sign of the rate is proved with the radius.
+_DOUBTFUL = 1e-8
 
 
 def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -62,26 +67,44 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         fraction = is_traced(d) or bool(np.any(np.asarray(d, float) % 1.0))
         return -elementwise(traced_kernel, NAMES, values, (fraction,))
     arrays = broadcast(NAMES, values)
-    shape = arrays[0].shape
-    columns = [array.reshape(-1) for array in arrays]
-    ok = np.asarray(wall_status(*columns)) == Status.OK
-    columns = [np.where(ok, column, fill) for column, fill in zip(columns, (0.1, 0.1, 1.0, 0.0), strict=True)]
-    alpha, beta, delta, d = columns
-    found = outermost_poles(columns, _ACCURACY)
-    rate = np.array(-found.re)
-    refine = np.flatnonzero((np.abs(rate) < _SLOW) | (found.error > _ACCURACY))
+    columns, status = usable([array.reshape(-1) for array in arrays])
+    rate = rates(outermost_poles(columns, _ACCURACY), columns)
+    rate[status != Status.OK] = np.nan
+    return to_caller(rate.reshape(arrays[0].shape), values)
+
+
+def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
+    """The rates of decay of outermost poles, with relative accuracy; NaN where it is not known which decays slowest."""
+    rate = -found.re
+    # What float64 knows well enough needs no more digits.
+    refine = np.flatnonzero((found.doubt > _EXACT * np.abs(rate)) | (found.error > _ACCURACY))
     for start in range(0, refine.size, BLOCK):
         part = refine[start : start + BLOCK]
         with np.errstate(all="ignore"):
-            wall = alpha[part], beta[part]
-            rate[part] = refined_rate(*wall, delta[part], d[part], found.re[part], found.im[part])
-    with np.errstate(all="ignore"):
-        stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
-    # The two agree but for walls within rounding of the circle: there the verdict's side is kept.
-    rate = np.where(stable & (rate <= 0), np.finfo(float).tiny, np.where(~stable & (rate > 0), 0.0, rate))
-    known = (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
-    rate = np.where(ok & known, rate, np.nan)
-    return to_caller(rate.reshape(shape), values)
+            rate[part] = refined_rate(*(column[part] for column in (*columns, found.re, found.im)))
+    near = np.flatnonzero(~(np.abs(found.re) > _DOUBTFUL))
+    if near.size:
+        walls = [column[near] for column in columns]
+        with np.errstate(all="ignore"):
+            rate[near] = _beside_circle(rate[near], *walls)
+    # The steps must have stayed at the pole whose size is proved.
+    known = np.abs(rate + found.re) <= found.error
+    known &= (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
+    rate[~known] = np.nan
+    return rate
+
+
+def _beside_circle(rate: Array, alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """The rates of poles next to the unit circle: the slowest motion, on the verdict's side."""
+    # The proof of the radius does not tell apart poles that are all so near.
+    # Whole delays as fractions, too: what is alone must not be computed otherwise than among neighbors.
+    both = both_poles(_FOLLOWED, loop_of(alpha, beta, delta, d, True), True)
+    for re, im in (both[:2], both[2:], (0.0 * rate, 0.0 * rate + np.pi)):
+        other = refined_rate(alpha, beta, delta, d, re, im)
+        rate = np.where((other < rate) & (alpha != 0), other, rate)
+    stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
+    # The two agree but for walls within rounding of the circle.
+    return np.where(stable & (rate <= 0), np.finfo(float).tiny, np.where(~stable & (rate > 0), 0.0, rate))
 
 
 def refined_rate(alpha: Array, beta: Array, delta: Array, d: Array, re: Array, im: Array) -> Array:
@@ -109,9 +132,11 @@ def refined_rate(alpha: Array, beta: Array, delta: Array, d: Array, re: Array, i
         step = -value / slope
         # A multiple pole moves by as much as it is uncertain.
         step = np.where(np.isfinite(step) & (np.abs(step) < 0.5 * np.maximum(np.abs(zeta), 1e-3 / turns)), step, 0.0)
-        if k == _STEPS - 1 or np.all(np.abs(step) <= 4e-16 * np.abs(zeta)):
+        # What has arrived stays: a point's value must not depend on how long its neighbors take.
+        moving = np.abs(step) > 4e-16 * np.abs(zeta)
+        if k == _STEPS - 1 or not np.any(moving):
             break
-        zeta = zeta + step
+        zeta = np.where(moving, zeta + step, zeta)
     # |z|^2 - 1 = 2 Re zeta + |zeta|^2
     re2, im2 = single(zeta.real), single(zeta.imag)
     beyond = re2.scaled(2.0).plus(re2.times(re2)).plus(im2.times(im2))
@@ -139,8 +164,4 @@ def _plant(delta: Array, f: Array) -> tuple[Double, Double, Double, Double]:
     a1 = t.times(t).times(late.phi1.minus(late.phi2)).plus(overlap).plus(fraction.times(fraction).times(early.phi2))
     held = f != 0
     lead, bend = a2.scaled(2.0).plus(a1), a2
-
-    def chosen(new: Double, old: Double) -> Double:
-        return Double(np.where(held, new.high, old.high), np.where(held, new.low, old.low))
-
-    return whole.em, whole.phi1, chosen(lead, whole.phi2), chosen(bend, zero)
+    return whole.em, whole.phi1, chosen(held, lead, whole.phi2), chosen(held, bend, zero)

@@ -7,15 +7,15 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import elementwise, is_traced
+from zwidth.batching import broadcast, elementwise, is_traced, to_caller
 from zwidth.domain import check_scalars
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.poles import radius_and_bound, radius_by_companion
-from zwidth.stability.proved import Proved, proved_radii, radii
+from zwidth.stability.proved import radii_of
 from zwidth.stability.radius import traced_kernel
-from zwidth.status import Method
+from zwidth.status import Method, Status
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)
@@ -91,7 +91,8 @@ def spectral_radius(
         return radius_by_companion(*values)
     if is_traced(*values):
         return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
-    return radii(values, wanted)
+    arrays = broadcast(NAMES, values)
+    return to_caller(radii_of(arrays, wanted)[0].reshape(arrays[0].shape), values)
 
 
 def _exp(value: Array) -> Array:
@@ -156,8 +157,15 @@ def radius_of(
     check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
     if method == "companion":
         return Radius(*radius_and_bound(*values))
-    found: Proved = proved_radii(values, wanted)
-    return Radius(found.radius, found.error, found.certified, found.status, 0 * found.status + np.int32(Method.NEWTON))
+    arrays = broadcast(NAMES, values)
+    radius, proved, status = radii_of(arrays, wanted)
+    ok = status == Status.OK
+    # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
+    error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
+    certified = ok & (proved <= wanted)
+    status = np.where(ok & ~certified, np.int32(Status.NOT_CONVERGED), status).astype(np.int32)
+    leaves = (radius, np.where(ok, error, np.nan), certified, status, np.full(status.size, Method.NEWTON, np.int32))
+    return to_caller(Radius(*(leaf.reshape(arrays[0].shape) for leaf in leaves)), values)
 
 
 def _check_radius(method: str, accuracy: float | None, delay: str) -> float:

@@ -1,44 +1,45 @@
-"""The spectral radius of single points: the outermost pole by Newton's method, proved by two counts.
+"""The outermost pole of one loop: two starts, a fixed number of steps, one proof; a search for what that leaves.
 
-All poles lie inside ``|z| = r (1 + tol)`` and not all inside ``r (1 - tol)``: then the radius is r up to that
-tolerance, whatever led to it. Where rounding could have decided a count (next to multiple poles) nothing is claimed.
-Every count also tells where the next pole is expected (`zwidth.stability.circle`), so a few of them find the radius;
-an expectation that contradicts earlier counts is replaced by halving the interval that they leave.
+Either the slow pole next to 1 is the outermost, or the first pair of the ring that a delay makes. Halley's method
+follows both, and the larger one to its end. The proof: all poles are inside ``|z| = r (1 + tol)``, counted, and a pole
+is within tol of where the method ended. Where that fails the radius is searched for by halving an interval of counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth._types import Array
 from zwidth.loop import poison, valid_wall
-from zwidth.stability.arcs import angle
-from zwidth.stability.circle import Loop, circle, loop_of, real_ends, sides
-from zwidth.stability.log_step import Near, near, newton_step, ratio_step
-from zwidth.stability.pole_derivative import followed
-from zwidth.xp import epsilon, frozen, namespace
+from zwidth.stability.circle import Loop, angle, count, loop_of
+from zwidth.stability.pole_step import halley_step, moved, newton_step
+from zwidth.xp import epsilon, frozen, namespace, repeat
 
-_LEVEL_STEPS = 6
-# How far beyond a pole the next circle lies, as a power of the rounding unit: 1e-10 in float64.
-_BEYOND = 0.64
-_GUESS_STEPS = 3
-# Squares of steps, over the distance between poles: longer ones lead astray, shorter ones have settled.
-_LONGEST_STEP = 4.0
-_SETTLED = 1e-4
-_DONE = 1e-24
+# Steps on both starts, then on the larger of the two.
+_BOTH, _LARGER = 2, 3
+# A step after which a pole is within so much of where it began may be taken without looking again: N |P/P'| bounds
+# the distance before the step, N >= 3, and the step is an N-th of it.
+_AFTER = 1.4
+# From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
+# crossovers depend on it.
+_SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
+
+# Long formulas of few numbers gain a third from the widest registers; without such registers nothing changes.
+WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 class Found(NamedTuple):
-    """The outermost pole ``e^(re + j im)``, 0 <= im <= pi."""
+    """The outermost pole ``e^(re + j im)``, 0 <= im <= pi, and whether it is proved to be that."""
 
     re: Array
     im: Array
+    proved: Array
+    doubt: Array  # of rounding errors in re
 
 
-def largest(loop: Loop) -> Array:
+def _largest(loop: Loop) -> Array:
     """The logarithm of a radius that no pole exceeds: beyond it T is the larger part."""
     xp = namespace(loop.alpha)
     size = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
@@ -49,66 +50,7 @@ def largest(loop: Loop) -> Array:
     return 1e-9 + xp.where(loop.turns > 1, xp.minimum(short, steep), short)
 
 
-def smallest(loop: Loop, fractional: bool) -> Array:
-    """The logarithm of a radius that some pole reaches: ``max (|p_(N-i)|/C(N, i))^(1/i)`` of the coefficients."""
-    xp = namespace(loop.alpha)
-    c, s, beta = loop.c, loop.s, loop.beta
-    a1, a0 = loop.h + loop.a2 * loop.q, loop.h * loop.q
-    tiny = 1e-300
-    if fractional:
-        poles = loop.turns + 3.0
-        first = xp.abs(loop.a2 * s - (1.0 + c)) / 4.0
-        second = xp.sqrt(xp.abs(c + a1 * s - loop.a2 * beta) / 6.0)
-        third = xp.cbrt(xp.abs(a0 * s - a1 * beta) / 4.0)
-        last = xp.sqrt(xp.sqrt(xp.abs(a0 * beta)))
-        undelayed = xp.maximum(xp.maximum(first, second), xp.maximum(third, last))
-    else:
-        poles = loop.turns + 2.0
-        first = xp.abs(loop.a2 * s - (1.0 + c)) / 3.0
-        second = xp.sqrt(xp.abs(c + a1 * s - loop.a2 * beta) / 3.0)
-        undelayed = xp.maximum(xp.maximum(first, second), xp.cbrt(xp.abs(a1 * beta)))
-    return xp.log(xp.maximum(xp.where(loop.turns > 1, (1.0 + c) / poles, undelayed), tiny)) - 1e-9
-
-
-def beyond(value: Array) -> float:
-    """How far beyond a pole the next circle lies, in a value's precision."""
-    return epsilon(value) ** _BEYOND
-
-
-def until(steps: int, step: Callable[[Any], Any], done: Callable[[Any], Array], state: Any, xp: Any) -> Any:
-    """Apply ``step`` up to so many times, or until every point is done, which at the start none may be."""
-    if xp is np:
-        for _ in range(steps):
-            state = step(state)
-            if np.all(done(state)):
-                break
-        return state
-    from jax.lax import while_loop
-
-    return while_loop(
-        lambda carry: (carry[0] < steps) & ~done(carry[1]).all(),
-        lambda carry: (carry[0] + 1, step(carry[1])),
-        (0, state),
-    )[1]
-
-
-def level(high: Array, loop: Loop, steps: int = _LEVEL_STEPS) -> Array:
-    """Where T and B are equally large on the real axis, the top of the curve on which the poles lie."""
-    xp = namespace(high)
-
-    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        at, moved = state
-        front, _ = real_ends(at, sides(at, loop), loop)
-        new = at - front.level / front.slope
-        # What is done stays: a point's value must not depend on how long its neighbors take.
-        going = xp.isfinite(new) & ~(moved < 1e-3 * at)
-        new = xp.where(going, xp.clip(new, 0.1 * at, high), at)
-        return new, xp.where(going, xp.abs(new - at), moved)
-
-    return until(steps, step, lambda state: state[1] < 1e-3 * state[0], (high, 0.0 * high + np.inf), xp)[0]
-
-
-def slow_pole(loop: Loop) -> Found:
+def _slow_pole(loop: Loop) -> tuple[Array, Array]:
     """The larger pole near 1, of P to second order in z - 1."""
     xp = namespace(loop.alpha)
     alpha, s, turns = loop.alpha, loop.s, loop.turns
@@ -124,111 +66,86 @@ def slow_pole(loop: Loop) -> Found:
     pair = inside < 0
     re, im = xp.where(pair, -0.5 * linear / lead, real), xp.where(pair, 0.5 * root / lead, 0.0)
     re = xp.maximum(re, -0.5)
-    return Found(0.5 * xp.log1p(re * (2.0 + re) + im * im), angle(1.0 + re, im))
+    return 0.5 * xp.log1p(re * (2.0 + re) + im * im), angle(1.0 + re, im)
 
 
-def guesses(loop: Loop, high: Array, fractional: bool) -> tuple[Found, Array]:
-    """The pole that is the outermost of most loops, NaN where it was not found, and the level of the real axis."""
-    xp = namespace(high)
-    top = level(high, loop)
-    slow = polished(slow_pole(loop), loop, fractional, newton_step, _GUESS_STEPS)
-    pair = polished(Found(top, np.pi / (loop.turns + 1.0)), loop, fractional, ratio_step, _GUESS_STEPS)
-    later = (pair.re > slow.re) | xp.isnan(slow.re)
-    return Found(xp.where(later, pair.re, slow.re), xp.where(later, pair.im, slow.im)), top
-
-
-def outermost(loop: Loop, fractional: bool, steps: int, halve: bool = False) -> Found:
-    """Look for the outermost pole in so many counts; with ``halve`` every third one bisects."""
+def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The first pair of the ring, where T and B have one size as they change with |z| from the unit circle on."""
     xp = namespace(loop.alpha)
-    bound, low = largest(loop), smallest(loop, fractional)
+    im = np.pi / (loop.lag + 1.0)
+    x = xp.sin(0.5 * im) ** 2
+    sizes = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
+    body = (loop.a2 + loop.h) ** 2 - 4.0 * loop.a2 * loop.h * x
+    wall = loop.alpha * loop.alpha + 4.0 * loop.s * loop.beta * x
+    turns = loop.turns
+    if fractional:
+        body, turns = body * ((1.0 + loop.q) ** 2 - 4.0 * loop.q * x), turns + 1.0
+    return xp.maximum(0.5 * xp.log(body * wall / (sizes[0] * sizes[1])) / turns, -1.0), im
+
+
+def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
+    """The slow pole and the pair, after so many steps from their starts."""
+
+    def step(state: Any) -> Any:
+        slow_re, slow_im, re, im = state
+        return (*halley_step(slow_re, slow_im, loop, fractional), *halley_step(re, im, loop, fractional))
+
+    return repeat(steps, step, (*_slow_pole(loop), *_pair(loop, fractional)), namespace(loop.alpha))
+
+
+def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The larger of the two, nearly."""
+    xp = namespace(loop.alpha)
+    slow_re, slow_im, re, im = both_poles(_BOTH, loop, fractional)
+    first = (slow_re >= re) | xp.isnan(re)
+    state = xp.where(first, slow_re, re), xp.where(first, slow_im, im)
+    return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), state, xp)
+
+
+def certified(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> Found:
+    """The pole after one more step, and whether its modulus is proved to be the radius within the tolerance."""
+    xp = namespace(re, loop.alpha)
     # A wall without stiffness has a pole at 1.
-    low = xp.where(loop.alpha == 0, xp.maximum(low, 0.0), low)
-    guess, top = guesses(loop, bound, fractional)
-    past = beyond(low)
-    known = (guess.re > low) & (guess.re < bound)
-    # Where the delay is short other poles may lead by far.
-    unknown = xp.where(loop.turns > 1, top, 0.5 * (low + top))
-    start = xp.where(known, guess.re + past, xp.maximum(low, unknown))
-
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        at, low, high, re, im, done, turn = state
-        seen = circle(at, loop, fractional, low, high)
-        high = xp.where(seen.full & ~done, at, high)
-        low = xp.where(seen.full | done, low, at)
-        # What has been found before counts until it is refuted.
-        kept = ~xp.isfinite(seen.re) & (guess.re > low - past) & (guess.re < high + past)
-        new_re, new_im = xp.where(kept, guess.re, seen.re), xp.where(kept, guess.im, seen.im)
-        expected = xp.isfinite(new_re) & ~done
-        re, im = xp.where(expected, new_re, re), xp.where(expected, new_im, im)
-        # With more than a pair outside, the next pole is seldom the outermost.
-        good = expected & (seen.count >= loop.turns)
-        if halve:
-            good = good & (turn < 2)
-        # Climbing, one pole is left behind before the next is looked for.
-        new = new_re + xp.where(seen.full, 0.0, past)
-        middle = xp.where((high == bound) & (top > low) & (top < 0.99 * high), top, 0.5 * (low + high))
-        found = expected & seen.full & (xp.abs(new_re - at) < 3.0 * past)
-        return xp.where(good, new, middle), low, high, re, im, done | found, xp.mod(turn + 1.0, 3.0)
-
-    state = (start, low, bound, guess.re, guess.im, bound < low, 0.0 * start)
-    state = until(steps, step, lambda state: state[5], state, xp)
-    return Found(state[3], state[4])
+    at_one = (loop.alpha == 0) & ~(re > tolerance)
+    step = newton_step(re, im, loop, fractional)
+    re, im = (xp.where(at_one, 0.0, part) for part in moved(re, im, step.re, step.im))
+    seen = count(re + tolerance, loop, fractional, single)
+    proved = (at_one | (_AFTER * step.within <= tolerance)) & seen.full & seen.sure
+    return Found(re, im, proved, xp.where(at_one, 0.0, step.doubt))
 
 
-def polished(
-    found: Found, loop: Loop, fractional: bool, stepper: Callable[[Near], tuple[Array, Array]], steps: int
-) -> Found:
-    """Newton steps on a pole, NaN where they do not settle; the pole at 1 of a wall without stiffness stays there."""
-    xp = namespace(found.re)
-
-    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        re, im, last = state
-        by_re, by_im = stepper(near(re, im, loop, fractional))
-        going = ~(last < _DONE)
-        size = xp.where(going, (by_re * by_re + by_im * by_im) * loop.turns * loop.turns, last)
-        good = going & (size < _LONGEST_STEP) & ((loop.alpha != 0) | (re != 0))
-        re, im = xp.where(good, re + by_re, re), xp.where(good, im + by_im, im)
-        # Past the real axis the conjugate is meant.
-        im = xp.abs(im)
-        return re, xp.where(im > np.pi, 2.0 * np.pi - im, im), size
-
-    start = (found.re, found.im, 0.0 * found.re + np.inf)
-    re, im, size = until(steps, step, lambda state: state[2] < _DONE, start, xp)
-    settled = (size < _SETTLED) | ((loop.alpha == 0) & (re == 0))
-    return Found(xp.where(settled, re, np.nan), im)
-
-
-def proved(log_r: Array, tolerances: Sequence[Any], loop: Loop, fractional: bool) -> list[Array]:
-    """Whether the radius is ``e^log_r`` within each relative tolerance, in float64 arithmetic."""
-    xp = namespace(log_r)
-    offsets = [sign * tolerance + 0.0 * log_r for tolerance in tolerances for sign in (1.0, -1.0)]
-    if len(tolerances) == 1:
-        seen = [circle(log_r + offset, loop, fractional) for offset in offsets]
-        full, sure = [at.full for at in seen], [at.sure for at in seen]
-    else:
-        # One text for all circles compiles sooner; a text for each runs faster.
-        shape = (len(offsets), *np.shape(log_r))
-        spread = Loop(*(xp.broadcast_to(field, shape) for field in loop))
-        at = circle(xp.broadcast_to(log_r, shape) + xp.stack(offsets), spread, fractional)
-        full, sure = at.full, at.sure
-    return [full[k] & sure[k] & ~full[k + 1] & sure[k + 1] for k in range(0, len(offsets), 2)]
-
-
-def radius_kernel(
-    alpha: Array,
-    beta: Array,
-    delta: Array,
-    d: Array,
-    tolerance: Array,
-    fractional: bool,
-    steps: int,
-    halve: bool,
-    polishing: int,
-) -> tuple[Array, Array, Array]:
-    """The outermost pole of each point by the logarithm of its modulus and its argument, and whether it is proved."""
+def quick_kernel(alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool) -> Found:
+    """The outermost pole of most points."""
     loop = loop_of(alpha, beta, delta, d, fractional)
-    found = polished(outermost(loop, fractional, steps, halve), loop, fractional, newton_step, polishing)
-    return found.re, found.im, proved(found.re, [tolerance], loop, fractional)[0]
+    return certified(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
+
+
+def bounded(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:
+    """Whether two counts prove that the radius is ``e^log_r`` within a relative tolerance."""
+    above, below = (count(log_r + by, loop, fractional) for by in (tolerance, -tolerance))
+    return above.full & above.sure & ~below.full & below.sure
+
+
+def search(tolerance: Array, loop: Loop, fractional: bool) -> Found:
+    """The outermost pole by halvings of the interval that counts leave, then a few steps."""
+    xp = namespace(loop.alpha)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = 0.5 * (state[0] + state[1])
+        full = count(middle, loop, fractional).full
+        return xp.where(full, state[0], middle), xp.where(full, middle, state[1])
+
+    high = _largest(loop)
+    _, radius = repeat(_HALVINGS, step, (0.0 * high + _SMALLEST, high), xp)
+    best, im = np.inf, 0.0 * radius
+    # On that circle the pole is at a crossover or at one of the ends.
+    for place in (0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings):
+        within = newton_step(radius, place, loop, fractional).within
+        im, best = xp.where(within < best, place, im), xp.minimum(within, best)
+    at = repeat(_POLISHING, lambda at: halley_step(*at, loop, fractional), (radius, im), xp)
+    found = certified(*at, tolerance, loop, fractional, False)
+    # Next to multiple poles the steps end anywhere; the counts still know the radius.
+    return found._replace(re=xp.where(found.proved, found.re, radius))
 
 
 def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:
@@ -236,14 +153,21 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
 
     NaN where it was not found; derivatives are those of the outermost pole, NaN where that is a multiple one.
     """
+    from jax.lax import cond
+
     xp = namespace(alpha, beta, delta, d)
     still = loop_of(*frozen((alpha, beta, delta, d), xp), fractional)
-    found = polished(outermost(still, fractional, 60), still, fractional, newton_step, 3)
-    eps = epsilon(found.re)
-    known, simple = proved(found.re, [eps**0.25, eps**0.58], still, fractional)
-    moved = followed(found.re, found.im, loop_of(alpha, beta, delta, d, fractional), still, fractional)
-    change = moved * xp.where(simple, 1.0, np.nan)
-    # The value itself is not changed by what its derivatives are worth.
-    value = frozen(xp.where(simple, found.re + moved, found.re), xp) + (change - frozen(change, xp))
-    value = xp.where(simple, value, frozen(found.re, xp) + 0.0 * change)
+    eps = epsilon(still.c)
+    found = certified(*candidate(still, fractional), eps**0.58, still, fractional, False)
+    late = cond(found.proved.all(), lambda: found, lambda: search(eps**0.58, still, fractional))
+    start, im, simple, _ = frozen(Found(*(xp.where(found.proved, *pair) for pair in zip(found, late, strict=True))), xp)
+    loop, re = loop_of(alpha, beta, delta, d, fractional), start
+    # Each step doubles the order to which the derivatives are right: two make first and second ones exact.
+    for _ in range(2):
+        step = newton_step(re, im, loop, fractional)
+        re, im = re + step.re, im + step.im
+    known = simple | bounded(start, eps**0.25, still, fractional)
+    change = (re - start) * xp.where(simple, 1.0, np.nan)
+    value = frozen(xp.where(simple, re, start), xp)
+    value = xp.where(simple, value + (change - frozen(change, xp)), value + 0.0 * change)
     return xp.where(known, value, np.nan) + poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

@@ -1,9 +1,9 @@
 """Spectral radii of maps: the outermost pole of one node a cell is found by itself and followed to the cell's points.
 
-The derivatives of the node's pole with respect to alpha and beta, up to the second, place the pole of every point; two
-Newton steps finish it and the proof of `zwidth.stability.quick` accepts it. What is not accepted (another pole is the
-outermost there, or two are about to meet) is left to the search for single points. Cells are computed in lists of one
-length, so that maps of any size, and of any number of devices, share one compilation.
+The derivatives of the node's pole by alpha and beta place the pole of every point; steps of Halley's method, one of
+Newton's and the proof of `zwidth.stability.radius` finish it. What is not proved (another pole is the outermost there,
+or two are about to meet) is left to the methods for single points. Cells are computed in lists of one length, so that
+maps of any size, and of any number of devices, share one compilation.
 """
 
 from __future__ import annotations
@@ -19,16 +19,17 @@ from zwidth.batching import concretely, processors
 from zwidth.domain import wall_status
 from zwidth.stability.circle import Loop, loop_of
 from zwidth.stability.layout import Points
-from zwidth.stability.quick import certified, moved, stepped
-from zwidth.stability.radius import Found
+from zwidth.stability.pole_step import halley_step, moved, value_at
+from zwidth.stability.radius import WIDE, certified
 
 # Points along each side of a cell.
 _CELL = 16
 # Cells computed at one time: what their points hold stays in the cache.
 _LIST = 64
+# Of Halley's method.
+_STEPS = 2
 # Smaller maps are not worth a compilation of their own.
 SMALLEST_MAP = 1 << 14
-_STEPS = 2
 
 
 class Map(NamedTuple):
@@ -80,60 +81,33 @@ def as_map(points: Points) -> Map | None:
     return Map(points.alpha.reshape(-1), points.beta.reshape(-1), delta, d, order, whole)
 
 
-def _taylor(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) -> np.ndarray:
-    """``w = log z`` of the nodes and its derivatives, from those of P(e^w; alpha, beta) = 0."""
-    power = loop.turns + 1.0 if fractional else loop.turns
-    w = re + 1j * im
-    # e^w - 1 without cancellation
-    sine = np.sin(0.5 * im)
-    gap = np.expm1(re) - 2.0 * np.exp(re) * sine * sine + 1j * np.exp(re) * np.sin(im)
-    z = 1.0 + gap
-    scale = np.maximum(power * re, 0.0)
-    lag, down = np.exp(power * w - scale), np.exp(-scale)
-    # Values, first and second derivatives by w of T = z^p A, N = N(z) and of alpha + s (z - 1).
-    a = gap * (gap + loop.em)
-    a1 = z * (2.0 * gap + loop.em)
-    a2 = a1 + 2.0 * z * z
-    t1, t2 = lag * (power * a + a1), lag * (power * power * a + 2.0 * power * a1 + a2)
-    n, n1, n2 = loop.h + loop.a2 * z, loop.a2 * z, loop.a2 * z
-    if fractional:
-        late = z + loop.q
-        n, n1, n2 = n * late, n1 * late + n * z, n2 * late + 2.0 * n1 * z + n * z
-    n, n1, n2 = n * down, n1 * down, n2 * down
-    wall, wall1 = loop.alpha + loop.s * gap, loop.s * z
-    p1 = t1 + n1 * wall + n * wall1
-    p2 = t2 + n2 * wall + 2.0 * n1 * wall1 + n * wall1
-    # By alpha and by beta P changes by N z and N (z - 1).
-    by_a, by_a1 = n * z, n1 * z + n * z
-    by_b, by_b1 = n * gap, n1 * gap + n * z
-    w_a, w_b = -by_a / p1, -by_b / p1
-    w_aa = -(2.0 * by_a1 * w_a + p2 * w_a * w_a) / p1
-    w_ab = -(by_a1 * w_b + by_b1 * w_a + p2 * w_a * w_b) / p1
-    w_bb = -(2.0 * by_b1 * w_b + p2 * w_b * w_b) / p1
-    return np.stack([w, w_a, w_b, 0.5 * w_aa, w_ab, 0.5 * w_bb])
-
-
 @cache
 def _cells(fractional: bool) -> Any:
-    """The compiled work on a list of cells: arrays (cells, points of beta, points of alpha)."""
+    """The compiled work on a list of cells: arrays (points of beta, points of alpha, cells)."""
     import jax
 
-    def kernel(alpha: Array, beta: Array, middle: Array, re: Array, im: Array, device: Array, tolerance: Array) -> Any:
-        alpha, beta = alpha[:, None, :], beta[:, :, None]
-        middle, re, im, device = (part[..., None, None] for part in (middle, re, im, device))
-        da, db = alpha - middle[0], beta - middle[1]
-        z_re, z_im = (
-            part[0] + da * (part[1] + da * part[3] + db * part[4]) + db * (part[2] + db * part[5]) for part in (re, im)
-        )
-        z_re, z_im = moved(z_re, z_im, 0.0, 0.0)
-        nothing = 0.0 * device[0]
-        loop = loop_of(nothing, nothing, device[0], device[1], fractional)
-        loop = loop._replace(alpha=alpha, beta=beta, s=alpha + beta)
+    def kernel(alpha: Array, beta: Array, fields: Array, tolerance: Array) -> tuple[Array, Array]:
+        middle, beside, re, im, re_alpha, im_alpha, re_beta, im_beta, *device = fields[:, None, None, :]
+        alpha, beta = alpha[None, :, :], beta[:, None, :]
+        loop = Loop(alpha, beta, alpha + beta, *device)
+        da, db = alpha - middle, beta - beside
+        start = moved(re + (da * re_alpha + db * re_beta), im, 0.0, da * im_alpha + db * im_beta)
         for _ in range(_STEPS):
-            z_re, z_im = stepped(z_re, z_im, loop, fractional, limit=False)
-        return certified(Found(z_re, z_im), tolerance, loop, fractional)
+            start = halley_step(*start, loop, fractional)
+        found = certified(*start, tolerance, loop, fractional, fractional)
+        return found.re, found.proved
 
-    return jax.jit(kernel)
+    return jax.jit(kernel, compiler_options=WIDE)
+
+
+def _fields(nodes: list[np.ndarray], re: np.ndarray, im: np.ndarray, fractional: bool) -> np.ndarray:
+    """What the cells need of their nodes: the pole, how it moves with alpha and beta, the device."""
+    with np.errstate(all="ignore"):
+        loop = loop_of(nodes[0], nodes[1], nodes[2], nodes[3], fractional)
+        at = value_at(re, im, loop, fractional)
+        back = at.first.conjugate() * (-1.0 / (at.first.real**2 + at.first.imag**2))
+    alpha, beta = at.by_alpha * back, at.by_beta * back
+    return np.stack([*nodes[:2], re, im, alpha.real, alpha.imag, beta.real, beta.imag, *loop[3:]])
 
 
 def _cut(values: np.ndarray) -> np.ndarray:
@@ -152,33 +126,23 @@ def nodes_of(area: Map) -> list[np.ndarray]:
 
 def followed_poles(
     area: Map, nodes: list[np.ndarray], re: np.ndarray, im: np.ndarray, tolerance: float, fractional: bool
-) -> tuple[np.ndarray, ...]:
-    """The pole of every point and whether it is proved to be the outermost, from those of the nodes."""
-    across, down = _cut(area.alpha), _cut(area.beta)
-    with np.errstate(all="ignore"):
-        alpha, beta, delta, d = nodes
-        taylor: Any = _taylor(re, im, loop_of(alpha, beta, delta, d, fractional), fractional)
-    # A real pole stays real.
-    real = (im == 0) | (im == np.pi)
-    parts = np.stack([taylor.real, np.where(real & (np.arange(6)[:, None] > 0), 0.0, taylor.imag)])
-    parts = np.where(np.isfinite(parts), parts, 0.0)
-    grid = (area.delta.size, len(down), len(across))
-    count = int(np.prod(grid))
-    shape = (area.delta.size, len(down) * _CELL, len(across) * _CELL)
-    out = tuple(np.empty(shape, kind) for kind in (np.float64, np.float64, np.bool_))
-    tiles = [leaf.reshape(area.delta.size, len(down), _CELL, len(across), _CELL) for leaf in out]
-    run = _cells(fractional)
+) -> tuple[np.ndarray, np.ndarray]:
+    """The logarithm of every point's radius, and whether it is proved, from the poles of the nodes."""
+    across, down = _cut(area.alpha).T, _cut(area.beta).T
+    grid = (area.delta.size, down.shape[1], across.shape[1])
+    out = tuple(np.empty((grid[0], grid[1] * _CELL, grid[2] * _CELL), kind) for kind in (np.float64, np.bool_))
+    tiles = [leaf.reshape(grid[0], grid[1], _CELL, grid[2], _CELL) for leaf in out]
+    run, fields = _cells(fractional), _fields(nodes, re, im, fractional)
 
     def piece(start: int) -> None:
-        index = np.minimum(np.arange(start, start + _LIST), count - 1)
+        index = np.minimum(np.arange(start, start + _LIST), re.size - 1)
         at = np.unravel_index(index, grid)
-        middle, device = np.stack([c[index] for c in nodes[:2]]), np.stack([c[index] for c in nodes[2:]])
         with concretely():
-            found = run(across[at[2]], down[at[1]], middle, parts[0][:, index], parts[1][:, index], device, tolerance)
+            found = run(across[:, at[2]], down[:, at[1]], fields[:, index], tolerance)
             for tile, leaf in zip(tiles, found, strict=True):
-                tile[at[0], at[1], :, at[2], :] = np.asarray(leaf)
+                tile[at[0], at[1], :, at[2], :] = np.asarray(leaf).transpose(2, 0, 1)
 
     piece(0)
     with ThreadPoolExecutor(processors()) as pool:
-        list(pool.map(piece, range(_LIST, count, _LIST)))
-    return tuple(leaf[:, : area.beta.size, : area.alpha.size] for leaf in out)
+        list(pool.map(piece, range(_LIST, re.size, _LIST)))
+    return out[0][:, : area.beta.size, : area.alpha.size], out[1][:, : area.beta.size, : area.alpha.size]

@@ -15,13 +15,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from zwidth.batching import FEW
 from zwidth.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.stability.boundary_map import row_limits
-from zwidth.stability.decay import decay_rate
+from zwidth.stability.decay import rates
 from zwidth.stability.margins import margins
 from zwidth.stability.passivity import margin_at_one_delay
-from zwidth.stability.proved import proved_radii
+from zwidth.stability.proved import outermost_poles, radius_at, usable
 from zwidth.stability.ridge import alpha_max
 from zwidth.status import Status
 from zwidth.sweep.grid import Block
@@ -31,8 +30,6 @@ Columns: TypeAlias = tuple[np.ndarray, ...]
 # Small where a point is expensive, for a sweep of a few points pays for a whole piece; the last one is for rows.
 _PIECE = 1 << 9
 _ROW_PIECE = 1 << 12
-# Few enough for NumPy: points that need more patience are tried again together, however many they are.
-_RADIUS_PIECE = FEW
 _WALL_PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
@@ -192,16 +189,14 @@ def _by_device(
 
 def _radius_columns(accuracy: float, columns: Columns) -> Columns:
     """The spectral radius, whether it is proved to an accuracy (NaN where no error bound is), and the rate of decay."""
-
-    def of_piece(*piece: np.ndarray) -> Columns:
-        found = proved_radii(piece, accuracy)
-        rate = np.asarray(decay_rate(*piece))
-        radius = np.where(np.isfinite(found.error), found.radius, np.nan)
-        # The rate has more digits of it.
-        radius = np.where(np.isfinite(rate), np.exp(-rate), radius)
-        return radius, np.asarray(found.certified, dtype=np.float64), rate
-
-    return in_pieces(of_piece, columns, _RADIUS_PIECE)
+    walls, status = usable(list(columns))
+    # Always compiled, however few they are: a value must not depend on the size of its chunk.
+    found = outermost_poles(walls, accuracy, few=0)
+    rate, error = rates(found, walls), np.where(status == Status.OK, found.error, np.inf)
+    rate[status != Status.OK] = np.nan
+    # The rate has more digits of the radius.
+    radius = np.where(np.isfinite(rate), np.exp(-rate), radius_at(found.re, error, walls))
+    return radius, (error <= accuracy).astype(np.float64), rate
 
 
 def _margins(columns: Columns) -> Columns:

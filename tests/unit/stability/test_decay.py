@@ -49,7 +49,16 @@ def test_the_sign_is_that_of_the_verdict():
 
 
 @pytest.mark.parametrize(
-    "wall", [(1e-20, 1e-3, 1e-9, 0.0), (1e-15, 1e-9, 1e-9, 1.0), (1e-10, 1e-7, 0.0, 2.0), (0.05, 0.1, 0.03, 1.5)]
+    "wall",
+    [
+        (1e-20, 1e-3, 1e-9, 0.0),
+        (1e-15, 1e-9, 1e-9, 1.0),
+        (1e-10, 1e-7, 0.0, 2.0),
+        (0.05, 0.1, 0.03, 1.5),
+        # Poles next to 1 and a pair elsewhere, all within 1e-12 of the unit circle: the slowest is meant.
+        (1e-13, 1.4132588650193014, 0.00027724736314914985, 0.25),
+        (1e-17, 0.8284272285685977, 1.3888413586734453e-07, 1.0),
+    ],
 )
 def test_slow_loops_keep_their_digits(wall):
     assert zwidth.decay_rate(*wall) == pytest.approx(float(exact_rate(*wall)), rel=1e-13)

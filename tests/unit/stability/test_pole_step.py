@@ -6,7 +6,7 @@ from mpmath import mp
 
 import oracles
 from zwidth.stability.circle import loop_of
-from zwidth.stability.pole_step import pole_step, ratio_step
+from zwidth.stability.pole_step import halley_step, newton_step
 
 
 def walls(d, count=12):
@@ -32,7 +32,7 @@ def loop_at(alpha, beta, delta, d):
 @pytest.mark.parametrize("d", [0.0, 3.0, 0.5, 2.25])
 def test_steps_are_those_of_the_polynomial(d):
     for alpha, beta, delta, re, im in walls(d):
-        step = pole_step(np.float64(re), np.float64(im), loop_at(alpha, beta, delta, d), d % 1.0 != 0.0)
+        step = newton_step(np.float64(re), np.float64(im), loop_at(alpha, beta, delta, d), d % 1.0 != 0.0)
         with mp.workdps(60):
             polynomial = oracles.polynomial(alpha, beta, delta, d)
             degree = len(polynomial) - 1
@@ -50,7 +50,7 @@ def test_a_pole_is_as_near_as_is_said(d):
             poles = oracles.roots(oracles.polynomial(alpha, beta, delta, d))
         # From far away to where Newton's method stands still.
         for _ in range(8):
-            step = pole_step(np.float64(re), np.float64(im), loop, fractional)
+            step = newton_step(np.float64(re), np.float64(im), loop, fractional)
             with mp.workdps(60):
                 z = mp.exp(re) * mp.expj(im)
                 nearest = min(abs(pole / z - 1) for pole in poles)
@@ -60,10 +60,12 @@ def test_a_pole_is_as_near_as_is_said(d):
                 break
 
 
-def test_steps_on_the_ratio_end_at_a_pole_too():
-    loop = loop_at(0.01, 0.02, 0.1, 40.0)
-    re, im = np.float64(0.01), np.float64(np.pi / 42.0)
-    for _ in range(30):
-        by_re, by_im = ratio_step(re, im, loop, False)
-        re, im = re + by_re, im + by_im
-    assert pole_step(re, im, loop, False).within < 1e-9
+@pytest.mark.parametrize("d", [0.0, 40.0, 2.25])
+def test_halleys_method_ends_at_a_pole_from_far_away(d):
+    loop, fractional = loop_at(0.01, 0.02, 0.1, d), d % 1.0 != 0.0
+    # Not on the real axis: from there no step leads away, and this loop has no pole to its left.
+    for start in (0.1, np.pi / (d + 2.0), 3.0):
+        re, im = np.float64(0.01), np.float64(start)
+        for _ in range(30):
+            re, im = halley_step(re, im, loop, fractional)
+        assert newton_step(re, im, loop, fractional).within < 1e-9

@@ -58,7 +58,7 @@ def test_nearly_all_points_need_no_search(d):
     assert area is not None
     nodes = nodes_of(area)
     found = outermost_poles(nodes, 1e-9)
-    _, _, ok = followed_poles(area, nodes, found.re, found.im, 1e-9, d % 1.0 != 0.0)
+    _, ok = followed_poles(area, nodes, found.re, found.im, 1e-9, d % 1.0 != 0.0)
     assert ok.shape == (1, 320, 320)
     assert ok.mean() > 0.95
 
