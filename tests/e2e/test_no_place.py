@@ -176,7 +176,7 @@ def test_a_chunk_that_fails_is_named_and_the_exit_code_is_1(config, tmp_path, mo
     out, err = capsys.readouterr()
     assert "7 of 8 chunks done" in out
     assert "zwidth: chunk map/wall/2 (d 1:2, delta 0:2, alpha 0:40, beta 0:300) failed: ArithmeticError: no" in err
-    assert f"try the failed chunks again with: zwidth run {config} --out {tmp_path}/out --resume" in err
+    assert f"try again what failed with: zwidth run {config} --out {tmp_path}/out --resume" in err
     assert main_of("verify", tmp_path / "out") == 1
     assert "map.zarr: 7 of 8 chunks done, none damaged" in capsys.readouterr().out
 
@@ -186,7 +186,7 @@ def test_a_store_of_another_configuration_is_refused(finished, tmp_path, capsys)
     changed = written(tmp_path / "changed.yaml", study(axes={**AXES, "delta": [0.0, 0.1, 1.0, 2.5]}))
     assert main_of("run", changed, "--out", finished, "--resume") == 2
     key, remedy = capsys.readouterr().err.splitlines()
-    assert "studies[map].axes.delta[3]: the store was made with 3.0, the configuration has 2.5" in key
+    assert "studies[map].axes.delta[3]: the run was made with 3.0, the configuration has 2.5" in key
     assert "change the configuration back, or choose another folder with --out DIR" in remedy
     assert flags(finished) == before
 
@@ -196,8 +196,19 @@ def test_a_damaged_description_of_a_store_is_told(config, copy, capsys):
     for damaged in (text[:100], "", "[]", text.replace("float64", "float32")):
         (copy / "map.zarr" / "zarr.json").write_text(damaged, encoding="utf-8")
         assert main_of("verify", copy) == 1
+        # There is a second copy.
+        assert main_of("run", config, "--out", copy, "--resume") == 0
+        assert "repaired map/zarr.json (restored)" in capsys.readouterr().err
+        assert main_of("verify", copy) == 0
+        for name in ("zarr.json", "zwidth.json"):
+            (copy / "map.zarr" / name).write_text(damaged, encoding="utf-8")
+        assert main_of("verify", copy) == 1
         assert main_of("run", config, "--out", copy, "--resume") == 2
-        assert "map.zarr/zarr.json: " in capsys.readouterr().err
+        err = capsys.readouterr().err
+        assert "map.zarr: zarr.json " in err
+        assert "start again in a new folder" in err
+        for name in ("zarr.json", "zwidth.json"):
+            (copy / "map.zarr" / name).write_text(text, encoding="utf-8")
 
 
 def test_a_folder_without_a_store_is_told(tmp_path, capsys):
@@ -213,12 +224,17 @@ def test_the_plan_of_a_configuration_without_sweeps(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+def states(out):
+    entries = json.loads((out / "run.json").read_text(encoding="utf-8"))["studies"]
+    return {entry["name"]: entry["state"] for entry in entries}
+
+
 def test_other_studies_go_beside_sweeps_that_were_faster(tmp_path, capsys):
     ridge = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0}
     config, out = written(tmp_path / "both.yaml", ridge, study()), tmp_path / "out"
     assert main_of("run", config, "--out", out, "--shard", "2/2") == 0
-    assert not (out / "run.json").exists()
+    assert states(out) == {"map": "open"}
     assert main_of("run", config, "--out", out, "--shard", "1/2") == 0
-    assert (out / "run.json").is_file()
+    assert states(out) == {"map": "done", "r": "done"}
     assert (out / "r.csv").is_file()
     assert main_of("verify", out) == 0

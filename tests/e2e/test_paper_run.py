@@ -62,7 +62,7 @@ def test_the_paper_run_makes_every_file(paper):
     assert paper.failed == ()
     assert [note for study in paper.studies for note in study.notes] == []
     expected = {f"{name}.{suffix}" for name in FIGURES for suffix in ("csv", "png", "svg")}
-    expected |= {"published.md", "published.json", "run.json", "config.yaml"}
+    expected |= {"published.md", "published.json", "run.json", "config.yaml", ".locks"}
     assert {file.name for file in paper.folder.iterdir()} == expected
     for file in paper.folder.iterdir():
         assert file.stat().st_size > 500, file.name

@@ -24,7 +24,7 @@ from zwidth.sweep.engine import Progress, compute_sweeps
 from zwidth.sweep.jobs import Perform
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.resume import remove, store_path
-from zwidth.sweep.store import check_installed
+from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy
 
 AnyConfig = Config | str | os.PathLike[str]
@@ -255,7 +255,8 @@ class _Run:
         for study, _ in planned:
             sweep = sweeps.results[study.name]
             self.repaired += sweep.repaired
-            state = "failed" if sweep.failed else "done" if sweep.ok and options["shard"] is None else "open"
+            # A shard that ends last finds the others' chunks done as well.
+            state = "failed" if sweep.failed else "open" if Store(sweep.store).missing() else "done"
             error = next(iter(sweep.failed.values()), "")
             seconds = time.perf_counter() - clock
             if not self.hopeless:

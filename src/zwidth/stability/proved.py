@@ -65,7 +65,7 @@ def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW, 
 def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int, patient: bool) -> Poles:
     size = columns[0].size
     with np.errstate(all="ignore"):
-        if size == 1:
+        if size == 1 <= few:
             # Plain numbers are several times faster than arrays of one.
             alpha, beta, delta, d = (column[0] for column in columns)
             found = [np.reshape(leaf, 1) for leaf in quick_kernel(alpha, beta, delta, d, accuracy, kind)]

@@ -103,7 +103,7 @@ MANY_ROWS = {"alpha": [0.1], "beta": {"linear": {"start": -0.1, "stop": 0.5, "nu
 @pytest.mark.parametrize("axes, target", [(FEW, 1), (FEW, 7), (MANY_ROWS, 11), (MANY_ROWS, 100)])
 def test_values_do_not_depend_on_chunks(tmp_path, monkeypatch, axes, target):
     # Each of the many chunks fills up one piece of every size.
-    for size in ("_PIECE", "_WALL_PIECE", "_RADIUS_PIECE"):
+    for size in ("_PIECE", "_WALL_PIECE"):
         monkeypatch.setattr(f"zwidth.sweep.compute.{size}", 64)
     config = config_of(study(axes=axes, outputs=(*WALLS, *DEVICES)))
     run_sweeps(config, tmp_path / "whole")
@@ -205,15 +205,18 @@ def test_a_full_disk_ends_the_run(finished, tmp_path):
 def test_events_tell_how_far_it_is(tmp_path):
     events = []
     run_sweeps(config_of(), tmp_path, progress=events.append)
-    assert [event.chunks for event in events] == list(range(1, len(events) + 1))
-    assert events[-1].points == events[-1].total_points == 4 * 4 * 40 * 300
-    assert events[-1].seconds_left == 0
-    assert all(event.rate > 0 and event.study == "map" for event in events)
+    assert events[0].result is events[0].progress is None
+    assert events[-1].result.state == "done"
+    told = [event.progress for event in events[1:-1]]
+    assert [progress.chunks for progress in told] == list(range(1, len(told) + 1))
+    assert told[-1].points == told[-1].total_points == 4 * 4 * 40 * 300
+    assert told[-1].seconds_left == 0
+    assert all(progress.rate > 0 and progress.study == "map" for progress in told)
 
 
 def test_a_store_is_never_overwritten(finished):
     config, folder = finished
-    with pytest.raises(StoreExistsError, match=r"map\.zarr exists already; go on with it with --resume"):
+    with pytest.raises(StoreExistsError, match=r"already holds a run; .* go on with it with --resume"):
         run_sweeps(config, folder)
 
 
@@ -232,7 +235,7 @@ def test_another_configuration_is_refused(finished, change, key, words):
     changed = config_of(study(**change))
     with pytest.raises(StoreError) as caught:
         run_sweeps(changed, folder, resume=True)
-    assert f"studies[map].{key}: the store was made with" in str(caught.value)
+    assert f"studies[map].{key}: the run was made with" in str(caught.value)
     assert words in str(caught.value)
     assert flags(folder) == before
 
