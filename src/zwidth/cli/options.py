@@ -15,7 +15,7 @@ class Quantity(click.ParamType):
 
     def __init__(self, name: str) -> None:
         self.parameter = PARAMETERS[name]
-        self.name = self.parameter.unit
+        self.name = "quantity"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Parse one option."""
