@@ -101,7 +101,7 @@ def traced_row(name: str, kernel: Callable[..., Any], points: tuple[np.ndarray, 
     arguments = [jnp.asarray(column) for column in points]
     speeds = (points[0].size / best for best in timed(lambda: compiled(*arguments)))
     alpha, (by_delta, by_d) = function(*reference_points(rows))
-    return Row(name, *seconds, *speeds, *errors(alpha, by_delta, by_d, rows))
+    return Row._make((name, *seconds, *speeds, *errors(alpha, by_delta, by_d, rows)))
 
 
 def reference_points(rows: list[dict[str, str]]) -> tuple[np.ndarray, ...]:
@@ -119,11 +119,13 @@ def public_row(points: tuple[np.ndarray, ...], rows: list) -> Row:
     first = time.perf_counter() - start, time.process_time() - busy
     best = timed(lambda: call(*points))
     gain = call(*reference_points(rows))
-    return Row(
-        "zwidth.sensitivities",
-        *(with_compilation - without for with_compilation, without in zip(first, best, strict=True)),
-        *(points[0].size / seconds for seconds in best),
-        *errors(gain.stiffness_max, gain.per_damping, gain.per_delay, rows),
+    return Row._make(
+        (
+            "zwidth.sensitivities",
+            *(with_compilation - without for with_compilation, without in zip(first, best, strict=True)),
+            *(points[0].size / seconds for seconds in best),
+            *errors(gain.stiffness_max, gain.per_damping, gain.per_delay, rows),
+        )
     )
 
 

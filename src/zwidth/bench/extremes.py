@@ -31,7 +31,7 @@ class Group(NamedTuple):
     distance: np.ndarray
 
 
-class Outcome(NamedTuple):
+class Finding(NamedTuple):
     """What one method makes of one group at one delay."""
 
     method: str
@@ -86,7 +86,7 @@ def _ridge(delta: float, d: float) -> tuple[np.ndarray, ...]:
     return alpha, beta, np.full(distance.size, delta), distance
 
 
-def judge(d: float) -> Iterator[Outcome]:
+def judge(d: float) -> Iterator[Finding]:
     """What every method makes of every group; points exactly on the boundary have no label and are left out."""
     for group in groups(d):
         truth = certified_stable(*group.walls)
@@ -97,7 +97,7 @@ def judge(d: float) -> Iterator[Outcome]:
                 continue
             wrong = np.asarray(is_stable(*walls, method=method)) != np.asarray(truth.stable)[known]
             farthest = float(np.max(group.distance[known][wrong], initial=0.0))
-            yield Outcome(method, group.name, d, int(known.sum()), int(wrong.sum()), farthest)
+            yield Finding(method, group.name, d, int(known.sum()), int(wrong.sum()), farthest)
 
 
 def report(delays: tuple[float, ...] = DELAYS) -> str:
@@ -133,7 +133,7 @@ def _delay(d: float) -> str:
     return f"d = {d:g}"
 
 
-def _cell(outcome: Outcome) -> str:
+def _cell(outcome: Finding) -> str:
     if not outcome.wrong:
         return f"0 of {outcome.points}"
     where = f", {outcome.farthest:.0e}" if outcome.farthest > 0 else ""

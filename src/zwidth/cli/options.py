@@ -10,7 +10,7 @@ import click
 from zwidth.quantities import PARAMETERS
 
 
-class Quantity(click.ParamType):
+class QuantityType(click.ParamType):
     """A parameter of the loop: a number in its SI unit, or a number with a unit, as in configuration files."""
 
     def __init__(self, name: str) -> None:
@@ -40,7 +40,7 @@ def physical_options(*, wall: bool, required: bool) -> Callable[[Callable[..., A
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         for name in reversed(names):
             parameter = PARAMETERS[name]
-            given: dict[str, Any] = {"type": Quantity(name), "help": f"{parameter.symbol}, in {parameter.unit}."}
+            given: dict[str, Any] = {"type": QuantityType(name), "help": f"{parameter.symbol}, in {parameter.unit}."}
             # Without damping and delay a device is still one.
             if name in ("damping", "delay", "virtual_damping"):
                 given |= {"default": 0.0, "show_default": True}

@@ -53,7 +53,7 @@ def files_relative_to(folder: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True)
-class Table:
+class DeviceTable:
     """Rows of parameters.
 
     Args:
@@ -84,16 +84,16 @@ class Table:
         return lists
 
 
-def read_table(raw: Any) -> Table:
+def read_table(raw: Any) -> DeviceTable:
     """A validator for a table in any of its forms."""
-    if isinstance(raw, Table):
+    if isinstance(raw, DeviceTable):
         return raw
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", f"devices are {_FORMS}", "write {csv: devices.csv}")
     return _from_csv(raw) if "csv" in raw else _from_lists(raw)
 
 
-def _from_lists(raw: dict[str, Any]) -> Table:
+def _from_lists(raw: dict[str, Any]) -> DeviceTable:
     known = (LABEL, *PARAMETERS)
     found: list[LocatedProblem] = []
     columns: dict[str, tuple[float, ...]] = {}
@@ -151,7 +151,7 @@ def _labels(cells: Any) -> tuple[tuple[str, ...], list[LocatedProblem]]:
     return tuple(str(cell) for cell in cells), found
 
 
-def _checked(columns: dict[str, tuple[float, ...]], labels: tuple[str, ...], delay_unit: str) -> Table:
+def _checked(columns: dict[str, tuple[float, ...]], labels: tuple[str, ...], delay_unit: str) -> DeviceTable:
     """The table, where its columns are of one length."""
     if not columns:
         raise problem("got no parameter", f"devices are {_FORMS}", f"add a column such as {'mass'!r}")
@@ -164,10 +164,10 @@ def _checked(columns: dict[str, tuple[float, ...]], labels: tuple[str, ...], del
     rows = next(iter(lengths.values()))
     if rows > MAX_ROWS:
         raise problem(f"got {rows} rows", f"at most {MAX_ROWS} devices a study", "split the table")
-    return Table(columns, labels, delay_unit)
+    return DeviceTable(columns, labels, delay_unit)
 
 
-def _from_csv(raw: dict[str, Any]) -> Table:
+def _from_csv(raw: dict[str, Any]) -> DeviceTable:
     """A table from a file, whose header names parameters and, in brackets, their units."""
     for key in raw:
         if key not in ("csv", "columns"):
@@ -244,7 +244,7 @@ def _mapped(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, 
     return chosen
 
 
-def _parsed(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> Table:
+def _parsed(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
     """The chosen columns of a file's rows."""
     columns: dict[str, tuple[float, ...]] = {}
     labels: tuple[str, ...] = ()
@@ -298,7 +298,7 @@ def _schema() -> dict[str, Any]:
 
 
 TableField = Annotated[
-    Table,
+    DeviceTable,
     PlainValidator(read_table),
     PlainSerializer(lambda table: table.spelling(), return_type=Any),
     WithJsonSchema(_schema()),

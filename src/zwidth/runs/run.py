@@ -31,7 +31,7 @@ AnyConfig = Config | str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
-class Piece:
+class Computation:
     """What a run computes as a whole: a study that is no sweep, or the comparison with the paper's numbers.
 
     Attributes:
@@ -176,7 +176,7 @@ class _Run:
         """Whether nothing more is to be begun."""
         return bool(self.hopeless) or self.interrupted
 
-    def do(self, pieces: list[Piece]) -> None:
+    def do(self, pieces: list[Computation]) -> None:
         """Compute what is not done yet; whatever goes wrong is recorded, for the others do not depend on it."""
         for index, piece in enumerate(pieces, start=1):
             entry = self.record.entry(piece.name)
@@ -195,7 +195,7 @@ class _Run:
             if self.over:
                 return
 
-    def _compute(self, piece: Piece) -> StudyResult:
+    def _compute(self, piece: Computation) -> StudyResult:
         clock = time.perf_counter()
         entry = {"name": piece.name, "kind": piece.kind, "state": "failed", "inputs": piece.inputs}
         notes: tuple[str, ...] = ()
@@ -273,7 +273,7 @@ def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
     return {"name": study.name, "kind": "sweep", "state": state, "inputs": _inputs(study), "files": files}
 
 
-def _pieces(config: Config) -> list[Piece]:
+def _pieces(config: Config) -> list[Computation]:
     """The studies that are computed as a whole; where figures of the paper are repeated, its numbers as well."""
     pieces = []
     for study in config.studies:
@@ -282,11 +282,13 @@ def _pieces(config: Config) -> list[Piece]:
             inputs = {**_inputs(study), "alone": alone}
             if study.reads_scene and config.scene is not None:
                 inputs["scene"] = _spelled(config.scene)
-            pieces.append(Piece(study.name, study.kind_name(), inputs, partial(study.compute, config.scene, alone)))
+            pieces.append(
+                Computation(study.name, study.kind_name(), inputs, partial(study.compute, config.scene, alone))
+            )
     if any((getattr(study, "figure", None) or "").startswith("fig") for study in config.studies):
         from zwidth.studies.published import compare_published
 
-        pieces.append(Piece("published", "report", {}, compare_published))
+        pieces.append(Computation("published", "report", {}, compare_published))
     return pieces
 
 

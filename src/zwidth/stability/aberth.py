@@ -23,20 +23,20 @@ _FIRST_STEPS = 9
 _ROUNDING = 32.0
 
 
-class Complex(NamedTuple):
+class Cartesian(NamedTuple):
     """A complex number by its parts: real arithmetic is faster."""
 
     re: Array
     im: Array
 
-    def times(self, other: Complex) -> Complex:
+    def times(self, other: Cartesian) -> Cartesian:
         """The product."""
-        return Complex(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
+        return Cartesian(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
 
-    def over(self, other: Complex) -> Complex:
+    def over(self, other: Cartesian) -> Cartesian:
         """The quotient."""
         size = other.re * other.re + other.im * other.im
-        return Complex(
+        return Cartesian(
             (self.re * other.re + self.im * other.im) / size, (self.im * other.re - self.re * other.im) / size
         )
 
@@ -68,47 +68,47 @@ def product_form(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degr
     return ProductForm(degree.poles - 2 - spring, c, tuple(n), alpha, None if spring else beta)
 
 
-def _plus(x: Complex, y: Complex) -> Complex:
-    return Complex(x.re + y.re, x.im + y.im)
+def _plus(x: Cartesian, y: Cartesian) -> Cartesian:
+    return Cartesian(x.re + y.re, x.im + y.im)
 
 
-def _power(z: Complex, power: int) -> Complex:
+def _power(z: Cartesian, power: int) -> Cartesian:
     """z^power by repeated squaring."""
     if power == 0:
-        return Complex(0.0 * z.re + 1.0, 0.0 * z.im)
+        return Cartesian(0.0 * z.re + 1.0, 0.0 * z.im)
     root = _power(z, power // 2)
     square = root.times(root)
     return square.times(z) if power % 2 else square
 
 
-def evaluate(z: Complex, form: ProductForm) -> tuple[Complex, Complex]:
+def evaluate(z: Cartesian, form: ProductForm) -> tuple[Cartesian, Cartesian]:
     """P(z) and P'(z)."""
-    one, pole = Complex(z.re - 1.0, z.im), Complex(z.re - form.c, z.im)
+    one, pole = Cartesian(z.re - 1.0, z.im), Cartesian(z.re - form.c, z.im)
     quadratic = one.times(pole)
     lag = _power(z, max(form.power - 1, 0))
     body = z.times(_plus(one, pole))
     if form.power:
-        slope = lag.times(Complex(form.power * quadratic.re + body.re, form.power * quadratic.im + body.im))
+        slope = lag.times(Cartesian(form.power * quadratic.re + body.re, form.power * quadratic.im + body.im))
         value = lag.times(z).times(quadratic)
     else:
         slope, value = _plus(one, pole), quadratic
-    n = Complex(form.n[0] + 0.0 * z.re, 0.0 * z.im)
-    n_slope = Complex(0.0 * z.re, 0.0 * z.im)
+    n = Cartesian(form.n[0] + 0.0 * z.re, 0.0 * z.im)
+    n_slope = Cartesian(0.0 * z.re, 0.0 * z.im)
     for coefficient in form.n[1:]:
         n_slope = _plus(n_slope.times(z), n)
         n = n.times(z)
-        n = Complex(n.re + coefficient, n.im)
+        n = Cartesian(n.re + coefficient, n.im)
     if form.beta is None:
-        wall, stiffness = Complex(form.alpha, 0.0), 0.0
+        wall, stiffness = Cartesian(form.alpha, 0.0), 0.0
     else:
         stiffness = form.alpha + form.beta
-        wall = Complex(form.alpha * z.re + form.beta * one.re, stiffness * z.im)
+        wall = Cartesian(form.alpha * z.re + form.beta * one.re, stiffness * z.im)
     push = n_slope.times(wall)
-    slope = Complex(slope.re + push.re + stiffness * n.re, slope.im + push.im + stiffness * n.im)
+    slope = Cartesian(slope.re + push.re + stiffness * n.re, slope.im + push.im + stiffness * n.im)
     return _plus(value, n.times(wall)), slope
 
 
-def rounding(z: Complex, form: ProductForm, unit: float) -> Array:
+def rounding(z: Cartesian, form: ProductForm, unit: float) -> Array:
     """What rounding errors may add up to in P(z)."""
     xp = namespace(z.re)
     # Sums of the parts' sizes are upper bounds of moduli that neither overflow nor underflow.
@@ -130,9 +130,9 @@ def join(re: Array, im: Array) -> Array:
     return join(re, im)
 
 
-def split(z: Array) -> Complex:
+def split(z: Array) -> Cartesian:
     """Real and imaginary parts."""
-    return Complex(z.real, z.imag)
+    return Cartesian(z.real, z.imag)
 
 
 def _doubled(x: Array) -> Array:
@@ -146,7 +146,7 @@ def _doubled(x: Array) -> Array:
     return optimization_barrier(twice)
 
 
-def _differences(z: Array) -> list[Complex]:
+def _differences(z: Array) -> list[Cartesian]:
     """From each pole the ones that follow it, nearest in number first."""
     twice, count = _doubled(z), z.shape[0]
     return [split(z - twice[k : k + count]) for k in range(1, count)]
@@ -155,13 +155,13 @@ def _differences(z: Array) -> list[Complex]:
 def _step(z: Array, form: ProductForm) -> Array:
     q, *others = _differences(z)
     at = split(z)
-    q_slope = Complex(0.0 * at.re + 1.0, 0.0 * at.im)
+    q_slope = Cartesian(0.0 * at.re + 1.0, 0.0 * at.im)
     for difference in others:
         q_slope = _plus(q_slope.times(difference), q)
         q = q.times(difference)
     value, slope = evaluate(at, form)
     ours, theirs = slope.times(q), value.times(q_slope)
-    step = value.times(q).over(Complex(ours.re - theirs.re, ours.im - theirs.im))
+    step = value.times(q).over(Cartesian(ours.re - theirs.re, ours.im - theirs.im))
     return join(at.re - step.re, at.im - step.im)
 
 

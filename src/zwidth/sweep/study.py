@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, Wr
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.axes import AnyAxis, Axis, DelayAxis, DeltaAxis, PointAxis
-from zwidth.config.device_table import Table, TableField, read_table
+from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import Strict, members, one_of
 from zwidth.config.numbers import number
@@ -281,7 +281,7 @@ def _columns(raw: Any) -> set[str]:
     """The parameters of a table, as far as it can be read."""
     if raw is None:
         return set()
-    if isinstance(raw, Table):
+    if isinstance(raw, DeviceTable):
         return set(raw.columns)
     if isinstance(raw, dict) and "csv" not in raw:
         return set(raw) & set(PARAMETERS)
