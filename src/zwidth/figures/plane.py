@@ -103,11 +103,7 @@ def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndar
     columns = min(count, columns)
     rows = -(-count // columns)
     width, height = (5.9, 4.5) if count == 1 else (max(5.0, 0.9 + 2.5 * columns), 1.2 + 2.2 * rows)
-    panels = style.panels(given, count, width, height, columns, sharex=True, sharey=True)
-    for above in panels[max(0, count - columns) :] if given is None else ():
-        # The lowest of its column, in the last row or not.
-        above.tick_params(labelbottom=True)
-    return panels
+    return style.panels(given, count, width, height, columns, sharex=True, sharey=True)
 
 
 def _draw_panel(ax: Axes, part: xarray.Dataset, name: str, norm: Any) -> Any:

@@ -45,7 +45,7 @@ def _draw_region(ax: Axes, found: Mapping[str, Any], region: Table) -> None:
         stiffness, damping = getattr(curve, SI_COLUMNS[0]) * factor, getattr(curve, SI_COLUMNS[1])
         if curve.curve == "passive":
             _draw_passive(ax, stiffness, damping)
-        else:
+        elif curve.curve == "boundary":
             ax.fill(stiffness, damping, facecolor=style.SKY, alpha=0.25, linewidth=0.0, zorder=1)
             ax.plot(stiffness, damping, color=style.BLUE, label="boundary", zorder=3)
             ax.set_xlim(-0.02 * float(stiffness.max()), 1.26 * float(stiffness.max()))

@@ -36,8 +36,9 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     for ax in panels[1:]:
         _draw_forces(ax, responses, clock)
         ax.set_ylabel("wall force in N" if unit else "wall force  in $F$")
-    # The last sample ends before the time that was asked for.
-    panels[-1].set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
+    for ax in panels:
+        # The last sample ends before the time that was asked for.
+        ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
     panels[-1].set_xlabel(f"time  $t$  in {unit}" if unit else "time  $t/T$  in sampling periods")
     handles = [line for line in panels[0].lines if not line.get_label().startswith("_")]
     if any(each.settled for each in responses):

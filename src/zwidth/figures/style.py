@@ -91,12 +91,15 @@ def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **k
 
 
 def panels(given: AnyAxes | None, count: int, width: float, height: float, columns: int = 1, **keywords: Any) -> Any:
-    """The Axes to draw into: those given, or so many panels of a new figure; an array of one dimension."""
+    """The Axes to draw into, in one dimension: those given, or so many panels of a new figure, unknown to pyplot."""
     if given is not None:
         return np.asarray(given, dtype=object).ravel()[:count]
     _, axes = new_figure(width, height, -(-count // columns), columns, **keywords)
     for spare in axes.flat[count:]:
         spare.remove()
+    for lowest in axes.flat[max(0, count - columns) : count]:
+        # Of its column, in the last row or not; panels that share an axis would leave it bare.
+        lowest.tick_params(labelbottom=True)
     return axes.ravel()[:count]
 
 
@@ -116,10 +119,10 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
         ax.set(xlabel=x, ylabel=y)
 
 
-def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, **keywords: Any) -> None:
-    """Explain what is drawn, above the panels or within the first."""
+def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: str = "upper", **keywords: Any) -> None:
+    """Explain what is drawn, above the panels (or below), or within the first."""
     if handles and outside:
-        axes[0].figure.legend(handles=handles, loc="outside upper center", **keywords)
+        axes[0].figure.legend(handles=handles, loc=f"outside {place} center", **keywords)
     elif handles:
         axes[0].legend(handles=handles)
 
@@ -198,18 +201,13 @@ def span(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
 
 def spread(positions: Sequence[float], gap: float) -> np.ndarray:
     """Positions at least ``gap`` apart, as close to the given ones as their order allows."""
+    # It takes a moment to import, and most figures need it not.
+    from scipy.optimize import isotonic_regression
+
     order = np.argsort(positions, kind="stable")
-    wanted = np.asarray(positions, dtype=np.float64)[order] - gap * np.arange(len(positions))
-    # Pooling adjacent violators: the least-squares fit of a nondecreasing sequence.
-    blocks: list[list[float]] = []
-    for value in wanted:
-        blocks.append([value, 1.0])
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            mean, size = blocks.pop()
-            blocks[-1] = [(blocks[-1][0] * blocks[-1][1] + mean * size) / (blocks[-1][1] + size), blocks[-1][1] + size]
-    fitted = np.concatenate([np.full(int(size), mean) for mean, size in blocks]) + gap * np.arange(len(positions))
-    placed = np.empty_like(fitted)
-    placed[order] = fitted
+    steps = gap * np.arange(len(positions))
+    placed = np.empty(len(positions))
+    placed[order] = isotonic_regression(np.asarray(positions, dtype=np.float64)[order] - steps).x + steps
     return placed
 
 
