@@ -9,7 +9,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.errors import InputError
 from zwidth.figures import grid, style
-from zwidth.figures.plane import EDGES, panel_grid, resolved
+from zwidth.figures.plane import SMOOTH, boundary_level, panel_grid
 from zwidth.quantities import OUTPUTS, WALL
 
 if TYPE_CHECKING:
@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 _LINE = 56
 # More curves than this in one panel cannot be told apart.
 _CURVES = 9
-# The boundary by the first of these that a store has: a number gives a smoother line than a truth value.
-_BOUNDARIES = ("margin", "spectral_radius", "stable")
 
 
 @style.house_style()
@@ -71,7 +69,7 @@ def draw_curves(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = No
 
 def outlined(data: xarray.Dataset) -> tuple[str, str] | None:
     """The output whose contours are the boundaries of walls, and the parameter each of whose values has one."""
-    name = next((name for name in _BOUNDARIES if name in data and _has_walls(data, name)), None)
+    name = next((name for name in (*SMOOTH, "stable") if name in data and _has_walls(data, name)), None)
     dims = [dim for dim in grid.varied(data, name) if dim not in WALL] if name else []
     first = next((dim for dim in ("delta", "damping", *reversed(dims)) if dim in dims), None)
     return (name, first) if name and first else None
@@ -99,8 +97,7 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np
     name, family = found
     data = grid.shown(data, [name])
     x, y = dims = grid.axes_of(data, name)
-    parts, columns = grid.panels(data, [family, *dims])
-    parts = [grid.thin(part, dims, resolved(len(parts))) for part in parts]
+    parts, columns = grid.panels(data, [family, *dims], plane=dims)
     panels = panel_grid(axes, len(parts), columns)
     picked = style.evenly(data.sizes[family], _CURVES)
     colors = style.ordered_colors(len(picked))
@@ -108,7 +105,7 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np
     for part, ax in zip(parts, panels, strict=False):
         for k, color in zip(picked, colors, strict=True):
             shown = np.ma.masked_invalid(part[name].isel({family: k}).transpose(y, x).values)
-            level = EDGES[name]
+            level = boundary_level(name)
             if shown.count() and shown.min() < level < shown.max():
                 ax.contour(part[x].values, part[y].values, shown, levels=[level], colors=[color], linewidths=1.4)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,8 @@ from zwidth.quantities import NOT_COMPUTED, OUTPUTS, PARAMETERS, STATUS_OF, WALL
 if TYPE_CHECKING:
     import xarray
 
+# As many values as one panel, or one of several, resolves; of a finer grid every n-th is drawn.
+_RESOLVED, _RESOLVED_BY_MANY = 1000, 500
 # A grid of more panels than this says nothing on a page: evenly spaced values stand for all.
 _ACROSS = 3
 _MANY_PANELS = 9
@@ -73,26 +76,25 @@ def _readable(values: np.ndarray, unit: str) -> tuple[float, str]:
     return style.si_unit(float(np.max(np.abs(values))), unit)
 
 
-def panels(data: xarray.Dataset, over: list[str]) -> tuple[list[xarray.Dataset], int]:
+def panels(data: xarray.Dataset, over: list[str], plane: Sequence[str] = ()) -> tuple[list[xarray.Dataset], int]:
     """A part of a dataset for each panel, and how many panels are beside each other.
 
     Args:
         data: as `shown` gives it.
         over: the dimensions that a panel has; the last two others vary from panel to panel.
+        plane: those of them that are drawn as a plane, which resolves so many values and no more.
     """
     free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
     data = data.isel(dict.fromkeys(free[:-2], 0))
     free = free[-2:]
     picked = [style.evenly(data.sizes[dim], _MANY_PANELS if len(free) == 1 else _ACROSS) for dim in free]
-    parts = [data.isel(dict(zip(free, place, strict=True))) for place in product(*picked)]
+    places = [dict(zip(free, place, strict=True)) for place in product(*picked)]
+    most = _RESOLVED if len(places) == 1 else _RESOLVED_BY_MANY
+    thin = {dim: slice(None, None, -(-data.sizes[dim] // most)) for dim in plane}
+    parts = [data.isel({**place, **thin}) for place in places]
     if len(free) == 2:
         return parts, len(picked[1])
     return parts, 2 if len(parts) == 4 else min(_ACROSS, len(parts))
-
-
-def thin(data: xarray.Dataset, dims: list[str], most: int) -> xarray.Dataset:
-    """Every n-th value along some axes, so that no more than ``most`` are left."""
-    return data.isel({dim: slice(None, None, -(-data.sizes[dim] // most)) for dim in dims})
 
 
 def spell(value: xarray.DataArray) -> str:

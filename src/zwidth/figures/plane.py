@@ -21,13 +21,8 @@ if TYPE_CHECKING:
     import xarray
 
 _MISSING = "#D9D9D9"
-# The level at which the contour of an output is the boundary of the stable walls.
-EDGES = {
-    **{"margin": 0.0, "decay_rate": 0.0, "phase_margin": 0.0, "gain_margin": 1.0, "spectral_radius": 1.0},
-    **{"stable": 0.5, "passive": 0.5},
-}
-# Numbers that give a smoother boundary than truth values.
-_SMOOTH = ("margin", "spectral_radius")
+# Numbers whose contour is the boundary of the stable walls, smoother than that of truth values.
+SMOOTH = ("margin", "spectral_radius")
 # The stiffest stable wall in a plane of walls.
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 # Beyond this multiple of the smallest, a output that grows without end has one color.
@@ -62,10 +57,9 @@ def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = Non
     if len(dims) < 2:
         raise InputError(f"name: {name!r} varies over less than two parameters, a plane needs them")
     x, y = dims
-    parts, columns = grid.panels(_with_peak(data, _drawn(data, name), x, y), dims)
-    parts = [grid.thin(part, dims, resolved(len(parts))).compute() for part in parts]
+    parts, columns = grid.panels(_with_peak(data, _drawn(data, name), x, y), dims, plane=dims)
     panels = panel_grid(axes, len(parts), columns)
-    parts = parts[: len(panels)]
+    parts = [part.compute() for part in parts[: len(panels)]]
     norm, image = _norm(parts, name), None
     for part, ax in zip(parts, panels, strict=True):
         image = _draw_panel(ax, part.transpose(y, x), name, norm)
@@ -76,7 +70,7 @@ def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = Non
 
 def _drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
     """The output, and what is drawn along with it."""
-    beside = ["passive", *[edge for edge in _SMOOTH if edge in data][:1]] if name == "stable" else []
+    beside = ["passive", *[edge for edge in SMOOTH if edge in data][:1]] if name == "stable" else []
     beside += ["kind"] if OUTPUTS[name].family == "device" else []
     data = grid.shown(data, [name, *[each for each in beside if each in data and each != name]])
     if name in ("settling_time", "gain_margin", "delay_margin"):
@@ -93,9 +87,9 @@ def _with_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> x
     return drawn.assign({f"{dim}_peak": peak for dim, peak in peaks.items()})
 
 
-def resolved(panels: int) -> int:
-    """As many values as one panel, or one of several, resolves; of a finer grid every n-th is drawn."""
-    return 1000 if panels == 1 else 500
+def boundary_level(name: str) -> float:
+    """The level at which the contour of an output is the boundary of what is stable or passive."""
+    return OUTPUTS[name].center if OUTPUTS[name].look == "diverging" else 0.5
 
 
 def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndarray:
@@ -144,8 +138,8 @@ def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, mesh: dict[str, Any
         shades = ListedColormap(["white" if image is None else (0, 0, 0, 0), SHADES[each]])
         shown = np.ma.masked_invalid(part[each].values)
         image = ax.pcolormesh(x, y, shown, cmap=shades, vmin=0, vmax=1, **mesh)
-        edge = next((edge for edge in _SMOOTH if each == "stable" and edge in part), each)
-        _draw_line(ax, x, y, np.ma.masked_invalid(part[edge].values), EDGES[edge], dash)
+        edge = next((edge for edge in SMOOTH if each == "stable" and edge in part), each)
+        _draw_line(ax, x, y, np.ma.masked_invalid(part[edge].values), boundary_level(edge), dash)
     return image
 
 

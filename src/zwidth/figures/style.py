@@ -132,7 +132,9 @@ def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: di
     to_scale = ax.yaxis.get_transform().transform
     low, high = to_scale(np.array(ax.get_ylim()))
     heights = (to_scale(np.array(ends, dtype=np.float64)) - low) / (high - low)
-    places = spread(heights, 0.05 * 3.6 / figure_of(ax).get_figheight())
+    spec = ax.get_subplotspec()
+    rows = spec.get_gridspec().nrows if spec else 1
+    places = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
     for curve, place in zip(found, places, strict=True):
         ax.annotate(
             f"$d = {curve.d:g}$",
