@@ -2,89 +2,119 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from zwidth.figures import style
-from zwidth.figures.plane import label_outside, panel_grid, scale_axis
-from zwidth.figures.sweep_data import CurvesData, PlaneData, Quantity
+from zwidth.errors import InputError
+from zwidth.figures import grid, style
+from zwidth.figures.plane import SMOOTH, boundary_level, panel_grid
+from zwidth.quantities import OUTPUTS, WALL
+
+if TYPE_CHECKING:
+    import xarray
 
 # Characters of names that fit beside each other above the panels.
 _LINE = 56
+# More curves than this in one panel cannot be told apart.
+_CURVES = 9
 
 
-def draw_curves(data: CurvesData, quantity: Quantity) -> Figure:
-    """Draw one quantity over one parameter, a curve for each value of another one, panels for a third.
-
-    Args:
-        data: axis, curves and panels.
-        quantity: which of the fields.
-
-    Returns:
-        A new figure, unknown to pyplot.
-    """
-    with style.house_style():
-        figure, axes = panel_grid(len(data.panels), data.columns)
-        colors = style.ordered_colors(len(data.names))
-        few = data.x.values.size <= 12
-        for panel, ax in zip(data.panels, axes, strict=True):
-            for values, name, color in zip(panel.fields[quantity.name], data.names, colors, strict=True):
-                shown = np.where(np.isfinite(values), values, np.nan)
-                ax.plot(data.x.values, shown, color=color, marker="o" if few else "", markersize=3.5, label=name)
-            scale_axis(ax, "x", data.x)
-            ax.set_title(panel.title)
-            ax.margins(y=0.06)
-            if quantity.look in ("logarithmic", "steep"):
-                ax.set_yscale("log")
-                ax.yaxis.set_major_locator(LogLocator(subs=_decade(panel.fields[quantity.name])))
-                ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-                ax.yaxis.set_minor_formatter(NullFormatter())
-            if quantity.look == "diverging":
-                ax.axhline(quantity.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)
-        if few and not data.x.logarithmic:
-            axes[0].set_xlim(*style.span(float(data.x.values.min()), float(data.x.values.max())))
-        label_outside(figure, axes, data.x.label, quantity.label)
-        _name(figure, data.names, colors)
-        return figure
-
-
-def draw_outlines(data: PlaneData, field: str, level: float, names: tuple[str, ...], label: str) -> Figure:
-    """Draw the boundaries of many devices into one panel: the contour of a field at a level, one a device.
+@style.house_style()
+def draw_curves(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = None) -> np.ndarray:
+    """Draw an output of a sweep over one parameter, a curve for each value of another one, panels for a third.
 
     Args:
-        data: the plane; a panel holds ``field`` in the shape (devices, y, x).
-        field: truth values, or a number whose ``level`` is the boundary.
-        level: where the boundary is.
-        names: of the devices, in their order.
-        label: what is inside.
+        data: results of a sweep, as `zwidth.open_dataset` gives them, or a part of them.
+        name: the output, a number.
+        axes: Axes of yours, one for each panel or fewer.
 
     Returns:
-        A new figure, unknown to pyplot.
+        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
-    with style.house_style():
-        figure, axes = panel_grid(len(data.panels), data.columns)
-        colors = style.ordered_colors(len(names))
-        for panel, ax in zip(data.panels, axes, strict=True):
-            for values, color in zip(panel.fields[field], colors, strict=True):
-                _draw_outline(ax, data, values, level, color)
-            ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-            scale_axis(ax, "x", data.x)
-            scale_axis(ax, "y", data.y)
-            ax.set_title(panel.title)
-        label_outside(figure, axes, data.x.label, data.y.label)
-        _name(figure, names, colors, label)
-        return figure
+    output, data = OUTPUTS[name], grid.shown(data, [name])
+    dims = sorted(grid.axes_of(data, name), key=lambda dim: -data.sizes[dim])
+    if not dims:
+        raise InputError(f"name: {name!r} varies over no parameter that it could be drawn over")
+    x, several = dims[0], [*dims[1:], *[dim for dim in reversed(grid.varied(data, name)) if dim not in dims]][:1]
+    parts, columns = grid.panels(data, [x, *several])
+    panels = panel_grid(axes, len(parts), columns)
+    picked = style.evenly(data.sizes[several[0]], _CURVES) if several else [0]
+    labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]
+    colors = style.ordered_colors(len(picked))
+    few = data.sizes[x] <= 12
+    for part, ax in zip(parts, panels, strict=False):
+        curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
+        shown = [np.where(np.isfinite(curve[name].values), curve[name].values, np.nan) for curve in curves]
+        for values, label, color in zip(shown, labels, colors, strict=True):
+            ax.plot(data[x].values, values, color=color, marker="o" if few else "", markersize=3.5, label=label)
+        grid.scale_axis(ax, "x", data[x])
+        ax.set_title(grid.title(part))
+        ax.margins(y=0.06)
+        if output.look in ("logarithmic", "steep"):
+            ax.set_yscale("log")
+            ax.yaxis.set_major_locator(LogLocator(subs=_decade(np.concatenate(shown))))
+            ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            ax.yaxis.set_minor_formatter(NullFormatter())
+        if output.look == "diverging":
+            ax.axhline(output.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)
+    values = data[x].values
+    if few and not grid.logarithmic(values):
+        panels[0].set_xlim(*style.span(float(values.min()), float(values.max())))
+    style.label_axes(panels, grid.axis_label(data, x), grid.output_label(data, name), once=axes is None)
+    _name(panels, labels, colors, outside=axes is None)
+    return panels
 
 
-def _draw_outline(ax: Axes, data: PlaneData, values: np.ndarray, level: float, color: Any) -> None:
-    shown = np.ma.masked_invalid(values.astype(float))
-    if shown.count() and shown.min() < level < shown.max():
-        ax.contour(data.x.values, data.y.values, shown, levels=[level], colors=[color], linewidths=1.4)
+def outlined(data: xarray.Dataset) -> tuple[str, str] | None:
+    """The output whose contours are the boundaries of walls, and the parameter each of whose values has one."""
+    name = next((name for name in (*SMOOTH, "stable") if name in data and _has_walls(data, name)), None)
+    dims = [dim for dim in grid.varied(data, name) if dim not in WALL] if name else []
+    first = next((dim for dim in ("delta", "damping", *reversed(dims)) if dim in dims), None)
+    return (name, first) if name and first else None
+
+
+def _has_walls(data: xarray.Dataset, name: str) -> bool:
+    dims = grid.axes_of(data, name)
+    return len(dims) == 2 and dims[1] in WALL
+
+
+@style.house_style()
+def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np.ndarray:
+    """Draw the boundaries of the stable walls of many devices into one panel, panels for a further parameter.
+
+    Args:
+        data: results of a sweep over walls and devices, as `zwidth.open_dataset` gives them, or a part of them.
+        axes: Axes of yours, one for each panel or fewer.
+
+    Returns:
+        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
+    """
+    found = outlined(data)
+    if found is None:
+        raise InputError("data: holds no boundaries of several devices; a sweep over walls and devices does")
+    name, family = found
+    data = grid.shown(data, [name])
+    x, y = dims = grid.axes_of(data, name)
+    parts, columns = grid.panels(data, [family, *dims], plane=dims)
+    panels = panel_grid(axes, len(parts), columns)
+    picked = style.evenly(data.sizes[family], _CURVES)
+    colors = style.ordered_colors(len(picked))
+    labels = [grid.spell(data[family][k]) for k in picked]
+    for part, ax in zip(parts, panels, strict=False):
+        for k, color in zip(picked, colors, strict=True):
+            shown = np.ma.masked_invalid(part[name].isel({family: k}).transpose(y, x).values)
+            level = boundary_level(name)
+            if shown.count() and shown.min() < level < shown.max():
+                ax.contour(part[x].values, part[y].values, shown, levels=[level], colors=[color], linewidths=1.4)
+        ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
+        grid.scale_axis(ax, "x", part[x])
+        grid.scale_axis(ax, "y", part[y])
+        ax.set_title(grid.title(part))
+    style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)
+    _name(panels, labels, colors, outside=axes is None, title="boundaries of the stable walls")
+    return panels
 
 
 def _decade(values: np.ndarray) -> tuple[float, ...]:
@@ -93,11 +123,9 @@ def _decade(values: np.ndarray) -> tuple[float, ...]:
     return (1.0, 2.0, 5.0) if positive.size and positive.max() < 100 * positive.min() else (1.0,)
 
 
-def _name(figure: Figure, names: tuple[str, ...], colors: list[Any], title: str = "") -> None:
+def _name(axes: np.ndarray, names: list[str], colors: list[Any], *, outside: bool, title: str | None = None) -> None:
     """Which color is which."""
-    if not any(names):
-        return
-    handles = [Line2D([], [], color=color, label=name) for name, color in zip(names, colors, strict=True)]
     longest = max(10 if "$" in name else len(name) for name in names)
-    columns = max(1, min(len(names), 6, _LINE // longest))
-    figure.legend(handles=handles, loc="outside upper center", ncols=columns, title=title or None, title_fontsize=8)
+    columns = max(1, min(len(names), 6, _LINE // max(longest, 1)))
+    handles = [style.line(name, color=color) for name, color in zip(names, colors, strict=True) if name]
+    style.legend(axes, handles, outside=outside, ncols=columns, title=title, title_fontsize=8)

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocator
 
@@ -38,32 +37,33 @@ class Mark(NamedTuple):
     error: float
 
 
-def draw_pareto(marks: Sequence[Mark]) -> Figure:
+@style.house_style()
+def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw points a second over the worst error seen, both logarithmic: up and to the left is better.
 
     Filled marks: maps (alpha and beta as axes); open ones: scattered points.
 
     Args:
         marks: the measurements; of several with one name the first is drawn.
+        axes: Axes of yours, one for each delay or fewer.
 
     Returns:
-        A new figure, unknown to pyplot.
+        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     delays = sorted({mark.d for mark in marks})
     columns = min(4, len(delays))
-    rows = -(-len(delays) // columns)
-    with style.house_style():
-        figure, axes = style.new_figure(
-            max(3.2 * columns, 5.0), 3.6 * rows + 0.5, rows, columns, sharex=True, sharey=True
-        )
-        for ax, d in zip(axes.ravel(), delays, strict=False):
-            _draw_panel(ax, [mark for mark in marks if mark.d == d])
-            ax.set_title(f"d = {d:,.10g}")
-        for ax in axes.ravel()[len(delays) :]:
-            ax.set_visible(False)
-        _shared_axes(axes, marks)
-        figure.legend(handles=_legend(marks), loc="outside lower center", ncols=4)
-    return figure
+    size = (max(3.2 * columns, 5.0), 3.6 * -(-len(delays) // columns) + 0.5)
+    panels = style.panels(axes, len(delays), *size, columns, sharex=True, sharey=True)
+    for ax, d in zip(panels, delays, strict=False):
+        _draw_panel(ax, [mark for mark in marks if mark.d == d])
+        ax.set_title(f"d = {d:,.10g}")
+        _scale(ax, marks)
+    for lowest in panels[-columns:]:
+        lowest.set_xlabel("worst error seen")
+    for ax in panels[::columns]:
+        ax.set_ylabel("points per second")
+    style.legend(panels, _legend(marks), outside=axes is None, place="lower", ncols=4)
+    return panels
 
 
 def draw(marks: Sequence[Mark], stem: Path) -> tuple[Path, Path]:
@@ -107,28 +107,16 @@ def _draw_panel(ax: Axes, marks: Sequence[Mark]) -> None:
     ax.axvline(10 * _NONE_SEEN, color=style.GRAY, linewidth=0.5, linestyle=style.DOTTED)
 
 
-def _shared_axes(axes: np.ndarray, marks: Sequence[Mark]) -> None:
+def _scale(ax: Axes, marks: Sequence[Mark]) -> None:
     rates = [mark.rate for mark in marks]
     right = max(1e-11, 30 * max(mark.error for mark in marks))
-    for ax in axes.ravel():
-        ax.set_xscale("log")
-        ax.set_yscale("log")
-        ax.set_xlim(_LEAST, right)
-        ax.set_ylim(min(rates) / 3, max(rates) * 5)
-        ax.xaxis.set_major_locator(FixedLocator([tick for tick in _TICKS if tick < right]))
-        ax.xaxis.set_minor_locator(NullLocator())
-        ax.xaxis.set_major_formatter(
-            FuncFormatter(lambda x, _: "none" if x < 1e-16 else f"$10^{{{round(np.log10(x))}}}$")
-        )
-        ax.yaxis.set_major_locator(LogLocator(numticks=12))
-        ax.yaxis.set_minor_locator(NullLocator())
-        ax.grid(axis="y", color="#E8E8E8", linewidth=0.6)
-    for column in axes.T:
-        lowest = [ax for ax in column if ax.get_visible()][-1]
-        lowest.set_xlabel("worst error seen")
-        lowest.tick_params(labelbottom=True)
-    for ax in axes[:, 0]:
-        ax.set_ylabel("points per second")
+    ax.set(xscale="log", yscale="log", xlim=(_LEAST, right), ylim=(min(rates) / 3, max(rates) * 5))
+    ax.xaxis.set_major_locator(FixedLocator([tick for tick in _TICKS if tick < right]))
+    ax.xaxis.set_minor_locator(NullLocator())
+    ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: "none" if x < 1e-16 else f"$10^{{{round(np.log10(x))}}}$"))
+    ax.yaxis.set_major_locator(LogLocator(numticks=12))
+    ax.yaxis.set_minor_locator(NullLocator())
+    ax.grid(axis="y", color="#E8E8E8", linewidth=0.6)
 
 
 def _legend(marks: Sequence[Mark]) -> list[Line2D]:

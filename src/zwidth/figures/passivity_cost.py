@@ -2,75 +2,59 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 
 from zwidth.figures import style
-from zwidth.figures.data import PassivityData
+from zwidth.figures.table import Table, curves
 
 
-def draw_passivity_cost(data: PassivityData, ax: Axes | None = None) -> Figure:
+@style.house_style()
+def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the stiffest stable (solid) and the stiffest passive wall (dash-dotted) over delta, and their ratio.
 
     Args:
-        data: both maxima for every delay.
-        ax: draw the two maxima alone, into this Axes.
+        table: columns of a passivity study: d, delta, alpha_max, alpha_max_passive.
+        axes: an Axes of yours for the two maxima alone, or two.
 
     Returns:
-        The figure; a new one, unknown to pyplot, unless ``ax`` is given.
+        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
-    with style.house_style():
-        if ax is not None:
-            _draw_maxima(ax, data)
-            return style.figure_of(ax)
-        figure, axes = style.new_figure(style.WIDTH, 3.6, 1, 2)
-        _draw_maxima(axes[0, 0], data)
-        _draw_ratio(axes[0, 1], data)
-        axes[0, 0].set_title("(a)")
-        axes[0, 1].set_title("(b)")
-        return figure
+    panels = style.panels(axes, 2, style.WIDTH, 3.6, 2)
+    costs = curves(table, "d")
+    colors = style.color_by_value([cost.d for cost in costs])
+    for ax, draw in zip(panels, (_draw_maxima, _draw_ratio), strict=False):
+        draw(ax, costs, colors)
+        deltas = np.asarray(table["delta"])
+        ax.set_xlim(float(deltas.min()), float(deltas.max()))
+        ax.set_xlabel(style.DELTA_LABEL)
+    style.letter(panels)
+    return panels
 
 
-def _draw_maxima(ax: Axes, data: PassivityData) -> None:
-    colors = style.color_by_value([cost.d for cost in data.costs])
-    for cost in data.costs:
-        color = colors[cost.d]
-        ax.plot(cost.delta, cost.alpha_max, color=color, label=f"alpha_max, d = {cost.d:g}", zorder=3)
-        label = f"alpha_max_passive, d = {cost.d:g}"
-        ax.plot(cost.delta, cost.alpha_max_passive, color=color, linestyle=style.DASH_DOTTED, label=label, zorder=3)
-        ax.fill_between(
-            cost.delta, cost.alpha_max_passive, cost.alpha_max, color=color, alpha=0.12, linewidth=0.0, zorder=1
-        )
-    deltas = np.concatenate([cost.delta for cost in data.costs])
-    ax.set_xlim(float(deltas.min()), float(deltas.max()))
-    ax.set_ylim(0.0, 1.04 * max(float(np.nanmax(cost.alpha_max)) for cost in data.costs))
-    ends = [float(cost.alpha_max[-1]) for cost in data.costs]
-    _label_ends(ax, data, ends, colors)
-    ax.set_xlabel(style.DELTA_LABEL)
+def _draw_maxima(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
+    for cost in costs:
+        color, d = colors[cost.d], f"d = {cost.d:g}"
+        ax.plot(cost.delta, cost.alpha_max, color=color, label=f"alpha_max, {d}", zorder=3)
+        passive: dict[str, Any] = {"linestyle": style.DASH_DOTTED, "label": f"alpha_max_passive, {d}"}
+        ax.plot(cost.delta, cost.alpha_max_passive, color=color, zorder=3, **passive)
+        gap = (cost.delta, cost.alpha_max_passive, cost.alpha_max)
+        ax.fill_between(*gap, color=color, alpha=0.12, linewidth=0.0, zorder=1)
+    ax.set_ylim(0.0, 1.04 * max(float(np.nanmax(cost.alpha_max)) for cost in costs))
+    style.label_ends(ax, costs, [cost.alpha_max[-1] for cost in costs], colors)
     ax.set_ylabel(style.ALPHA_LABEL)
-    handles = [
-        Line2D([], [], color=style.GRAY, label=r"stiffest stable wall, $\alpha_{\max}$"),
-        Line2D([], [], color=style.GRAY, linestyle=style.DASH_DOTTED, label="stiffest passive wall"),
-    ]
+    passive_line = style.line("stiffest passive wall", style.DASH_DOTTED)
+    handles = [style.line(r"stiffest stable wall, $\alpha_{\max}$"), passive_line]
     ax.legend(handles=handles, loc="upper left")
 
 
-def _draw_ratio(ax: Axes, data: PassivityData) -> None:
+def _draw_ratio(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
     """The share of the stable stiffness that a passive wall reaches."""
-    colors = style.color_by_value([cost.d for cost in data.costs])
-    ratios = [100.0 * cost.alpha_max_passive / cost.alpha_max for cost in data.costs]
-    for cost, ratio in zip(data.costs, ratios, strict=True):
-        label = f"passive share, d = {cost.d:g}"
-        ax.plot(cost.delta, ratio, color=colors[cost.d], label=label, zorder=3)
-    deltas = np.concatenate([cost.delta for cost in data.costs])
-    ax.set_xlim(float(deltas.min()), float(deltas.max()))
+    ratios = [100.0 * cost.alpha_max_passive / cost.alpha_max for cost in costs]
+    for cost, ratio in zip(costs, ratios, strict=True):
+        ax.plot(cost.delta, ratio, color=colors[cost.d], label=f"passive share, d = {cost.d:g}", zorder=3)
     ax.set_ylim(0.0, 100.0)
-    _label_ends(ax, data, [float(ratio[-1]) for ratio in ratios], colors)
-    ax.set_xlabel(style.DELTA_LABEL)
+    style.label_ends(ax, costs, [ratio[-1] for ratio in ratios], colors)
     ax.set_ylabel(r"stiffest passive wall in % of $\alpha_{\max}$")
-
-
-def _label_ends(ax: Axes, data: PassivityData, ends: list[float], colors: dict[float, object]) -> None:
-    style.label_ends(ax, [f"$d = {cost.d:g}$" for cost in data.costs], ends, [colors[cost.d] for cost in data.costs])

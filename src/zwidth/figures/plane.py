@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize, TwoSlopeNorm
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from zwidth.figures import style
-from zwidth.figures.sweep_data import Panel, PlaneData, Quantity, Scale
+from zwidth.errors import InputError
+from zwidth.figures import grid, style
+from zwidth.figures.stability_map import SHADES
+from zwidth.quantities import OUTPUTS, Output
 
-# Light, so that curves drawn over them stay legible; in gray, passive is the darker one.
-STABLE, PASSIVE, MISSING = "#BFE3F7", "#F3C46B", "#D9D9D9"
-# Numbers whose contour at this level is the boundary of the stable walls.
-_EDGES = {"margin": 0.0, "decay_rate": 0.0, "phase_margin": 0.0, "gain_margin": 1.0, "spectral_radius": 1.0}
-# Beyond this multiple of the smallest, a quantity that grows without end has one color.
+if TYPE_CHECKING:
+    import xarray
+
+_MISSING = "#D9D9D9"
+# Numbers whose contour is the boundary of the stable walls, smoother than that of truth values.
+SMOOTH = ("margin", "spectral_radius")
+# The stiffest stable wall in a plane of walls.
+_PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
+# Beyond this multiple of the smallest, a output that grows without end has one color.
 _STEEP = 100.0
 # A region that fills less of its panel than this has no room for labels.
 _LABELLED = 0.1
@@ -29,219 +34,221 @@ _SEEN = 0.003
 _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "white", "markeredgecolor": style.BLACK}
 
 
-def draw_plane(data: PlaneData, quantity: Quantity, ax: Axes | None = None) -> Figure:
-    """Draw one quantity over two parameters, a panel for each of some values of the others.
+@style.house_style()
+def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = None) -> np.ndarray:
+    """Draw an output of a sweep over two parameters, a panel for each of some values of the others.
 
     Truth values are shown as regions within their boundary, ``passive`` over ``stable`` where both are known; numbers
     as colors under labelled contours, the edge of what is stable or passive as the bold one. The stiffest stable wall
     is marked where it is known; in a ridge surface, corner optima are hatched.
 
     Args:
-        data: axes and panels.
-        quantity: which of the fields, and how it looks.
-        ax: draw the first panel alone, into this Axes.
+        data: results of a sweep, as `zwidth.open_dataset` gives them, or a part of them.
+        name: the output.
+        axes: Axes of yours, one for each panel or fewer.
 
     Returns:
-        The figure; a new one, unknown to pyplot, unless ``ax`` is given.
+        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
+
+    Raises:
+        InputError: the output varies over less than two parameters.
     """
-    with style.house_style():
-        if ax is not None:
-            norm = _norm(data.panels[:1], quantity)
-            image = _draw_panel(ax, data, data.panels[0], quantity, norm)
-            _explain(style.figure_of(ax), [ax], data.panels[:1], quantity, image)
-            return style.figure_of(ax)
-        figure, axes = panel_grid(len(data.panels), data.columns)
-        norm, image = _norm(data.panels, quantity), None
-        for panel, panel_ax in zip(data.panels, axes, strict=True):
-            image = _draw_panel(panel_ax, data, panel, quantity, norm)
-        label_outside(figure, axes, data.x.label, data.y.label)
-        _explain(figure, axes, data.panels, quantity, image)
-        return figure
+    dims = grid.axes_of(data, name)
+    if len(dims) < 2:
+        raise InputError(f"name: {name!r} varies over less than two parameters, a plane needs them")
+    x, y = dims
+    parts, columns = grid.panels(_with_peak(data, _drawn(data, name), x, y), dims, plane=dims)
+    panels = panel_grid(axes, len(parts), columns)
+    parts = [part.compute() for part in parts[: len(panels)]]
+    norm, image = _norm(parts, name), None
+    for part, ax in zip(parts, panels, strict=True):
+        image = _draw_panel(ax, part.transpose(y, x), name, norm)
+    style.label_axes(panels, grid.axis_label(parts[0], x), grid.axis_label(parts[0], y), once=axes is None)
+    _explain(panels, parts, name, image, outside=axes is None)
+    return panels
 
 
-def panel_grid(count: int, columns: int) -> tuple[Figure, list[Axes]]:
-    """A figure with so many panels in columns, which share their axes."""
+def _drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
+    """The output, and what is drawn along with it."""
+    beside = ["passive", *[edge for edge in SMOOTH if edge in data][:1]] if name == "stable" else []
+    beside += ["kind"] if OUTPUTS[name].family == "device" else []
+    data = grid.shown(data, [name, *[each for each in beside if each in data and each != name]])
+    if name in ("settling_time", "gain_margin", "delay_margin"):
+        data[name] = data[name].where(np.isfinite(data[name]) & (data[name] > 0))
+    return data
+
+
+def _with_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xarray.Dataset:
+    """The stiffest stable wall of every panel, where the plane is one of walls."""
+    names = dict(zip((x, y), _PEAKS.get(x, ()), strict=False))
+    if y not in ("beta", "virtual_damping") or not names or not all(name in data for name in names.values()):
+        return drawn
+    peaks = {dim: data[name].squeeze().variable * drawn[dim].attrs["factor"] for dim, name in names.items()}
+    return drawn.assign({f"{dim}_peak": peak for dim, peak in peaks.items()})
+
+
+def boundary_level(name: str) -> float:
+    """The level at which the contour of an output is the boundary of what is stable or passive."""
+    return OUTPUTS[name].center if OUTPUTS[name].look == "diverging" else 0.5
+
+
+def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndarray:
+    """So many panels in columns, which share their axes, or those that are given."""
     columns = min(count, columns)
     rows = -(-count // columns)
     width, height = (5.9, 4.5) if count == 1 else (max(5.0, 0.9 + 2.5 * columns), 1.2 + 2.2 * rows)
-    figure, axes = style.new_figure(width, height, rows, columns, sharex=True, sharey=True)
-    flat = list(axes.flat)
-    for spare in flat[count:]:
-        spare.remove()
-    for above in flat[max(0, count - columns) : count]:
-        # The lowest of its column, in the last row or not.
-        above.tick_params(labelbottom=True)
-    return figure, flat[:count]
+    return style.panels(given, count, width, height, columns, sharex=True, sharey=True)
 
 
-def label_outside(figure: Figure, axes: list[Axes], x: str, y: str) -> None:
-    """Name the axes once for all panels."""
-    if len(axes) == 1:
-        axes[0].set(xlabel=x, ylabel=y)
-        return
-    figure.supxlabel(x, fontsize=9.0)
-    figure.supylabel(y, fontsize=9.0)
-
-
-def scale_axis(ax: Axes, which: str, scale: Scale) -> None:
-    """The range of an axis, and its spacing."""
-    if scale.logarithmic:
-        getattr(ax, f"set_{which}scale")("log")
-    getattr(ax, f"set_{which}lim")(float(scale.values.min()), float(scale.values.max()))
-
-
-def _draw_panel(ax: Axes, data: PlaneData, panel: Panel, quantity: Quantity, norm: Any) -> Any:
-    ax.set_facecolor(MISSING)
-    values = panel.fields[quantity.name]
+def _draw_panel(ax: Axes, part: xarray.Dataset, name: str, norm: Any) -> Any:
+    x, y = (part[dim].values for dim in reversed(part[name].dims))
+    output = OUTPUTS[name]
+    ax.set_facecolor(_MISSING)
     mesh: dict[str, Any] = {"shading": "nearest", "rasterized": True}
-    if quantity.look == "truth":
-        image = _draw_regions(ax, data, panel, quantity, mesh)
+    if output.look == "truth":
+        image = _draw_regions(ax, part, name, mesh)
     else:
-        shown = np.ma.masked_invalid(values)
-        image = ax.pcolormesh(data.x.values, data.y.values, shown, cmap=_colors(quantity), norm=norm, **mesh)
-        _draw_contours(ax, data, shown, quantity, norm)
-        _draw_corners(ax, data, panel)
-    if panel.peak is not None:
-        ax.plot(*panel.peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
-    scale_axis(ax, "x", data.x)
-    scale_axis(ax, "y", data.y)
-    ax.set_title(panel.title)
+        shown = np.ma.masked_invalid(part[name].values)
+        image = ax.pcolormesh(x, y, shown, cmap=_colors(output), norm=norm, **mesh)
+        _draw_contours(ax, x, y, shown, output, norm)
+        _draw_corners(ax, x, y, part)
+    peak = _peak(part)
+    if peak is not None:
+        ax.plot(*peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
+    for which, values in (("x", x), ("y", y)):
+        grid.scale_axis(ax, which, values)
+    ax.set_title(grid.title(part))
     return image
 
 
-def _draw_regions(ax: Axes, data: PlaneData, panel: Panel, quantity: Quantity, mesh: dict[str, Any]) -> Any:
+def _peak(part: xarray.Dataset) -> list[float] | None:
+    """The stiffest stable wall, where it lies within the panel."""
+    peaks = {str(name)[: -len("_peak")]: float(value) for name, value in part.items() if str(name).endswith("_peak")}
+    inside = (part[dim].min() <= value <= part[dim].max() for dim, value in peaks.items())
+    return list(peaks.values()) if peaks and all(inside) else None
+
+
+def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, mesh: dict[str, Any]) -> Any:
     """Stable and passive walls as areas, each with its boundary."""
     image = None
-    for name, color, dash in (("stable", STABLE, style.SOLID), ("passive", PASSIVE, style.DASH_DOTTED)):
-        if name not in panel.fields or (name != quantity.name and quantity.name != "stable"):
+    x, y = (part[dim].values for dim in reversed(part[name].dims))
+    for each, dash in (("stable", style.SOLID), ("passive", style.DASH_DOTTED)):
+        if each not in part or (each != name and name != "stable"):
             continue
-        values = np.ma.masked_less(panel.fields[name].astype(float), 0.0)
-        low = "white" if image is None else (0, 0, 0, 0)
-        shades = ListedColormap([low, color])
-        image = ax.pcolormesh(data.x.values, data.y.values, values, cmap=shades, vmin=0, vmax=1, **mesh)
-        smooth = next((edge for edge in _EDGES if name == "stable" and edge in panel.fields), None)
-        if smooth is None:
-            _draw_line(ax, data, values, 0.5, dash)
-        else:
-            _draw_line(ax, data, np.ma.masked_invalid(panel.fields[smooth]), _EDGES[smooth], dash)
+        shades = ListedColormap(["white" if image is None else (0, 0, 0, 0), SHADES[each]])
+        shown = np.ma.masked_invalid(part[each].values)
+        image = ax.pcolormesh(x, y, shown, cmap=shades, vmin=0, vmax=1, **mesh)
+        edge = next((edge for edge in SMOOTH if each == "stable" and edge in part), each)
+        _draw_line(ax, x, y, np.ma.masked_invalid(part[edge].values), boundary_level(edge), dash)
     return image
 
 
-def _draw_line(ax: Axes, data: PlaneData, values: Any, level: float, dash: Any = style.SOLID) -> None:
+def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> None:
     """The boundary: the contour on which something changes, where the panel has one."""
     if min(values.shape) < 2 or not values.count() or not values.min() < level < values.max():
         return
-    ax.contour(data.x.values, data.y.values, values, levels=[level], colors=style.BLACK, linewidths=1.3,
+    ax.contour(x, y, values, levels=[level], colors=style.BLACK, linewidths=1.3,
                linestyles=[dash])  # fmt: skip
 
 
-def _draw_contours(ax: Axes, data: PlaneData, values: Any, quantity: Quantity, norm: Any) -> None:
+def _draw_contours(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, output: Output, norm: Any) -> None:
     """Labelled contours where a number is good, and the bold one at which it ceases to be."""
     if min(values.shape) < 2 or not values.count():
         return
-    levels = _levels(values, quantity, norm)
+    levels = _levels(values, output, norm)
     if levels.size:
         # Over a dark color a light line, over a light one a dark line.
-        shade = _colors(quantity)(norm(levels))
+        shade = _colors(output)(norm(levels))
         luminance = shade[:, :3] @ np.array([0.299, 0.587, 0.114])
         colors = [("white" if dark < 0.5 else "#303030") for dark in luminance]
-        drawn = ax.contour(data.x.values, data.y.values, values, levels=levels, colors=colors, linewidths=0.7)
-        within = (values < levels.max()) if quantity.below else (values > levels.min())
-        if quantity.look == "steep":
+        drawn = ax.contour(x, y, values, levels=levels, colors=colors, linewidths=0.7)
+        within = (values < levels.max()) if output.below else (values > levels.min())
+        if output.look == "steep":
             within = values < levels.max()
         if within.filled(False).mean() > _LABELLED:
             ax.clabel(drawn, fontsize=7, inline_spacing=2, fmt=lambda level: f"{level:.4g}")
-    if quantity.look == "diverging":
-        _draw_line(ax, data, values, quantity.center)
+    if output.look == "diverging":
+        _draw_line(ax, x, y, values, output.center)
 
 
-def _levels(values: Any, quantity: Quantity, norm: Any) -> np.ndarray:
+def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
     """Round numbers at which contours are drawn."""
     low, high = float(values.min()), float(values.max())
-    if quantity.look in ("logarithmic", "steep"):
-        end = min(high, norm.vmax / 2.0) if quantity.look == "steep" else high
+    if output.look in ("logarithmic", "steep"):
+        end = min(high, norm.vmax / 2.0) if output.look == "steep" else high
         levels = np.asarray(LogLocator(subs=(1.0, 2.0, 5.0)).tick_values(low, end))
         levels = levels[levels <= end]
-    elif quantity.look == "diverging":
-        ends = (low, quantity.center) if quantity.below else (quantity.center, high)
+    elif output.look == "diverging":
+        ends = (low, output.center) if output.below else (output.center, high)
         levels = np.asarray(MaxNLocator(6).tick_values(*ends)) if ends[0] < ends[1] else np.empty(0)
-        levels = levels[levels != quantity.center]
-        levels = levels[(levels < quantity.center) == quantity.below]
+        levels = levels[levels != output.center]
+        levels = levels[(levels < output.center) == output.below]
     else:
         levels = np.asarray(MaxNLocator(8).tick_values(low, high))
     return levels[(levels > low) & (levels < high)]
 
 
-def _draw_corners(ax: Axes, data: PlaneData, panel: Panel) -> None:
+def _draw_corners(ax: Axes, x: np.ndarray, y: np.ndarray, part: xarray.Dataset) -> None:
     """Hatch where the stiffest wall is a corner of the stable region."""
-    kind = panel.fields.get("kind")
-    if kind is None or min(kind.shape) < 2 or not (kind == 1).any():
+    if "kind" not in part or min(x.size, y.size) < 2 or not (part["kind"] == 1).any():
         return
+    corner = (part["kind"].values == 1).astype(float)
     with matplotlib.rc_context({"hatch.linewidth": 0.5, "hatch.color": "#606060"}):
-        ax.contourf(
-            data.x.values, data.y.values, (kind == 1).astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"]
-        )
+        ax.contourf(x, y, corner, levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
-def _colors(quantity: Quantity) -> Any:
-    if quantity.look == "diverging":
-        return matplotlib.colormaps["PuOr_r" if quantity.below else "PuOr"]
-    return matplotlib.colormaps["viridis_r" if quantity.look == "steep" else "viridis"]
+def _colors(output: Output) -> Any:
+    if output.look == "diverging":
+        return matplotlib.colormaps["PuOr_r" if output.below else "PuOr"]
+    return matplotlib.colormaps["viridis_r" if output.look == "steep" else "viridis"]
 
 
-def _norm(panels: tuple[Panel, ...], quantity: Quantity) -> Any:
+def _norm(parts: list[xarray.Dataset], name: str) -> Any:
     """The colors of all panels alike."""
-    fields = [panel.fields[quantity.name] for panel in panels]
-    finite = np.concatenate([field[np.isfinite(field)].ravel() for field in fields])
-    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
-    if quantity.look == "diverging":
+    output = OUTPUTS[name]
+    low, high = _range(parts, name) or (0.0, 1.0)
+    if output.look == "diverging":
         # As far on the bad side as on the good one: what lies beyond is no better known by its color.
-        good = max(quantity.center - low if quantity.below else high - quantity.center, 1e-6)
-        return TwoSlopeNorm(quantity.center, quantity.center - good, quantity.center + good)
-    if quantity.look in ("logarithmic", "steep"):
+        good = max(output.center - low if output.below else high - output.center, 1e-6)
+        return TwoSlopeNorm(output.center, output.center - good, output.center + good)
+    if output.look in ("logarithmic", "steep"):
         low = max(low, 1e-300)
-        high = min(high, _STEEP * low) if quantity.look == "steep" else high
+        high = min(high, _STEEP * low) if output.look == "steep" else high
         return LogNorm(low, max(high, 1.001 * low))
     return Normalize(low, high if high > low else low + 1.0)
 
 
-def _explain(figure: Figure, axes: list[Axes], panels: tuple[Panel, ...], quantity: Quantity, image: Any) -> None:
+def _range(parts: list[xarray.Dataset], name: str) -> tuple[float, float] | None:
+    """The least and the largest finite value in all panels."""
+    finite = np.concatenate([part[name].values[np.isfinite(part[name].values)] for part in parts])
+    return (float(finite.min()), float(finite.max())) if finite.size else None
+
+
+def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: Any, *, outside: bool) -> None:
     """The legend, and the colors of numbers."""
     handles: list[Any] = []
-    fields = panels[0].fields
-    if quantity.look == "truth":
-        if quantity.name == "stable":
-            handles.append(Patch(facecolor=STABLE, edgecolor=style.BLACK, linewidth=0.8, label="stable"))
-        if "passive" in fields:
-            handles.append(
-                Patch(facecolor=PASSIVE, edgecolor=style.BLACK, linewidth=0.8, linestyle="-.", label="passive")
-            )
+    output = OUTPUTS[name]
+    if output.look == "truth":
+        for each, dash in (("stable", "-"), ("passive", "-.")):
+            if each == name or each in parts[0]:
+                edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.8, "linestyle": dash}
+                handles.append(Patch(facecolor=SHADES[each], label=each, **edge))
     else:
-        bar = figure.colorbar(image, ax=axes, label=quantity.label, extend=_beyond(panels, quantity, image))
+        low, high = _range(parts, name) or (image.norm.vmin, image.norm.vmax)
+        beyond = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+        extend = beyond[low < image.norm.vmin, high > image.norm.vmax]
+        label = grid.output_label(parts[0], name)
+        bar = axes[0].figure.colorbar(image, ax=list(axes), label=label, extend=extend)
         bar.ax.tick_params(labelsize=8)
-    if quantity.look == "diverging":
-        edge = "passive" if quantity.name == "passivity_margin" else "stable"
-        handles.append(Line2D([], [], color=style.BLACK, linewidth=1.3, label=f"edge of what is {edge}"))
-    if quantity.name in ("settling_time", "delay_margin"):
-        handles.append(Patch(facecolor=MISSING, label="unstable"))
-    elif any(_missing(panel.fields[quantity.name]) for panel in panels):
-        handles.append(Patch(facecolor=MISSING, label="not computed"))
-    if quantity.name != "kind" and any(
-        (panel.fields["kind"] == 1).mean() > _SEEN for panel in panels if "kind" in panel.fields
-    ):
+    if output.look == "diverging":
+        what = "passive" if name == "passivity_margin" else "stable"
+        handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
+    if name in ("settling_time", "delay_margin"):
+        handles.append(Patch(facecolor=_MISSING, label="unstable"))
+    elif any(part[name].isnull().any() for part in parts):
+        handles.append(Patch(facecolor=_MISSING, label="not computed"))
+    if any("kind" in part and (part["kind"] == 1).mean() > _SEEN for part in parts):
         handles.append(Patch(facecolor="white", hatch="////", edgecolor="#606060", linewidth=0, label="corner optimum"))
-    if any(panel.peak is not None for panel in panels):
+    if any(_peak(part) is not None for part in parts):
         handles.append(Line2D([], [], linestyle="", label="stiffest stable wall", **_PEAK))
-    if handles:
-        figure.legend(handles=handles, loc="outside upper center", ncols=len(handles))
-
-
-def _missing(values: np.ndarray) -> bool:
-    return bool(np.isnan(values).any() if values.dtype.kind == "f" else (values < 0).any())
-
-
-def _beyond(panels: tuple[Panel, ...], quantity: Quantity, image: Any) -> Any:
-    finite = [panel.fields[quantity.name][np.isfinite(panel.fields[quantity.name])] for panel in panels]
-    low = any(field.size and field.min() < image.norm.vmin for field in finite)
-    high = any(field.size and field.max() > image.norm.vmax for field in finite)
-    return {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}[low, high]
+    style.legend(axes, handles, outside=outside, ncols=len(handles))

@@ -2,105 +2,77 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
-from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.figures import style
-from zwidth.figures.data import SlopeData
+from zwidth.figures.table import Table, curves, held_or_all
 
 # Below, alpha_max hardly depends on delta and the ratio says nothing.
 _LEAST_DELTA = 0.1
 
 
-def draw_slope(data: SlopeData, ax: Axes | None = None) -> Figure:
+@style.house_style()
+def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw alpha_max/delta over delta beside its limit g(d), and g over the delay.
 
     Args:
-        data: paths of maximum stiffness with their limits, and g over a range of delays.
-        ax: draw the first of the two panels alone, into this Axes.
+        table: columns of a ridge study: d, delay_model, delta, alpha_max.
+        slopes: delay_model, d and slope, which is g(d): over a range of delays, those of ``table`` among them.
+        axes: an Axes of yours for the first panel alone, or two.
 
     Returns:
-        The figure; a new one, unknown to pyplot, unless ``ax`` is given.
+        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
-    with style.house_style():
-        if ax is not None:
-            _draw_ratio(ax, data)
-            return style.figure_of(ax)
-        figure, axes = style.new_figure(style.WIDTH, 3.6, 1, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
-        _draw_ratio(axes[0, 0], data)
-        _draw_limit(axes[0, 1], data)
-        axes[0, 0].set_title("(a)")
-        axes[0, 1].set_title("(b)")
-        return figure
+    panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
+    paths, models = curves(table, "d", "delay_model"), curves(slopes, "delay_model")
+    colors = style.color_by_value([path.d for path in paths])
+    for path in paths:
+        own = next(model for model in models if model.delay_model == path.delay_model)
+        path.limit = float(own.slope[own.d == path.d][0])
+    _draw_ratio(panels[0], paths, colors)
+    for ax in panels[1:]:
+        _draw_limit(ax, paths, models, colors)
+    style.letter(panels)
+    return panels
 
 
-def _draw_ratio(ax: Axes, data: SlopeData) -> None:
+def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
     """alpha_max/delta on logarithmic axes, the limits dotted across."""
-    colors = style.color_by_value([path.d for path in data.paths])
-    drawn = [path.delta >= _LEAST_DELTA for path in data.paths]
-    for path, limit, shown in zip(data.paths, data.limits, drawn, strict=True):
-        held = path.delay_model == "held"
-        color, dash = colors[path.d], style.SOLID if held else style.DASHED
+    for path in paths:
+        color, dash = colors[path.d], style.SOLID if path.delay_model == "held" else style.DASHED
         label = f"alpha_max/delta, d = {path.d:g}, {path.delay_model}"
+        shown = path.delta >= _LEAST_DELTA
         delta = path.delta[shown]
         ax.plot(delta, path.alpha_max[shown] / delta, color=color, linestyle=dash, label=label, zorder=3)
-        ax.axhline(limit, color=color, linestyle=style.DOTTED, linewidth=0.9, label=f"g, d = {path.d:g}", zorder=2)
-    ax.set_xscale("log")
-    ax.set_yscale("log")
-    largest = max(float(path.delta.max()) for path in data.paths)
-    ax.set_xlim(_LEAST_DELTA, largest)
-    ax.set_ylim(0.7 * min(data.limits), 3.0 * max(data.limits))
+        ax.axhline(path.limit, color=color, linestyle=style.DOTTED, linewidth=0.9, label=f"g, d = {path.d:g}", zorder=2)
+    limits = [path.limit for path in paths]
+    ax.set(xscale="log", yscale="log")
+    ax.set_xlim(_LEAST_DELTA, max(float(path.delta.max()) for path in paths))
+    ax.set_ylim(0.7 * min(limits), 3.0 * max(limits))
     # Ticks as plain numbers: the axis spans a decade or two.
     ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
     ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     ax.yaxis.set_minor_formatter(NullFormatter())
-    _label_limits(ax, data, colors)
-    ax.set_xlabel(style.DELTA_LABEL)
-    ax.set_ylabel(r"$\alpha_{\max}/\delta = K_{\max}T/b$")
-    handles = [
-        Line2D([], [], color=style.GRAY, label=r"$\alpha_{\max}/\delta$"),
-        Line2D([], [], color=style.GRAY, linestyle=style.DOTTED, linewidth=0.9, label=r"its limit $g(d)$"),
-    ]
-    ax.legend(handles=handles, loc="upper right")
+    named = held_or_all(paths)
+    style.label_ends(ax, named, [path.limit for path in named], colors)
+    ax.set(xlabel=style.DELTA_LABEL, ylabel=r"$\alpha_{\max}/\delta = K_{\max}T/b$")
+    limit = style.line(r"its limit $g(d)$", style.DOTTED, 0.9)
+    ax.legend(handles=[style.line(r"$\alpha_{\max}/\delta$"), limit], loc="upper right")
 
 
-def _label_limits(ax: Axes, data: SlopeData, colors: dict[float, object]) -> None:
-    """The delay of each curve to the right of its end, on an axis whose heights are logarithms."""
-    low, high = np.log(ax.get_ylim())
-    heights = [(float(np.log(limit)) - low) / (high - low) for limit in data.limits]
-    named: dict[float, float] = {}
-    # Where both models are drawn the held one, which comes first, is named.
-    for path, height in sorted(zip(data.paths, heights, strict=True), key=lambda pair: pair[0].delay_model != "held"):
-        named.setdefault(path.d, height)
-    places = style.spread(list(named.values()), 0.05)
-    for d, place in zip(named, places, strict=True):
-        at = (1.015, float(place))
-        ax.annotate(
-            f"$d = {d:g}$",
-            at,
-            xycoords="axes fraction",
-            color=colors[d],  # pyright: ignore[reportArgumentType]  (any color of matplotlib)
-            fontsize=8,
-            va="center",
-            annotation_clip=False,
-        )
-
-
-def _draw_limit(ax: Axes, data: SlopeData) -> None:
+def _draw_limit(ax: Axes, paths: list[Any], models: list[Any], colors: dict[float, Any]) -> None:
     """g over the delay, with the delays of the paths marked."""
-    for curve in data.curves:
-        dash = style.SOLID if curve.delay_model == "held" else style.DASHED
-        ax.plot(curve.d, curve.slope, color=style.GRAY, linestyle=dash, label=f"g, {curve.delay_model}", zorder=2)
-    colors = style.color_by_value([path.d for path in data.paths])
-    for path, limit in zip(data.paths, data.limits, strict=True):
-        ax.plot([path.d], [limit], "o", color=colors[path.d], markersize=5, zorder=3, clip_on=False)
-    longest = max(float(curve.d.max()) for curve in data.curves)
-    ax.set_xlim(0.0, longest)
-    ax.set_ylim(0.0, 1.04 * max(float(curve.slope.max()) for curve in data.curves))
-    ax.set_xlabel(r"delay  $d = t_d/T$")
-    ax.set_ylabel(r"limit slope  $g(d)$")
-    if len(data.curves) > 1:
+    for model in models:
+        dash = style.SOLID if model.delay_model == "held" else style.DASHED
+        ax.plot(model.d, model.slope, color=style.GRAY, linestyle=dash, label=f"g, {model.delay_model}", zorder=2)
+    for path in paths:
+        ax.plot([path.d], [path.limit], "o", color=colors[path.d], markersize=5, zorder=3, clip_on=False)
+    ax.set_xlim(0.0, max(float(model.d.max()) for model in models))
+    ax.set_ylim(0.0, 1.04 * max(float(model.slope.max()) for model in models))
+    ax.set(xlabel=r"delay  $d = t_d/T$", ylabel=r"limit slope  $g(d)$")
+    if len(models) > 1:
         ax.legend(handles=style.delay_model_handles(), loc="upper right")

@@ -6,106 +6,94 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from zwidth.figures import style
-from zwidth.figures.data import Response, StepData
+from zwidth.figures.table import Table, curves
 
 # In gray these differ in lightness from one to the next.
 _COLORS = (style.BLUE, style.ORANGE, style.BLACK, style.GREEN, style.VERMILION, style.SKY, style.PURPLE)
 _STYLES = (style.SOLID, style.DASHED, style.DASH_DOTTED, style.DOTTED)
+_UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
+_DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
 
 
-SETTLED = "settled to 2 %"
-
-
-def draw_step(data: StepData, ax: Axes | None = None) -> Figure:
+@style.house_style()
+def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw step responses from force to position, with final values (thin) and settling times (dots).
 
     Args:
-        data: the responses.
-        ax: draw the positions alone, into this Axes.
+        table: columns of a step study: label, alpha, beta, time, position, wall_force, final_position, settling_time;
+            those of a device in SI units have their units behind their names, as in time_s and position_m.
+        axes: an Axes of yours for the positions alone, or two.
 
     Returns:
-        The figure; a new one, unknown to pyplot, unless ``ax`` is given.
+        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
-    with style.house_style():
-        if ax is not None:
-            draw_positions(ax, data)
-            _label_time(ax, data)
-            ax.legend(handles=_legend_handles(ax, data))
-            return style.figure_of(ax)
-        figure, axes = style.new_figure(5.6, 5.0, 2, 1, height_ratios=(1.8, 1.2), sharex=True)
-        draw_positions(axes[0, 0], data)
-        draw_forces(axes[1, 0], data)
-        _label_time(axes[1, 0], data)
-        # Responses swing over all of the panel.
-        figure.legend(handles=_legend_handles(axes[0, 0], data), loc="outside upper center", ncols=2)
-        return figure
+    panels = style.panels(axes, 2, 5.6, 5.0, height_ratios=(1.8, 1.2), sharex=True)
+    clock, unit = draw_positions(panels[0], table)
+    responses = _responses(table)
+    for ax in panels[1:]:
+        _draw_forces(ax, responses, clock)
+        ax.set_ylabel("wall force in N" if unit else "wall force  in $F$")
+    for ax in panels:
+        # The last sample ends before the time that was asked for.
+        ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
+    panels[-1].set_xlabel(f"time  $t$  in {unit}" if unit else "time  $t/T$  in sampling periods")
+    handles = [line for line in panels[0].lines if not line.get_label().startswith("_")]
+    if any(each.settled for each in responses):
+        handles.append(Line2D([], [], color=style.GRAY, label="settled to 2 %", **_DOT))
+    # Responses swing over all of the panel.
+    style.legend(panels, handles, outside=axes is None, ncols=2)
+    return panels
 
 
-def draw_positions(ax: Axes, data: StepData) -> None:
-    """The position of every response over time."""
-    factor, unit = _position_unit(data)
-    clock, _ = _time_unit(data)
-    for response, look in zip(data.responses, _looks(len(data.responses)), strict=True):
-        ax.plot(response.time * clock, response.position * factor, **look, label=_text(response), zorder=3)
-        if np.isfinite(response.final_position):
-            ax.axhline(response.final_position * factor, color=look["color"], linewidth=0.5, zorder=2)
-        if response.settles_in_view:
-            at = np.interp(response.settling_time, response.time, response.position)
-            ax.plot(response.settling_time * clock, at * factor, "o", color=look["color"], markersize=4.5, zorder=4)
+def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
+    """Draw the position of every response over time; returns the scale and the unit of time, "" where normalized."""
+    responses, physical = _responses(table), "time_s" in table
+    clock, unit, factor, length = 1.0, "", 1.0, ""
+    if physical:
+        clock, unit = style.si_unit(max(float(each.time[-1]) for each in responses), "s")
+        # The final position: an unstable response has no largest one worth a unit.
+        finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
+        factor, length = style.si_unit(max(finals, default=0.0), "m")
+    for each, color, dash in _colored(responses):
+        text = rf"{each.label}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
+        text += "" if each.settled else ", not settled"
+        ax.plot(each.time * clock, each.position * factor, color=color, linestyle=dash, label=text, zorder=3)
+        if np.isfinite(each.final_position):
+            ax.axhline(each.final_position * factor, color=color, linewidth=0.5, zorder=2)
+        if each.settled:
+            at = np.interp(each.settling_time, each.time, each.position)
+            ax.plot(each.settling_time * clock, at * factor, color=color, zorder=4, **_DOT)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
-    ax.set_ylabel(f"position  $x$  in {unit} for 1 N" if data.physical else r"position  $x$  in $F\,T^2\!/m$")
+    ax.set_ylabel(f"position  $x$  in {length} for 1 N" if physical else r"position  $x$  in $F\,T^2\!/m$")
+    return clock, unit
 
 
-def draw_forces(ax: Axes, data: StepData) -> None:
+def _responses(table: Table) -> list[Any]:
+    """The responses in a table; ``settled`` tells that one has settled, for good, at the end of the time shown."""
+    columns = {name: np.asarray(table[name + unit if name + unit in table else name]) for name, unit in _UNITS.items()}
+    columns |= {name: np.asarray(table[name]) for name in ("label", "alpha", "beta")}
+    # Each begins at time 0: two of them may be alike in all but that.
+    columns["number"] = np.cumsum(columns["time"] == 0.0)
+    responses = curves(columns, "number")
+    for each in responses:
+        for name in ("label", "alpha", "beta", "final_position", "settling_time"):
+            setattr(each, name, getattr(each, name)[0])
+        each.settled = bool(each.settling_time <= each.time[-1])
+    return responses
+
+
+def _colored(responses: list[Any]) -> list[tuple[Any, Any, Any]]:
+    """Each with a color and a line style."""
+    return [(each, _COLORS[k % len(_COLORS)], _STYLES[k % len(_STYLES)]) for k, each in enumerate(responses)]
+
+
+def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
     """The force of the wall over time."""
-    clock, _ = _time_unit(data)
-    for response, look in zip(data.responses, _looks(len(data.responses)), strict=True):
-        label = f"wall_force, {response.label}"
+    for each, color, _ in _colored(responses):
+        label = f"wall_force, {each.label}"
         # Steps are too short for dashes: lightness has to do.
-        ax.plot(response.time * clock, response.wall_force, color=look["color"], linewidth=1.1, label=label, zorder=3)
+        ax.plot(each.time * clock, each.wall_force, color=color, linewidth=1.1, label=label, zorder=3)
     ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
-    ax.set_ylabel("wall force in N" if data.physical else r"wall force  in $F$")
-
-
-def _label_time(ax: Axes, data: StepData) -> None:
-    clock, unit = _time_unit(data)
-    # The last sample ends before the time that was asked for.
-    ax.set_xlim(0.0, max(float(response.time[-1] + response.time[1]) for response in data.responses) * clock)
-    ax.set_xlabel(f"time  $t$  in {unit}" if data.physical else "time  $t/T$  in sampling periods")
-
-
-def _looks(count: int) -> list[dict[str, Any]]:
-    """A color and a line style for every response."""
-    return [{"color": _COLORS[k % len(_COLORS)], "linestyle": _STYLES[k % len(_STYLES)]} for k in range(count)]
-
-
-def _legend_handles(ax: Axes, data: StepData) -> list[Line2D]:
-    """The responses, and what the dots mean."""
-    handles, _ = ax.get_legend_handles_labels()
-    lines = [handle for handle in handles if isinstance(handle, Line2D)]
-    if any(response.settles_in_view for response in data.responses):
-        lines.append(Line2D([], [], linestyle="", marker="o", markersize=4.5, color=style.GRAY, label=SETTLED))
-    return lines
-
-
-def _text(response: Response) -> str:
-    settles = "" if response.settles_in_view else ", not settled"
-    return rf"{response.label}  ($\alpha = {response.alpha:.3g}$, $\beta = {response.beta:.3g}$){settles}"
-
-
-def _time_unit(data: StepData) -> tuple[float, str]:
-    if not data.physical:
-        return 1.0, ""
-    return style.si_unit(max(float(response.time[-1]) for response in data.responses), "s")
-
-
-def _position_unit(data: StepData) -> tuple[float, str]:
-    if not data.physical:
-        return 1.0, ""
-    # The final position: an unstable response has no largest one worth a unit.
-    finals = [abs(response.final_position) for response in data.responses if np.isfinite(response.final_position)]
-    return style.si_unit(max(finals, default=0.0), "m")

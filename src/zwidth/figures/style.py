@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import matplotlib
 import numpy as np
@@ -16,8 +16,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-
-from zwidth.figures.data import SIScale
 
 # Okabe and Ito's palette, told apart with any color vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -34,6 +32,8 @@ ALPHA_LABEL = r"normalized stiffness  $\alpha = K\,T^2\!/m$"
 BETA_LABEL = r"normalized virtual damping  $\beta = B\,T/m$"
 DELTA_LABEL = r"normalized physical damping  $\delta = b\,T/m$"
 ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
+
+AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 
 WIDTH = 7.0  # inches: both columns of a journal page
 PNG_DPI = 180
@@ -78,7 +78,7 @@ _RC: Any = {
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """Draw and save within this look; the settings of before return at the end."""
+    """Draw and save within this look; the settings of before return at the end. Serves as a decorator, too."""
     with matplotlib.rc_context(_RC):
         yield
 
@@ -90,39 +90,83 @@ def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **k
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
 
-def label_ends(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: Sequence[Any]) -> None:
-    """Write the name of each curve to the right of its end, moved apart where they would overlap."""
-    low, high = ax.get_ylim()
-    places = spread(ends, 0.05 * (high - low) * 3.6 / figure_of(ax).get_figheight())
-    for name, place, color in zip(names, places, colors, strict=True):
+def panels(given: AnyAxes | None, count: int, width: float, height: float, columns: int = 1, **keywords: Any) -> Any:
+    """The Axes to draw into, in one dimension: those given, or so many panels of a new figure, unknown to pyplot."""
+    if given is not None:
+        return np.asarray(given, dtype=object).ravel()[:count]
+    _, axes = new_figure(width, height, -(-count // columns), columns, **keywords)
+    for spare in axes.flat[count:]:
+        spare.remove()
+    for lowest in axes.flat[max(0, count - columns) : count]:
+        # Of its column, in the last row or not; panels that share an axis would leave it bare.
+        lowest.tick_params(labelbottom=True)
+    return axes.ravel()[:count]
+
+
+def letter(axes: np.ndarray) -> None:
+    """Name several panels (a), (b) and so on."""
+    for ax, title in zip(axes if len(axes) > 1 else (), "abc", strict=False):
+        ax.set_title(f"({title})")
+
+
+def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
+    """Name the axes of every panel, or once for all."""
+    if once and len(axes) > 1:
+        axes[0].figure.supxlabel(x, fontsize=9.0)
+        axes[0].figure.supylabel(y, fontsize=9.0)
+        return
+    for ax in axes:
+        ax.set(xlabel=x, ylabel=y)
+
+
+def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: str = "upper", **keywords: Any) -> None:
+    """Explain what is drawn, above the panels (or below), or within the first."""
+    if handles and outside:
+        axes[0].figure.legend(handles=handles, loc=f"outside {place} center", **keywords)
+    elif handles:
+        axes[0].legend(handles=handles)
+
+
+def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
+    """Write the delay of each curve to the right of its end, moved apart where names would overlap."""
+    to_scale = ax.yaxis.get_transform().transform
+    low, high = to_scale(np.array(ax.get_ylim()))
+    heights = (to_scale(np.array(ends, dtype=np.float64)) - low) / (high - low)
+    spec = ax.get_subplotspec()
+    rows = spec.get_gridspec().nrows if spec else 1
+    places = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
+    for curve, place in zip(found, places, strict=True):
         ax.annotate(
-            name,
-            (1.015, (place - low) / (high - low)),
+            f"$d = {curve.d:g}$",
+            (1.015, place),
             xycoords="axes fraction",
-            color=color,
+            color=colors[curve.d],
             fontsize=8,
             va="center",
             annotation_clip=False,
         )
 
 
+def line(label: str, dash: Any = SOLID, width: float | None = None, color: str = GRAY, **keywords: Any) -> Line2D:
+    """An entry of a legend."""
+    return Line2D([], [], color=color, linestyle=dash, linewidth=width, label=label, **keywords)
+
+
 def delay_model_handles() -> list[Line2D]:
     """What solid and dashed mean where both delay models are drawn."""
-    return [
-        Line2D([], [], color=GRAY, label="held delay (exact)"),
-        Line2D([], [], color=GRAY, linestyle=DASHED, label=r"fractional power $z^{1+d}$"),
-    ]
+    return [line("held delay (exact)"), line(r"fractional power $z^{1+d}$", DASHED)]
 
 
-def figure_of(ax: Axes) -> Figure:
-    """The figure that an Axes belongs to."""
-    figure = ax.get_figure(root=True)
+def figure_of(drawn: AnyAxes | Figure) -> Figure:
+    """The figure that Axes belong to."""
+    figure = drawn if isinstance(drawn, Figure) else np.asarray(drawn, dtype=object).flat[0].get_figure(root=True)
     assert isinstance(figure, Figure), "an Axes belongs to a figure"
     return figure
 
 
-def save(figure: Figure, stem: Path) -> tuple[Path, Path]:
-    """Write ``stem.png`` and ``stem.svg``; the same figure gives the same bytes."""
+def save(drawn: AnyAxes | Figure, stem: Path) -> tuple[Path, Path]:
+    """Write the figure of some Axes as ``stem.png`` and ``stem.svg``; the same figure gives the same bytes."""
+    figure = figure_of(drawn)
     png, svg = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
     engine = figure.get_layout_engine()
     with house_style():
@@ -146,6 +190,11 @@ def color_by_value(values: Sequence[float]) -> dict[float, Any]:
     return dict(zip(distinct, ordered_colors(len(distinct)), strict=True))
 
 
+def evenly(count: int, most: int) -> list[int]:
+    """Indices of all values, or of so many that are spaced evenly."""
+    return list(range(count)) if count <= most else sorted({round(place) for place in np.linspace(0, count - 1, most)})
+
+
 def span(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
     """An axis range with a margin on both sides."""
     width = (high - low) or abs(high) or 1.0
@@ -154,32 +203,25 @@ def span(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
 
 def spread(positions: Sequence[float], gap: float) -> np.ndarray:
     """Positions at least ``gap`` apart, as close to the given ones as their order allows."""
+    # It takes a moment to import, and most figures need it not.
+    from scipy.optimize import isotonic_regression
+
     order = np.argsort(positions, kind="stable")
-    wanted = np.asarray(positions, dtype=np.float64)[order] - gap * np.arange(len(positions))
-    # Pooling adjacent violators: the least-squares fit of a nondecreasing sequence.
-    blocks: list[list[float]] = []
-    for value in wanted:
-        blocks.append([value, 1.0])
-        while len(blocks) > 1 and blocks[-2][0] > blocks[-1][0]:
-            mean, size = blocks.pop()
-            blocks[-1] = [(blocks[-1][0] * blocks[-1][1] + mean * size) / (blocks[-1][1] + size), blocks[-1][1] + size]
-    fitted = np.concatenate([np.full(int(size), mean) for mean, size in blocks]) + gap * np.arange(len(positions))
-    placed = np.empty_like(fitted)
-    placed[order] = fitted
+    steps = gap * np.arange(len(positions))
+    placed = np.empty(len(positions))
+    placed[order] = isotonic_regression(np.asarray(positions, dtype=np.float64)[order] - steps).x + steps
     return placed
 
 
-def add_si_axes(ax: Axes, si: SIScale) -> None:
+def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
     """Read the normalized axes of an (alpha, beta) plane in kN/m and N s/m as well, at the top and the right."""
     ax.spines[["top", "right"]].set_visible(True)
-    top = ax.secondary_xaxis("top", functions=_scaled(si.stiffness / 1e3))
-    top.set_xlabel(r"stiffness  $K$  in kN/m")
-    right = ax.secondary_yaxis("right", functions=_scaled(si.virtual_damping))
-    right.set_ylabel(r"virtual damping  $B$  in N s/m")
-
-
-def _scaled(factor: float) -> tuple[Any, Any]:
-    return (lambda value: value * factor), (lambda value: value / factor)
+    stiffness, damping = (
+        ((lambda value, factor=factor: value * factor), (lambda value, factor=factor: value / factor))
+        for factor in (scale[0] / 1e3, scale[1])
+    )
+    ax.secondary_xaxis("top", functions=stiffness).set_xlabel(r"stiffness  $K$  in kN/m")
+    ax.secondary_yaxis("right", functions=damping).set_ylabel(r"virtual damping  $B$  in N s/m")
 
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}

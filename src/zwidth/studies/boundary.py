@@ -4,33 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
+from itertools import product
 from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from pydantic import BeforeValidator
 
 from zwidth import figures
+from zwidth._types import DelayModel
 from zwidth.batching import map_flat
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import Boolean, one_of
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, figure_layout
-from zwidth.figures.data import (
-    BoundaryData,
-    DampingInterval,
-    DelayModel,
-    Outline,
-    RidgePath,
-    SIScale,
-    ZeroStiffnessData,
-)
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.stability.curve import lobe_end
 from zwidth.stability.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, Table, si_of, stack
+from zwidth.studies.outcome import Outcome, of_scene, stack
 from zwidth.studies.passivity import passive_intervals, passive_outlines
-from zwidth.studies.ridge import needed_models, ridge_paths
+from zwidth.studies.ridge import needed_models, ridge_table
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 
@@ -95,82 +88,47 @@ class BoundaryStudy(CurvesStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """One boundary for every delta, d and delay model, as a table and a figure."""
+        deltas, delays = self.delta.values(), self.d.values()
+        models = needed_models(self.delay_models, delays)
         if self.plane == "delta_beta":
-            return _zero_stiffness(self)
-        return _stiffness(self, si_of(self.delta, self.d, scene))
-
-
-def outline(delta: float, d: float, delay: DelayModel) -> tuple[Outline, bool]:
-    """The stable region of one device, and whether a pole count confirms its edge."""
-    region = stable_region(delta, d, delay=delay)
-    piece = np.array([Piece(int(code)).name.lower() for code in region.piece])
-    return Outline(delta, d, delay, region.alpha, region.beta, region.omega, piece), region.verified
-
-
-def _stiffness(study: BoundaryStudy, si: SIScale | None) -> Outcome:
-    """Boundaries over alpha and beta."""
-    deltas, delays = study.delta.values(), study.d.values()
-    outlines, notes = [], []
-    paths: list[RidgePath] = []
-    for model, chosen in needed_models(study.delay_models, delays):
-        for d in chosen.tolist():
-            for delta in deltas.tolist():
+            deltas = np.sort(deltas)
+            parts = [part for model, chosen in models for part in stable_intervals(deltas, chosen, model)]
+            parts += passive_intervals(deltas, delays) if self.passivity else ()
+            table = stack(parts)
+            return Outcome(table=table, figures={"": partial(figures.draw_zero_stiffness, table)})
+        parts, notes = [], []
+        for model, chosen in models:
+            for d, delta in product(chosen.tolist(), deltas.tolist()):
                 edge, verified = outline(delta, d, model)
-                outlines.append(edge)
+                parts.append(edge)
                 if model == "held" and not verified:
                     notes.append(f"boundary: the pole count does not confirm the edge at delta = {delta:g}, d = {d:g}")
-        if study.ridge_path:
-            along = np.linspace(deltas.min(), deltas.max(), _RIDGE_POINTS)
-            more, remarks = ridge_paths(along, chosen, model)
-            paths += more
+        for model, chosen in models if self.ridge_path else ():
+            path, remarks = ridge_table(np.linspace(deltas.min(), deltas.max(), _RIDGE_POINTS), chosen, model)
+            path["alpha"] = path.pop("alpha_max")
+            del path["kind"]
+            parts.append({"curve": "ridge_path", **path})
             notes += remarks
-    passive = passive_outlines(deltas, delays) if study.passivity else ()
-    data = BoundaryData(tuple(outlines), tuple(paths), passive, si)
-    return Outcome(table=_stiffness_table(data), figures={"": partial(figures.draw_boundary, data)}, notes=tuple(notes))
+        parts += passive_outlines(deltas, delays) if self.passivity else ()
+        table = of_scene(stack(parts), self.delta, self.d, scene)
+        return Outcome(table=table, figures={"": partial(figures.draw_boundary, table)}, notes=tuple(notes))
 
 
-def _stiffness_table(data: BoundaryData) -> Table:
-    """All curves below each other; the column ``curve`` tells them apart."""
-    names = ("d", "delta", "delay_model", "omega", "alpha", "beta", "piece")
-    parts = [{"curve": "boundary", **{name: getattr(edge, name) for name in names}} for edge in data.outlines]
-    for path in data.ridge_paths:
-        columns = {"d": path.d, "delta": path.delta, "delay_model": path.delay_model, "omega": path.omega}
-        parts.append({"curve": "ridge_path", **columns, "alpha": path.alpha_max, "beta": path.beta})
-    for edge in data.passive:
-        columns = {"d": edge.d, "delta": edge.delta, "delay_model": "held", "alpha": edge.alpha, "beta": edge.beta}
-        parts.append({"curve": "passive", **columns})
-    table = stack(parts)
-    if data.si is not None:
-        table["stiffness_N_per_m"] = table["alpha"] * data.si.stiffness
-        table["virtual_damping_N_s_per_m"] = table["beta"] * data.si.virtual_damping
-    return table
+def outline(delta: float, d: float, delay: DelayModel) -> tuple[dict[str, Any], bool]:
+    """The edge of one device's stable set, as columns, and whether a pole count confirms it."""
+    region = stable_region(delta, d, delay=delay)
+    columns = {"omega": region.omega, "alpha": region.alpha, "beta": region.beta}
+    columns["piece"] = np.array([Piece(int(code)).name.lower() for code in region.piece])
+    return {"curve": "boundary", "d": d, "delta": delta, "delay_model": delay, **columns}, region.verified
 
 
-def _zero_stiffness(study: BoundaryStudy) -> Outcome:
-    """Boundaries over delta and beta for alpha -> 0."""
-    deltas, delays = np.sort(study.delta.values()), study.d.values()
-    stable = [
-        interval
-        for model, chosen in needed_models(study.delay_models, delays)
-        for interval in stable_intervals(deltas, chosen, model)
-    ]
-    passive = passive_intervals(deltas, delays) if study.passivity else ()
-    data = ZeroStiffnessData(tuple(stable), passive)
-    names = ("d", "delay_model", "delta", "beta_lower", "beta_upper")
-    parts = [
-        {"curve": curve, **{name: getattr(interval, name) for name in names}}
-        for curve, intervals in (("stable", data.stable), ("passive", data.passive))
-        for interval in intervals
-    ]
-    return Outcome(table=stack(parts), figures={"": partial(figures.draw_zero_stiffness, data)})
-
-
-def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[DampingInterval]:
-    """The virtual damping that is stable for alpha -> 0, over delta, for every delay."""
+def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
+    """The virtual damping that is stable for alpha -> 0, over delta, as columns for every delay."""
     columns = [np.tile(deltas, delays.size), np.repeat(delays, deltas.size)]
     upper = map_flat(_upper_kernel, columns, (delay,), _BATCH, fused=False)
     rows = np.asarray(upper).reshape(delays.size, deltas.size)
-    return [DampingInterval(float(d), delay, deltas, -deltas, row) for d, row in zip(delays, rows, strict=True)]
+    shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
+    return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in zip(delays, rows, strict=True)]
 
 
 def _upper_kernel(delta, d, delay: str):

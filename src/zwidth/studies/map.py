@@ -13,11 +13,10 @@ from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.config.fields import members, one_of
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly
-from zwidth.figures.data import MapData
 from zwidth.stability.labels import is_stable
 from zwidth.stability.passivity import is_passive
 from zwidth.stability.radii import spectral_radius
-from zwidth.studies.outcome import ComputedStudy, Outcome, si_of
+from zwidth.studies.outcome import ComputedStudy, Outcome, of_scene
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 
@@ -91,7 +90,6 @@ class MapStudy(ComputedStudy):
             for name in outputs:
                 outputs[name][place] = np.asarray(_FUNCTIONS[name](*wall))
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
-        if min(alpha.size, beta.size) < 2:
-            return Outcome(arrays=arrays)
-        data = MapData(alpha, beta, delta, d, outputs, si_of(self.delta, self.d, scene))
-        return Outcome(arrays=arrays, figures={f"_{name}": partial(figures.draw_map, data, name) for name in outputs})
+        arrays = of_scene(arrays, self.delta, self.d, scene)
+        names = outputs if min(alpha.size, beta.size) > 1 else ()
+        return Outcome(arrays=arrays, figures={f"_{name}": partial(figures.draw_map, arrays, name) for name in names})

@@ -7,7 +7,7 @@ import io
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
 
@@ -15,10 +15,7 @@ from zwidth import figures
 from zwidth.config.axes import Axis
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import Study
-from zwidth.figures.data import SIScale
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from zwidth.figures.table import SI_COLUMNS
 
 Table: TypeAlias = dict[str, np.ndarray]
 
@@ -30,14 +27,15 @@ class Outcome:
     Attributes:
         table: columns of the study's CSV file, all of one length; empty for none.
         arrays: arrays of the study's npz file; empty for none.
-        figures: what draws each figure, by what its file name adds to the study's name ("" for nothing).
+        figures: what draws each figure and returns its Axes, by what its file name adds to the study's name ("" for
+            nothing).
         documents: texts by file name.
         notes: what a reader of the results must know, such as points without an answer.
     """
 
     table: Table = field(default_factory=dict)
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
-    figures: Mapping[str, Callable[[], Figure]] = field(default_factory=dict)
+    figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
@@ -77,17 +75,22 @@ class ComputedStudy(Study):
         raise NotImplementedError
 
 
-def scale_of(device: PhysicalDevice) -> SIScale:
-    """How normalized walls of a device read in N/m and N s/m."""
-    return SIScale(device.mass / device.period**2, device.mass / device.period)
+def si_scales(device: PhysicalDevice) -> tuple[float, float]:
+    """N/m for alpha = 1 and N s/m for beta = 1."""
+    return device.mass / device.period**2, device.mass / device.period
 
 
-def si_of(delta: Axis, d: Axis, scene: AnyScene | None) -> SIScale | None:
-    """How to read walls in SI units: delta and d must be those of the file's scene alone."""
-    if not isinstance(scene, PhysicalScene):
-        return None
-    same = _is(delta, scene.delta) and _is(d, scene.d)
-    return scale_of(scene.device) if same else None
+def in_si(table: Table, device: PhysicalDevice) -> Table:
+    """A table with its walls in N/m and N s/m as well."""
+    stiffness, damping = si_scales(device)
+    return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
+
+
+def of_scene(table: Table, delta: Axis, d: Axis, scene: AnyScene | None) -> Table:
+    """A table of walls, in SI units as well where delta and d are those of the file's scene alone."""
+    if isinstance(scene, PhysicalScene) and _is(delta, scene.delta) and _is(d, scene.d):
+        return in_si(table, scene.device)
+    return table
 
 
 def _is(axis: Axis, value: float) -> bool:

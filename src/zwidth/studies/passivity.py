@@ -6,19 +6,19 @@ origin. The damping that a unit circle of walls needs therefore gives the whole 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from functools import partial
-from typing import Annotated, ClassVar, Literal, NamedTuple
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, figure_layout
-from zwidth.figures.data import DampingInterval, PassiveOutline, PassivityCost, PassivityData
 from zwidth.stability.passivity import passive_stiffness_slope, passivity_margin
 from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, stack
-from zwidth.studies.ridge import ridge_paths
+from zwidth.studies.outcome import Outcome
+from zwidth.studies.ridge import ridge_table
 
 _DIRECTIONS = 721
 
@@ -39,24 +39,12 @@ class PassivityStudy(CurvesStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The stiffest passive and the stiffest stable wall over delta, as a table and a figure."""
-        delta, delays = self.delta.values(), self.d.values()
-        paths, notes = ridge_paths(delta, delays, self.delay_model)
-        costs = []
-        for path in paths:
-            wall = stiffest_passive(path.d)
-            passive = (wall.alpha * delta, wall.beta * delta)
-            costs.append(PassivityCost(path.d, delta, path.alpha_max, path.beta, *passive))
-        names = ("d", "delta", "alpha_max", "beta", "alpha_max_passive", "beta_passive")
-        table = stack({name: getattr(cost, name) for name in names} for cost in costs)
-        draw = partial(figures.draw_passivity_cost, PassivityData(tuple(costs)))
-        return Outcome(table=table, figures={"": draw}, notes=tuple(notes))
-
-
-class PassiveWall(NamedTuple):
-    """A wall on the edge of the passive set, over delta."""
-
-    alpha: float
-    beta: float
+        ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
+        table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
+        slopes = [passive_stiffness_slope(d) for d in self.d.values().tolist()]
+        for name, slope in zip(("alpha_max_passive", "beta_passive"), zip(*slopes, strict=True), strict=True):
+            table[name] = np.repeat(slope, self.delta.size) * table["delta"]
+        return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
 
 
 def passive_edge(angles: np.ndarray, d: float) -> tuple[np.ndarray, np.ndarray]:
@@ -71,24 +59,18 @@ def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     return passive_edge(np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS), d)
 
 
-def passive_outlines(deltas: np.ndarray, delays: np.ndarray) -> tuple[PassiveOutline, ...]:
-    """The edge of the passive set of every device that has damping; without it nothing is passive."""
-    found = []
+def passive_outlines(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
+    """The edge of the passive set of every device that has damping, as columns; without it nothing is passive."""
     for d in delays:
         alpha, beta = unit_outline(float(d))
-        found += [PassiveOutline(float(delta), float(d), delta * alpha, delta * beta) for delta in deltas if delta > 0]
-    return tuple(found)
+        for delta in deltas[deltas > 0]:
+            yield {"curve": "passive", "d": d, "delta": delta, "delay_model": "held",
+                   "alpha": delta * alpha, "beta": delta * beta}  # fmt: skip
 
 
-def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> tuple[DampingInterval, ...]:
-    """The virtual damping that is passive for alpha -> 0, over delta."""
-    found = []
+def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
+    """The virtual damping that is passive for alpha -> 0, over delta, as columns."""
     for d in delays:
         _, beta = unit_outline(float(d))
-        found.append(DampingInterval(float(d), "held", deltas, deltas * beta[0], deltas * beta[-1]))
-    return tuple(found)
-
-
-def stiffest_passive(d: float) -> PassiveWall:
-    """The stiffest passive wall, over delta."""
-    return PassiveWall(*passive_stiffness_slope(d))
+        yield {"curve": "passive", "d": d, "delay_model": "held", "delta": deltas,
+               "beta_lower": deltas * beta[0], "beta_upper": deltas * beta[-1]}  # fmt: skip

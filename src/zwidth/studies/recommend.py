@@ -13,14 +13,13 @@ from zwidth import figures
 from zwidth.assessment import Assessment, assess
 from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
-from zwidth.figures.data import BoundaryData, RecommendationData, Response
 from zwidth.formatting import plain, with_unit
 from zwidth.scene import Scene, VirtualWall
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.boundary import outline
-from zwidth.studies.outcome import Outcome, scale_of, stack
+from zwidth.studies.outcome import Outcome, in_si, si_scales, stack
 from zwidth.studies.passivity import passive_outlines
-from zwidth.studies.step import ResponseStudy, respond, response_columns, unsettled
+from zwidth.studies.step import ResponseStudy
 
 
 class RecommendStudy(ResponseStudy):
@@ -57,40 +56,28 @@ class RecommendStudy(ResponseStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """Recommend a wall, judge it, and write both down as text and JSON, with a table and a figure."""
         stem = "recommendation" if alone else f"{self.name}_recommendation"
-        device, si = self.device, scale_of(self.device)
+        device = self.device
         bare = device.to_scene()
         ridge = alpha_max(device.delta, device.d)
         alpha, beta = self.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
-        wall = VirtualWall(stiffness=alpha * si.stiffness, virtual_damping=beta * si.virtual_damping)
+        stiffness, damping = si_scales(device)
+        wall = VirtualWall(stiffness=alpha * stiffness, virtual_damping=beta * damping)
         verdict = assess(Scene(bare.device, bare.timing, wall))
-        times = {"periods": self.periods(device), "substeps": self.substeps}
-        response = respond(device, alpha, beta, label=device.label or self.name, physical=True, **times)
+        columns, note = self.respond(device, alpha, beta, label=device.label or self.name, physical=True)
+        response = stack([columns])
+        found = _summary(device, wall, verdict, self.stiffness_fraction, float(columns["settling_time_s"]))
         edge, verified = outline(device.delta, device.d, "held")
         passive = passive_outlines(np.array([device.delta]), np.array([device.d]))
-        data = RecommendationData(
-            stiffness=wall.stiffness,
-            virtual_damping=wall.virtual_damping,
-            stiffness_fraction=self.stiffness_fraction,
-            stiffness_max=verdict.stiffness_max,
-            virtual_damping_at_max=verdict.virtual_damping_at_max,
-            virtual_damping_lower=verdict.virtual_damping_lower,
-            virtual_damping_upper=verdict.virtual_damping_upper,
-            region=BoundaryData((edge,), passive=passive, si=si),
-            response=response,
-        )
-        documents = {
-            f"{stem}.json": json.dumps(_summary(device, data, verdict), indent=2, allow_nan=False) + "\n",
-            f"{stem}.md": _markdown(device, data, verdict),
-        }
+        region = in_si(stack([edge, *passive]), device)
         notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
-        if note := unsettled(response, physical=True):
-            notes.append(note)
-        table = stack([response_columns(response, physical=True)])
         return Outcome(
-            table=table,
-            figures={"": partial(figures.draw_recommendation, data)},
-            documents=documents,
-            notes=tuple(notes),
+            table=response,
+            figures={"": partial(figures.draw_recommendation, found, region, response)},
+            documents={
+                f"{stem}.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
+                f"{stem}.md": _markdown(device, wall, verdict, found),
+            },
+            notes=(*notes, *([note] if note else [])),
         )
 
 
@@ -99,7 +86,9 @@ def _finite(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _summary(device: PhysicalDevice, data: RecommendationData, verdict: Assessment) -> dict[str, Any]:
+def _summary(
+    device: PhysicalDevice, wall: VirtualWall, verdict: Assessment, stiffness_fraction: float, settling_time: float
+) -> dict[str, Any]:
     """All numbers of the recommendation in SI units, with the normalized ones beside them."""
     return {
         "units": {
@@ -126,9 +115,9 @@ def _summary(device: PhysicalDevice, data: RecommendationData, verdict: Assessme
             "kind": verdict.ridge_kind,
         },
         "recommended": {
-            "stiffness_fraction": data.stiffness_fraction,
-            "stiffness": data.stiffness,
-            "virtual_damping": data.virtual_damping,
+            "stiffness_fraction": stiffness_fraction,
+            "stiffness": wall.stiffness,
+            "virtual_damping": wall.virtual_damping,
             "alpha": verdict.alpha,
             "beta": verdict.beta,
             "virtual_damping_lower": _finite(verdict.virtual_damping_lower),
@@ -137,26 +126,29 @@ def _summary(device: PhysicalDevice, data: RecommendationData, verdict: Assessme
             "spectral_radius": verdict.spectral_radius,
             "passive": verdict.passive,
             "passivity_margin": _finite(verdict.passivity_margin),
-            "settling_time": _finite(data.response.settling_time),
+            "settling_time": _finite(settling_time),
             "time_constant": _finite(verdict.time_constant),
             "frequency": _finite(verdict.frequency),
         },
     }
 
 
-def _markdown(device: PhysicalDevice, data: RecommendationData, verdict: Assessment) -> str:
+def _markdown(device: PhysicalDevice, wall: VirtualWall, verdict: Assessment, found: dict[str, Any]) -> str:
     """The recommendation for a reader."""
-    stiffness, stiffness_max = (with_unit(value, "N/m") for value in (data.stiffness, data.stiffness_max))
+    stiffness, stiffness_max = (with_unit(value, "N/m") for value in (wall.stiffness, verdict.stiffness_max))
     dampings = (
-        data.virtual_damping,
-        data.virtual_damping_at_max,
-        data.virtual_damping_lower,
-        data.virtual_damping_upper,
+        wall.virtual_damping,
+        verdict.virtual_damping_at_max,
+        verdict.virtual_damping_lower,
+        verdict.virtual_damping_upper,
         device.damping,
         -verdict.passivity_margin,
     )
     recommended, at_max, lower, upper, physical, missing = (with_unit(value, "N s/m") for value in dampings)
     period, delay = (with_unit(value, "s") for value in (device.period, device.delay.seconds(device.period)))
+    best = found["recommended"]
+    settled = best["settling_time"]
+    settling = "not known" if settled is None else f"{with_unit(settled, 's', 3)} after a step of force"
     passive = "yes" if verdict.passive else f"no, that would take {missing} more physical damping"
     lines = [
         "# Recommended virtual wall",
@@ -168,23 +160,17 @@ def _markdown(device: PhysicalDevice, data: RecommendationData, verdict: Assessm
         "|---|---|---|---|---|",
         f"| stiffest stable wall | {stiffness_max} | {at_max} "
         f"| {plain(verdict.alpha_max)} | {plain(verdict.beta_at_max)} |",
-        f"| **recommended, {100 * data.stiffness_fraction:g} % of it** | **{stiffness}** | **{recommended}** "
+        f"| **recommended, {100 * best['stiffness_fraction']:g} % of it** | **{stiffness}** | **{recommended}** "
         f"| {plain(verdict.alpha)} | {plain(verdict.beta)} |",
         "",
         "The recommended wall",
         "",
         f"- is {'stable' if verdict.stable else 'NOT stable'}: spectral radius {verdict.spectral_radius:.6f};",
         f"- stays stable at this K for B between {lower} and {upper};",
-        f"- settles to 2 % {_settling(data.response)};",
+        f"- settles to 2 % {settling};",
         f"- is passive: {passive}.",
         "",
         "No virtual damping makes a stiffness above the maximum stable.",
         "",
     ]
     return "\n".join(lines)
-
-
-def _settling(response: Response) -> str:
-    if math.isfinite(response.settling_time):
-        return f"{with_unit(response.settling_time, 's', 3)} after a step of force"
-    return "not known"

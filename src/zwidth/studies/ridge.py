@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 
 from zwidth import figures
+from zwidth._types import DelayModel
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, figure_layout
-from zwidth.figures.data import DelayModel, RidgeData, RidgePath, SlopeCurve, SlopeData
 from zwidth.stability.ridge import RidgeKind, RidgePoint, alpha_max
 from zwidth.stability.slope import stiffness_slope
 from zwidth.status import Status
 from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, stack
+from zwidth.studies.outcome import Outcome, Table, stack
 
 # Every batch has this size, so that a run with many of them compiles the ridge once for each delay model.
 _BATCH = 4096
@@ -41,16 +42,16 @@ class RidgeStudy(CurvesStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The maximum stiffness over delta, as a table and a figure."""
-        paths, notes = [], []
+        parts, notes = [], []
         for model, delays in needed_models(self.delay_models, self.d.values()):
-            more, remarks = ridge_paths(self.delta.values(), delays, model)
-            paths += more
+            part, remarks = ridge_table(self.delta.values(), delays, model)
+            parts.append(part)
             notes += remarks
-        data = RidgeData(tuple(paths))
-        drawn: dict[str, Any] = {"": partial(figures.draw_ridge, data, two_scalings=self.figure == "fig10")}
-        if min(float(path.delta.max()) for path in paths) >= _STRONG_DAMPING:
-            drawn["_slope"] = partial(figures.draw_slope, slope_data(tuple(paths)))
-        return Outcome(table=stack(ridge_columns(path) for path in paths), figures=drawn, notes=tuple(notes))
+        table = stack(parts)
+        drawn: dict[str, Any] = {"": partial(figures.draw_ridge, table, two_scalings=self.figure == "fig10")}
+        if table["delta"].max() >= _STRONG_DAMPING:
+            drawn["_slope"] = partial(figures.draw_slope, table, slope_table(table))
+        return Outcome(table=table, figures=drawn, notes=tuple(notes))
 
 
 def ridges(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> RidgePoint:
@@ -66,21 +67,19 @@ def ridges(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> RidgePoint:
     return RidgePoint(*(np.concatenate(column)[:count] for column in zip(*pieces, strict=True)))
 
 
-def ridge_paths(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[list[RidgePath], list[str]]:
-    """One path over ``delta`` for every delay, and notes about points without an answer."""
-    points = ridges(np.tile(delta, d.size), np.repeat(d, delta.size), delay)
-    rows = RidgePoint(*(column.reshape(d.size, delta.size) for column in points))
-    paths, notes = [], []
-    for index, delay_factor in enumerate(d):
-        alpha, beta, omega, kind, status = (column[index] for column in rows)
-        names = np.array([RidgeKind(int(code)).name.lower() for code in kind])
-        paths.append(RidgePath(float(delay_factor), delay, delta, alpha, beta, omega, names))
-        failed = int(np.count_nonzero(status != Status.OK))
-        if failed:
-            notes.append(
-                f"alpha_max: {failed} of {delta.size} points have no answer for d = {delay_factor:g} ({delay})"
-            )
-    return paths, notes
+def ridge_table(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[Table, list[str]]:
+    """The stiffest stable walls over ``delta``, delay by delay, and notes about points without an answer."""
+    deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
+    points = ridges(deltas, delays, delay)
+    columns = {"alpha_max": points.alpha, "beta": points.beta, "omega": points.omega}
+    columns["kind"] = np.array([RidgeKind(int(code)).name.lower() for code in points.kind])
+    failed = [(value, np.count_nonzero(points.status[delays == value] != Status.OK)) for value in d]
+    notes = [
+        f"alpha_max: {count} of {delta.size} points have no answer for d = {value:g} ({delay})"
+        for value, count in failed
+        if count
+    ]
+    return {"d": delays, "delay_model": np.full(delays.size, delay), "delta": deltas, **columns}, notes
 
 
 def needed_models(models: tuple[DelayModel, ...], d: np.ndarray) -> list[tuple[DelayModel, np.ndarray]]:
@@ -93,17 +92,9 @@ def needed_models(models: tuple[DelayModel, ...], d: np.ndarray) -> list[tuple[D
     return chosen
 
 
-def ridge_columns(path: RidgePath) -> dict[str, object]:
-    """The columns of one path in a data file."""
-    names = ("d", "delay_model", "delta", "alpha_max", "beta", "omega", "kind")
-    return {name: getattr(path, name) for name in names}
-
-
-def slope_data(paths: tuple[RidgePath, ...]) -> SlopeData:
-    """Add to paths of maximum stiffness what alpha_max/delta tends to, and that limit over the delay."""
-    limits = tuple(float(stiffness_slope(path.d, delay=path.delay_model)) for path in paths)
-    longest = max(1.0, np.ceil(max(path.d for path in paths)))
-    d = np.linspace(0.0, longest, int(longest) * _SLOPE_SAMPLES + 1)
-    models: dict[DelayModel, None] = {path.delay_model: None for path in paths}
-    curves = tuple(SlopeCurve(model, d, np.asarray(stiffness_slope(d, delay=model))) for model in models)
-    return SlopeData(paths, limits, curves)
+def slope_table(table: Table) -> Table:
+    """The slope g(d) that alpha_max/delta of a ridge's table tends to, over its delays and those between them."""
+    longest = max(1, math.ceil(table["d"].max()))
+    d = np.union1d(np.linspace(0.0, longest, longest * _SLOPE_SAMPLES + 1), table["d"])
+    models = dict.fromkeys(table["delay_model"].tolist())
+    return stack({"delay_model": model, "d": d, "slope": stiffness_slope(d, delay=model)} for model in models)

@@ -28,7 +28,6 @@ from zwidth.config.scenes import (
 )
 from zwidth.config.study import HeldOnly, figure_layout
 from zwidth.config.units import Span
-from zwidth.figures.data import Response, StepData
 from zwidth.formatting import plain, with_unit
 from zwidth.quantities import Range
 from zwidth.response import step_response
@@ -60,6 +59,39 @@ class ResponseStudy(ComputedStudy):
         if self.duration.unit == "s" and isinstance(device, PhysicalDevice):
             return self.duration.value / device.period
         return self.duration.value
+
+    def respond(
+        self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
+    ) -> tuple[dict[str, Any], str]:
+        """The response of one device to 1 N, or to a unit force where normalized.
+
+        Returns:
+            Its columns, those in SI units with their unit; and what to say of one that has not settled at the end.
+        """
+        periods = max(1, round(self.periods(device)))
+        raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
+        clock, length, units = 1.0, 1.0, ("", "", "", "")
+        if physical:
+            assert isinstance(device, PhysicalDevice), "only a device with mass and period has SI units"
+            clock, length = device.period, device.period**2 / device.mass
+            units = ("_s", "_m", "_m_per_s", "_N")
+        second, meter, speed, newton = units
+        time, settling_time = raw.time * clock, raw.settling_time * clock
+        columns = {
+            **{"label": label, "alpha": alpha, "beta": beta, "delta": device.delta, "d": device.d},
+            f"time{second}": time,
+            f"position{meter}": raw.position * length,
+            f"velocity{speed}": raw.velocity * length / clock,
+            f"wall_force{newton}": raw.wall_force,
+            f"final_position{meter}": raw.final_position * length,
+            f"settling_time{second}": settling_time,
+        }
+        if np.isnan(settling_time):
+            unknown = "the wall is not stable, its poles nearly coincide, or the delay exceeds 500 periods"
+            return columns, f"no settling time: {unknown}"
+        after = with_unit(settling_time, "s", 3) if physical else f"{plain(settling_time)} periods"
+        late = settling_time > time[-1]
+        return columns, f"the response settles after {after}, later than the time shown" if late else ""
 
     @property
     def extent(self) -> str:
@@ -158,7 +190,7 @@ class StepStudy(ResponseStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The responses, as a table and a figure."""
         physical = all(isinstance(device, PhysicalDevice) for device in self.devices)
-        responses, notes = [], []
+        parts, notes = [], []
         for number, (device, given) in enumerate(self.pairs(), start=1):
             if given is not None:
                 alpha, beta = normalized_wall(device, given)
@@ -167,50 +199,11 @@ class StepStudy(ResponseStudy):
                 assert self.stiffness_fraction is not None, "a study without walls has a fraction"
                 alpha, beta = self.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
             label = device.label or _wall_text(device, alpha, beta) or f"device {number}"
-            times = {"periods": self.periods(device), "substeps": self.substeps}
-            responses.append(respond(device, alpha, beta, label=label, physical=physical, **times))
-            if note := unsettled(responses[-1], physical):
-                notes.append(f"{label}: {note}")
-        data = StepData(tuple(responses), physical)
-        return Outcome(
-            table=stack(response_columns(response, physical) for response in responses),
-            figures={"": partial(figures.draw_step, data)},
-            notes=tuple(notes),
-        )
-
-
-def respond(
-    device: AnyDevice, alpha: float, beta: float, *, label: str, periods: float, substeps: int, physical: bool
-) -> Response:
-    """The response of one device: to 1 N in SI units, or to a unit force in normalized ones."""
-    raw = step_response(alpha, beta, device.delta, device.d, periods=max(1, round(periods)), substeps=substeps)
-    clock = length = 1.0
-    if physical:
-        assert isinstance(device, PhysicalDevice), "only a device with mass and period has SI units"
-        clock, length = device.period, device.period**2 / device.mass
-    return Response(
-        label,
-        alpha,
-        beta,
-        device.delta,
-        device.d,
-        raw.time * clock,
-        raw.position * length,
-        raw.velocity * length / clock,
-        raw.wall_force,
-        raw.final_position * length,
-        raw.settling_time * clock,
-    )
-
-
-def unsettled(response: Response, physical: bool) -> str:
-    """What to say of a response that has not settled at the end of the time shown; nothing otherwise."""
-    if np.isnan(response.settling_time):
-        return "no settling time: the wall is not stable, its poles nearly coincide, or the delay exceeds 500 periods"
-    if response.settles_in_view:
-        return ""
-    after = with_unit(response.settling_time, "s", 3) if physical else f"{plain(response.settling_time)} periods"
-    return f"the response settles after {after}, later than the time shown"
+            part, note = self.respond(device, alpha, beta, label=label, physical=physical)
+            parts.append(part)
+            notes += [f"{label}: {note}"] if note else []
+        table = stack(parts)
+        return Outcome(table=table, figures={"": partial(figures.draw_step, table)}, notes=tuple(notes))
 
 
 def _wall_text(device: AnyDevice, alpha: float, beta: float) -> str:
@@ -219,12 +212,3 @@ def _wall_text(device: AnyDevice, alpha: float, beta: float) -> str:
         return ""
     wall = device.to_scene().to_si(alpha=alpha, beta=beta)
     return f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"
-
-
-def response_columns(response: Response, physical: bool) -> dict[str, object]:
-    """The columns of one response in a data file; SI columns carry their unit."""
-    units = ("_s", "_m", "_m_per_s", "_N") if physical else ("", "", "", "")
-    columns: dict[str, object] = {name: getattr(response, name) for name in ("label", "alpha", "beta", "delta", "d")}
-    for name, unit in zip(("time", "position", "velocity", "wall_force"), units, strict=True):
-        columns[name + unit] = getattr(response, name)
-    return columns

@@ -83,12 +83,12 @@ def test_the_figure_has_a_panel_for_each_delay_and_a_mark_for_each_method():
     marks = [Mark("stable", "crossover", "map", d, 1e9, 0.0) for d in (0.0, 1.0, 4.0, 8.0, 50.0)] + [
         Mark("stable", "companion", "scattered", 0.0, 1e8, 1e-4)
     ]
-    figure = draw_pareto(marks)
+    axes = draw_pareto(marks)
     titles = ["d = 0", "d = 1", "d = 4", "d = 8", "d = 50"]
-    assert [ax.get_title(loc="left") for ax in figure.axes if ax.get_visible()] == titles
+    assert [ax.get_title(loc="left") for ax in axes] == titles
     # Below a panel without a neighbor, too.
-    assert [bool(ax.get_xlabel()) for ax in figure.axes if ax.get_visible()] == [False, True, True, True, True]
-    drawn = [line.get_data() for line in figure.axes[0].lines if len(line.get_xdata()) == 1]
+    assert [bool(ax.get_xlabel()) for ax in axes] == [False, True, True, True, True]
+    drawn = [line.get_data() for line in axes[0].lines if len(line.get_xdata()) == 1]
     assert [float(y[0]) for _, y in drawn] == [1e9, 1e8]
 
 

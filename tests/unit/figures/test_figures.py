@@ -1,5 +1,8 @@
 """Figures are tested by the data they draw and the words on them, not by pixels."""
 
+import csv
+import inspect
+import io
 import warnings
 from functools import cache
 from pathlib import Path
@@ -7,11 +10,12 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from zwidth import figures
-from zwidth.figures import data as records
-from zwidth.figures import style
+from zwidth.figures import style, table
+from zwidth.studies.outcome import csv_text, stack
 
 
 def outline(delta, d=0.0, delay_model="held", line=False):
@@ -19,97 +23,109 @@ def outline(delta, d=0.0, delay_model="held", line=False):
     omega = np.linspace(0.0, np.pi if line else 2.0, 21)
     turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 21)
     alpha, beta = (1.0 + delta) * np.cos(turn), 1.0 + (1.0 + delta) * np.sin(turn)
-    piece = np.full(omega.size, "complex_pair")
     if line:
         alpha, beta, omega = np.append(alpha, 0.0), np.append(beta, 3.0), np.append(omega, np.pi)
         alpha[-2] = 0.5
-        piece = np.append(piece, "minus_one")
-    return records.Outline(delta, d, delay_model, alpha, beta, omega, piece)
+    keys = {"curve": "boundary", "d": d, "delta": delta, "delay_model": delay_model}
+    return {**keys, "omega": omega, "alpha": alpha, "beta": beta}
 
 
-def path(d=0.0, delay_model="held"):
+def ridge(d=0.0, delay_model="held"):
     delta = np.linspace(0.0, 10.0, 41)
-    kind = np.full(delta.size, "smooth")
-    return records.RidgePath(d, delay_model, delta, (1.0 + delta) / (1.0 + d), 0.5 - 0.1 * delta, delta / 10, kind)
+    columns = {"alpha_max": (1.0 + delta) / (1.0 + d), "beta": 0.5 - 0.1 * delta, "omega": delta / 10}
+    return {"d": d, "delay_model": delay_model, "delta": delta, **columns}
 
 
-def slopes():
-    d = np.linspace(0.0, 1.0, 9)
-    curves = tuple(records.SlopeCurve(model, d, 4.0 - 3.0 * d) for model in ("held", "fractional_power"))
-    return records.SlopeData((path(), path(0.5), path(0.5, "fractional_power")), (4.0, 2.5, 1.5), curves)
+def path(d=0.0):
+    given = ridge(d)
+    return {"curve": "ridge_path", **given, "alpha": given.pop("alpha_max")}
 
 
-def interval(d=0.0, delay_model="held"):
+def interval(d=0.0, delay_model="held", curve="stable"):
     delta = np.linspace(0.0, 2.0, 11)
-    return records.DampingInterval(d, delay_model, delta, -delta, 2.0 / (1.0 + d) + delta)
+    bounds = {"beta_lower": -delta, "beta_upper": 2.0 / (1.0 + d) + delta}
+    return {"curve": curve, "d": d, "delay_model": delay_model, "delta": delta, **bounds}
 
 
 def passive_outline(delta, d=0.0):
-    return records.PassiveOutline(delta, d, np.array([0.0, 2.0 * delta, 0.0]), np.array([-delta, 0.0, delta]))
+    columns = {"alpha": np.array([0.0, 2.0 * delta, 0.0]), "beta": np.array([-delta, 0.0, delta])}
+    return {"curve": "passive", "d": d, "delta": delta, "delay_model": "held", **columns}
+
+
+def in_si(columns):
+    """The same walls in N/m and N s/m as well."""
+    return {
+        **columns,
+        "stiffness_N_per_m": 1e5 * columns["alpha"],
+        "virtual_damping_N_s_per_m": 100.0 * columns["beta"],
+    }
 
 
 def cost(d):
     delta = np.linspace(0.0, 4.0, 17)
-    return records.PassivityCost(d, delta, 1.0 + 3.0 * delta, -0.1 * delta, 2.0 * delta / (1.0 + d), 0.1 * delta)
+    return {"d": d, "delta": delta, "alpha_max": 1.0 + 3.0 * delta, "alpha_max_passive": 2.0 * delta / (1.0 + d)}
 
 
-def response(label="a device", settling_time=0.03):
+def response(label="a device", settling_time=0.03, physical=True):
     time = np.arange(100) * 1e-3
     position = 1e-4 * (1.0 - np.exp(-time / 0.01))
-    return records.Response(
-        label, 0.1, 0.4, 0.1, 1.0, time, position, np.gradient(position), -position / 1e-4, 1e-4, settling_time
-    )
+    columns = {"time_s": time, "position_m": position, "wall_force_N": -position / 1e-4}
+    columns |= {"final_position_m": 1e-4, "settling_time_s": settling_time}
+    if not physical:
+        columns = {name.rpartition("_")[0]: column for name, column in columns.items()}
+    return {"label": label, "alpha": 0.1, "beta": 0.4, "delta": 0.1, "d": 1.0, **columns}
 
 
-def grid_map(deltas=(0.1,), si=None):
+def grid_map(deltas=(0.1,)):
     alpha, beta = np.linspace(0.0, 1.0, 6), np.linspace(-1.0, 1.0, 5)
     shape = (alpha.size, beta.size, len(deltas), 1)
     radius = 0.5 + np.broadcast_to(alpha[:, None, None, None] + beta[None, :, None, None] ** 2, shape)
     outputs = {"stable": radius < 1, "spectral_radius": radius, "passive": radius < 0.8}
-    return records.MapData(alpha, beta, np.array(deltas), np.array([1.0]), outputs, si)
+    return {"alpha": alpha, "beta": beta, "delta": np.array(deltas), "d": np.array([1.0]), **outputs}
 
 
-def recommendation():
-    region = records.BoundaryData((outline(0.1, 1.0),), passive=(passive_outline(0.1, 1.0),), si=SI)
-    return records.RecommendationData(8e4, 100.0, 0.75, 1.1e5, 100.0, 20.0, 180.0, region, response())
-
-
-SI = records.SIScale(stiffness=1e5, virtual_damping=100.0)
-
-EVERY_FIGURE = {
-    "boundary": lambda ax=None: figures.draw_boundary(
-        records.BoundaryData((outline(0.5), outline(1.0), outline(0.5, 2.0), outline(1.0, 2.0)), (path(), path(2.0))),
-        ax,
-    ),
-    "boundary with a line": lambda ax=None: figures.draw_boundary(
-        records.BoundaryData((outline(1.0), outline(3.0, line=True))), ax
-    ),
-    "boundary with passivity in SI": lambda ax=None: figures.draw_boundary(
-        records.BoundaryData((outline(0.5),), passive=(passive_outline(0.5),), si=SI), ax
-    ),
-    "boundary of many deltas": lambda ax=None: figures.draw_boundary(
-        records.BoundaryData(tuple(outline(delta) for delta in np.linspace(0.1, 2.0, 20))), ax
-    ),
-    "boundary of both models": lambda ax=None: figures.draw_boundary(
-        records.BoundaryData((outline(0.5, 0.5), outline(0.6, 0.5, "fractional_power"))), ax
-    ),
-    "zero stiffness": lambda ax=None: figures.draw_zero_stiffness(
-        records.ZeroStiffnessData((interval(), interval(0.5), interval(0.5, "fractional_power")), (interval(3.0),)), ax
-    ),
-    "ridge": lambda ax=None: figures.draw_ridge(
-        records.RidgeData((path(), path(0.5), path(0.5, "fractional_power"))), ax
-    ),
-    "slope": lambda ax=None: figures.draw_slope(slopes(), ax),
-    "passivity cost": lambda ax=None: figures.draw_passivity_cost(records.PassivityData((cost(0.0), cost(1.0))), ax),
-    "step": lambda ax=None: figures.draw_step(
-        records.StepData((response("first"), response("second", np.nan)), True), ax
-    ),
-    "normalized step": lambda ax=None: figures.draw_step(records.StepData((response("first"),), False), ax),
-    "map of radius": lambda ax=None: figures.draw_map(grid_map(), "spectral_radius", ax),
-    "map of stable": lambda ax=None: figures.draw_map(grid_map(si=SI), "stable", ax),
-    "map of many": lambda ax=None: figures.draw_map(grid_map(np.linspace(0, 1, 7)), "passive", ax),
-    "recommendation": lambda ax=None: figures.draw_recommendation(recommendation(), ax),
+BOUNDARY = stack([outline(0.5), outline(1.0), outline(0.5, 2.0), outline(1.0, 2.0), path(), path(2.0)])
+RIDGE = stack([ridge(), ridge(0.5), ridge(0.5, "fractional_power")])
+LIMITS = {("held", 0.0): 4.0, ("held", 0.5): 2.5, ("fractional_power", 0.5): 2.5}
+SLOPES = stack(
+    {"delay_model": model, "d": np.linspace(0.0, 1.0, 9), "slope": 4.0 - 3.0 * np.linspace(0.0, 1.0, 9)}
+    for model in ("held", "fractional_power")
+)
+COSTS = stack([cost(0.0), cost(1.0)])
+FOUND = {
+    "maximum": {"stiffness": 1.1e5, "virtual_damping": 100.0},
+    "recommended": {
+        **{"stiffness": 8e4, "virtual_damping": 100.0, "stiffness_fraction": 0.75, "settling_time": 0.03},
+        **{"virtual_damping_lower": 20.0, "virtual_damping_upper": 180.0},
+    },
 }
+REGION = in_si(stack([outline(0.1, 1.0), passive_outline(0.1, 1.0)]))
+
+# What each function draws; the name is the function's, and what is special about the case.
+EVERY_FIGURE = {
+    "draw_boundary": (BOUNDARY,),
+    "draw_boundary with a line": (stack([outline(1.0), outline(3.0, line=True)]),),
+    "draw_boundary with passivity in SI": (in_si(stack([outline(0.5), passive_outline(0.5)])),),
+    "draw_boundary of many deltas": (stack([outline(delta) for delta in np.linspace(0.1, 2.0, 20)]),),
+    "draw_boundary of both models": (stack([outline(0.5, 0.5), outline(0.6, 0.5, "fractional_power")]),),
+    "draw_zero_stiffness": (
+        stack([interval(), interval(0.5), interval(0.5, "fractional_power"), interval(3.0, curve="passive")]),
+    ),
+    "draw_ridge": (RIDGE,),
+    "draw_slope": (RIDGE, SLOPES),
+    "draw_passivity_cost": (COSTS,),
+    "draw_step": (stack([response("first"), response("second", np.nan)]),),
+    "draw_step normalized": (stack([response("first", physical=False)]),),
+    "draw_map of radius": (grid_map(), "spectral_radius"),
+    "draw_map of stable": (in_si(grid_map()), "stable"),
+    "draw_map of many": (grid_map(np.linspace(0, 1, 7)), "passive"),
+    "draw_recommendation": (FOUND, REGION, stack([response()])),
+}
+
+
+def draw(name, axes=None, **keywords):
+    """Draw one of the figures; returns its Axes."""
+    return getattr(figures, name.split()[0])(*EVERY_FIGURE[name], axes, **keywords)
 
 
 def curves(ax):
@@ -133,7 +149,7 @@ def drawn(name):
     """One of the figures, laid out once for all tests, with every warning an error."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        figure = EVERY_FIGURE[name]()
+        figure = style.figure_of(draw(name))
         figure.draw_without_rendering()
     return figure
 
@@ -149,13 +165,70 @@ def test_a_figure_leaves_no_trace_in_matplotlib(name):
 
 
 @pytest.mark.parametrize("name", EVERY_FIGURE)
-def test_a_figure_is_drawn_into_a_given_axes(name):
+def test_a_figure_is_drawn_into_a_given_axes_which_is_returned(name):
     figure = Figure()
     ax = figure.subplots()
-    assert EVERY_FIGURE[name](ax) is figure
+    drawn_into = draw(name, ax)
+    assert drawn_into is ax if name == "draw_zero_stiffness" else list(drawn_into) == [ax]
     assert ax.has_data()
     assert ax.get_xlabel()
     assert ax.get_ylabel()
+    # A color bar is all that comes beside it.
+    assert len(figure.axes) <= 2
+    assert not figure.legends
+
+
+@pytest.mark.parametrize("name", ["draw_boundary", "draw_step", "draw_passivity_cost", "draw_map of many"])
+def test_every_panel_is_drawn_into_axes_of_ones_own(name):
+    expected = drawn(name).axes
+    part = Figure(layout="constrained").subfigures(1, 2)[1]
+    axes = part.subplots(1, len(expected))
+    assert list(draw(name, axes)) == list(axes)
+    for ax, alike in zip(axes, expected, strict=True):
+        assert {name: line.tolist() for name, line in curves(ax).items()} == {
+            name: line.tolist() for name, line in curves(alike).items()
+        }
+        assert ax.get_xlabel() or name == "draw_step"
+
+
+def test_every_function_takes_axes_last_and_returns_them():
+    for name in (name for name in figures.__all__ if name.startswith("draw_")):
+        signature = inspect.signature(getattr(figures, name))
+        (where,) = [each for each in signature.parameters.values() if each.default is None]
+        assert where.name == ("ax" if name == "draw_zero_stiffness" else "axes"), name
+        assert signature.return_annotation == ("Axes" if where.name == "ax" else "np.ndarray"), name
+
+
+def test_a_figure_is_drawn_from_what_its_csv_file_holds():
+    header, *rows = csv.reader(io.StringIO(csv_text(BOUNDARY)))
+    read = {name: np.array(column) for name, column in zip(header, zip(*rows, strict=True), strict=True)}
+    words_of = {"curve", "delay_model"}
+    read = {name: column if name in words_of else column.astype(float) for name, column in read.items()}
+    for ax, alike in zip(figures.draw_boundary(read), drawn("draw_boundary").axes, strict=True):
+        assert {name: line.tolist() for name, line in curves(ax).items()} == {
+            name: line.tolist() for name, line in curves(alike).items()
+        }
+
+
+def test_a_data_frame_serves_as_a_table():
+    pandas = pytest.importorskip("pandas")
+    assert isinstance(figures.draw_zero_stiffness(pandas.DataFrame(EVERY_FIGURE["draw_zero_stiffness"][0])), Axes)
+    for name in ("draw_boundary", "draw_ridge", "draw_step", "draw_passivity_cost"):
+        frame = pandas.DataFrame(EVERY_FIGURE[name][0])
+        for ax, alike in zip(getattr(figures, name)(frame), drawn(name).axes, strict=True):
+            assert curves(ax).keys() == curves(alike).keys()
+
+
+def test_curves_are_told_apart_by_their_keys():
+    given = {"d": [0.0, 0.0, 1.0, 0.0], "kind": ["a", "a", "a", "b"], "x": [1.0, 2.0, 3.0, 4.0]}
+    found = table.curves(given, "d", "kind")
+    assert [(curve.d, curve.kind, curve.x.tolist()) for curve in found] == [
+        (0.0, "a", [1.0, 2.0]),
+        (1.0, "a", [3.0]),
+        (0.0, "b", [4.0]),
+    ]
+    assert [curve.x.tolist() for curve in table.curves(given, "kind", d=0.0)] == [[1.0, 2.0], [4.0]]
+    assert table.curves(given, "d", kind="c") == []
 
 
 @pytest.mark.parametrize("name", EVERY_FIGURE)
@@ -174,12 +247,12 @@ def test_every_text_stays_on_the_page(name):
         assert box.y1 <= page.y1 + 1, text.get_text()
 
 
-@pytest.mark.parametrize("name", ["boundary with a line", "map of stable"])
+@pytest.mark.parametrize("name", ["draw_boundary with a line", "draw_map of stable"])
 def test_the_same_figure_is_written_in_the_same_bytes(name, tmp_path):
     written = []
     before = matplotlib.rcParams.copy()
     for attempt in ("first", "second"):
-        files = figures.save(EVERY_FIGURE[name](), tmp_path / attempt)
+        files = figures.save(draw(name), tmp_path / attempt)
         assert [file.suffix for file in files] == [".png", ".svg"]
         written.append([file.read_bytes() for file in files])
     assert matplotlib.rcParams == before
@@ -189,36 +262,36 @@ def test_the_same_figure_is_written_in_the_same_bytes(name, tmp_path):
 
 
 def test_boundaries_show_the_given_curves_in_one_panel_for_each_delay():
-    figure = drawn("boundary")
+    figure = drawn("draw_boundary")
     assert [ax.get_title(loc="left") for ax in figure.axes] == ["$d = 0$", "$d = 2$"]
     for ax, d in zip(figure.axes, (0.0, 2.0), strict=True):
         for delta in (0.5, 1.0):
             given = outline(delta, d)
-            assert_drawn(ax, f"boundary, delta = {delta:g}, d = {d:g}", given.alpha, given.beta)
-        assert_drawn(ax, f"path of alpha_max, d = {d:g}", path(d).alpha_max, path(d).beta)
+            assert_drawn(ax, f"boundary, delta = {delta:g}, d = {d:g}", given["alpha"], given["beta"])
+        assert_drawn(ax, f"path of alpha_max, d = {d:g}", path(d)["alpha"], path(d)["beta"])
         shaded = [patch.get_xy() for patch in ax.patches]
-        assert any(np.array_equal(xy[:21], np.c_[outline(1.0, d).alpha, outline(1.0, d).beta]) for xy in shaded)
+        assert any(np.array_equal(xy[:21], np.c_[outline(1.0, d)["alpha"], outline(1.0, d)["beta"]]) for xy in shaded)
 
 
 def test_axes_carry_the_symbols_with_their_definitions():
-    text = words(drawn("boundary"))
+    text = words(drawn("draw_boundary"))
     assert r"\alpha = K\,T^2\!/m" in text
     assert r"\beta = B\,T/m" in text
     assert r"$\delta = 0.5$" in text
-    assert r"\delta = b\,T/m" in words(drawn("ridge"))
+    assert r"\delta = b\,T/m" in words(drawn("draw_ridge"))
 
 
 def test_a_real_pole_at_minus_one_has_a_line_of_its_own():
-    ax = drawn("boundary with a line").axes[0]
+    ax = drawn("draw_boundary with a line").axes[0]
     given = outline(3.0, line=True)
-    assert_drawn(ax, "boundary, delta = 3, d = 0", given.alpha[:21], given.beta[:21])
-    assert_drawn(ax, "z = -1, delta = 3, d = 0", given.alpha[20:], given.beta[20:])
+    assert_drawn(ax, "boundary, delta = 3, d = 0", given["alpha"][:21], given["beta"][:21])
+    assert_drawn(ax, "z = -1, delta = 3, d = 0", given["alpha"][20:], given["beta"][20:])
     styles = {line.get_label(): line.get_linestyle() for line in ax.lines}
     assert styles["boundary, delta = 3, d = 0"] != styles["z = -1, delta = 3, d = 0"]
 
 
 def test_passivity_is_dash_dotted_and_si_axes_are_added():
-    ax = drawn("boundary with passivity in SI").axes[0]
+    ax = drawn("draw_boundary with passivity in SI").axes[0]
     assert_drawn(ax, "passive, delta = 0.5, d = 0", [0.0, 1.0, 0.0], [-0.5, 0.0, 0.5])
     top, right = ax.child_axes
     assert "kN/m" in top.get_xlabel()
@@ -228,7 +301,7 @@ def test_passivity_is_dash_dotted_and_si_axes_are_added():
 
 
 def test_the_larger_delta_is_darker():
-    ax = drawn("boundary").axes[0]
+    ax = drawn("draw_boundary").axes[0]
     gray = {
         line.get_label(): np.dot(matplotlib.colors.to_rgb(line.get_color()), [0.299, 0.587, 0.114]) for line in ax.lines
     }
@@ -236,12 +309,12 @@ def test_the_larger_delta_is_darker():
 
 
 def test_zero_stiffness_shows_both_models_and_the_lower_bound():
-    figure = drawn("zero stiffness")
+    figure = drawn("draw_zero_stiffness")
     ax = figure.axes[0]
     for given in (interval(), interval(0.5), interval(0.5, "fractional_power")):
-        assert_drawn(ax, f"beta_upper, d = {given.d:g}, {given.delay_model}", given.delta, given.beta_upper)
-    assert_drawn(ax, "beta_lower", interval().delta, -interval().delta)
-    assert_drawn(ax, "passive beta_upper, d = 3", interval(3.0).delta, interval(3.0).beta_upper)
+        assert_drawn(ax, f"beta_upper, d = {given['d']:g}, {given['delay_model']}", given["delta"], given["beta_upper"])
+    assert_drawn(ax, "beta_lower", interval()["delta"], -interval()["delta"])
+    assert_drawn(ax, "passive beta_upper, d = 3", interval(3.0)["delta"], interval(3.0)["beta_upper"])
     styles = {line.get_label(): line.get_linestyle() for line in ax.lines}
     assert styles["beta_upper, d = 0.5, held"] == "-"
     assert styles["beta_upper, d = 0.5, fractional_power"] == "--"
@@ -249,31 +322,28 @@ def test_zero_stiffness_shows_both_models_and_the_lower_bound():
 
 
 def test_the_ridge_comes_in_two_scalings():
-    given = records.RidgeData((path(), path(0.5), path(0.5, "fractional_power")))
-    near, far = figures.draw_ridge(given, two_scalings=True).axes
+    near, far = figures.draw_ridge(RIDGE, two_scalings=True)
     assert near.get_xlim() == (0.0, 1.0)
     assert far.get_xlim() == (0.0, 10.0)
-    for each in given.paths:
-        label = f"alpha_max, d = {each.d:g}, {each.delay_model}"
-        assert_drawn(far, label, each.delta, each.alpha_max)
-        inside = each.delta <= 1.0
-        assert_drawn(near, label, each.delta[inside], each.alpha_max[inside])
+    for each in (ridge(), ridge(0.5), ridge(0.5, "fractional_power")):
+        label = f"alpha_max, d = {each['d']:g}, {each['delay_model']}"
+        assert_drawn(far, label, each["delta"], each["alpha_max"])
+        inside = each["delta"] <= 1.0
+        assert_drawn(near, label, each["delta"][inside], each["alpha_max"][inside])
 
 
 def test_the_slope_is_drawn_beside_its_limit():
-    ratio, limit = drawn("slope").axes
-    given = slopes()
-    for each, value in zip(given.paths, given.limits, strict=True):
-        shown = each.delta >= 0.1
-        label = f"alpha_max/delta, d = {each.d:g}, {each.delay_model}"
-        assert_drawn(ratio, label, each.delta[shown], each.alpha_max[shown] / each.delta[shown])
-        assert any(
-            np.all(np.asarray(line.get_ydata()) == value)
-            for line in ratio.lines
-            if line.get_label() == f"g, d = {each.d:g}"
-        )
-    for curve in given.curves:
-        assert_drawn(limit, f"g, {curve.delay_model}", curve.d, curve.slope)
+    ratio, limit = drawn("draw_slope").axes
+    for each in (ridge(), ridge(0.5), ridge(0.5, "fractional_power")):
+        shown = each["delta"] >= 0.1
+        label = f"alpha_max/delta, d = {each['d']:g}, {each['delay_model']}"
+        assert_drawn(ratio, label, each["delta"][shown], each["alpha_max"][shown] / each["delta"][shown])
+        value = LIMITS[each["delay_model"], each["d"]]
+        lines = [line for line in ratio.lines if line.get_label() == f"g, d = {each['d']:g}"]
+        assert any(np.all(np.asarray(line.get_ydata()) == value) for line in lines)
+    for model in ("held", "fractional_power"):
+        rows = SLOPES["delay_model"] == model
+        assert_drawn(limit, f"g, {model}", SLOPES["d"][rows], SLOPES["slope"][rows])
     # The name of a delay stands at the end of its held curve.
     places = {text.get_text(): text.xy[1] for text in ratio.texts}
     low, high = np.log(ratio.get_ylim())
@@ -281,46 +351,46 @@ def test_the_slope_is_drawn_beside_its_limit():
 
 
 def test_passivity_cost_shows_both_maxima_and_their_ratio():
-    maxima, ratio = drawn("passivity cost").axes
+    maxima, ratio = drawn("draw_passivity_cost").axes
     for d in (0.0, 1.0):
         given = cost(d)
-        assert_drawn(maxima, f"alpha_max, d = {d:g}", given.delta, given.alpha_max)
-        assert_drawn(maxima, f"alpha_max_passive, d = {d:g}", given.delta, given.alpha_max_passive)
-        share = 100.0 * given.alpha_max_passive / given.alpha_max
-        assert_drawn(ratio, f"passive share, d = {d:g}", given.delta, share)
+        for name in ("alpha_max", "alpha_max_passive"):
+            assert_drawn(maxima, f"{name}, d = {d:g}", given["delta"], given[name])
+        share = 100.0 * given["alpha_max_passive"] / given["alpha_max"]
+        assert_drawn(ratio, f"passive share, d = {d:g}", given["delta"], share)
 
 
 def test_step_responses_are_drawn_in_readable_units():
-    figure = drawn("step")
+    figure = drawn("draw_step")
     positions, forces = figure.axes
     given = response()
     text = r"first  ($\alpha = 0.1$, $\beta = 0.4$)"
     line = curves(positions)[text]
-    np.testing.assert_allclose(line[0], given.time * 1e3, rtol=1e-14)
-    np.testing.assert_allclose(line[1], given.position * 1e6, rtol=1e-14)
-    np.testing.assert_array_equal(curves(forces)["wall_force, first"][1], given.wall_force)
+    np.testing.assert_allclose(line[0], given["time_s"] * 1e3, rtol=1e-14)
+    np.testing.assert_allclose(line[1], given["position_m"] * 1e6, rtol=1e-14)
+    np.testing.assert_array_equal(curves(forces)["wall_force, first"][1], given["wall_force_N"])
     assert "µm" in positions.get_ylabel()
     assert "ms" in forces.get_xlabel()
     assert "not settled" in words(figure)
 
 
 def test_a_map_shows_the_grid_and_the_edge_of_stability():
-    figure = drawn("map of radius")
+    figure = drawn("draw_map of radius")
     mesh = figure.axes[0].collections[0]
-    np.testing.assert_array_equal(mesh.get_array().T, grid_map().outputs["spectral_radius"][:, :, 0, 0])
+    np.testing.assert_array_equal(mesh.get_array().T, grid_map()["spectral_radius"][:, :, 0, 0])
     contour = figure.axes[0].collections[1]
     assert list(contour.levels) == [1.0]
-    stable = drawn("map of stable").axes[0].collections[0]
-    np.testing.assert_array_equal(stable.get_array().T, grid_map().outputs["stable"][:, :, 0, 0])
+    stable = drawn("draw_map of stable").axes[0].collections[0]
+    np.testing.assert_array_equal(stable.get_array().T, grid_map()["stable"][:, :, 0, 0])
 
 
 def test_a_map_of_many_deltas_shows_the_ends_and_the_middle():
-    titles = [ax.get_title(loc="left") for ax in drawn("map of many").axes]
+    titles = [ax.get_title(loc="left") for ax in drawn("draw_map of many").axes]
     assert titles == [rf"$\delta = {delta:g}$,  $d = 1$" for delta in (0, 0.5, 1)]
 
 
 def test_a_recommendation_is_marked_inside_its_interval():
-    region, _ = drawn("recommendation").axes
+    region, _ = drawn("draw_recommendation").axes
     marks = curves(region)
     np.testing.assert_allclose(marks["recommended"][:, 0], (80.0, 100.0))
     np.testing.assert_allclose(marks["virtual_damping_interval"][1], (20.0, 180.0))

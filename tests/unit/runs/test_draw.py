@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from sweeping import config_of, failing_on_2, main_of, run_sweeps, study
 from zwidth.errors import InputError, StoreError
-from zwidth.figures.curves import draw_curves
-from zwidth.figures.plane import draw_plane
+from zwidth.figures import draw_curves, draw_outlines, draw_plane
 from zwidth.runs import draw
-from zwidth.runs.draw import _View, draw_stores
+from zwidth.runs.draw import draw_stores
 from zwidth.sweep.store import open_dataset
 
 PLANE = {
@@ -45,14 +45,24 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def view(folder):
-    return _View(open_dataset(folder / "plane.zarr"), {})
+def plane(folder):
+    """The results over walls, devices and delays."""
+    return open_dataset(folder / "plane.zarr").load()
+
+
+def meshes(axes):
+    """What is drawn as colors, panel by panel."""
+    return [ax.collections[0].get_array() for ax in axes]
+
+
+def titles(axes):
+    return [ax.get_title(loc="left") for ax in axes]
 
 
 def test_every_sweep_is_drawn(folder, tmp_path, monkeypatch):
     told = []
     # To write the files takes longer than all the rest; another test does.
-    monkeypatch.setattr(draw, "save", lambda figure, stem: (stem.with_suffix(".png"), stem.with_suffix(".svg")))
+    monkeypatch.setattr(draw, "save", lambda drawn, stem: (stem.with_suffix(".png"), stem.with_suffix(".svg")))
     files = draw_stores(folder, tmp_path, progress=told.append)
     assert told == list(files)
     names = {file.stem for file in files}
@@ -63,68 +73,109 @@ def test_every_sweep_is_drawn(folder, tmp_path, monkeypatch):
     assert {file.suffix for file in files} == {".png", ".svg"}
 
 
-def test_a_plane_holds_the_values_of_the_store(folder, view):
-    data = view._plane("margin")
-    kept = open_dataset(folder / "plane.zarr")
-    assert (data.x.name, data.y.name, data.columns) == ("alpha", "beta", 3)
+def test_a_plane_holds_the_values_of_the_store(plane):
+    axes = draw_plane(plane, "margin")
     # Two delays, and three of the four dampings.
-    assert len(data.panels) == 6
-    place = {"d": 1, "delta": 3}
-    assert data.panels[5].title == r"$d = 1$,  $\delta = 1$"
-    np.testing.assert_array_equal(data.panels[5].fields["margin"], kept.margin.isel(place).values.T)
-    peak = kept[["alpha_max", "beta_at_max"]].isel(place)
-    assert data.panels[5].peak == (float(peak.alpha_max), float(peak.beta_at_max))
-    # Its stiffest wall lies beyond the axis.
-    assert data.panels[2].peak is None
+    places = [{"d": d, "delta": delta} for d in (0, 1) for delta in (0, 2, 3)]
+    assert titles(axes) == [rf"$d = {d}$,  $\delta = {delta}$" for d in (0, 1) for delta in (0.05, 0.5, 1)]
+    peaks = []
+    for place, ax, mesh in zip(places, axes, meshes(axes), strict=True):
+        np.testing.assert_array_equal(mesh, plane.margin.isel(place).values.T)
+        peaks += [line.get_xydata().tolist() for line in ax.lines if line.get_label() == "stiffest stable wall"]
+        wall = plane[["alpha_max", "beta_at_max"]].isel(place)
+        # Without delay the stiffest wall of the third damping lies beyond the axis.
+        if wall.alpha_max <= plane.alpha.max() and wall.beta_at_max <= plane.beta.max():
+            assert peaks[-1] == [[float(wall.alpha_max), float(wall.beta_at_max)]]
+    assert 0 < len(peaks) < 6
 
 
-def test_a_region_is_bounded_by_the_contour_of_a_number(view):
-    data = view._plane("stable")
-    assert set(data.panels[0].fields) == {"stable", "passive", "margin"}
-    figure = draw_plane(data, view._quantity("stable"))
-    assert len(figure.axes) == 6
+def test_a_region_is_bounded_by_the_contour_of_a_number(plane):
+    axes = draw_plane(plane, "stable")
+    figure = axes[0].figure
+    assert list(figure.axes) == list(axes)
     assert [text.get_text() for text in figure.legends[0].get_texts()] == ["stable", "passive", "stiffest stable wall"]
     assert figure.get_supxlabel() == r"normalized stiffness  $\alpha = K\,T^2\!/m$"
+    np.testing.assert_array_equal(meshes(axes)[0], plane.stable.isel(d=0, delta=0).values.T)
+    # The contour of truth values runs along grid lines and half way between them, that of the margin anywhere.
+    edge, step = axes[0].collections[1].get_paths()[0].vertices, float(np.diff(plane.alpha)[0])
+    off = np.abs(edge[:, :1] - plane.alpha.values).min(axis=1) / step
+    assert np.count_nonzero((off > 0.01) & (off < 0.49)) > 3
 
 
-def test_slices_are_the_nearest_values(folder, capsys, tmp_path):
-    view = _View(open_dataset(folder / "plane.zarr"), {"delta": "0.12", "d": 0.9})
-    (panel,) = view._plane("stable").panels
-    assert panel.title == r"$d = 1$,  $\delta = 0.1$"
+def test_a_part_of_a_dataset_is_drawn_into_axes_of_ones_own(plane):
+    figure = Figure(layout="constrained")
+    left, right = figure.subplots(1, 2)
+    part = plane.sel(d=1, delta=0.1)
+    assert list(draw_plane(part, "margin", left)) == [left]
+    np.testing.assert_array_equal(meshes([left])[0], part.margin.values.T)
+    assert left.get_title(loc="left") == r"$d = 1$,  $\delta = 0.1$"
+    assert left.get_xlabel()
+    assert left.get_ylabel()
+    assert list(draw_curves(part.isel(beta=3), "margin", right)) == [right]
+    np.testing.assert_array_equal(right.lines[0].get_ydata(), part.margin.isel(beta=3).values)
+    # The data is as it was.
+    assert "units" in plane.alpha.attrs
+    assert "factor" not in plane.alpha.attrs
+
+
+def test_every_device_has_its_boundary(plane):
+    part = plane.sel(d=1)
+    (ax,) = draw_outlines(part, Figure().subplots())
+    assert [text.get_text() for text in ax.get_legend().get_texts()] == [
+        rf"$\delta = {delta}$" for delta in (0.05, 0.1, 0.5, 1)
+    ]
+    assert len(ax.collections) == 4
+    for outline, device in zip(ax.collections, range(4), strict=True):
+        for alpha, beta in outline.get_paths()[0].vertices[::5]:
+            # Between points of the grid the margin is all but linear.
+            assert abs(float(part.margin.isel(delta=device).interp(alpha=alpha, beta=beta))) < 1e-3
+
+
+@pytest.mark.parametrize("draw", [draw_plane, lambda data, name: draw_curves(data.isel(alpha=0), name)])
+def test_a_single_value_is_no_figure(plane, draw):
+    with pytest.raises(InputError, match="'stable' varies over"):
+        draw(plane.isel(beta=0, delta=0, d=0), "stable")
+    with pytest.raises(InputError, match="holds no boundaries of several devices"):
+        draw_outlines(plane.isel(delta=0, d=0))
+
+
+def test_slices_are_the_nearest_values(folder, capsys, tmp_path, monkeypatch):
+    found = []
+    with monkeypatch.context() as patch:
+        patch.setattr(draw, "save", lambda drawn, stem: found.append((stem.name, drawn)) or ())
+        draw_stores(folder / "plane.zarr", tmp_path, at={"delta": "0.12", "d": 0.9})
+        draw_stores(folder / "devices.zarr", tmp_path, at={"device": "heavy"})
+    drawn = dict(found)
+    assert titles(drawn["plane_stable"]) == [r"$d = 1$,  $\delta = 0.1$"]
+    assert titles(drawn["devices_stiffness_max"]) == ["heavy"]
     words = ["figures", folder / "plane.zarr", "--at", "delta=0.12", "--at", "d=1", "--out", tmp_path, "--json"]
     assert main_of(*words) == 0
     assert len(json.loads(capsys.readouterr().out)["files"]) == 8
     assert all(file.stat().st_size > 1000 for file in tmp_path.iterdir())
-    device = _View(open_dataset(folder / "devices.zarr"), {"device": "heavy"})
-    curves = device._curves("stiffness_max", device._quantity("stiffness_max"))
-    assert [panel.title for panel in curves.panels] == ["heavy"]
 
 
 def test_curves_have_units_one_can_read(folder):
-    view = _View(open_dataset(folder / "devices.zarr"), {})
-    quantity = view._quantity("stiffness_max")
-    assert quantity.label == r"maximum stable stiffness  $K_{\max}$  in kN/m"
-    data = view._curves("stiffness_max", quantity)
-    assert data.x.label == "sampling rate  $1/T$  in kHz"
-    np.testing.assert_allclose(data.x.values, [1, 2, 4])
-    kept = open_dataset(folder / "devices.zarr").stiffness_max.isel(device=1).transpose("delay", "rate").values
-    np.testing.assert_allclose(data.panels[1].fields["stiffness_max"], kept / 1000)
-    figure = draw_curves(data, quantity)
-    assert [line.get_label() for line in figure.axes[0].lines] == [
-        r"$t_d = 0\,\mathrm{periods}$", r"$t_d = 1\,\mathrm{periods}$"
-    ]  # fmt: skip
+    kept = open_dataset(folder / "devices.zarr")
+    axes = draw_curves(kept, "stiffness_max")
+    figure = axes[0].figure
+    assert figure.get_supylabel() == r"maximum stable stiffness  $K_{\max}$  in kN/m"
+    assert figure.get_supxlabel() == "sampling rate  $1/T$  in kHz"
+    for index, line in enumerate(axes[1].lines):
+        np.testing.assert_allclose(line.get_xdata(), [1, 2, 4])
+        np.testing.assert_allclose(line.get_ydata(), kept.stiffness_max.isel(device=1, delay=index).values / 1000)
+    names = [r"$t_d = 0\,\mathrm{periods}$", r"$t_d = 1\,\mathrm{periods}$"]
+    assert [line.get_label() for line in axes[0].lines] == names
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == names
 
 
 def test_what_is_not_computed_is_left_blank_and_said(tmp_path):
     axes = {**PLANE, "alpha": {"linear": {"start": 0.01, "stop": 1.0, "num": 2000}}, "delta": [0.1], "d": [0, 1, 2]}
     run_sweeps(config_of(study(axes=axes)), tmp_path, perform=failing_on_2)
-    view = _View(open_dataset(tmp_path), {})
-    data = view._plane("stable")
-    assert any((panel.fields["stable"] < 0).any() for panel in data.panels)
+    drawn = draw_plane(open_dataset(tmp_path), "stable")
+    assert any(np.ma.getmaskarray(mesh).any() for mesh in meshes(drawn))
     # A grid finer than a page is thinned.
-    assert data.x.values.size == 500
-    figure = draw_plane(data, view._quantity("stable"))
-    assert "not computed" in [text.get_text() for text in figure.legends[0].get_texts()]
+    assert [mesh.shape for mesh in meshes(drawn)] == [(13, 500)] * 3
+    assert "not computed" in [text.get_text() for text in drawn[0].figure.legends[0].get_texts()]
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,13 @@ import pytest
 
 import zwidth
 from zwidth.config.scenes import PhysicalScene
+from zwidth.stability.passivity import passive_stiffness_slope
 from zwidth.stability.poles import unstable_poles
 from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
 from zwidth.studies.map import MapStudy
 from zwidth.studies.outcome import csv_text, stack
-from zwidth.studies.passivity import PassivityStudy, passive_edge, stiffest_passive, unit_outline
-from zwidth.studies.ridge import RidgeStudy, needed_models, ridge_paths, slope_data
+from zwidth.studies.passivity import PassivityStudy, passive_edge, unit_outline
+from zwidth.studies.ridge import RidgeStudy, needed_models, ridge_table, slope_table
 from zwidth.studies.step import StepStudy
 
 DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])
@@ -27,10 +28,11 @@ def test_the_interval_at_zero_stiffness_is_where_poles_cross():
     # Close enough to alpha = 0 that beta moves by less than the step, far enough that the pole near 1 is counted.
     alpha, step = 1e-7, 1e-3
     for found in stable_intervals(DELTAS, DELAYS, "held"):
-        inside = unstable_poles(alpha, np.stack([found.beta_lower + step, found.beta_upper - step]), DELTAS, found.d)
-        beyond = unstable_poles(alpha, np.stack([found.beta_lower - step, found.beta_upper + step]), DELTAS, found.d)
-        assert np.all(inside == 0), found.d
-        assert np.all(beyond > 0), found.d
+        lower, upper, d = found["beta_lower"], found["beta_upper"], found["d"]
+        inside = unstable_poles(alpha, np.stack([lower + step, upper - step]), DELTAS, d)
+        beyond = unstable_poles(alpha, np.stack([lower - step, upper + step]), DELTAS, d)
+        assert np.all(inside == 0), d
+        assert np.all(beyond > 0), d
 
 
 def test_both_models_give_one_interval_for_whole_periods():
@@ -38,7 +40,7 @@ def test_both_models_give_one_interval_for_whole_periods():
         stable_intervals(DELTAS, np.array([0.0, 1.0, 3.0]), model) for model in ("held", "fractional_power")
     )
     for one, other in zip(held, powers, strict=True):
-        np.testing.assert_allclose(one.beta_upper, other.beta_upper, rtol=1e-12)
+        np.testing.assert_allclose(one["beta_upper"], other["beta_upper"], rtol=1e-12)
 
 
 def test_the_fractional_power_ends_at_its_lobe():
@@ -46,7 +48,7 @@ def test_the_fractional_power_ends_at_its_lobe():
     omega = np.linspace(1e-3, np.pi, 200_001)
     curve = zwidth.boundary(omega, 0.5, 0.5, delay="fractional_power")
     end = np.flatnonzero(curve.alpha[1:] < 0)[0]
-    assert found.beta_upper[0] == pytest.approx(curve.beta[end], abs=1e-4)
+    assert found["beta_upper"][0] == pytest.approx(curve.beta[end], abs=1e-4)
 
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 2.0])
@@ -65,14 +67,6 @@ def test_without_delay_the_passive_set_is_colgates_triangle():
     np.testing.assert_allclose(alpha / 2 + np.abs(beta), 1.0, rtol=1e-13)
 
 
-@pytest.mark.parametrize("d, slope", [(0.0, 2.0), (1.0, 2 * np.sqrt(2) - 2)])
-def test_the_stiffest_passive_wall(d, slope):
-    # d = 0: eq. (21) at beta = 0. d = 1: the largest alpha with alpha (1 + 2 cos w)/2 - beta cos 2w <= 1 for every w.
-    found = stiffest_passive(d)
-    assert found.alpha == pytest.approx(slope, rel=1e-12)
-    assert zwidth.passivity_margin(found.alpha, found.beta, 1.0, d) == pytest.approx(0.0, abs=1e-12)
-
-
 def test_a_passive_wall_is_never_stiffer_than_a_stable_one():
     study = PassivityStudy.model_validate(
         {"kind": "passivity", "name": "p", "delta": [0.1, 1.0, 10.0], "d": [0, 0.5, 2]}
@@ -80,17 +74,27 @@ def test_a_passive_wall_is_never_stiffer_than_a_stable_one():
     table = study.compute(None, alone=True).table
     assert np.all(table["alpha_max_passive"] < table["alpha_max"])
     np.testing.assert_allclose(table["alpha_max"], zwidth.alpha_max(table["delta"], table["d"]).alpha, rtol=1e-13)
+    for d in (0.0, 0.5, 2.0):
+        here = table["d"] == d
+        slopes = np.outer(table["delta"][here], passive_stiffness_slope(d)).T
+        np.testing.assert_array_equal((table["alpha_max_passive"][here], table["beta_passive"][here]), slopes)
 
 
 def test_ridges_are_those_of_the_library():
     delta, d = np.linspace(0.0, 10.0, 7), np.array([0.0, 0.125, 3.0])
-    paths, notes = ridge_paths(delta, d, "held")
+    table, notes = ridge_table(delta, d, "held")
     assert notes == []
-    for path in paths:
-        expected = zwidth.alpha_max(delta, path.d)
-        np.testing.assert_allclose(path.alpha_max, expected.alpha, rtol=1e-13)
-        assert [zwidth.RidgeKind[name.upper()] for name in path.kind] == list(expected.kind)
-    assert paths[0].kind[-1] == "corner"
+    expected = zwidth.alpha_max(np.tile(delta, 3), np.repeat(d, 7))
+    np.testing.assert_array_equal(table["delta"], np.tile(delta, 3))
+    np.testing.assert_array_equal(table["d"], np.repeat(d, 7))
+    np.testing.assert_allclose(table["alpha_max"], expected.alpha, rtol=1e-13)
+    assert [zwidth.RidgeKind[name.upper()] for name in table["kind"]] == list(expected.kind)
+    assert table["kind"][6] == "corner"
+
+
+def test_points_without_an_answer_are_noted():
+    _, notes = ridge_table(np.array([0.1, np.nan, np.inf]), np.array([0.0, 1.0]), "held")
+    assert notes == [f"alpha_max: 2 of 3 points have no answer for d = {d} (held)" for d in (0, 1)]
 
 
 def test_whole_delays_are_computed_in_one_model_alone():
@@ -114,16 +118,20 @@ def test_strong_damping_is_drawn_with_its_limit():
     study = RidgeStudy.model_validate({"kind": "ridge", "name": "r", "delta": [1, 1e4], "d": [0, 1]})
     outcome = study.compute(None, alone=True)
     assert list(outcome.figures) == ["", "_slope"]
-    data = slope_data(tuple(ridge_paths(np.array([1.0, 1e4]), np.array([0.0, 1.0]), "held")[0]))
-    assert data.limits == pytest.approx((4.0, 1.0), rel=1e-14)
-    assert [path.alpha_max[-1] / 1e4 for path in data.paths] == pytest.approx(data.limits, rel=1e-3)
-    assert [curve.delay_model for curve in data.curves] == ["held"]
+    slopes = slope_table(outcome.table)
+    assert set(slopes["delay_model"]) == {"held"}
+    limits = [slopes["slope"][slopes["d"] == d][0] for d in (0.0, 1.0)]
+    assert limits == pytest.approx((4.0, 1.0), rel=1e-14)
+    strongest = outcome.table["alpha_max"][outcome.table["delta"] == 1e4] / 1e4
+    assert strongest == pytest.approx(limits, rel=1e-3)
+    # A delay that no sample meets is there as well.
+    assert 0.3 in slope_table({"d": np.array([0.3]), "delay_model": np.array(["held"])})["d"]
 
 
 def test_an_outline_has_names_for_its_pieces():
     edge, verified = outline(3.0, 0.0, "held")
     assert verified
-    assert set(edge.piece) == {"complex_pair", "minus_one"}
+    assert set(edge["piece"]) == {"complex_pair", "minus_one"}
 
 
 def test_a_boundary_study_tables_boundaries_ridge_and_passivity():
@@ -166,6 +174,8 @@ def test_step_responses_of_devices_and_walls():
     np.testing.assert_allclose(table["position_m"], expected.position * 1e-3**2 / 0.1, rtol=1e-12)
     np.testing.assert_allclose(table["time_s"], expected.time * 1e-3, rtol=1e-12)
     assert table["label"][0] == "K = 14.90 kN/m, B = 41.60 N s/m"
+    np.testing.assert_allclose(table["final_position_m"], expected.final_position * 1e-3**2 / 0.1, rtol=1e-12)
+    np.testing.assert_allclose(table["settling_time_s"], expected.settling_time * 1e-3, rtol=1e-12)
 
 
 def test_a_response_that_does_not_settle_is_noted():
@@ -201,6 +211,15 @@ def test_a_map_holds_every_output_on_the_grid():
     np.testing.assert_allclose(arrays["spectral_radius"].ravel(), radius, rtol=1e-9)
     np.testing.assert_array_equal(arrays["stable"], arrays["spectral_radius"] < 1)
     np.testing.assert_array_equal(arrays["passive"], zwidth.is_passive(*grid))
+    assert "stiffness_N_per_m" not in arrays
+
+
+def test_a_map_of_the_scene_alone_is_in_si_units_too():
+    scene = PhysicalScene.model_validate({"mass": 0.1, "damping": 50, "period": "1 ms", "delay": "1 ms"})
+    study = {"kind": "map", "name": "m", "alpha": [0.1, 0.2], "beta": 0.1, "delta": scene.delta, "d": scene.d}
+    arrays = MapStudy.model_validate(study).compute(scene, alone=True).arrays
+    np.testing.assert_allclose(arrays["stiffness_N_per_m"], 1e5 * arrays["alpha"], rtol=1e-15)
+    np.testing.assert_allclose(arrays["virtual_damping_N_s_per_m"], 1e2 * arrays["beta"], rtol=1e-15)
 
 
 def test_tables_keep_every_digit():

@@ -1,0 +1,145 @@
+"""What the figures of sweeps share: the axes, the panels and the values of a dataset, in units that have few digits."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from zwidth.figures import style
+from zwidth.quantities import NOT_COMPUTED, OUTPUTS, PARAMETERS, STATUS_OF, WALL
+
+if TYPE_CHECKING:
+    import xarray
+
+# As many values as one panel, or one of several, resolves; of a finer grid every n-th is drawn.
+_RESOLVED, _RESOLVED_BY_MANY = 1000, 500
+# A grid of more panels than this says nothing on a page: evenly spaced values stand for all.
+_ACROSS = 3
+_MANY_PANELS = 9
+# What an axis of a plane is, rather than a choice of panels: the first two that vary.
+_ORDER = ("alpha", "stiffness", "beta", "virtual_damping", "delta", "damping", "d", "delay", "rate", "period", "mass")
+
+
+def varied(data: xarray.Dataset, name: str) -> list[str]:
+    """The parameters that a variable varies over."""
+    return [str(dim) for dim in data[name].dims if data.sizes[dim] > 1]
+
+
+def axes_of(data: xarray.Dataset, name: str) -> list[str]:
+    """One or two parameters that a variable is drawn over."""
+    dims = varied(data, name)
+    return [dim for dim in _ORDER if dim in dims][:2]
+
+
+def shown(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
+    """Some variables of one family as they are drawn.
+
+    Only dimensions with two values or more remain, single values of the others beside them. All is in units with few
+    digits, which the attribute ``units`` names. What was not computed is NaN; truth values are 0 and 1.
+    """
+    family = OUTPUTS[names[0]].family
+    status = STATUS_OF[family]
+    data = data[[*names, status]]
+    beside = [name for name, values in data.coords.items() if values.ndim and name not in data.dims]
+    beside += [name for name in WALL if family == "device" and name not in data.dims]
+    data = data.drop_vars(beside, errors="ignore").squeeze()
+    for name in names:
+        values, output = data[name], OUTPUTS[name]
+        if output.dtype == "bool":
+            values = values.astype(float).where(data[status] == 0)
+        elif output.dtype == "float64":
+            unit, factor = str(values.attrs.get("units", "1")), 1.0
+            if unit not in ("1", "sampling periods"):
+                # Two digits of the first slice are enough to choose a prefix.
+                part = np.abs(values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values)
+                part = part[np.isfinite(part)]
+                factor, unit = style.si_unit(float(np.median(part)) if part.size else 1.0, unit)
+            values = (values * factor).where(data[status] != NOT_COMPUTED).assign_attrs(units=unit)
+        data[name] = values
+    for name, values in data.coords.items():
+        if name in PARAMETERS:
+            factor, unit = _readable(values.values, str(values.attrs.get("units", "1")))
+            data = data.assign_coords({name: (values * factor).assign_attrs(units=unit, factor=factor)})
+    return data.drop_vars(status)
+
+
+def _readable(values: np.ndarray, unit: str) -> tuple[float, str]:
+    """The factor and the unit in which the values of a parameter have few digits."""
+    if unit in ("1", "sampling periods"):
+        return 1.0, unit
+    if unit == "kg":
+        return (1.0, unit) if np.max(np.abs(values)) >= 1 else (1e3, "g")
+    return style.si_unit(float(np.max(np.abs(values))), unit)
+
+
+def panels(data: xarray.Dataset, over: list[str], plane: Sequence[str] = ()) -> tuple[list[xarray.Dataset], int]:
+    """A part of a dataset for each panel, and how many panels are beside each other.
+
+    Args:
+        data: as `shown` gives it.
+        over: the dimensions that a panel has; the last two others vary from panel to panel.
+        plane: those of them that are drawn as a plane, which resolves so many values and no more.
+    """
+    free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
+    data = data.isel(dict.fromkeys(free[:-2], 0))
+    free = free[-2:]
+    picked = [style.evenly(data.sizes[dim], _MANY_PANELS if len(free) == 1 else _ACROSS) for dim in free]
+    places = [dict(zip(free, place, strict=True)) for place in product(*picked)]
+    most = _RESOLVED if len(places) == 1 else _RESOLVED_BY_MANY
+    thin = {dim: slice(None, None, -(-data.sizes[dim] // most)) for dim in plane}
+    parts = [data.isel({**place, **thin}) for place in places]
+    if len(free) == 2:
+        return parts, len(picked[1])
+    return parts, 2 if len(parts) == 4 else min(_ACROSS, len(parts))
+
+
+def spell(value: xarray.DataArray) -> str:
+    """A single value of a parameter, with symbol and unit."""
+    if value.name == "device":
+        return str(value.values)
+    unit = {"1": "", "sampling periods": "periods"}.get(value.attrs["units"], value.attrs["units"])
+    unit = rf"\,\mathrm{{{unit.replace(' ', '~')}}}" if unit else ""
+    return rf"${PARAMETERS[str(value.name)].symbol} = {float(value):.4g}{unit}$"
+
+
+def title(part: xarray.Dataset) -> str:
+    """The single values of a part of a dataset."""
+    names = [name for name in ("device", *PARAMETERS) if name in part.coords and not part[name].ndim]
+    return ",  ".join(spell(part[name]) for name in names)
+
+
+def axis_label(data: xarray.Dataset, name: str) -> str:
+    """A parameter in words, with symbol and unit."""
+    parameter = PARAMETERS[name]
+    definition = f" = {parameter.definition}" if parameter.definition else ""
+    return f"{parameter.words}  ${parameter.symbol}{definition}$" + _in_unit(data, name)
+
+
+def output_label(data: xarray.Dataset, name: str) -> str:
+    """A variable in words, with symbol and unit."""
+    return f"{OUTPUTS[name].words}  ${OUTPUTS[name].symbol}$" + _in_unit(data, name)
+
+
+def _in_unit(data: xarray.Dataset, name: str) -> str:
+    unit = data[name].attrs.get("units", "1")
+    return "" if unit == "1" else f"  in {unit}"
+
+
+def logarithmic(values: np.ndarray) -> bool:
+    """Whether the values of an axis are spaced so."""
+    if values.size < 3 or not (values > 0).all():
+        return False
+    steps = values[1:] / values[:-1]
+    return bool(np.allclose(steps, steps[0], rtol=1e-6) and not np.isclose(steps[0], 1.0))
+
+
+def scale_axis(ax: Axes, which: str, values: Any) -> None:
+    """The range of an axis, and its spacing."""
+    values = np.asarray(values)
+    if logarithmic(values):
+        getattr(ax, f"set_{which}scale")("log")
+    getattr(ax, f"set_{which}lim")(float(values.min()), float(values.max()))

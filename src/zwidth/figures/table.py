@@ -1,0 +1,69 @@
+"""What figures draw: tables of named columns, as the CSV file of a study holds them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any, Protocol
+
+import numpy as np
+
+# Walls in SI units, beside alpha and beta.
+SI_COLUMNS = ("stiffness_N_per_m", "virtual_damping_N_s_per_m")
+
+
+class Table(Protocol):
+    """Columns of one length by their names: a dict of arrays, or a pandas DataFrame."""
+
+    def __getitem__(self, key: str, /) -> Any: ...
+
+    def __iter__(self) -> Iterator[Any]: ...
+
+    def __contains__(self, key: Any, /) -> bool: ...
+
+
+def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:
+    """The rows that have the wanted values in some columns."""
+    columns = {str(name): np.asarray(table[name]) for name in table}
+    for name, value in wanted.items():
+        keep = columns[name] == value
+        columns = {each: column[keep] for each, column in columns.items()}
+    return columns
+
+
+def curves(table: Table, *keys: str, **wanted: object) -> list[Any]:
+    """The curves that lie below each other in a table: rows in a row that share the values of ``keys``.
+
+    Args:
+        table: columns by name.
+        keys: names of columns that are constant along a curve.
+        wanted: values of further columns; other rows are left out.
+
+    Returns:
+        For each curve its columns as attributes: single values of the keys, arrays of the others.
+    """
+    columns = select(table, **wanted)
+    changes = [columns[key][1:] != columns[key][:-1] for key in keys]
+    ends = np.flatnonzero(np.any(changes, axis=0)) + 1
+    parts = {name: np.split(column, ends) for name, column in columns.items()}
+    found = [SimpleNamespace(**{name: part[k] for name, part in parts.items()}) for k in range(ends.size + 1)]
+    for curve in found if columns[keys[0]].size else ():
+        vars(curve).update({key: getattr(curve, key)[0] for key in keys})
+    return found if columns[keys[0]].size else []
+
+
+def held_or_all(found: list[Any]) -> list[Any]:
+    """The curves of the held delay, which stand for the other model's as well; all where there are none."""
+    return [curve for curve in found if curve.delay_model == "held"] or found
+
+
+def si_scale(table: Table) -> tuple[float, float] | None:
+    """N/m for alpha = 1 and N s/m for beta = 1; None for a table that has no walls in SI units."""
+    if SI_COLUMNS[0] not in table:
+        return None
+    scales = []
+    for name, si in zip(("alpha", "beta"), SI_COLUMNS, strict=True):
+        normalized = np.asarray(table[name])
+        top = int(np.nanargmax(np.abs(normalized)))
+        scales.append(float(np.asarray(table[si])[top] / normalized[top]))
+    return scales[0], scales[1]
