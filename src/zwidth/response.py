@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth import phi
 from zwidth._types import Array
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.grouping import degree_of
+from zwidth.numerics import phi
 from zwidth.scene import Scene
 from zwidth.settling import advance, settling_time
 

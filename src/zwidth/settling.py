@@ -16,10 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth import phi
 from zwidth._types import Array
 from zwidth.grouping import degree_of
 from zwidth.loop import coefficients
+from zwidth.numerics import phi
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.poles import poles
 

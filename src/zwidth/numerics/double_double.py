@@ -141,7 +141,7 @@ _SMALL = 2.0**-6
 
 
 def phi_pair(x: Double) -> PhiPair:
-    """The functions of `zwidth.phi` at x >= 0: Taylor's series at x/2^k, then doubled k times without cancellation."""
+    """As `numerics.phi` at x >= 0: Taylor's series at x/2^k, then doubled k times without cancellation."""
     largest = float(np.max(x.high, initial=0.0))
     halvings = max(0, int(np.ceil(np.log2(largest / _SMALL)))) if largest > 0 else 0
     y = x.scaled(0.5**halvings)
