@@ -8,10 +8,9 @@ from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64, elementwise, is_traced
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_device
-from zwidth.stability.curve import device_of, lobe, spread, wall
+from zwidth.stability.curve import lobe, spread, wall
 from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.stability.open_loop import along
-from zwidth.xp import frozen, namespace
+from zwidth.xp import along, frozen, namespace
 
 # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic.
 _NODES = 48
@@ -56,7 +55,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
 def _area_kernel(delta: Array, d: Array, kind: Kind) -> Array:
     xp = namespace(delta, d)
-    curve = lobe(device_of(delta, d, "held", kind), d, "held", kind)
+    curve = lobe(delta, d, "held", kind)
     end = frozen(curve.end, xp)
     node, weight = (along(part, end) for part in (0.5 + 0.5 * _NODE, 0.5 * _WEIGHT))
     at = wall(end[..., None] * node, spread(curve))

@@ -9,15 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import is_traced, pointwise, to_caller
-from zwidth.design.column import column, lobe
+from zwidth.batching import elementwise, is_traced, pointwise, to_caller
 from zwidth.design.lowest import Cost, lowest, without_slope
 from zwidth.design.margin import margin_kernel
+from zwidth.domain import device_status
 from zwidth.grouping import Degree, by_degree
+from zwidth.stability.curve import column, lobe, peak
+from zwidth.stability.devices import Kind
 from zwidth.stability.labels import is_stable
 from zwidth.stability.poles import companion_chunk, radius_kernel
-from zwidth.stability.ridge import RidgePoint, alpha_max, ridge_kernel
+from zwidth.stability.ridge import occurring
 from zwidth.status import Status
+from zwidth.xp import frozen, namespace
 
 # Samples across a column, how many of their dips are refined, and by how many steps of golden section.
 _COLUMN = {"samples": 66, "dips": 3, "steps": 52}
@@ -53,7 +56,6 @@ def fastest_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Damping
         stable.
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
         TracedDelayError: d is traced.
 
     Numerics:
@@ -73,7 +75,7 @@ def fastest_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Damping
         0.452 0.609
     """
     inputs = (alpha, delta, d)
-    lower, upper, status = _columns(*inputs)
+    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (occurring(d),))
     found = by_degree(
         _fastest_kernel,
         (alpha, lower, upper, delta, d),
@@ -118,7 +120,6 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
         stable.
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
         TracedDelayError: d is traced.
 
     Numerics:
@@ -135,7 +136,7 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
         np.True_
     """
     inputs = (alpha, delta, d)
-    lower, upper, status = _columns(*inputs)
+    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (occurring(d),))
     names = ("alpha", "lower", "upper", "delta", "d")
     found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (), _CHUNK, least=_LEAST)
     # The margin says nothing of the side of the boundary.
@@ -150,27 +151,15 @@ def _robust_kernel(alpha: Array, lower: Array, upper: Array, delta: Array, d: Ar
     return beta, -achieved
 
 
-def _columns(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> tuple[Array, Array, Array]:
-    """The ends of the stable dampings, and a status; compiled once for both questions and every degree."""
-    # The ridge is traced where the stiffness alone is; else it shares the compilation of `alpha_max`.
-    traced = is_traced(alpha, delta, d)
-    ridge = pointwise(_ridge_kernel, _NAMES, (alpha, delta, d)) if traced else alpha_max(delta, d)
-    names = ("alpha", "delta", "d", "ridge.alpha", "ridge.omega", "ridge.status")
-    values = (alpha, delta, d, ridge.alpha, ridge.omega, ridge.status)
-    return pointwise(_column_kernel, names, values, (), _CHUNK, least=_LEAST)
-
-
-def _ridge_kernel(alpha: Array, delta: Array, d: Array) -> RidgePoint:
-    return ridge_kernel(delta, d, "held")
-
-
-def _column_kernel(
-    alpha: Array, delta: Array, d: Array, ridge_alpha: Array, ridge_omega: Array, status: Array
-) -> tuple[Array, Array, Array]:
-    lower, upper, exists = column(alpha, lobe(delta, d))
-    status = jnp.where((status == Status.OK) & ~exists, Status.NO_BOUNDARY, status)
-    status = jnp.where(jnp.isfinite(alpha), status, Status.INVALID_INPUT)
-    return lower, upper, status.astype(jnp.int32)
+def _column_kernel(alpha: Array, delta: Array, d: Array, kind: Kind) -> tuple[Array, Array, Array]:
+    """The ends of the stable dampings, and a status."""
+    xp = namespace(alpha, delta, d)
+    alpha, delta, d = frozen((alpha, delta, d), xp)
+    curve, status = lobe(delta, d, "held", kind), device_status(delta, d)
+    lower, upper, exists = column(alpha, curve, peak(curve, "held", kind))
+    status = xp.where((status == Status.OK) & ~exists, int(Status.NO_BOUNDARY), status)
+    status = xp.where(xp.isfinite(alpha), status, int(Status.INVALID_INPUT))
+    return lower, upper, status.astype(np.int32)
 
 
 def _answer(found: tuple[Array, Array], good: Array, status: Array, inputs: tuple[ArrayLike, ...]) -> DampingChoice:
@@ -210,7 +199,6 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
         is not 0.
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
         TracedDelayError: d is traced.
 
     Numerics:
@@ -227,25 +215,22 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
         >>> print(f"{wall.alpha:.2f} {wall.beta:.2f} {wall.spectral_radius:.2f}")
         0.07 0.41 0.59
     """
-    ridge = alpha_max(delta, d)
-    names = ("delta", "ridge.alpha", "ridge.omega", "ridge.status", "d")
-    values = (delta, ridge.alpha, ridge.omega, ridge.status, d)
-    return by_degree(_wall_kernel, values, names=names, chunk=companion_chunk, threads=_THREADS)
+    return by_degree(_wall_kernel, (delta, d), names=("delta", "d"), chunk=companion_chunk, threads=_THREADS)
 
 
-def _wall_kernel(
-    delta: Array, ridge_alpha: Array, ridge_omega: Array, status: Array, d: Array, degree: Degree
-) -> FastestWall:
-    device = lobe(delta, d)
+def _wall_kernel(delta: Array, d: Array, degree: Degree) -> FastestWall:
+    kind = Kind(degree.whole == 0, degree.whole > 0, degree.fractional)
+    curve = frozen(lobe(delta, d, "held", kind), jnp)
+    top = peak(curve, "held", kind)
+    status = device_status(delta, d)
 
     def best_damping(alpha: Array) -> tuple[Array, Array]:
-        stable = column(alpha, device)
-        cost = _radius_over(alpha, delta, d, degree)
-        beta, radius, _ = lowest(cost, stable.lower, stable.upper, **_COLUMN)
+        lower, upper, exists = column(alpha, curve, top)
+        beta, radius, _ = lowest(_radius_over(alpha, delta, d, degree), lower, upper, **_COLUMN)
         # Without stiffness, and on the ridge, a pole is on the circle.
-        return jnp.where(stable.exists, radius, 1.0), beta
+        return jnp.where(exists, radius, 1.0), beta
 
-    alpha, radius, beta = lowest(jax.vmap(best_damping), jnp.zeros_like(delta), ridge_alpha, **_WALL)
+    alpha, radius, beta = lowest(jax.vmap(best_damping), jnp.zeros_like(delta), top.alpha, **_WALL)
     bad = jnp.where(status == Status.OK, 0.0, jnp.nan).astype(alpha.dtype)
     alpha, beta, radius = without_slope((alpha + bad, beta + bad, radius + bad), (delta, d))
     return FastestWall(alpha, beta, radius, status.astype(jnp.int32))

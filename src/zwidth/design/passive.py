@@ -21,8 +21,7 @@ from zwidth.batching import elementwise
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_device
 from zwidth.stability.needed_damping import directions, needed_damping
-from zwidth.stability.open_loop import along
-from zwidth.xp import frozen, namespace
+from zwidth.xp import along, frozen, namespace
 
 # Gauss-Legendre nodes for each of the three parts.
 _NODES = (64, 64, 32)

@@ -25,7 +25,7 @@ from zwidth.figures.data import (
     ZeroStiffnessData,
 )
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
-from zwidth.stability.curve import lobe_end
+from zwidth.stability.bracketing import lobe_end
 from zwidth.stability.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, Table, si_of, stack
