@@ -17,6 +17,7 @@ from zwidth.batching import as_float64
 from zwidth.design.stiffness import max_stiffness
 from zwidth.domain import SI_RANGE, within
 from zwidth.errors import InputError
+from zwidth.numerics.roots import bisect
 from zwidth.scene import normalize
 from zwidth.stability.affine import quantities, stable_everywhere
 from zwidth.stability.boundary import boundary_point
@@ -33,7 +34,6 @@ _LOOSER = (1e-4, 1e-2, 0.1)
 _MOST_PARTS, _AT_ONCE = 1 << 18, 1 << 11
 # Rounds of proof and counterexample.
 _ROUNDS = 40
-_BISECTIONS = 60
 _SEARCH_ROUNDS = 60
 # Shares this close to 0 or 1 are taken for it.
 _AT_END = 1e-12
@@ -336,17 +336,18 @@ def _best_wall(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
         lower, upper = _stable_dampings(stiffness, devices)
         return float(np.max(lower)), float(np.min(upper))
 
-    low, high = 0.0, float(np.min(_stiffest(devices)))
-    for _ in range(_BISECTIONS):
-        trial = 0.5 * (low + high)
-        lower, upper = common(trial)
-        low, high = (trial, high) if lower < upper else (low, trial)
+    def suits(stiffness: np.ndarray) -> np.ndarray:
+        lower, upper = common(float(stiffness))
+        return np.asarray(lower < upper)
+
+    # Rounded up: no wall reaches it.
+    limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_stiffest(devices))), np.inf))
 
     def middle(stiffness: float) -> float:
         lower, upper = common(stiffness)
         return 0.5 * (lower + upper)
 
-    return high, middle
+    return limit, middle
 
 
 def _wall(low: np.ndarray, high: np.ndarray) -> tuple:

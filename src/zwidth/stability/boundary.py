@@ -223,7 +223,7 @@ def _point_kernel(delta: Array, d: Array, *arguments: Any) -> BoundaryPoint:
     xp = namespace(delta, d, *numbers)
     inputs = (delta, d, *numbers)
     ray = _as_ray(line, tuple(numbers))
-    given = line_status(delta, d, *ray)
+    given = line_status(delta, d, *ray) if line == "ray" else wall_status(ray.alpha, ray.beta, delta, d)
     if line == "ray":
         size = xp.where(given == int(Status.OK), xp.maximum(xp.abs(ray.dalpha), xp.abs(ray.dbeta)), 1.0)
         ray = ray._replace(dalpha=ray.dalpha / size, dbeta=ray.dbeta / size)
@@ -265,8 +265,10 @@ def _point_kernel(delta: Array, d: Array, *arguments: Any) -> BoundaryPoint:
         beta = xp.where(on_lobe, beta, ray.beta + s * ray.dbeta)
         omega = xp.where(on_lobe, omega, there)
     # What the line itself fixes.
-    alpha = xp.where(ray.dalpha == 0, ray.alpha, alpha)
-    beta = xp.where(ray.dbeta == 0, ray.beta, beta)
+    if line == "ray":
+        alpha, beta = xp.where(ray.dalpha == 0, ray.alpha, alpha), xp.where(ray.dbeta == 0, ray.beta, beta)
+    else:
+        alpha, beta = (alpha, ray.beta) if row else (ray.alpha, beta)
     if creeping:
         # The frequency of a fractional power of less than one is too close to pi.
         undecided = undecided | (on_lobe & (np.pi - x < _NEAREST_PI) & (d > 0) & (d < 1))

@@ -1,4 +1,4 @@
-"""The least distance of the Nyquist curve from -1, between bounds that no minimum can lie beyond.
+"""The least distance of the rigid loop's Nyquist curve from -1, between bounds that no minimum can lie beyond.
 
 ``|L|`` falls strictly with the frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. So
 once a distance r has been seen, no lower one lies where ``|L| > 1 + r`` or ``|L| < 1 - r``. Within a turn of the phase
@@ -15,8 +15,8 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.stability.crossover import gain_crossover
 from zwidth.stability.devices import Device
-from zwidth.stability.open_loop import along, angle_of, size_and_phase
-from zwidth.xp import frozen, namespace, repeat
+from zwidth.stability.open_loop import angle_of, size_and_phase
+from zwidth.xp import along, frozen, namespace, repeat
 
 # Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
 _TURN, _DECADES, _DIPS, _ZOOMS, _TRIALS = 100, 50, 5, 5, 13
