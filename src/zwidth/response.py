@@ -112,9 +112,6 @@ def step_response(
         ``settling_time`` in periods is the last instant of all outside 2 % of it, however long was simulated: it comes
         from the poles, see `zwidth.settling`. NaN where the wall is not stable, and beyond d = 500.
 
-    Raises:
-        InputError: an argument is no single finite number, or out of range.
-
     Numerics:
         Exact between force changes up to rounding; float64, by NumPy. An unstable response that outgrows it ends as
         inf or NaN.

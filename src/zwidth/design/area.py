@@ -32,9 +32,6 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
     Returns:
         Array of the broadcast shape; NaN out of range.
 
-    Raises:
-        InputError: a plain number is beyond its range, an argument is no real number, or shapes do not broadcast.
-
     Numerics:
         Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first derivatives: the area does
         not change to first order when the ends of the lobe move, so they count as fixed; second derivatives are not

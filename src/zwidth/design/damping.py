@@ -11,12 +11,12 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise, is_traced, pointwise, to_caller
 from zwidth.design.lowest import Cost, lowest, without_slope
-from zwidth.design.margin import margin_kernel
 from zwidth.domain import device_status
 from zwidth.grouping import Degree, by_degree
 from zwidth.stability.curve import column, lobe, peak
 from zwidth.stability.devices import Kind
 from zwidth.stability.labels import is_stable
+from zwidth.stability.modulus import margin_kernel
 from zwidth.stability.poles import companion_chunk, radius_kernel
 from zwidth.stability.ridge import occurring
 from zwidth.status import Status
@@ -59,11 +59,9 @@ def fastest_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Damping
         TracedDelayError: d is traced.
 
     Numerics:
-        The optimum is usually a kink, where a pole pair meets on the real axis or another pole takes over: sampled
-        across the stable interval, then golden section round the lowest dips. The radius is right to about 1e-8, the
-        accuracy of a double pole, and below 1, or else nothing is returned. The interval relies on the single lobe of
-        the stable set, as pole counts found it. Traceable in alpha and delta, with NaN for derivatives: at a kink
-        there are none.
+        The optimum is usually a kink, where poles meet on the real axis or another takes over: sampled across the
+        stable interval, then golden section round the lowest dips. The radius is right to about 1e-8, the accuracy of
+        a double pole. Traceable in alpha and delta, with NaN for derivatives: at a kink there are none.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VIII.
@@ -107,24 +105,15 @@ def _radius_over(alpha: Array, delta: Array, d: Array, degree: Degree) -> Cost:
 def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> DampingChoice:
     """Find the virtual damping with the largest stability margin for a wall of this stiffness.
 
-    ``max over beta of min over omega |1 + L(e^(j omega))|``, see `zwidth.design.modulus_margin`: the loop that bears
+    ``max over beta of min over omega |1 + L(e^(j omega))|``, see `zwidth.modulus_margin`: the loop that bears
     the largest unknown multiplicative change of its inverse at every frequency.
 
     Args:
-        alpha: normalized stiffness K T^2/m, > 0.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not (held); concrete also inside `jit`. All three broadcast.
+        alpha, delta, d: as for `fastest_damping`.
 
     Returns:
-        DampingChoice: ``beta``; ``achieved``, the modulus margin; ``status``, NO_BOUNDARY with NaN where no beta is
-        stable.
-
-    Raises:
-        TracedDelayError: d is traced.
-
-    Numerics:
-        As `fastest_damping`; the margin is right to about 1e-12. Called directly or traced, the answer is returned
-        only where `zwidth.is_stable` finds it stable.
+        DampingChoice: ``beta``; ``achieved``, the modulus margin, right to about 1e-12 and returned only where
+        `zwidth.is_stable` finds the wall stable; ``status`` as for `fastest_damping`.
 
     References:
         Landau 1990 (modulus margin).

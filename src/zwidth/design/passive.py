@@ -43,9 +43,6 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
     Returns:
         Array of the broadcast shape; NaN out of range (see `zwidth.domain`).
 
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
     Numerics:
         Gauss-Legendre quadrature between the kinks of ``needed``: about 1e-14 relative, at a cost that does not grow
         with d. Traceable, with derivatives; those in d at whole d are from the right.

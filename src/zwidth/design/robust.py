@@ -116,19 +116,12 @@ def robust_wall(*, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain,
     """Find the stiffest single wall (K, B) that is stable on every device of a box.
 
     Args:
-        mass: m in kg, > 0: an `Interval`, or what is known exactly; likewise the others.
-        damping: b in N s/m, >= 0.
-        period: T in s, > 0.
-        delay: t_d in s, >= 0, held. All broadcast, the ends of intervals too: a box for each entry.
+        mass, damping, period, delay: as for `robust_max_stiffness`.
 
     Returns:
         RobustWall of the broadcast shape: ``stiffness`` in N/m and ``virtual_damping`` in N s/m, proved stable on every
-        device of the box; ``limit``, a stiffness that no wall can reach on all devices. ``status``: OK where
-        ``stiffness`` is within 1e-6 of ``limit``, UNDECIDED where only less could be proved (NaN if nothing could),
-        INVALID_INPUT or OUT_OF_RANGE with NaN for a box among arrays.
-
-    Raises:
-        InputError: as for `robust_max_stiffness`.
+        device of the box; ``limit``, a stiffness that no wall can reach on all devices. ``status`` as for
+        `robust_max_stiffness`.
 
     Numerics:
         The wall that suits some devices best, proved for all by branch and bound as in `robust_max_stiffness`; a part

@@ -73,9 +73,6 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
         negative, below -180 too; ``delay_margin`` is 0; ``phase_margin`` and ``gain_crossover`` are NaN if ``|L|`` is
         above 1 at every frequency, ``phase_margin`` also if beta <= -delta, where it decides nothing.
 
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
     Numerics:
         Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
         grow with d. The fraction of the delay is sampled 64 times a period, and the last change looked for between two

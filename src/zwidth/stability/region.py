@@ -88,9 +88,6 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
         its distance from the middle inside to unstable as far outside (the two at alpha = 0: along a soft column). It
         is False for a fractional power, which has no poles. ``area`` in units of alpha times beta, of the polygon.
 
-    Raises:
-        InputError: an argument is no single number in range, or ``delay`` is unknown.
-
     References:
         Hulin, Preusche, Hirzinger 2006, section V, Figs. 5 and 7.
 
