@@ -8,7 +8,6 @@ from .design.damping import FastestWall as FastestWall
 from .design.damping import fastest_damping as fastest_damping
 from .design.damping import fastest_wall as fastest_wall
 from .design.damping import most_robust_damping as most_robust_damping
-from .design.margin import modulus_margin as modulus_margin
 from .design.passive import passive_area as passive_area
 from .design.requirements import Requirement as Requirement
 from .design.requirements import allowed_delay as allowed_delay
@@ -49,6 +48,7 @@ from .stability.labels import is_stable as is_stable
 from .stability.labels import stability_of as stability_of
 from .stability.margins import Margins as Margins
 from .stability.margins import margins as margins
+from .stability.modulus import modulus_margin as modulus_margin
 from .stability.passivity import is_passive as is_passive
 from .stability.passivity import passivity_margin as passivity_margin
 from .stability.poles import poles as poles

@@ -23,53 +23,32 @@ _POLE_ACCURACY = 1e-9
 
 @dataclass(frozen=True)
 class Assessment:
-    """What `assess` finds; SI units unless a symbol is Greek. NaN where a quantity does not exist.
+    """What `assess` finds; SI units unless a symbol is Greek. NaN where a quantity does not exist."""
 
-    Attributes:
-        alpha, beta, delta, d: the normalized wall, device and delay.
-        stable: whether every pole lies strictly inside the unit circle; everything else agrees with it.
-        spectral_radius: the largest pole magnitude, 1 to rounding where the decay is very slow.
-        decay_rate: of the slowest motion, in 1/s, with relative accuracy; negative for a growing one.
-        stiffness_limit: the stiffest stable K at this B, in N/m.
-        virtual_damping_lower, virtual_damping_upper: the ends of the stable B at this K, in N s/m.
-        passive: whether the wall is passive at this delay.
-        passivity_margin: the physical damping in excess of what a passive wall needs, in N s/m.
-        alpha_max, beta_at_max: the stiffest stable wall of this device, normalized.
-        stiffness_max, virtual_damping_at_max: the same in N/m and N s/m.
-        ridge_kind: "smooth" or "corner".
-        time_constant: of the slowest pole, in s; negative for a growing one, infinite on the circle.
-        frequency: at which the slowest pole oscillates, in Hz; 0 for one that does not.
-        gain_margin: the factor by which K and B together may grow; below 1 the one to which they must fall.
-        phase_margin: in degrees; positive exactly for a stable wall.
-        delay_margin: how much more delay the wall bears, in s.
-        modulus_margin: the least distance of the open loop from -1.
-        gain_crossover, phase_crossover: where the first two are taken, in Hz.
-    """
-
-    alpha: float
+    alpha: float  # the normalized wall, device and delay
     beta: float
     delta: float
     d: float
-    stable: bool
-    spectral_radius: float
-    decay_rate: float
-    stiffness_limit: float
-    virtual_damping_lower: float
+    stable: bool  # every pole lies strictly inside the unit circle; everything else agrees with it
+    spectral_radius: float  # the largest pole magnitude, 1 to rounding where the decay is very slow
+    decay_rate: float  # of the slowest motion, in 1/s, with relative accuracy; negative for a growing one
+    stiffness_limit: float  # the stiffest stable K at this B, in N/m
+    virtual_damping_lower: float  # the ends of the stable B at this K, in N s/m
     virtual_damping_upper: float
-    passive: bool
-    passivity_margin: float
-    alpha_max: float
+    passive: bool  # at this delay
+    passivity_margin: float  # the physical damping in excess of what a passive wall needs, in N s/m
+    alpha_max: float  # the stiffest stable wall of this device
     beta_at_max: float
-    stiffness_max: float
+    stiffness_max: float  # the same in N/m and N s/m
     virtual_damping_at_max: float
-    ridge_kind: str
-    time_constant: float
-    frequency: float
-    gain_margin: float
-    phase_margin: float
-    delay_margin: float
-    modulus_margin: float
-    gain_crossover: float
+    ridge_kind: str  # "smooth" or "corner"
+    time_constant: float  # of the slowest pole, in s; negative for a growing one, infinite on the circle
+    frequency: float  # at which the slowest pole oscillates, in Hz; 0 for one that does not
+    gain_margin: float  # the factor by which K and B together may grow; below 1 the one to which they must fall
+    phase_margin: float  # in degrees; positive exactly for a stable wall
+    delay_margin: float  # how much more delay the wall bears, in s
+    modulus_margin: float  # the least distance of the open loop from -1
+    gain_crossover: float  # where the first two are taken, in Hz
     phase_crossover: float
 
     def as_dict(self) -> dict[str, Any]:

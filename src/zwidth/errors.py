@@ -11,7 +11,11 @@ class ZwidthError(Exception):
 
 
 class InputError(ZwidthError, ValueError):
-    """An argument that cannot be used as given."""
+    """An argument that cannot be used as given.
+
+    Every public function raises it where an argument is no real number, a single number is beyond its range, shapes do
+    not broadcast, or a name is not one of those listed. A bad entry of an array becomes NaN and spoils no other.
+    """
 
 
 class ConfigError(ZwidthError, ValueError):

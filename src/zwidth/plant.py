@@ -19,13 +19,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from zwidth import phi
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
+from zwidth.numerics import phi
 from zwidth.scene import normalize
 from zwidth.xp import namespace
 
-# x -> `zwidth.phi.PhiFunctions`, in any arithmetic
+# x -> `zwidth.numerics.phi.PhiFunctions`, in any arithmetic
 Functions = Callable[[Any], Any]
 
 

@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth import phi
 from zwidth._types import Array
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.grouping import degree_of
+from zwidth.numerics import phi
 from zwidth.scene import Scene
 from zwidth.settling import advance, settling_time
 
@@ -111,9 +111,6 @@ def step_response(
         wall applies then; all (periods * substeps,). ``final_position`` is force/alpha, NaN for alpha = 0.
         ``settling_time`` in periods is the last instant of all outside 2 % of it, however long was simulated: it comes
         from the poles, see `zwidth.settling`. NaN where the wall is not stable, and beyond d = 500.
-
-    Raises:
-        InputError: an argument is no single finite number, or out of range.
 
     Numerics:
         Exact between force changes up to rounding; float64, by NumPy. An unstable response that outgrows it ends as

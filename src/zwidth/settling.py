@@ -16,10 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth import phi
 from zwidth._types import Array
 from zwidth.grouping import degree_of
 from zwidth.loop import coefficients
+from zwidth.numerics import phi
+from zwidth.numerics.roots import bisect
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.poles import poles
 
@@ -35,7 +36,6 @@ _MISFIT = 1e-6
 _BLOCK = 1 << 16
 # How many such blocks are searched at most: some seconds.
 _MOST_BLOCKS = 1 << 12
-_BISECTIONS = 60
 
 
 class Modes(NamedTuple):
@@ -123,12 +123,8 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
 
 def _envelope_end(bound: np.ndarray, rate: np.ndarray, allowed: float) -> int:
     """The first period from which on the sum of the modes' sizes stays within the band."""
-    low, high = 0.0, float(np.max(np.log(np.maximum(bound * bound.size / allowed, 1.0)) / rate))
-    for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        inside = np.sum(bound * np.exp(-rate * middle)) <= allowed
-        low, high = (low, middle) if inside else (middle, high)
-    return math.ceil(high)
+    longest = np.max(np.log(np.maximum(bound * bound.size / allowed, 1.0)) / rate)
+    return math.ceil(bisect(lambda k: np.sum(bound * np.exp(-rate * k)) > allowed, np.float64(0.0), longest))
 
 
 def _last_outside(found: Modes, instants: np.ndarray, last: int, allowed: float) -> float:
@@ -148,14 +144,8 @@ def _last_outside(found: Modes, instants: np.ndarray, last: int, allowed: float)
             continue
         after = time[np.searchsorted(time, latest, side="right") :]
         inside = float(after[0]) if after.size else float(stop)
-        low, high = latest, inside
-        for _ in range(_BISECTIONS):
-            middle = 0.5 * (low + high)
-            if abs(found.deviation(np.array([middle]))[0]) > allowed:
-                low = middle
-            else:
-                high = middle
-        return low
+        ends = np.array([latest]), np.array([inside])
+        return float(bisect(lambda at: np.abs(found.deviation(at)) > allowed, *ends)[0])
     return 0.0
 
 

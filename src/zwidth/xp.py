@@ -59,6 +59,11 @@ def frozen(values: State, xp: Any) -> State:
     return stop_gradient(values)
 
 
+def along(values: np.ndarray, like: Any) -> Any:
+    """Values along a new last axis behind those of ``like``, and of its type."""
+    return namespace(like).asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
+
+
 def epsilon(value: Any) -> float:
     """The rounding unit of a value's type; that of float64 for plain numbers."""
     return float(np.finfo(getattr(value, "dtype", np.float64)).eps)

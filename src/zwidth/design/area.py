@@ -8,10 +8,9 @@ from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64, elementwise, is_traced
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_device
-from zwidth.stability.curve import device_of, lobe, spread, wall
+from zwidth.stability.curve import lobe, spread, wall
 from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.stability.open_loop import along
-from zwidth.xp import frozen, namespace
+from zwidth.xp import along, frozen, namespace
 
 # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic.
 _NODES = 48
@@ -33,9 +32,6 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
     Returns:
         Array of the broadcast shape; NaN out of range.
 
-    Raises:
-        InputError: a plain number is beyond its range, an argument is no real number, or shapes do not broadcast.
-
     Numerics:
         Gauss-Legendre quadrature of the closed form, about 1e-13. Traceable, with first derivatives: the area does
         not change to first order when the ends of the lobe move, so they count as fixed; second derivatives are not
@@ -56,7 +52,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
 def _area_kernel(delta: Array, d: Array, kind: Kind) -> Array:
     xp = namespace(delta, d)
-    curve = lobe(device_of(delta, d, "held", kind), d, "held", kind)
+    curve = lobe(delta, d, "held", kind)
     end = frozen(curve.end, xp)
     node, weight = (along(part, end) for part in (0.5 + 0.5 * _NODE, 0.5 * _WEIGHT))
     at = wall(end[..., None] * node, spread(curve))

@@ -9,15 +9,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import is_traced, pointwise, to_caller
-from zwidth.design.column import column, lobe
+from zwidth.batching import elementwise, is_traced, pointwise, to_caller
 from zwidth.design.lowest import Cost, lowest, without_slope
-from zwidth.design.margin import margin_kernel
+from zwidth.domain import device_status
 from zwidth.grouping import Degree, by_degree
+from zwidth.stability.curve import column, lobe, peak
+from zwidth.stability.devices import Kind
 from zwidth.stability.labels import is_stable
+from zwidth.stability.modulus import margin_kernel
 from zwidth.stability.poles import companion_chunk, radius_kernel
-from zwidth.stability.ridge import RidgePoint, alpha_max, ridge_kernel
+from zwidth.stability.ridge import occurring
 from zwidth.status import Status
+from zwidth.xp import frozen, namespace
 
 # Samples across a column, how many of their dips are refined, and by how many steps of golden section.
 _COLUMN = {"samples": 66, "dips": 3, "steps": 52}
@@ -53,15 +56,12 @@ def fastest_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Damping
         stable.
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
         TracedDelayError: d is traced.
 
     Numerics:
-        The optimum is usually a kink, where a pole pair meets on the real axis or another pole takes over: sampled
-        across the stable interval, then golden section round the lowest dips. The radius is right to about 1e-8, the
-        accuracy of a double pole, and below 1, or else nothing is returned. The interval relies on the single lobe of
-        the stable set, as pole counts found it. Traceable in alpha and delta, with NaN for derivatives: at a kink
-        there are none.
+        The optimum is usually a kink, where poles meet on the real axis or another takes over: sampled across the
+        stable interval, then golden section round the lowest dips. The radius is right to about 1e-8, the accuracy of
+        a double pole. Traceable in alpha and delta, with NaN for derivatives: at a kink there are none.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VIII.
@@ -73,7 +73,7 @@ def fastest_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Damping
         0.452 0.609
     """
     inputs = (alpha, delta, d)
-    lower, upper, status = _columns(*inputs)
+    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (occurring(d),))
     found = by_degree(
         _fastest_kernel,
         (alpha, lower, upper, delta, d),
@@ -105,25 +105,15 @@ def _radius_over(alpha: Array, delta: Array, d: Array, degree: Degree) -> Cost:
 def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> DampingChoice:
     """Find the virtual damping with the largest stability margin for a wall of this stiffness.
 
-    ``max over beta of min over omega |1 + L(e^(j omega))|``, see `zwidth.design.modulus_margin`: the loop that bears
+    ``max over beta of min over omega |1 + L(e^(j omega))|``, see `zwidth.modulus_margin`: the loop that bears
     the largest unknown multiplicative change of its inverse at every frequency.
 
     Args:
-        alpha: normalized stiffness K T^2/m, > 0.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not (held); concrete also inside `jit`. All three broadcast.
+        alpha, delta, d: as for `fastest_damping`.
 
     Returns:
-        DampingChoice: ``beta``; ``achieved``, the modulus margin; ``status``, NO_BOUNDARY with NaN where no beta is
-        stable.
-
-    Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
-        TracedDelayError: d is traced.
-
-    Numerics:
-        As `fastest_damping`; the margin is right to about 1e-12. Called directly or traced, the answer is returned
-        only where `zwidth.is_stable` finds it stable.
+        DampingChoice: ``beta``; ``achieved``, the modulus margin, right to about 1e-12 and returned only where
+        `zwidth.is_stable` finds the wall stable; ``status`` as for `fastest_damping`.
 
     References:
         Landau 1990 (modulus margin).
@@ -135,7 +125,7 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
         np.True_
     """
     inputs = (alpha, delta, d)
-    lower, upper, status = _columns(*inputs)
+    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (occurring(d),))
     names = ("alpha", "lower", "upper", "delta", "d")
     found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (), _CHUNK, least=_LEAST)
     # The margin says nothing of the side of the boundary.
@@ -150,27 +140,15 @@ def _robust_kernel(alpha: Array, lower: Array, upper: Array, delta: Array, d: Ar
     return beta, -achieved
 
 
-def _columns(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> tuple[Array, Array, Array]:
-    """The ends of the stable dampings, and a status; compiled once for both questions and every degree."""
-    # The ridge is traced where the stiffness alone is; else it shares the compilation of `alpha_max`.
-    traced = is_traced(alpha, delta, d)
-    ridge = pointwise(_ridge_kernel, _NAMES, (alpha, delta, d)) if traced else alpha_max(delta, d)
-    names = ("alpha", "delta", "d", "ridge.alpha", "ridge.omega", "ridge.status")
-    values = (alpha, delta, d, ridge.alpha, ridge.omega, ridge.status)
-    return pointwise(_column_kernel, names, values, (), _CHUNK, least=_LEAST)
-
-
-def _ridge_kernel(alpha: Array, delta: Array, d: Array) -> RidgePoint:
-    return ridge_kernel(delta, d, "held")
-
-
-def _column_kernel(
-    alpha: Array, delta: Array, d: Array, ridge_alpha: Array, ridge_omega: Array, status: Array
-) -> tuple[Array, Array, Array]:
-    lower, upper, exists = column(alpha, lobe(delta, d))
-    status = jnp.where((status == Status.OK) & ~exists, Status.NO_BOUNDARY, status)
-    status = jnp.where(jnp.isfinite(alpha), status, Status.INVALID_INPUT)
-    return lower, upper, status.astype(jnp.int32)
+def _column_kernel(alpha: Array, delta: Array, d: Array, kind: Kind) -> tuple[Array, Array, Array]:
+    """The ends of the stable dampings, and a status."""
+    xp = namespace(alpha, delta, d)
+    alpha, delta, d = frozen((alpha, delta, d), xp)
+    curve, status = lobe(delta, d, "held", kind), device_status(delta, d)
+    lower, upper, exists = column(alpha, curve, peak(curve, "held", kind))
+    status = xp.where((status == Status.OK) & ~exists, int(Status.NO_BOUNDARY), status)
+    status = xp.where(xp.isfinite(alpha), status, int(Status.INVALID_INPUT))
+    return lower, upper, status.astype(np.int32)
 
 
 def _answer(found: tuple[Array, Array], good: Array, status: Array, inputs: tuple[ArrayLike, ...]) -> DampingChoice:
@@ -210,7 +188,6 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
         is not 0.
 
     Raises:
-        InputError: an argument is no real number, or shapes do not broadcast.
         TracedDelayError: d is traced.
 
     Numerics:
@@ -227,25 +204,22 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
         >>> print(f"{wall.alpha:.2f} {wall.beta:.2f} {wall.spectral_radius:.2f}")
         0.07 0.41 0.59
     """
-    ridge = alpha_max(delta, d)
-    names = ("delta", "ridge.alpha", "ridge.omega", "ridge.status", "d")
-    values = (delta, ridge.alpha, ridge.omega, ridge.status, d)
-    return by_degree(_wall_kernel, values, names=names, chunk=companion_chunk, threads=_THREADS)
+    return by_degree(_wall_kernel, (delta, d), names=("delta", "d"), chunk=companion_chunk, threads=_THREADS)
 
 
-def _wall_kernel(
-    delta: Array, ridge_alpha: Array, ridge_omega: Array, status: Array, d: Array, degree: Degree
-) -> FastestWall:
-    device = lobe(delta, d)
+def _wall_kernel(delta: Array, d: Array, degree: Degree) -> FastestWall:
+    kind = Kind(degree.whole == 0, degree.whole > 0, degree.fractional)
+    curve = frozen(lobe(delta, d, "held", kind), jnp)
+    top = peak(curve, "held", kind)
+    status = device_status(delta, d)
 
     def best_damping(alpha: Array) -> tuple[Array, Array]:
-        stable = column(alpha, device)
-        cost = _radius_over(alpha, delta, d, degree)
-        beta, radius, _ = lowest(cost, stable.lower, stable.upper, **_COLUMN)
+        lower, upper, exists = column(alpha, curve, top)
+        beta, radius, _ = lowest(_radius_over(alpha, delta, d, degree), lower, upper, **_COLUMN)
         # Without stiffness, and on the ridge, a pole is on the circle.
-        return jnp.where(stable.exists, radius, 1.0), beta
+        return jnp.where(exists, radius, 1.0), beta
 
-    alpha, radius, beta = lowest(jax.vmap(best_damping), jnp.zeros_like(delta), ridge_alpha, **_WALL)
+    alpha, radius, beta = lowest(jax.vmap(best_damping), jnp.zeros_like(delta), top.alpha, **_WALL)
     bad = jnp.where(status == Status.OK, 0.0, jnp.nan).astype(alpha.dtype)
     alpha, beta, radius = without_slope((alpha + bad, beta + bad, radius + bad), (delta, d))
     return FastestWall(alpha, beta, radius, status.astype(jnp.int32))

@@ -21,8 +21,7 @@ from zwidth.batching import elementwise
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_device
 from zwidth.stability.needed_damping import directions, needed_damping
-from zwidth.stability.open_loop import along
-from zwidth.xp import frozen, namespace
+from zwidth.xp import along, frozen, namespace
 
 # Gauss-Legendre nodes for each of the three parts.
 _NODES = (64, 64, 32)
@@ -43,9 +42,6 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
 
     Returns:
         Array of the broadcast shape; NaN out of range (see `zwidth.domain`).
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
         Gauss-Legendre quadrature between the kinks of ``needed``: about 1e-14 relative, at a cost that does not grow

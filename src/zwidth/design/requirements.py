@@ -1,9 +1,14 @@
-"""What a device needs for a wanted stiffness: damping, sampling period, shortness of delay, or mass.
+"""What a device needs for a wanted stiffness: damping, sampling period, shortness of delay, or mass (rigid loop).
 
-Every answer is a zero of ``log(K_max/K)`` in one quantity with the others fixed. The search is bracketed by bounds that
+Every answer is the last zero of K_max - K in one quantity with the others fixed. The search is bracketed by bounds that
 were found over delta from 0 to 1e5 and d from 0 to 1e6, with room to spare:
 
     0.2 (1/D^2 + delta/D) < alpha_max(delta, d) < 6 (1/D^2 + delta/D)     D = d + 1
+
+Over that range K_max was found to rise with the damping, and to fall with the period at a fixed number of periods of
+delay. In the mass (damping may dominate), in the delay (d < 0.17 and delta > 6) and in the period at a delay in seconds
+(by 1.2 % at strong damping) it is not quite monotone: samples a few percent apart show the last zero. K_max at the
+answer equals K to 2e-14; derivatives are those of the implicit function, 0 where nothing is required.
 """
 
 from __future__ import annotations
@@ -14,24 +19,32 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise
-from zwidth.design.crossing import outermost_zero
 from zwidth.design.stiffness import check_stiffness, checked_device
 from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, within
 from zwidth.errors import InputError
 from zwidth.loop import poison
+from zwidth.numerics.roots import last_cell, newton
 from zwidth.scene import denormalize, in_periods, normalize, quantity_status
-from zwidth.stability.ridge import ridge_kernel, slopes_kernel
+from zwidth.stability.devices import ANY, Kind
+from zwidth.stability.ridge import occurring, ridge_kernel, slopes_kernel
 from zwidth.status import Status
-from zwidth.xp import namespace
+from zwidth.xp import frozen, namespace
 
 _LEAST, _MOST = 0.2, 6.0
-# A hundred samples of a lobe at a time: what a block needs stays in the cache.
+# Enough for two zeros that all but meet; in NumPy a few steps end it.
+_STEPS = 24
+_ENTERING = ("strength", "lag", "scale")
+# A hundred samples of a point at a time: what a block needs stays in the cache.
 _BLOCK = 1 << 6
 _FEW = 1 << 9
 
 
 class Requirement(NamedTuple):
-    """The value asked for, in SI units, and a `zwidth.Status`."""
+    """The value asked for, in SI units, and a `zwidth.Status`.
+
+    NaN where an entry is out of range, or the answer would be (OUT_OF_RANGE: SI quantities are 0 or 1e-30 to 1e30,
+    delta at most 1e12, d at most 1e5), and where nothing is enough (UNREACHABLE).
+    """
 
     value: Array
     status: Array
@@ -40,77 +53,100 @@ class Requirement(NamedTuple):
 class _Path(NamedTuple):
     """How the wanted quantity x enters: ``delta = strength x^a``, ``d = lag x^b``, ``K_max/K = alpha_max scale x^p``.
 
-    ``outwards`` is the sign with which ``log(K_max/K)`` turns negative towards large x.
+    The misfit is ``(K/K_max)^outwards - 1``: positive at large x, and there all but a power of x.
     """
 
     strength: Array
     lag: Array
     scale: Array
+    kind: Kind
     a: int = 0
     b: int = 0
     p: int = 0
-    outwards: float = 1.0
+    outwards: int = 1
 
     def device(self, x: Array) -> tuple[Array, Array]:
         """(delta, d) at x."""
-        xp = namespace(x, self.scale)
-        delta, d = xp.broadcast_arrays(_times_power(self.strength, x, self.a), _times_power(self.lag, x, self.b))
-        return delta, d
+        return self.strength * x**self.a, self.lag * x**self.b
 
-    def value(self, x: Array) -> Array:
-        """The logarithm of K_max/K, signed."""
-        alpha = ridge_kernel(*self.device(x), "held").alpha
-        return self._signed_log(alpha, x)
+    def misfit(self, x: Array) -> Array:
+        """``(K/K_max)^outwards - 1`` at x."""
+        alpha = ridge_kernel(*self.device(x), "held", self.kind).alpha
+        return (alpha * self.scale * x**self.p) ** -self.outwards - 1.0
 
-    def value_and_slope(self, x: Array) -> tuple[Array, Array]:
-        """The same with its derivative in x."""
-        delta, d = self.device(x)
-        point, by_delta, by_d = slopes_kernel(delta, d, "held")
-        slope = by_delta * _power_slope(self.strength, x, self.a) + by_d * _power_slope(self.lag, x, self.b)
+    def at_samples(self, x: Array) -> Array:
+        """The same along a new last axis."""
+        wide = self._replace(**{name: getattr(self, name)[..., None] for name in _ENTERING})
+        return wide.misfit(x)
+
+    def with_slope(self, x: Array) -> tuple[Array, Array]:
+        """The misfit with its derivative in x."""
+        point, by_delta, by_d = slopes_kernel(*self.device(x), "held", self.kind)
+        slope = by_delta * self.strength * self.a * x ** (self.a - 1) if self.a else 0.0 * x
+        slope = slope + by_d * self.lag * self.b * x ** (self.b - 1) if self.b else slope
         slope = slope / point.alpha + (self.p / x if self.p else 0.0)
-        return self._signed_log(point.alpha, x), self.outwards * slope
-
-    def _signed_log(self, alpha: Array, x: Array) -> Array:
-        xp = namespace(alpha)
-        return self.outwards * xp.log(_times_power(alpha * self.scale, x, self.p))
-
-
-def _times_power(factor: Array, x: Array, exponent: int) -> Array:
-    return factor if exponent == 0 else factor * x**exponent if exponent > 0 else factor / x**-exponent
-
-
-def _power_slope(factor: Array, x: Array, exponent: int) -> Array:
-    return 0.0 * x if exponent == 0 else factor + 0.0 * x if exponent == 1 else -factor / (x * x)
+        ratio = (point.alpha * self.scale * x**self.p) ** -self.outwards
+        return ratio - 1.0, -self.outwards * ratio * slope
 
 
 def _solved(
-    path: _Path, bracket: tuple[Array, Array, Array], unit: Array, given: Array, inputs: tuple, free: bool = False
+    path: _Path,
+    bracket: tuple[Array, Array],
+    unit: Array,
+    given: Array,
+    inputs: tuple,
+    *,
+    start: Array | None = None,
+    offset: Array | float = 0.0,
+    free: bool = False,
 ) -> Requirement:
-    """Solve for x and give ``x unit`` with its status. ``free``: a function that is never 0 requires nothing at all."""
+    """Solve for x and give ``x unit`` with its status.
+
+    Args:
+        start: where to begin on a path that is monotone; without it the last zero is looked for.
+        offset: lets samples of equal ratios begin at 0.
+        free: where the misfit is never 0, nothing at all is required.
+    """
     xp = namespace(unit, *inputs)
-    lifted = path._replace(strength=path.strength[None], lag=path.lag[None], scale=path.scale[None])
-    inner, outer, offset = (xp.broadcast_to(value, unit.shape)[None] for value in bracket)
-    x, found = (leaf[0] for leaf in outermost_zero(lifted.value, lifted.value_and_slope, inner, outer, offset))
-    # Cut off by the domain, the bracket does not end where the function is negative.
-    beyond = ~(lifted.value(outer)[0] < 0.0)
-    found = found & ~beyond
+    still = path._replace(**frozen({name: getattr(path, name) for name in _ENTERING}, xp))
+    inner, outer = frozen(bracket, xp)
+    # Cut off by the domain, the bracket may end short of any zero.
+    beyond = ~(still.misfit(outer) > 0.0)
+    if start is None:
+        low, high, crossed = last_cell(still.at_samples, inner, outer, offset + 0.0 * inner)
+        x, _ = newton(still.with_slope, low, high, high, _STEPS)
+        # Between samples that are all short of K a peak may touch it.
+        crossed = crossed | (xp.abs(still.misfit(x)) <= 1e-12)
+    else:
+        crossed = ~(still.misfit(inner) > 0.0)
+        x, _ = newton(still.with_slope, inner, outer, frozen(start, xp), _STEPS)
+    x = frozen(x, xp)
+    for _ in range(0 if xp is np else 2):
+        # Each of these steps makes one more order of derivatives exact.
+        value, slope = path.with_slope(x)
+        step = value / slope
+        x = x - xp.where(xp.abs(step) <= 1e-3 * xp.abs(x), step, 0.0)
+    x = xp.where(x < inner, inner, x)
+    found = crossed & ~beyond
     value = xp.where(found, x, 0.0) * unit
-    delta, d = (leaf[0] for leaf in lifted.device(xp.where(found, x, outer[0])[None]))
+    delta, d = path.device(xp.where(found, x, outer))
     inside = within(value, SI_RANGE) & (device_status(delta, d) == Status.OK) & ~beyond
     status = xp.where(found | free, int(Status.OK), int(Status.UNREACHABLE))
     status = xp.where(given == Status.OK, xp.where(inside, status, int(Status.OUT_OF_RANGE)), given)
     return Requirement(value + poison(status == Status.OK, *inputs), status.astype(np.int32))
 
 
-def _safe(*inputs: Array, **quantities: Array) -> tuple[Array, ...]:
-    """The status of the inputs, then the inputs with harmless numbers in place of bad ones."""
-    given = quantity_status(**quantities)
-    xp = namespace(*inputs)
-    return given, *(xp.where(given == Status.OK, value, 1.0) for value in inputs)
+def _safe(**quantities: Array) -> tuple[Any, ...]:
+    """The status of the inputs, the inputs, and each of them with a harmless number in place of a bad one."""
+    given, values = quantity_status(**quantities), tuple(quantities.values())
+    xp = namespace(*values)
+    return given, values, *(xp.where(given == Status.OK, value, 1.0) for value in values)
 
 
-def _answer(kernel: Any, names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Requirement:
-    return elementwise(kernel, names, values, few=_FEW, block=_BLOCK)
+def _answer(kernel: Any, known: ArrayLike | None = None, /, **values: ArrayLike) -> Requirement:
+    """Apply a kernel; ``known`` are the delays in periods where the question fixes them."""
+    kind = ANY if known is None else occurring(known)
+    return elementwise(kernel, tuple(values), tuple(values.values()), (kind,), few=_FEW, block=_BLOCK)
 
 
 def required_damping(
@@ -128,15 +164,7 @@ def required_damping(
         delay: t_d in s, >= 0. All four broadcast.
 
     Returns:
-        Requirement: ``value`` in N s/m; ``status``. NaN where an entry is out of range, or the answer would be
-        (OUT_OF_RANGE: SI quantities are 0 or 1e-30 to 1e30, delta at most 1e12, d at most 1e5).
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
-    Numerics:
-        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem
-        (0 where no damping is needed).
+        `Requirement` in N s/m.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -147,22 +175,21 @@ def required_damping(
         10.24 N s/m
     """
     check_stiffness(stiffness)
-    checked_device(mass=mass, period=period, delay=delay)
-    return _answer(_damping_kernel, ("stiffness", "mass", "period", "delay"), (stiffness, mass, period, delay))
+    device = checked_device(mass=mass, period=period, delay=delay)
+    return _answer(_damping_kernel, device.d, stiffness=stiffness, mass=mass, period=period, delay=delay)
 
 
-def _damping_kernel(stiffness: Array, mass: Array, period: Array, delay: Array) -> Requirement:
-    inputs = (stiffness, mass, period, delay)
-    given, stiffness, mass, period, delay = _safe(
-        *inputs, wanted_stiffness=stiffness, mass=mass, period=period, delay=delay
+def _damping_kernel(stiffness: Array, mass: Array, period: Array, delay: Array, kind: Kind) -> Requirement:
+    given, inputs, stiffness, mass, period, delay = _safe(
+        wanted_stiffness=stiffness, mass=mass, period=period, delay=delay
     )
     xp = namespace(*inputs)
     rate, d = mass / period, in_periods(delay, period)
     wanted = stiffness * period / rate
-    # In delta; outwards is towards more damping, and the offset lets the samples start at 0.
+    # In delta.
     enough = xp.minimum(wanted * (d + 1.0) / _LEAST, LARGEST_DAMPING)
-    path = _Path(xp.ones_like(d), d, 1.0 / wanted, a=1, outwards=-1.0)
-    return _solved(path, (0.0 * d, enough, xp.minimum(1e-3, 1e-3 * enough)), rate, given, inputs, free=True)
+    path = _Path(xp.ones_like(d)[()], d, 1.0 / wanted, kind, a=1, outwards=-1)
+    return _solved(path, (0.0 * d, enough), rate, given, inputs, start=_LEAST * enough, free=True)
 
 
 def required_period(
@@ -188,15 +215,7 @@ def required_period(
         delay_periods: d = t_d/T, >= 0. Everything broadcasts.
 
     Returns:
-        Requirement: ``value`` in s; ``status``, UNREACHABLE with NaN where no rate is enough; OUT_OF_RANGE as for
-        `required_damping`.
-
-    Raises:
-        InputError: not exactly one delay is given, a scalar is out of range, an argument is no real number, or
-            shapes do not broadcast.
-
-    Numerics:
-        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem.
+        `Requirement` in s, UNREACHABLE where no rate is enough.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -209,15 +228,16 @@ def required_period(
     given = [name for name, value in (("delay", delay), ("delay_periods", delay_periods)) if value is not None]
     if len(given) != 1:
         raise InputError(f"delay, delay_periods: got {' and '.join(given) or 'neither'}; give exactly one of the two")
-    fixed = delay if delay_periods is None else delay_periods
     check_stiffness(stiffness)
     normalize(mass=mass, damping=damping, period=1.0)
     if delay is not None:
         normalize(mass=1.0, period=1.0, delay=delay)
-    else:
-        denormalize(mass=1.0, period=1.0, d=delay_periods)
-    kernel = _period_kernel if delay_periods is None else _period_in_periods_kernel
-    return _answer(kernel, ("stiffness", "mass", "damping", given[0]), (stiffness, mass, damping, fixed))
+        return _answer(_period_kernel, stiffness=stiffness, mass=mass, damping=damping, delay=delay)
+    denormalize(mass=1.0, period=1.0, d=delay_periods)
+    assert delay_periods is not None
+    return _answer(
+        _period_in_periods_kernel, delay_periods, stiffness=stiffness, mass=mass, damping=damping, d=delay_periods
+    )
 
 
 def _period_at(bound: float, stiffness: Array, mass: Array, damping: Array, D: Array) -> Array:
@@ -227,27 +247,25 @@ def _period_at(bound: float, stiffness: Array, mass: Array, damping: Array, D: A
     return (linear + xp.sqrt(linear * linear + 4.0 * stiffness * constant)) / (2.0 * stiffness)
 
 
-def _period_in_periods_kernel(stiffness: Array, mass: Array, damping: Array, d: Array) -> Requirement:
-    inputs = (stiffness, mass, damping, d)
-    given, stiffness, mass, damping, d = _safe(*inputs, wanted_stiffness=stiffness, mass=mass, damping=damping, d=d)
+def _period_in_periods_kernel(stiffness: Array, mass: Array, damping: Array, d: Array, kind: Kind) -> Requirement:
+    given, inputs, stiffness, mass, damping, d = _safe(wanted_stiffness=stiffness, mass=mass, damping=damping, d=d)
+    xp = namespace(*inputs)
     shortest, longest = (_period_at(bound, stiffness, mass, damping, d + 1.0) for bound in (_LEAST, _MOST))
-    path = _Path(damping / mass, d, mass / stiffness, a=1, p=-2)
-    return _solved(path, (shortest, longest, 0.0 * d), 0.0 * d + 1.0, given, inputs)
+    path = _Path(damping / mass, d, mass / stiffness, kind, a=1, p=-2)
+    between = xp.sqrt(shortest) * xp.sqrt(longest)
+    return _solved(path, (shortest, longest), xp.ones_like(d)[()], given, inputs, start=between)
 
 
-def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array) -> Requirement:
-    inputs = (stiffness, mass, damping, delay)
-    given, stiffness, mass, damping, delay = _safe(
-        *inputs, wanted_stiffness=stiffness, mass=mass, damping=damping, delay=delay
+def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array, kind: Kind) -> Requirement:
+    given, inputs, stiffness, mass, damping, delay = _safe(
+        wanted_stiffness=stiffness, mass=mass, damping=damping, delay=delay
     )
     xp = namespace(*inputs)
-    longest = _period_at(_MOST, stiffness, mass, damping, 1.0)
-    without_delay = _period_at(_LEAST, stiffness, mass, damping, 1.0)
+    without_delay, longest = (_period_at(bound, stiffness, mass, damping, 1.0) for bound in (_LEAST, _MOST))
     # A delay of 1e5 periods, the longest that the model takes, is as good as continuous time, to 1e-5 of K.
     shortest = xp.where(delay > 0, xp.maximum(1.001 * delay / LONGEST_DELAY, 1e-6 * without_delay), without_delay)
-    shortest = xp.minimum(shortest, longest)
-    path = _Path(damping / mass, delay, mass / stiffness, a=1, b=-1, p=-2)
-    return _solved(path, (shortest, longest, 0.0 * delay), 0.0 * delay + 1.0, given, inputs)
+    path = _Path(damping / mass, delay, mass / stiffness, kind, a=1, b=-1, p=-2)
+    return _solved(path, (xp.minimum(shortest, longest), longest), xp.ones_like(delay)[()], given, inputs)
 
 
 def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike) -> Requirement:
@@ -263,14 +281,7 @@ def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike =
         period: T in s, > 0. All four broadcast.
 
     Returns:
-        Requirement: ``value`` in s; ``status``, UNREACHABLE with NaN where even the best delay is not enough;
-        OUT_OF_RANGE as for `required_damping`.
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
-    Numerics:
-        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem.
+        `Requirement` in s, UNREACHABLE where even the best delay is not enough.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -282,22 +293,19 @@ def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike =
     """
     check_stiffness(stiffness)
     checked_device(mass=mass, damping=damping, period=period)
-    return _answer(_delay_kernel, ("stiffness", "mass", "damping", "period"), (stiffness, mass, damping, period))
+    return _answer(_delay_kernel, stiffness=stiffness, mass=mass, damping=damping, period=period)
 
 
-def _delay_kernel(stiffness: Array, mass: Array, damping: Array, period: Array) -> Requirement:
-    inputs = (stiffness, mass, damping, period)
-    given, stiffness, mass, damping, period = _safe(
-        *inputs, wanted_stiffness=stiffness, mass=mass, damping=damping, period=period
+def _delay_kernel(stiffness: Array, mass: Array, damping: Array, period: Array, kind: Kind) -> Requirement:
+    given, inputs, stiffness, mass, damping, period = _safe(
+        wanted_stiffness=stiffness, mass=mass, damping=damping, period=period
     )
     xp = namespace(*inputs)
     delta, wanted = damping * period / mass, stiffness * (period / mass) * period
     # alpha_max < 6 (1/D^2 + delta/D) at D = d + 1
-    linear = _MOST * delta
-    longest = (linear + xp.sqrt(linear * linear + 4.0 * wanted * _MOST)) / (2.0 * wanted)
-    longest = xp.minimum(xp.maximum(longest, 1.5) - 1.0, LONGEST_DELAY)
-    path = _Path(delta, 0.0 * delta + 1.0, 1.0 / wanted, b=1)
-    return _solved(path, (0.0 * delta, longest, 0.0 * delta + 1.0), period, given, inputs)
+    longest = xp.minimum(xp.maximum(_period_at(_MOST, wanted, 1.0, delta, 1.0), 1.5) - 1.0, LONGEST_DELAY)
+    path = _Path(delta, xp.ones_like(delta)[()], 1.0 / wanted, kind, b=1)
+    return _solved(path, (0.0 * delta, longest), period, given, inputs, offset=1.0)
 
 
 def required_mass(
@@ -316,15 +324,7 @@ def required_mass(
         delay: t_d in s, >= 0. All four broadcast.
 
     Returns:
-        Requirement: ``value`` in kg; ``status``. NaN where an entry is out of range, or the answer would be, see
-        `required_damping`.
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
-    Numerics:
-        K_max at the answer equals K to 2e-14. Traceable, with derivatives by the implicit function theorem
-        (0 where any mass will do).
+        `Requirement` in kg.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -335,22 +335,20 @@ def required_mass(
         0.1010 kg
     """
     check_stiffness(stiffness)
-    checked_device(mass=1.0, damping=damping, period=period, delay=delay)
-    return _answer(_mass_kernel, ("stiffness", "damping", "period", "delay"), (stiffness, damping, period, delay))
+    device = checked_device(mass=1.0, damping=damping, period=period, delay=delay)
+    return _answer(_mass_kernel, device.d, stiffness=stiffness, damping=damping, period=period, delay=delay)
 
 
-def _mass_kernel(stiffness: Array, damping: Array, period: Array, delay: Array) -> Requirement:
-    inputs = (stiffness, damping, period, delay)
-    given, stiffness, damping, period, delay = _safe(
-        *inputs, wanted_stiffness=stiffness, damping=damping, period=period, delay=delay
+def _mass_kernel(stiffness: Array, damping: Array, period: Array, delay: Array, kind: Kind) -> Requirement:
+    given, inputs, stiffness, damping, period, delay = _safe(
+        wanted_stiffness=stiffness, damping=damping, period=period, delay=delay
     )
     xp = namespace(*inputs)
     d = in_periods(delay, period)
-    D = d + 1.0
-    heaviest = stiffness * (period * D) ** 2 / _LEAST
+    heaviest = stiffness * (period * (d + 1.0)) ** 2 / _LEAST
     # The undamped device answers above the second bound; the lightest one has the largest delta.
     lightest = xp.where(damping > 0, damping * period / LARGEST_DAMPING, heaviest * _LEAST / _MOST)
     # No device so light that the damping drowns its mass is needed to see where K_max rises.
     lightest = xp.minimum(xp.maximum(lightest, 1e-12 * heaviest), 0.01 * heaviest)
-    path = _Path(damping * period, d, 1.0 / (stiffness * period * period), a=-1, p=1, outwards=-1.0)
-    return _solved(path, (lightest, heaviest, 0.0 * d), 0.0 * d + 1.0, given, inputs, free=True)
+    path = _Path(damping * period, d, 1.0 / (stiffness * period * period), kind, a=-1, p=1, outwards=-1)
+    return _solved(path, (lightest, heaviest), xp.ones_like(d)[()], given, inputs, free=True)

@@ -17,6 +17,7 @@ from zwidth.batching import as_float64
 from zwidth.design.stiffness import max_stiffness
 from zwidth.domain import SI_RANGE, within
 from zwidth.errors import InputError
+from zwidth.numerics.roots import bisect
 from zwidth.scene import normalize
 from zwidth.stability.affine import quantities, stable_everywhere
 from zwidth.stability.boundary import boundary_point
@@ -33,7 +34,6 @@ _LOOSER = (1e-4, 1e-2, 0.1)
 _MOST_PARTS, _AT_ONCE = 1 << 18, 1 << 11
 # Rounds of proof and counterexample.
 _ROUNDS = 40
-_BISECTIONS = 60
 _SEARCH_ROUNDS = 60
 # Shares this close to 0 or 1 are taken for it.
 _AT_END = 1e-12
@@ -116,19 +116,12 @@ def robust_wall(*, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain,
     """Find the stiffest single wall (K, B) that is stable on every device of a box.
 
     Args:
-        mass: m in kg, > 0: an `Interval`, or what is known exactly; likewise the others.
-        damping: b in N s/m, >= 0.
-        period: T in s, > 0.
-        delay: t_d in s, >= 0, held. All broadcast, the ends of intervals too: a box for each entry.
+        mass, damping, period, delay: as for `robust_max_stiffness`.
 
     Returns:
         RobustWall of the broadcast shape: ``stiffness`` in N/m and ``virtual_damping`` in N s/m, proved stable on every
-        device of the box; ``limit``, a stiffness that no wall can reach on all devices. ``status``: OK where
-        ``stiffness`` is within 1e-6 of ``limit``, UNDECIDED where only less could be proved (NaN if nothing could),
-        INVALID_INPUT or OUT_OF_RANGE with NaN for a box among arrays.
-
-    Raises:
-        InputError: as for `robust_max_stiffness`.
+        device of the box; ``limit``, a stiffness that no wall can reach on all devices. ``status`` as for
+        `robust_max_stiffness`.
 
     Numerics:
         The wall that suits some devices best, proved for all by branch and bound as in `robust_max_stiffness`; a part
@@ -336,17 +329,18 @@ def _best_wall(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
         lower, upper = _stable_dampings(stiffness, devices)
         return float(np.max(lower)), float(np.min(upper))
 
-    low, high = 0.0, float(np.min(_stiffest(devices)))
-    for _ in range(_BISECTIONS):
-        trial = 0.5 * (low + high)
-        lower, upper = common(trial)
-        low, high = (trial, high) if lower < upper else (low, trial)
+    def suits(stiffness: np.ndarray) -> np.ndarray:
+        lower, upper = common(float(stiffness))
+        return np.asarray(lower < upper)
+
+    # Rounded up: no wall reaches it.
+    limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_stiffest(devices))), np.inf))
 
     def middle(stiffness: float) -> float:
         lower, upper = common(stiffness)
         return 0.5 * (lower + upper)
 
-    return high, middle
+    return limit, middle
 
 
 def _wall(low: np.ndarray, high: np.ndarray) -> tuple:

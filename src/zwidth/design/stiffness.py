@@ -52,14 +52,9 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
     Returns:
         Array of the broadcast shape, in N/m; an entry of an array that is out of range gives NaN.
 
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
     Numerics:
-        About 1e-15 relative. Traceable, with first and second derivatives. Over delta from 0 to 1e5 and d from 0 to
-        1e6 K_max was found to rise with the damping everywhere. It falls with the delay except for d < 0.17 and
-        delta > 6, with the period at a fixed number of periods of delay everywhere (at a delay fixed in seconds it
-        may rise by up to 1.2 % at strong damping), and rises with the mass unless damping dominates.
+        About 1e-15 relative. Traceable, with first and second derivatives. How it moves with each quantity stands in
+        `zwidth.design.requirements`.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -113,15 +108,9 @@ def sensitivities(
         Sensitivities of the broadcast shape: ``stiffness_max`` in N/m, ``per_mass`` in N/m per kg, ``per_damping``
         in N/m per N s/m, ``per_period`` and ``per_delay`` in N/m per s; ``status``, with NaN where it is not 0.
 
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
     Numerics:
-        Exact derivatives, about 1e-14. At zero damping and at zero delay they are those from the right. At every
-        other whole d both sides agree, since a force that arrives a little later moves the sampled position by a
-        little times the velocity, which is continuous; second derivatives there are those from the right, and for
-        strong damping the first turns within about m/b around it. With the fractional power strong damping makes
-        ``per_delay`` -inf at zero delay. Traceable.
+        Exact derivatives, about 1e-14. Both sides agree at whole d > 0; at zero damping and zero delay they are those
+        from the right (-inf for ``per_delay`` of the fractional power at strong damping). Traceable.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII.
@@ -171,17 +160,11 @@ def sensitivity_lines(
     Each line is a derivative times a step: one N s/m, and about one percent of the mass and of the period.
 
     Args:
-        mass: m in kg, > 0.
-        damping: b in N s/m, >= 0.
-        period: T in s, > 0.
-        delay: t_d in s, >= 0. Single numbers.
+        mass, damping, period, delay: single numbers as for `sensitivities`.
         delay_model: "held" or "fractional_power".
 
     Returns:
         Four lines: damping, mass, sampling period (at the same delay in seconds), delay.
-
-    Raises:
-        InputError: an argument is no single number in range.
 
     Example:
         >>> from zwidth.design.stiffness import sensitivity_lines

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.phi import PhiFunctions
+from zwidth.numerics.phi import PhiFunctions
 from zwidth.plant import discretized
 from zwidth.stability.crossover import Lag, Verdict, first_zero, gain_cubic, long_verdict, short_verdict
 from zwidth.stability.devices import Device

@@ -1,4 +1,4 @@
-"""The stability boundary: its closed form, and exact points on a given line."""
+"""The stability boundary of the rigid loop: its closed form, and exact points on a given line."""
 
 from __future__ import annotations
 
@@ -11,26 +11,24 @@ from zwidth.batching import elementwise, is_traced
 from zwidth.domain import WALL_RANGE, check_scalars, wall_status, within
 from zwidth.errors import InputError, check_choice
 from zwidth.loop import BoundaryCurve, check_delay_model, frequency_boundary, frequency_loop, poison, valid_device
+from zwidth.numerics.roots import bisect, newton
 from zwidth.stability.crossover import stable_at
 from zwidth.stability.curve import (
     Lobe,
     RowEnd,
-    bisect_place,
     column_end,
     creeps,
-    device_of,
     frequency,
     lobe,
+    on_line,
     peak,
     row_end,
     spread,
     wall,
 )
-from zwidth.stability.devices import ANY, Device, Kind, kind_of
-from zwidth.stability.open_loop import along
-from zwidth.stability.row_limit import short_row
+from zwidth.stability.devices import ANY, Kind, kind_of
 from zwidth.status import Status
-from zwidth.xp import epsilon, frozen, namespace, repeat
+from zwidth.xp import along, epsilon, frozen, namespace
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 _METHODS: tuple[str, ...] = ("auto", "optimistix")
@@ -61,10 +59,6 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
         values are the limits. They are finite unless the curve runs to infinity at pi: where N(-1) = 0, as for
         delta = 0 and whole d (for held delays between whole numbers it vanishes at one damping, if at all), and for a
         fractional power.
-
-    Raises:
-        InputError: a plain number is beyond its range, an argument is no real number, shapes do not broadcast, or
-            ``delay`` is unknown.
 
     Numerics:
         A few units in the last place, at a cost that does not grow with d. Traceable, also in d (derivatives at whole
@@ -136,8 +130,7 @@ def boundary_point(
         crossing ahead, or lies closer to omega = pi than its digits allow (a fractional power of almost 0).
 
     Raises:
-        InputError: not exactly one line is given, a plain number is beyond its range, an argument is no real number,
-            or a name is unknown.
+        InputError: not exactly one line is given, or as `zwidth.InputError` says.
 
     Numerics:
         alpha and ``beta + delta`` to about 1e-15 relative, times the condition of the line: close to the ridge a column
@@ -177,7 +170,7 @@ def boundary_point(
         from zwidth.stability.boundary_solve import solved_point
 
         return solved_point(names, everything, line, delay)
-    return elementwise(_KERNELS[line], ("delta", "d", *names), everything, (line, delay, _kind(d)))
+    return elementwise(_point_kernel, ("delta", "d", *names), everything, (line, delay, _kind(d)))
 
 
 def _four(ray: Any) -> tuple[ArrayLike, ...]:
@@ -200,132 +193,115 @@ def _kind(d: ArrayLike) -> Kind:
         return ANY
 
 
-def _row_kernel(delta: Array, d: Array, beta: Array, line: str, delay: str, kind: Kind) -> BoundaryPoint:
-    xp = namespace(delta, d, beta)
-    given = wall_status(0.0 * beta, beta, delta, d)
-    here = device_of(delta, d, delay, kind)
-    curve = lobe(here, d, delay, kind)
+class _Ray(NamedTuple):
+    """A ray from (alpha, beta), or from (alpha, b) with b = beta + delta where points of the lobe are compared."""
+
+    alpha: Array
+    beta: Array
+    dalpha: Array
+    dbeta: Array
+
+    def offset(self, wall: Any) -> Array:
+        """Negative on the side of the ray from which the lobe, followed from its start, comes ahead of its origin."""
+        return self.dalpha * (wall.b - self.beta) - self.dbeta * (wall.alpha - self.alpha)
+
+    def offset_slope(self, wall: Any) -> Array:
+        """The derivative of `offset` along the lobe."""
+        return self.dalpha * wall.d_b - self.dbeta * wall.d_alpha
+
+
+def _as_ray(line: str, numbers: tuple[Array, ...]) -> _Ray:
+    """A row begins at alpha = 0; the ends of a column lie up and down from any point of it."""
+    zero, one = 0.0 * numbers[0], 1.0 + 0.0 * numbers[0]
+    if line == "ray":
+        return _Ray(*numbers)
+    return _Ray(zero, numbers[0], one, zero) if line == "row" else _Ray(numbers[0], zero, zero, one)
+
+
+def _point_kernel(delta: Array, d: Array, *arguments: Any) -> BoundaryPoint:
+    *numbers, line, delay, kind = arguments
+    xp = namespace(delta, d, *numbers)
+    inputs = (delta, d, *numbers)
+    ray = _as_ray(line, tuple(numbers))
+    given = line_status(delta, d, *ray) if line == "ray" else wall_status(ray.alpha, ray.beta, delta, d)
+    if line == "ray":
+        size = xp.where(given == int(Status.OK), xp.maximum(xp.abs(ray.dalpha), xp.abs(ray.dbeta)), 1.0)
+        ray = ray._replace(dalpha=ray.dalpha / size, dbeta=ray.dbeta / size)
+    curve = lobe(delta, d, delay, kind)
     creeping = creeps(delay, kind)
-    fixed = frozen(curve, xp)
-    row = frozen(row_end(beta, fixed, creeping), xp)
-    x, meets, beyond, _ = row
-    smooth, at = _follow(x, curve, lambda wall: (wall.b - (beta + delta), wall.d_b), xp)
-    # What `zwidth.is_stable` compares with, to the last place.
-    limit = _limit(beta, row, here, fixed, delay)
-    alpha = xp.where(beyond, _on_line(curve, xp) - 2.0 * beta, _with_slope(limit, at.alpha, xp))
-    omega = xp.where(beyond, np.pi, frequency(smooth, curve))
-    exists = (meets | beyond) & (limit > 0)
-    return _answer(alpha, beta, omega, given, exists, _too_close(x, creeping, curve), (delta, d, beta))
+    from_b = ray._replace(beta=ray.beta + delta)
+    fixed, still, still_b = frozen((curve, ray, from_b), xp)
+    undecided = delta != delta
+    row = None
+    if line in ("row", "ray"):
+        row = frozen(row_end(still.beta, fixed, delay, kind), xp)
+        x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
+    else:
+        top = peak(fixed, delay, kind)
+        exists = (still.alpha > 0) & (still.alpha < top.alpha)
+        goal = xp.where(exists, still.alpha, 0.5 * top.alpha)
+        x, cut = frozen(column_end(goal, top, fixed, line == "upper", creeping), xp)
+        on_lobe = ~cut
+    if line == "ray" and row is not None:
+        # For a held delay the verdict of `zwidth.is_stable` itself.
+        inside = (ray.alpha > 0) & exists & (ray.alpha < row.alpha)
+        exists = stable_at(ray.alpha, ray.beta, curve.here, kind) if delay == "held" else inside
+        x, on_lobe, single = frozen(_first_crossing(still_b, row, fixed, creeping), xp)
+        undecided = on_lobe & ~single
+    smooth, at = _follow(x, curve, from_b)
+    alpha, b = at.alpha, at.b
+    if row and line == "row":
+        alpha = _with_slope(row.alpha, alpha, xp)
+    elif xp is not np and line != "ray":
+        # Beside the ridge a step more would be rounding over rounding.
+        b = _with_slope(wall(x, fixed).b, b, xp)
+    beta, omega = b - delta, frequency(smooth, curve)
+    if line == "ray" or (curve.short is not None and line != "lower"):
+        s, there = _off_lobe(ray, curve)
+        ends = on_lobe | (s < np.inf)
+        undecided = undecided | ~ends
+        s = xp.where(on_lobe | ~ends, 0.0, s)
+        alpha = xp.where(on_lobe, alpha, xp.where(there == 0.0, 0.0, ray.alpha + s * ray.dalpha))
+        beta = xp.where(on_lobe, beta, ray.beta + s * ray.dbeta)
+        omega = xp.where(on_lobe, omega, there)
+    # What the line itself fixes.
+    if line == "ray":
+        alpha, beta = xp.where(ray.dalpha == 0, ray.alpha, alpha), xp.where(ray.dbeta == 0, ray.beta, beta)
+    else:
+        alpha, beta = (alpha, ray.beta) if row else (ray.alpha, beta)
+    if creeping:
+        # The frequency of a fractional power of less than one is too close to pi.
+        undecided = undecided | (on_lobe & (np.pi - x < _NEAREST_PI) & (d > 0) & (d < 1))
+    status = xp.where(exists, xp.where(undecided, int(Status.UNDECIDED), int(Status.OK)), int(Status.NO_BOUNDARY))
+    status = xp.where(given == int(Status.OK), status, given)
+    # NaN, derivatives included, where there is no point.
+    spoiled = poison(status == int(Status.OK), *inputs)
+    return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
 
 
-def _limit(beta: Array, row: RowEnd, here: Device, curve: Lobe, delay: str) -> Array:
-    """The stiffest stable alpha of a row."""
-    if delay != "held":
-        xp = namespace(beta)
-        return xp.where(row.beyond, _on_line(curve, xp) - 2.0 * beta, wall(row.x, curve).alpha)
-    if curve.long is None:
-        return short_row(beta, here)
-    if curve.short is None:
-        return row.alpha
-    return namespace(beta).where(curve.is_short, short_row(beta, here), row.alpha)
+def _off_lobe(ray: _Ray, curve: Lobe) -> tuple[Array, Array]:
+    """How far a ray leads to the line of z = -1 or to alpha = 0, whichever comes first, and omega there."""
+    xp = namespace(curve.d, ray.alpha)
+    rate = ray.dalpha + 2.0 * ray.dbeta
+    # Divided before it is chosen: the derivative of an infinite distance would be NaN.
+    to_line = (on_line(curve) - ray.alpha - 2.0 * ray.beta) / xp.where(rate > 0, rate, 1.0)
+    to_line = xp.where(curve.to_corner & (rate > 0), to_line, np.inf)
+    to_zero = xp.where(ray.dalpha < 0, ray.alpha / xp.where(ray.dalpha < 0, -ray.dalpha, 1.0), np.inf)
+    at_zero = to_zero < to_line
+    return xp.where(at_zero, to_zero, to_line), xp.where(at_zero, 0.0, np.pi)
 
 
-def _column_kernel(delta: Array, d: Array, alpha: Array, line: str, delay: str, kind: Kind) -> BoundaryPoint:
-    xp = namespace(delta, d, alpha)
-    given = wall_status(alpha, 0.0 * alpha, delta, d)
-    curve = lobe(device_of(delta, d, delay, kind), d, delay, kind)
-    creeping = creeps(delay, kind)
-    fixed, goal = frozen((curve, alpha), xp)
-    top = peak(fixed, creeping)
-    exists = (goal > 0) & (goal < top.alpha)
-    goal = xp.where(exists, goal, 0.5 * top.alpha)
-    x, on_line = frozen(column_end(goal, top, fixed, line == "upper", creeping), xp)
-    smooth, at = _follow(x, curve, lambda wall: (wall.alpha - alpha, wall.d_alpha), xp)
-    beta = _with_slope(wall(x, fixed).b - delta, at.b - delta, xp)
-    beta = xp.where(on_line, 0.5 * (_on_line(curve, xp) - alpha), beta)
-    omega = xp.where(on_line, np.pi, frequency(smooth, curve))
-    return _answer(alpha, beta, omega, given, exists, _too_close(x, creeping, curve), (delta, d, alpha))
-
-
-def _follow(x: Array, curve: Lobe, residual: Any, xp: Any) -> tuple[Array, Any]:
+def _follow(x: Array, curve: Lobe, ray: _Ray) -> tuple[Array, Any]:
     """A root that moves with the curve and the line: it stands still in NumPy, which knows no derivative."""
-    if xp is not np:
-        for _ in range(_EXACT_STEPS):
-            value, slope = residual(wall(x, curve))
-            x = x - value / slope
+    for _ in range(0 if namespace(x) is np else _EXACT_STEPS):
+        at = wall(x, curve)
+        x = x - ray.offset(at) / ray.offset_slope(at)
     return x, wall(x, curve)
 
 
 def _with_slope(value: Array, moving: Array, xp: Any) -> Array:
     """A value with the derivatives of another expression for it."""
     return value if xp is np else frozen(value, xp) + (moving - frozen(moving, xp))
-
-
-def _on_line(curve: Lobe, xp: Any) -> Array:
-    """``alpha + 2 beta`` on the line of a real pole at z = -1, of no meaning where no corner is reached."""
-    return 1.0 / xp.where(curve.to_corner, curve.tilt, 1.0)
-
-
-def _too_close(x: Array, creeping: bool, curve: Lobe) -> Array:
-    """Where the frequency of a fractional power of less than one is too close to pi."""
-    near = x != x
-    return near | ((np.pi - x < _NEAREST_PI) & (curve.long[1] > 0.5) & (curve.long[1] < 1.5)) if creeping else near
-
-
-def _answer(
-    alpha: Array, beta: Array, omega: Array, given: Array, exists: Array, undecided: Array, inputs: tuple[Array, ...]
-) -> BoundaryPoint:
-    """NaN, derivatives included, and the reason where there is no point."""
-    xp = namespace(alpha, beta, *inputs)
-    status = xp.where(exists, xp.where(undecided, int(Status.UNDECIDED), int(Status.OK)), int(Status.NO_BOUNDARY))
-    status = xp.where(given == int(Status.OK), status, given)
-    spoiled = poison(status == int(Status.OK), *inputs)
-    return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
-
-
-def _ray_kernel(
-    delta: Array,
-    d: Array,
-    alpha0: Array,
-    beta0: Array,
-    dalpha: Array,
-    dbeta: Array,
-    line: str,
-    delay: str,
-    kind: Kind,
-) -> BoundaryPoint:
-    xp = namespace(delta, d, alpha0, beta0, dalpha, dbeta)
-    inputs = (delta, d, alpha0, beta0, dalpha, dbeta)
-    given = line_status(*inputs)
-    size = xp.maximum(xp.abs(dalpha), xp.abs(dbeta))
-    size = xp.where(given == int(Status.OK), size, 1.0)
-    dalpha, dbeta = dalpha / size, dbeta / size
-    here = device_of(delta, d, delay, kind)
-    curve = lobe(here, d, delay, kind)
-    creeping = creeps(delay, kind)
-    ray = _Ray(alpha0, beta0 + delta, dalpha, dbeta)
-    fixed, still = frozen((curve, ray), xp)
-    row = frozen(row_end(beta0, fixed, creeping), xp)
-    # For a held delay the verdict of `zwidth.is_stable` itself.
-    inside = (alpha0 > 0) & (row.meets | row.beyond) & (alpha0 < _limit(beta0, row, here, fixed, delay))
-    starts = stable_at(alpha0, beta0, here, kind) if delay == "held" else inside
-    x, on_lobe, single = frozen(_first_crossing(still, row, fixed, creeping), xp)
-    smooth, at = _follow(x, curve, lambda wall: (ray.offset(wall), ray.offset_slope(wall)), xp)
-    # Off the lobe: along the line of z = -1 or along alpha = 0, whichever comes first.
-    rate = dalpha + 2.0 * dbeta
-    # Divided before it is chosen: the derivative of an infinite distance would be NaN.
-    to_line = (_on_line(curve, xp) - alpha0 - 2.0 * beta0) / xp.where(rate > 0, rate, 1.0)
-    to_line = xp.where(curve.to_corner & (rate > 0), to_line, np.inf)
-    to_zero = xp.where(dalpha < 0, alpha0 / xp.where(dalpha < 0, -dalpha, 1.0), np.inf)
-    at_zero = to_zero < to_line
-    s = xp.where(at_zero, to_zero, to_line)
-    ends = on_lobe | (s < np.inf)
-    s = xp.where(on_lobe | ~ends, 0.0, s)
-    alpha = xp.where(on_lobe & (dalpha != 0), at.alpha, xp.where(at_zero & ~on_lobe, 0.0, alpha0 + s * dalpha))
-    beta = xp.where(on_lobe & (dbeta != 0), at.b - delta, beta0 + s * dbeta)
-    omega = xp.where(on_lobe, frequency(smooth, curve), xp.where(at_zero, 0.0, np.pi))
-    undecided = _too_close(xp.where(on_lobe, x, 0.0), creeping, curve) | (on_lobe & ~single) | ~ends
-    return _answer(alpha, beta, omega, given, starts, undecided, inputs)
 
 
 def line_status(delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Array, dbeta: Array) -> Array:
@@ -338,30 +314,13 @@ def line_status(delta: Array, d: Array, alpha0: Array, beta0: Array, dalpha: Arr
     return xp.where(real, given, int(Status.INVALID_INPUT))
 
 
-class _Ray(NamedTuple):
-    """A ray from (alpha, b), b = beta + delta."""
-
-    alpha: Array
-    b: Array
-    dalpha: Array
-    dbeta: Array
-
-    def offset(self, wall: Any) -> Array:
-        """Negative on the side of the ray from which the lobe, followed from its start, comes ahead of its origin."""
-        return self.dalpha * (wall.b - self.b) - self.dbeta * (wall.alpha - self.alpha)
-
-    def offset_slope(self, wall: Any) -> Array:
-        """The derivative of `offset` along the lobe."""
-        return self.dalpha * wall.d_b - self.dbeta * wall.d_alpha
-
-
 def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tuple[Array, Array, Array]:
     """Where a ray from a stable wall leaves through the lobe, whether it does, and whether it was seen to do so once.
 
     Of the row on which the wall lies, ``row`` is the end: a ray upwards can only leave behind that, one downwards
     before it.
     """
-    xp = namespace(curve.delta, ray.alpha)
+    xp = namespace(curve.d, ray.alpha)
     upwards = ray.dbeta >= 0
     low, high = xp.where(upwards, row.x, 0.0), xp.where(upwards, curve.end, row.x)
     # Places even in the square of omega, in which the start of the lobe is straight.
@@ -375,7 +334,7 @@ def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tupl
     offsets = wide_ray.offset(wall(places, wide))
     begins, ends = offsets[..., 0], offsets[..., -1]
     # Where the lobe returns, alpha is 0 to the last digit.
-    returned = ray.dalpha * (wall(curve.end, curve).b - ray.b) + ray.dbeta * ray.alpha
+    returned = ray.dalpha * (wall(curve.end, curve).b - ray.beta) + ray.dbeta * ray.alpha
     ends = xp.where(upwards & ~curve.to_corner, returned, ends)
     leaves = xp.where(upwards, (ends >= 0) & ~row.beyond, (begins < 0) & (ends > 0))
     passed = offsets >= 0
@@ -386,30 +345,22 @@ def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tupl
     after = xp.take_along_axis(places, index[..., None], -1)[..., 0]
     before = xp.take_along_axis(places, index[..., None] - 1, -1)[..., 0]
     if creeping:
-        x = bisect_place(lambda x: ray.offset(wall(x, curve)) < 0, xp.maximum(before, 1e-32 * after), after, xp)
-        return x, leaves, single
+        before = xp.maximum(before, 1e-32 * after)
+        return bisect(lambda x: ray.offset(wall(x, curve)) < 0, before, after, geometric=True), leaves, single
 
-    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        x, below, above, _ = state
+    def offset(x: Array) -> tuple[Array, Array]:
         at = wall(x, curve)
-        value = ray.offset(at)
-        below, above = xp.where(value < 0, x, below), xp.where(value < 0, above, x)
-        new = x - value / ray.offset_slope(at)
-        new = xp.where((new >= below) & (new <= above), new, 0.5 * (below + above))
-        return new, below, above, xp.abs(new - x)
+        return ray.offset(at), ray.offset_slope(at)
 
     left, right = (xp.take_along_axis(offsets, (index - k)[..., None], -1)[..., 0] for k in (1, 0))
     part = xp.clip(left / xp.where(left == right, 1.0, left - right), 0.0, 1.0)
     between = before * before + (after * after - before * before) * part
     start = xp.where(square, xp.sqrt(between), before + (after - before) * part)
-    x, _, _, last_step = repeat(_RAY_STEPS, step, (start, before, after, start), xp)
-    return x, leaves, single & (last_step <= epsilon(x) ** 0.5 * x)
+    x, last = newton(offset, before, after, start, _RAY_STEPS)
+    return x, leaves, single & (last <= epsilon(x) ** 0.5 * x)
 
 
 def _squared(curve: Lobe, xp: Any) -> Array:
     if curve.is_short is not None:
         return ~curve.is_short
     return curve.end == curve.end if curve.short is None else curve.end != curve.end
-
-
-_KERNELS = {"row": _row_kernel, "lower": _column_kernel, "upper": _column_kernel, "ray": _ray_kernel}

@@ -1,4 +1,4 @@
-"""Bracketed bisection by jaxopt, in the one module that imports it."""
+"""Bisection by jaxopt, in the one module that imports it, and what the general solvers bracket with it (any loop)."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from functools import cache
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 
 from zwidth._types import Array
+from zwidth.loop import FrequencyLoop, frequency_boundary
+from zwidth.stability.ridge_newton import corner, curve_of
 
 # Each step halves the bracket: 52 of them leave one unit in the last place of a float64.
 _STEPS = 52
@@ -43,3 +46,10 @@ def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: Ar
     )
     root, state = solver.run(None, *args)
     return jax.lax.stop_gradient(root), state.sign != 0
+
+
+def lobe_end(loop: FrequencyLoop, d: Array, delay: str) -> Array:
+    """The frequency at which the boundary curve first returns to alpha = 0, pi where it reaches the corner before."""
+    limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
+    end, found = bisect(lambda omega, loop: frequency_boundary(omega, loop, delay).alpha, 1e-6 * limit, limit, loop)
+    return jnp.where(found & ~corner(curve_of(loop.plant), loop.lag).reached, end, jnp.pi)

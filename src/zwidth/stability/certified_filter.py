@@ -5,8 +5,8 @@ proved errors. ``u = 2^-53``. No library's exp is trusted.
 
 - ``exp``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 14 terms below 3u: together
   below 8u. Below x = -700 it is off by 1e-304 at most.
-- `zwidth.phi.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have positive
-  terms only, 4u: phi1 and gap are within 14u, phi2 15u, and psi, in which phi1 and gap share the error of the
+- `numerics.phi.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have
+  positive terms only, 4u: phi1 and gap are within 14u, phi2 15u, and psi, in which phi1 and gap share the error of the
   exponential, 8u + 12u. Above, where c < 0.083, phi1 is within 5u, phi2 7u, psi 14u, gap 20u. All are within 30u.
 - Held fraction: t = 1 - f is off by u, and x = delta t by 2u. phi1 and phi2 amplify that at most once and psi twice,
   e^-x x times; as ``x e^-x <= phi1(x)`` and ``<= 1/2``, that error is below 2u of another term of a1, and of a0 below u
@@ -23,7 +23,7 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import BLOCK, FEW, in_blocks, in_strips, stored
 from zwidth.domain import WALL_RANGE, wall_status
-from zwidth.phi import phi_functions
+from zwidth.numerics.phi import phi_functions
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.crossover import COSINE, SINE, Lag, first_zero, long_verdict, short_verdict
 from zwidth.stability.devices import Device, Kind, device, kind_of

@@ -7,8 +7,8 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import BLOCK, broadcast, elementwise, is_traced, to_caller
 from zwidth.domain import check_scalars
-from zwidth.double_double import Complex, Double, chosen, phi_pair, single, two_sum
 from zwidth.grouping import NAMES
+from zwidth.numerics.double_double import Complex, Double, chosen, phi_pair, single, two_sum
 from zwidth.stability.circle import loop_of
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import kind_of

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth import phi
 from zwidth._types import Array
 from zwidth.loop import tilt_at_minus_one, valid_device
+from zwidth.numerics import phi
 from zwidth.plant import Functions, discretized, split_delay
 from zwidth.xp import namespace
 

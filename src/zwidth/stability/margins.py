@@ -13,12 +13,13 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_wall
+from zwidth.numerics.roots import false_position, followed
 from zwidth.plant import split_delay
 from zwidth.stability.crossover import gain_crossover, stable_at
 from zwidth.stability.devices import ANY, Device, device
 from zwidth.stability.modulus import modulus
-from zwidth.stability.open_loop import along, angle_of, by_samples, sign_change, size_and_phase
-from zwidth.xp import epsilon, frozen, namespace
+from zwidth.stability.open_loop import angle_of, by_samples, size_and_phase
+from zwidth.xp import along, epsilon, frozen, namespace
 
 _NAMES = ("alpha", "beta", "delta", "d")
 # Steps of false position at most; every sixth one halves the bracket.
@@ -71,9 +72,6 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
         ``gain_margin`` is below 1, and 0 (with a NaN ``phase_crossover``) if no gain is stable; ``phase_margin`` is
         negative, below -180 too; ``delay_margin`` is 0; ``phase_margin`` and ``gain_crossover`` are NaN if ``|L|`` is
         above 1 at every frequency, ``phase_margin`` also if beta <= -delta, where it decides nothing.
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
 
     Numerics:
         Phase margin and gain crossover are in closed form, the others are found to about 1e-14, at a cost that does not
@@ -151,10 +149,10 @@ def _gain_margin(alpha: Array, beta: Array, here: Device, xp: Any) -> tuple[Arra
     start = phase(low)
     none = ~(start > 0)
     bracket = frozen((low, high, xp.where(none, 1.0, start)), xp)
-    found = sign_change(
+    found = false_position(
         lambda x: frozen(phase(x), xp), bracket[0], bracket[1], bracket[2], -1.0 + 0.0 * low, _STEPS, 1e-15
     )
-    w = xp.minimum(xp.exp(_followed(phase, found, xp)), np.pi)
+    w = xp.minimum(xp.exp(followed(phase, found, _falling)), np.pi)
     first = 1.0 / size_and_phase(w, alpha, beta, here)[0]
     line = xp.abs(here.gap * (alpha + 2.0 * beta))
     last = xp.where(line > 0, 2.0 * (1.0 + here.c) / xp.where(line > 0, line, 1.0), xp.inf)
@@ -162,21 +160,9 @@ def _gain_margin(alpha: Array, beta: Array, here: Device, xp: Any) -> tuple[Arra
     return gain, xp.where(none, xp.nan, xp.where(last < first, np.pi, w))
 
 
-def _followed(function: Any, root: Array, xp: Any) -> Array:
-    """A root with its derivatives in whatever the function depends on, to the second order."""
-    if xp is np:
-        return root
-    import jax
-    import jax.numpy as jnp
-
-    root = frozen(root, jnp)
-    for _ in range(2):
-        value, slope = jax.jvp(function, (root,), (jnp.ones_like(root),))
-        regular = slope < 0
-        step = jnp.where(regular, value / jnp.where(regular, slope, 1.0), 0.0)
-        # At an end of the range there is no root to follow.
-        root = root - jnp.where(jnp.abs(frozen(step, jnp)) < 1e-3, step, 0.0)
-    return root
+def _falling(slope: Array, step: Array) -> Array:
+    """At an end of the range there is no zero to follow."""
+    return (slope < 0) & (abs(step) < 1e-3)
 
 
 def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> Array:
@@ -217,8 +203,8 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     high, at_high = sample(grid, place), xp.minimum(sample(excess_of, place), 0.0)
     # The delay is known to a rounding error of the whole of it.
     width = 4e-16 * (1.0 + there)
-    f = sign_change(lambda f: excess(f, *still), low, high, at_low, at_high, _STEPS, width)
-    return there + _followed(lambda f: excess(f, *wall), f, xp) - d
+    f = false_position(lambda f: excess(f, *still), low, high, at_low, at_high, _STEPS, width)
+    return there + followed(lambda f: excess(f, *wall), f, _falling) - d
 
 
 def _undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:

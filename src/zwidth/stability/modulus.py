@@ -1,4 +1,4 @@
-"""The least distance of the Nyquist curve from -1, between bounds that no minimum can lie beyond.
+"""The least distance of the rigid loop's Nyquist curve from -1, between bounds that no minimum can lie beyond.
 
 ``|L|`` falls strictly with the frequency (docs/theory/one-crossover.md, Theorem 1), and ``|1 + L| >= ||L| - 1|``. So
 once a distance r has been seen, no lower one lies where ``|L| > 1 + r`` or ``|L| < 1 - r``. Within a turn of the phase
@@ -12,14 +12,56 @@ from typing import Any
 
 import numpy as np
 
-from zwidth._types import Array
+from zwidth._types import Array, ArrayLike
+from zwidth.domain import check_scalars
+from zwidth.loop import poison, valid_wall
 from zwidth.stability.crossover import gain_crossover
-from zwidth.stability.devices import Device
-from zwidth.stability.open_loop import along, angle_of, size_and_phase
-from zwidth.xp import frozen, namespace, repeat
+from zwidth.stability.devices import Device, device
+from zwidth.stability.open_loop import angle_of, by_samples, size_and_phase
+from zwidth.xp import along, frozen, namespace, repeat
 
 # Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
 _TURN, _DECADES, _DIPS, _ZOOMS, _TRIALS = 100, 50, 5, 5, 13
+
+
+def modulus_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return how closely the Nyquist curve of the loop passes the point -1.
+
+    ``min over omega of |1 + L(e^(j omega))|``, with ``L = N(z) (alpha z + beta (z - 1))/(z^(2+n) (z - 1)(z - c))``; the
+    inverse of the largest sensitivity. A margin in the sense of robustness only where the wall is stable.
+
+    Args:
+        alpha: normalized stiffness, > 0.
+        beta: normalized virtual damping.
+        delta: normalized physical damping, >= 0.
+        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+
+    Returns:
+        Array of the broadcast shape: 0 for a pole on the unit circle, at most 1 for a stable wall, at most 2 for any
+        other; NaN where alpha <= 0 or out of range.
+
+    Numerics:
+        About 1e-14, at a cost that does not grow with d. Traceable, with derivatives up to the second.
+
+    References:
+        Landau 1990 (modulus margin); Hulin, Preusche, Hirzinger 2006, eq. (15) for the loop.
+
+    Example:
+        >>> from zwidth import modulus_margin
+        >>> print(f"{modulus_margin(0.1, 0.2, 0.1, 0):.4f}")
+        0.5898
+    """
+    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
+    return by_samples(margin_kernel, ("alpha", "beta", "delta", "d"), (alpha, beta, delta, d))
+
+
+def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """`modulus_margin`, elementwise."""
+    ok = valid_wall(alpha, beta, delta, d) & (alpha > 0)
+    inputs = (alpha, beta, delta, d)
+    xp = namespace(*inputs)
+    alpha, beta, delta, d = (xp.where(ok, value, 1.0) for value in inputs)
+    return modulus(alpha, beta, device(delta, d))[0] + poison(ok, *inputs)
 
 
 def squared_distance(w: Array, alpha: Array, beta: Array, here: Device) -> Array:

@@ -31,14 +31,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.numerics.roots import bisect
 from zwidth.plant import split_delay
 from zwidth.stability.crossover import ARCSINE
 from zwidth.stability.devices import ANY, Kind
-from zwidth.xp import epsilon, frozen, horner, namespace, repeat
+from zwidth.xp import epsilon, frozen, horner, namespace
 
 _STEPS = 3
-# The last place of float64.
-_HALVINGS = 56
 # Taylor series; on [0, pi/2] the first term left out is below 1e-17.
 SINE = [(-1.0) ** i / factorial(2 * i + 1) for i in range(11)]
 COSINE = [(-1.0) ** i / factorial(2 * i) for i in range(12)]
@@ -231,16 +230,10 @@ def directions(d: Array) -> Directions:
     spring = (1.0 - f) * n * k * (2.0 * n + 1.0) + f * k * (k + 1.0) * (2.0 * k + 1.0)
     damper = (1.0 - f) * k * k + f * (k + 1.0) * (k + 1.0)
 
-    def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        # The slope at w = 0 grows with beta. For alpha = 0 it is 0, which `turns` counts as falling.
-        rises = turns(half, middle, delay).rise > 0
-        return xp.where(rises, low, middle), xp.where(rises, middle, high)
-
-    low, high = repeat(_HALVINGS, halve, (0.0 * d, spring / (6.0 * damper)), xp)
+    # The slope at w = 0 grows with beta. For alpha = 0 it is 0, which `turns` counts as falling.
+    first = bisect(lambda beta: ~(turns(half, beta, delay).rise > 0), 0.0 * d, spring / (6.0 * damper))
     # (2 - 9 f) t^2 + (1 - 6 f) t = f
     ends = (k == 1) & (9.0 * f < 2.0)
     below = xp.where(ends, f, 0.0)
     last = 2.0 * below / (1.0 - 6.0 * below + xp.sqrt(1.0 - 4.0 * below))
-    return Directions(0.5 * (low + high), xp.where(ends, last, xp.inf))
+    return Directions(first, xp.where(ends, last, xp.inf))

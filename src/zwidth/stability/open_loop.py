@@ -1,4 +1,4 @@
-"""Size and phase of the loop ``L = B/T`` at a frequency, for the margins.
+"""Size and phase of the rigid loop ``L = B/T`` at a frequency, for the margins.
 
 Notation as in `zwidth.stability.crossover`: with ``u = 1 - cos w``, ``s = sin w``,
 
@@ -12,7 +12,7 @@ each argument principal and continuous in w, so that the phase needs no unwrappi
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -47,79 +47,8 @@ def size_and_phase(w: Array, alpha: Array, beta: Array, here: Device) -> tuple[A
     return size, phase - (here.whole + 0.5) * w
 
 
-class _Bracket(NamedTuple):
-    low: Any
-    high: Any
-    at_low: Any  # weights: the values, halved where an end stays twice
-    at_high: Any
-    side: Any  # which end moved last, 1 the low one
-    best: Any
-    value: Any
-
-
 # A point becomes some hundreds of samples.
 _BLOCK = 1 << 9
-# A phase in radians is not known better.
-_ROUNDING = 1e-15
-
-
-def sign_change(
-    function: Callable[[Array], Array],
-    low: Array,
-    high: Array,
-    at_low: Array,
-    at_high: Array,
-    steps: int,
-    width: Array | float,
-) -> Array:
-    """Where a function that is positive at ``low`` and not at ``high`` changes sign.
-
-    False position with halved weights, every sixth step a bisection. NumPy stops when every point is done: its value
-    no more than rounding, or the bracket no wider than ``width``.
-    """
-    xp = namespace(low, at_low)
-
-    def done(at: _Bracket) -> Array:
-        return (xp.abs(at.value) <= _ROUNDING) | (at.high - at.low <= width)
-
-    def step(k: Any, at: _Bracket) -> _Bracket:
-        middle = 0.5 * (at.low + at.high)
-        gap = at.at_low - at.at_high
-        trial = at.low + (at.high - at.low) * (at.at_low / xp.where(gap > 0, gap, 1.0))
-        trial = xp.where((trial > at.low) & (trial < at.high) & (k % 6 != 5), trial, middle)
-        # A scalar of NumPy is five times faster than an array of no dimension.
-        trial = trial[()]
-        value = function(trial)
-        # A point that is done keeps its value: it must not depend on the points beside it.
-        above, better = value > 0, (xp.abs(value) < xp.abs(at.value)) & ~done(at)
-        return _Bracket(
-            xp.where(above, trial, at.low),
-            xp.where(above, at.high, trial),
-            xp.where(above, value, xp.where(at.side < 0, 0.5 * at.at_low, at.at_low)),
-            xp.where(above, xp.where(at.side > 0, 0.5 * at.at_high, at.at_high), value),
-            xp.where(above, 1.0, -1.0) + 0.0 * value,
-            xp.where(better, trial, at.best),
-            xp.where(better, value, at.value),
-        )
-
-    lower = at_low < -at_high
-    none = 0.0 * at_low
-    at = _Bracket(low, high, at_low, at_high, none, xp.where(lower, low, high), xp.where(lower, at_low, at_high))
-    if xp is np:
-        for k in range(steps):
-            at = step(k, at)
-            if np.all(done(at)):
-                break
-        return at.best
-    from jax.lax import fori_loop
-
-    return fori_loop(0, steps, step, at).best
-
-
-def along(values: np.ndarray, like: Array) -> Array:
-    """Values along a new last axis behind those of ``like``."""
-    xp = namespace(like)
-    return xp.asarray(values, like.dtype).reshape((1,) * like.ndim + (-1,))
 
 
 def by_samples(kernel: Callable[..., Any], names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Any:

@@ -160,15 +160,10 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
     Returns:
         Array of the broadcast shape; NaN where the input is out of range (see `zwidth.domain`).
 
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
     Numerics:
-        About 1e-15 of what is needed, at a cost that does not grow with d. The peak of the condition is the first one,
-        which for whole d is proved to be the only candidate (`zwidth.stability.needed_damping`), and Newton's method
-        finds it from a start in closed form. Many walls that share a delay go by a polynomial of the direction in the
-        (alpha, beta) plane. Traceable in all four: `jit`, `vmap`, `grad` and second derivatives, by the envelope
-        theorem; those in d at whole d are from the right.
+        About 1e-15 of what is needed, at a cost that does not grow with d. Where the condition peaks is proved for
+        whole d, and seen for held delays (`zwidth.stability.needed_damping`). Many walls that share a delay go by a
+        polynomial of their direction. Traceable, also twice; at whole d derivatives in d are those from the right.
 
     References:
         Colgate, Schenkel 1994; Hulin, Preusche, Hirzinger 2006, eqs. (20), (21), here extended to any delay.
@@ -198,19 +193,11 @@ def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     Passive implies stable for alpha > 0; stable does not imply passive.
 
     Args:
-        alpha: normalized stiffness.
-        beta: normalized virtual damping.
-        delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+        alpha, beta, delta, d: as for `passivity_margin`.
 
     Returns:
-        Boolean array of the broadcast shape; False where the input is out of range.
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
-    Numerics:
-        The sign of `passivity_margin`: right beyond about 1e-15 of the boundary.
+        Boolean array of the broadcast shape; False where the input is out of range. Right beyond about 1e-15 of the
+        boundary.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.

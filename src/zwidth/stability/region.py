@@ -58,8 +58,8 @@ def lobe(delta: float, d: float, *, delay: DelayModel = "held", points: int = 40
     kind = kind_of(d)
     with np.errstate(all="ignore"):
         numbers = np.float64(delta), np.float64(d)
-        whole = curve.lobe(curve.device_of(*numbers, delay, kind), numbers[1], delay, kind)
-        top = curve.peak(whole, curve.creeps(delay, kind)).x
+        whole = curve.lobe(*numbers, delay, kind)
+        top = curve.peak(whole, delay, kind).x
         first, last = (float(curve.frequency(x, whole)) for x in (top, whole.end))
     # Closer together at both ends and round the ridge, where the outline bends most.
     half = 0.5 * (1.0 - np.cos(np.linspace(0.0, np.pi, points // 2)))
@@ -87,9 +87,6 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
         ``verified`` tells that the verdict of `zwidth.is_stable` changes at every vertex, from stable a millionth of
         its distance from the middle inside to unstable as far outside (the two at alpha = 0: along a soft column). It
         is False for a fractional power, which has no poles. ``area`` in units of alpha times beta, of the polygon.
-
-    Raises:
-        InputError: an argument is no single number in range, or ``delay`` is unknown.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V, Figs. 5 and 7.

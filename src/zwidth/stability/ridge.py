@@ -67,21 +67,14 @@ def alpha_max(
         the frequency in radians a period at which the loop then oscillates; ``kind``, 0 smooth or 1 corner (a double
         pole at z = -1); ``status``, see `zwidth.Status`. NaN where the status is not 0.
 
-    Raises:
-        InputError: an argument is no real number, a single number is beyond the range above, shapes do not broadcast,
-            or ``delay`` is unknown.
-
     Numerics:
-        alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable: `jit`, `vmap`,
-        `grad`, `jvp` and second derivatives, in delta and d; NaN where the status is not 0. Float64 when called
-        directly. Inside a transformation, `jax.grad` included, JAX's own precision holds: float32 unless
-        ``jax.config.update("jax_enable_x64", True)`` was called, which a `zwidth.PrecisionWarning` says once. Few
-        points are computed by NumPy, without importing JAX.
+        alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable in delta and d, also
+        twice. alpha's first derivatives are continuous, also where the corner takes over (d = 0:
+        delta = 3.65936162742...) and at whole d > 0; its second ones and the first ones of beta and omega jump there,
+        and at a whole d are those from the right. A fractional power has a corner at d = 0 only, with -inf in d.
 
-        alpha's first derivatives are continuous, also where the corner takes over (d = 0: delta = 3.65936162742...)
-        and at whole d > 0; its second derivatives and the first ones of beta and omega jump there. At a whole d they
-        are those from the right, at the take-over those of the kind that is returned, and omega is left like a square
-        root. With the fractional power a corner exists at d = 0 only: derivatives in d are -inf there.
+        Float64 when called directly. Inside a transformation, `jax.grad` included, JAX's own precision holds: float32
+        unless ``jax.config.update("jax_enable_x64", True)`` was called, which a `zwidth.PrecisionWarning` says once.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII, eqs. (24), (25).

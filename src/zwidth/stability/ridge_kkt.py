@@ -21,9 +21,9 @@ from zwidth._types import Array
 from zwidth.batching import stored
 from zwidth.domain import device_status
 from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
-from zwidth.stability.bracketing import bisect
-from zwidth.stability.curve import corner, lobe_end
+from zwidth.stability.bracketing import bisect, lobe_end
 from zwidth.stability.ridge import RidgeKind, RidgePoint
+from zwidth.stability.ridge_newton import corner, curve_of
 from zwidth.status import Status
 
 _MAX_STEPS = 16
@@ -86,7 +86,7 @@ def kkt_ridge(delta: Array, d: Array, delay: str) -> tuple[Array, Array, Array, 
     poison = 0.0 * (delta + d)
     delta, d = jnp.where(jnp.isnan(delta), 1.0, delta), jnp.where(jnp.isnan(d), 1.0, d)
     loop = stored(frequency_loop(delta, d, delay), delta)
-    at_corner = corner(loop)
+    at_corner = corner(curve_of(loop.plant), loop.lag)
     is_corner = at_corner.is_ridge
     omega, found = _smooth_omega(loop, d, delay)
     smooth = frequency_boundary(omega, loop, delay)

@@ -145,23 +145,31 @@ def stationarity(s: Array, curve: Curve, lag: Array, undelayed: bool = False) ->
     return first, 2.0 * s * (rho * (2.0 * slope + y * bend) - weighted * ddrho)
 
 
-def _corner(curve: Curve, lag: Array, known: Array) -> tuple[Array, ...]:
-    """Whether the ridge is the double pole at z = -1, and what `Ridge` holds there.
+class Corner(NamedTuple):
+    """The wall with a double pole at z = -1, P(-1) = P'(-1) = 0."""
 
-    It is where the lobe reaches y = 1 with alpha > 0, still rising. The curve gets there on the first lobe only if
-    D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0. ``known`` is `Start.corner`, which decides where it can.
+    alpha: Array
+    beta: Array
+    reached: Array  # whether the lobe ends there
+    is_ridge: Array  # and whether it is the stiffest stable wall
+
+
+def corner(curve: Curve, lag: Array) -> Corner:
+    """The corner: where the lobe reaches y = 1 with alpha > 0, the ridge if it is still rising there.
+
+    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0.
     """
     xp = namespace(curve.b, lag)
     g1 = sum(curve.g1[1:], curve.g1[0])
     g2 = curve.g2[0] + curve.g2[1]
     value, slope = g1 - g2, curve.g1[1] + 2.0 * curve.g1[2] - 2.0 * g2 - curve.g2[1]
     rho, drho = curve.gap**2, 4.0 * (curve.b * curve.gap - curve.k**2)
-    rising = rho * (value + slope) - value * drho >= 0.0
-    judged = (lag <= 0.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0) & rising
-    corner = xp.where(known == 0.0, judged, known > 0.0)
-    rho = xp.where(corner, rho, 1.0)
+    reached = (lag <= 0.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0)
+    is_ridge = reached & (rho * (value + slope) - value * drho >= 0.0)
+    # Elsewhere nothing may overflow: its derivative would be NaN and spoil what is chosen instead.
+    rho = xp.where(reached, rho, 1.0)
     alpha = 4.0 * value / rho
-    return corner, alpha, g1 / rho - 0.5 * alpha, np.pi, 1.0, 0.0
+    return Corner(alpha, g1 / rho - 0.5 * alpha, reached, is_ridge)
 
 
 class Start(NamedTuple):
@@ -295,5 +303,7 @@ def solve(plant: Plant, lag: Array, start: Start, delay: str, kind: Kind) -> Rid
     ridge = Ridge(alpha, beta, 2.0 * wave(s, lag, True).half, s, last)
     if not kind.short:
         return ridge
-    corner, *there = _corner(curve, lag, start.corner)
-    return Ridge(*(xp.where(corner, end, value) for end, value in zip(there, ridge, strict=True)))
+    at_end = corner(curve, lag)
+    taken = xp.where(start.corner == 0.0, at_end.is_ridge, start.corner > 0.0)
+    there = Ridge(at_end.alpha, at_end.beta, np.pi, 1.0, 0.0)
+    return Ridge(*(xp.where(taken, end, value) for end, value in zip(there, ridge, strict=True)))

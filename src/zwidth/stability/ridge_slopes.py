@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from zwidth import phi
 from zwidth._types import Array
+from zwidth.numerics import phi
 from zwidth.plant import Plant, held_plant
 from zwidth.stability.devices import Kind
 from zwidth.stability.ridge_newton import Ridge, Start, curve_of, is_undelayed, sides, solve, stationarity, wall, wave
 from zwidth.xp import horner, namespace
 
-# -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `zwidth.phi`
+# -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `zwidth.numerics.phi`
 _CHI = [(k + 1.0) / factorial(2 * k + 3) for k in range(13)]
 
 

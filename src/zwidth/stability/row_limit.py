@@ -60,6 +60,15 @@ def short_curve(here: Any) -> tuple[tuple[Any, Any], tuple[Any, Any, Any], tuple
     return by_b, size, (p1 * (em + f * em + p1), (a1 + a0 * 3.0 + a0 * em) * -4.0, a0 * 16.0)
 
 
+def short_place(b: Array, curve: Any) -> tuple[Array, Array]:
+    """The y of a row on the lobe of `short_curve`, the first zero of a quadratic, and whether there is one."""
+    (u0, u1), (v0, v1, v2), _ = curve
+    xp = namespace(b, u0)
+    linear = u0 - b * v1
+    square = linear * linear + 4.0 * b * v0 * (u1 - b * v2)
+    return 2.0 * b * v0 / (linear + xp.sqrt(xp.maximum(square, 0.0))), square >= 0
+
+
 def short_row(beta: Array, device: Device) -> Array:
     """The limit for d < 1, where the lobe is a quadratic in y; 0 where no alpha is stable, NaN for bad input.
 
@@ -70,16 +79,14 @@ def short_row(beta: Array, device: Device) -> Array:
     b = beta + device.delta
     # For d = 0 the row ends at phi1 b (1 - psi beta)/(psi (phi1 + phi2 b)).
     whole = p1 * b * (1.0 - psi * beta) / (psi * (p1 + device.p2 * b))
-    (u0, u1), size, shape = short_curve(device)
-    linear = u0 - b * size[1]
-    square = linear * linear + 4.0 * b * p1 * p1 * (u1 - b * size[2])
-    y = 2.0 * b * p1 * p1 / (linear + xp.sqrt(xp.maximum(square, 0.0)))
+    (u0, u1), size, shape = curve = short_curve(device)
+    y, real = short_place(b, curve)
     # V = |N|^2 vanishes where the curve runs to infinity; rounding must not turn its sign there.
-    curve = 4.0 * y * horner(y, shape) / xp.abs(horner(y, size))
+    limit = 4.0 * y * horner(y, shape) / xp.abs(horner(y, size))
     corner_reached = (tilt > 0) & (shape[0] + shape[1] + shape[2] > 0)
     beyond = xp.where(corner_reached, xp.inf, 0.0)
     # Behind the lobe the curve comes from infinity with b < 0: a row above all of the lobe must not end there.
-    fractional = xp.where((square >= 0) & (y <= 1) & (u0 + u1 * y > 0), curve, beyond)
+    fractional = xp.where(real & (y <= 1) & (u0 + u1 * y > 0), limit, beyond)
     limit = xp.where(device.f == 0, whole, fractional)
     line = 1.0 / xp.where(tilt > 0, tilt, 1.0) - 2.0 * beta
     limit = xp.where(tilt > 0, xp.minimum(limit, line), limit)

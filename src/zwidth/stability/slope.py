@@ -36,9 +36,6 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
         Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN where d is NaN, negative,
         infinite or too long.
 
-    Raises:
-        InputError: d is no real number, a single one is longer than 1e5, or ``delay`` is unknown.
-
     Numerics:
         About 1e-15 relative. Traceable, with derivatives of every order in d. The held slope is
         ``4 (1 - 3 d)/(1 - 2 d)^2`` (a corner, with its maximum 4.5 at d = 1/6) up to d = 1/4, ``1/d`` up to d = 1. It

@@ -18,7 +18,7 @@ from zwidth.config.fields import Boolean, one_of
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, figure_layout
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
-from zwidth.stability.curve import lobe_end
+from zwidth.stability.bracketing import lobe_end
 from zwidth.stability.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, of_scene, stack

@@ -18,7 +18,7 @@ from zwidth.errors import ConfigError
 from zwidth.studies.document import Config, load_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
-# More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/sweep/test_config_fuzz.py
+# More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/config/test_config_fuzz.py
 SEEDS = range(int(os.environ.get("ZWIDTH_MUTATIONS", "150")))
 # Far above what reading takes (some 50 ms), far below what a quadratic reader would take.
 LONGEST_SECONDS = 5.0
@@ -267,7 +267,7 @@ def with_keys_swapped(tree, rng):
     return copy(tree)
 
 
-# More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/sweep/test_config_fuzz.py -k plan
+# More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/config/test_config_fuzz.py -k plan
 @pytest.mark.parametrize("seed", SEEDS)
 def test_any_mutation_ends_in_a_plan_or_in_exit_code_2(seed, tmp_path, capsys):
     rng = random.Random(f"plan {seed}")

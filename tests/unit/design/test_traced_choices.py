@@ -7,7 +7,8 @@ import pytest
 import zwidth
 from compiling import SOON
 from zwidth import fastest_damping, fastest_wall, most_robust_damping
-from zwidth.design.column import column, lobe
+from zwidth.stability.curve import column, lobe, peak
+from zwidth.stability.devices import ANY
 from zwidth.status import Status
 
 # One degree, hence one compilation a question; two stiffnesses, one out of reach.
@@ -106,7 +107,8 @@ def test_columns_end_where_stability_does():
     alpha = top.alpha * random.uniform(0.01, 0.999, count)
     # What does not apply to a point is computed beside it.
     with np.errstate(all="ignore"):
-        lower, upper, exists = column(alpha, lobe(delta, d))
+        curve = lobe(delta, d, "held", ANY)
+        lower, upper, exists = column(alpha, curve, peak(curve, "held", ANY))
     assert np.all(exists)
     width = upper - lower
     for end, inside in ((lower, 1.0), (upper, -1.0)):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zwidth.phi import phi_functions
+from zwidth.numerics.phi import phi_functions
 from zwidth.stability import affine
 from zwidth.stability.certified import certified_stable
 

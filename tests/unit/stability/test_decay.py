@@ -9,8 +9,8 @@ from mpmath import mp
 
 import oracles
 import zwidth
-from zwidth.double_double import phi_pair, single
 from zwidth.errors import InputError
+from zwidth.numerics.double_double import phi_pair, single
 
 REFERENCE = Path(__file__).resolve().parents[2] / "reference"
 NAMES = ("alpha", "beta", "delta", "d")

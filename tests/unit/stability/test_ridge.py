@@ -14,8 +14,6 @@ import pytest
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
-from zwidth.loop import frequency_loop
-from zwidth.stability.curve import corner
 from zwidth.stability.poles import unstable_poles
 from zwidth.stability.ridge import RidgeKind, ridge_kernel
 from zwidth.status import Status
@@ -202,9 +200,6 @@ def test_agrees_with_the_general_solver(model):
     np.testing.assert_array_equal(general.kind, fast.kind)
     np.testing.assert_allclose(general.alpha, fast.alpha, rtol=tol.RIDGE.float64)
     np.testing.assert_allclose(general.omega, fast.omega, rtol=1e-9)
-    with jax.enable_x64(True):
-        decided = jax.vmap(lambda a, b: corner(frequency_loop(a, b, model)).is_ridge)(delta, d)
-    np.testing.assert_array_equal(decided, fast.kind == RidgeKind.CORNER)
 
 
 def independent_curve(omega, point, model):

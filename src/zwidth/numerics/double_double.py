@@ -141,7 +141,7 @@ _SMALL = 2.0**-6
 
 
 def phi_pair(x: Double) -> PhiPair:
-    """The functions of `zwidth.phi` at x >= 0: Taylor's series at x/2^k, then doubled k times without cancellation."""
+    """The functions of `numerics.phi` at x >= 0: Taylor's series at x/2^k, then doubled k times without cancellation."""
     halvings = np.ceil(np.log2(np.maximum(x.high, _SMALL) / _SMALL))
     y = x.scaled(0.5**halvings)
     one = single(1.0 + 0.0 * y.high)

@@ -7,7 +7,7 @@ import pytest
 from mpmath import hyp1f1, mp, mpf
 
 import tolerances as tol
-from zwidth import phi
+from zwidth.numerics import phi
 
 SMALL = [0.0, 5e-324, 1e-300, *(10.0**k for k in range(-16, 0))]
 AROUND_THE_SWITCH = [2.4, np.nextafter(2.5, 0), 2.5, np.nextafter(2.5, 3), 2.6]

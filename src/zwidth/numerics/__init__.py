@@ -1,0 +1,1 @@
+"""Numerics that know nothing of walls: special functions, sums of floats, roots and minima."""
