@@ -11,11 +11,11 @@ from zwidth.batching import BLOCK, broadcast, elementwise, is_traced, to_caller
 from zwidth.domain import check_scalars
 from zwidth.double_double import Complex, Double, chosen, phi_pair, single, two_sum
 from zwidth.grouping import NAMES
-from zwidth.stability.circle import loop_of
+from zwidth.stability.circle import count, loop_of
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import kind_of
 from zwidth.stability.proved import Poles, outermost_poles, usable
-from zwidth.stability.radius import both_poles, traced_kernel
+from zwidth.stability.radius import traced_kernel, window
 from zwidth.status import Status
 
 # A bound of rounding errors over the rate, many times what they are: smaller ones leave the digits promised.
@@ -24,15 +24,17 @@ _STEPS = 16
 # Errors of the rate over the rate that are left where more digits are used; half a unit of these digits, with room for
 # all operations of a part; and what is lost where numbers become too small.
 _PROMISED = 2e-11
-_LAST = 2.0**-100
+_LAST = 2.0**-103
 _TINY = 1e-300
 # An error of the radius this small beside the rate leaves no doubt which pole decays most slowly.
 _SURELY = 1e-3
 _ACCURACY = 1e-9
-# Steps of Halley's method with poles that may be the slowest; that at -1 begins close enough.
-_FOLLOWED = 8
-# Farther from the unit circle (in the logarithm of the radius) the sign of the rate is proved with the radius.
-_DOUBTFUL = 1e-8
+# Rivals are looked for where the error of the radius is below this.
+_NEARBY = 1e-6
+# Poles so near to the real axis are taken for single ones; a pair is then a crowd.
+_REAL = 1e-6
+# So near to 1, in units of what the delay allows, P is known well enough by its second order.
+_CLOSE = 0.1
 
 
 def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -89,17 +91,29 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
         part = refine[start : start + BLOCK]
         with np.errstate(all="ignore"):
             walls = [column[part] for column in columns]
-            rate[part] = _refined(_Factors.of(*walls), _beyond_one(found.re[part], found.im[part]))
-    near = np.flatnonzero(~(np.abs(found.re) > _DOUBTFUL))
-    if near.size:
-        with np.errstate(all="ignore"):
-            rate[near] = _beside_circle(rate[near], [column[near] for column in columns])
-    # A pole at 1 stays there. The steps must have stayed at the pole whose size is proved.
-    rate[(columns[0] == 0) & (found.re == 0) & ~(rate < 0)] = 0.0
+            new, error = _refined(_Factors.of(*walls), _beyond_one(found.re[part], found.im[part]))
+            # A pole at 1 stays there.
+            at_one = (walls[0] == 0) & (found.re[part] == 0)
+            rate[part] = np.where(at_one, 0.0, np.where(error <= _PROMISED * np.abs(new), new, np.nan))
+    loose = np.flatnonzero((found.error > _ACCURACY) | (window(found.re, _ACCURACY) > _PROMISED * np.abs(found.re)))
+    with np.errstate(all="ignore"):
+        for start in range(0, loose.size, BLOCK):
+            part = loose[start : start + BLOCK]
+            walls = [column[part] for column in columns]
+            crowd = ~_alone(found.re[part], found.im[part], found.error[part], walls)
+            rate[part[crowd]] = _slowest(rate[part[crowd]], found.re[part[crowd]], [column[crowd] for column in walls])
+    # The steps must have stayed at the pole whose size is proved.
     known = np.abs(rate + found.re) <= found.error
-    known &= (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
+    known &= (found.error <= _NEARBY) | (found.error < _SURELY * np.abs(rate))
     rate[~known] = np.nan
     return rate
+
+
+def _alone(re: Array, im: Array, error: Array, walls: list[np.ndarray]) -> Array:
+    """Whether a count proves that no other pole is nearly as large."""
+    loop = loop_of(*walls, True)
+    seen = count(re - window(re, _ACCURACY), loop, True)
+    return seen.sure & (error <= _ACCURACY) & (seen.missing == np.where(np.sin(im) < _REAL, 1, 2))
 
 
 def _beyond_one(re: Array, im: Array) -> Array:
@@ -108,14 +122,21 @@ def _beyond_one(re: Array, im: Array) -> Array:
     return (np.expm1(re) - 2.0 * size * half * half) + 1j * (size * np.sin(im))
 
 
-def _beside_circle(rate: Array, walls: list[np.ndarray]) -> Array:
-    """The rates of poles next to the unit circle: the slowest motion, where the verdict agrees."""
-    # The proof of the radius does not tell apart poles that are all so near: two next to 1, one at -1, and a pair.
-    factors = _Factors.of(*walls)
+def _slowest(rate: Array, re: Array, walls: list[np.ndarray]) -> Array:
+    """The rates of the slowest motions where several poles may be of one size, and the verdict agrees."""
     # Whole delays as fractions, too: what is alone must not be computed otherwise than among neighbors.
-    pair = both_poles(_FOLLOWED, loop_of(*walls, True), True)[2:]
-    for start in (factors.next_to_one(), _beyond_one(*pair), 0j * rate - 2.0):
-        rate = np.fmin(rate, _refined(factors, start))
+    factors, loop = _Factors.of(*walls), loop_of(*walls, True)
+    # On a circle poles are where both parts of P are equally large, or real.
+    close, turn = factors.next_to_one(), 0.0 * re + np.pi
+    real = np.where(np.abs(close) * factors.turns < _CLOSE, close, np.expm1(re))
+    starts = real, *(_beyond_one(re, w) for w in (turn, *count(re, loop, True).crossings))
+    rivals = [_refined(factors, start) for start in starts]
+    for new, error in rivals:
+        rate = np.where((error <= _PROMISED * np.abs(new)) & ~(new > rate), new, rate)
+    for new, error in rivals:
+        # What is not near to any pole is no rival.
+        slower = (error < _NEARBY) & (new - error < rate - _PROMISED * np.abs(rate))
+        rate = np.where(slower & ~(error <= _PROMISED * np.abs(new)), np.nan, rate)
     # The verdict errs within its rounding of the boundary.
     stable = np.asarray(stable_kernel(*walls, kind_of(walls[3])))
     return np.where(stable == (rate > 0), rate, np.nan)
@@ -155,9 +176,9 @@ class _Factors(NamedTuple):
         return np.where(root.imag != 0, 0.5 * (root - linear) / bend, 0.5 * away / np.where(linear < 0, bend, 1.0))
 
 
-def _refined(at: _Factors, zeta: Array) -> Array:
-    """``-log |z|`` of the pole next to ``1 + zeta``, NaN where its error is not proved to be small."""
-    here, rate = Complex(single(zeta.real), single(zeta.imag)), np.full(zeta.shape, np.nan)
+def _refined(at: _Factors, zeta: Array) -> tuple[Array, Array]:
+    """``-log |z|`` of the pole next to ``1 + zeta`` and a bound of its error."""
+    here, rate, error = Complex(single(zeta.real), single(zeta.imag)), np.full(zeta.shape, np.nan), np.inf
     one = single(np.ones(zeta.shape))
     size_b, size_s, alpha = np.abs(at.b.high), np.abs(at.s.high), np.abs(at.alpha)
     for _ in range(_STEPS):
@@ -186,17 +207,21 @@ def _refined(at: _Factors, zeta: Array) -> Array:
         # |z|^2 - 1 = 2 Re zeta + |zeta|^2
         beyond = here.re.scaled(2.0).plus(here.re.times(here.re)).plus(here.im.times(here.im))
         new = -0.5 * np.log1p(beyond.high) - 0.5 * beyond.low / (1.0 + beyond.high)
-        error = within / r + _LAST * (np.abs(zeta.real) + size * size)
+        wide = within / r + _LAST * (np.abs(zeta.real) + size * size)
+        # A circle with z = 1 inside says nothing: steps towards two poles there take long.
+        wide = np.where((steepness > 0) & (wide < 0.5 * size), wide, np.inf)
         # What has arrived stays: a point's value must not depend on how long its neighbors take.
-        rate = np.where(np.isnan(rate) & (steepness > 0) & (error <= _PROMISED * np.abs(new)), new, rate)
-        if not np.any(np.isnan(rate)):
+        moving = ~(error <= _PROMISED * np.abs(rate))
+        if not np.any(moving):
             break
+        better = moving & (wide < error)
+        rate, error = np.where(better, new, rate), np.where(better, wide, error)
         step = -value / slope
         # Not to another pole, far away.
         step = step * np.minimum(1.0, np.maximum(size, 1e-3 / at.turns) / np.abs(step))
         step = np.where(np.isfinite(step), step, 0.0)
         here = here.plus(Complex(single(step.real), single(step.imag)))
-    return rate
+    return rate, error
 
 
 def _plant(delta: Array, f: Array) -> tuple[Double, Double, Double, Double]:
