@@ -106,20 +106,17 @@ class Complex(NamedTuple):
             self.re.times(other.im).plus(self.im.times(other.re)),
         )
 
-    def power(self, exponent: Array) -> Complex:
-        """To a whole power of at least 0, by repeated squaring."""
+    def grown(self, exponent: Array) -> Complex:
+        """``((1 + x)^k - 1)/x`` for whole k >= 0, without cancellation, by repeated squaring."""
         left = np.asarray(exponent).astype(np.int64)
-        square, result = self, None
-        one = Complex(single(1.0 + 0.0 * self.re.high), single(0.0 * self.re.high))
-        result = one
-        while True:
-            odd = (left & 1) == 1
-            product = result.times(square)
-            result = Complex(*(chosen(odd, new, old) for new, old in zip(product, result, strict=True)))
-            left = left >> 1
-            if not np.any(left):
-                return result
-            square = square.times(square)
+        one, two = (single(value + 0.0 * self.re.high) for value in (1.0, 2.0))
+        result = Complex(single(0.0 * self.re.high), single(0.0 * self.re.high))
+        for bit in reversed(range(int(np.max(left, initial=0)).bit_length())):
+            result = result.times(result.times(self).shifted(two))
+            more = result.plus(result.times(self)).shifted(one)
+            odd = (left >> bit) & 1 == 1
+            result = Complex(*(chosen(odd, new, old) for new, old in zip(more, result, strict=True)))
+        return result
 
     @property
     def rounded(self) -> Array:
@@ -141,7 +138,7 @@ _SMALL = 2.0**-6
 
 
 def phi_pair(x: Double) -> PhiPair:
-    """The functions of `numerics.phi` at x >= 0: Taylor's series at x/2^k, then doubled k times without cancellation."""
+    """As `numerics.phi` at x >= 0: Taylor's series at x/2^k, then doubled k times without cancellation."""
     halvings = np.ceil(np.log2(np.maximum(x.high, _SMALL) / _SMALL))
     y = x.scaled(0.5**halvings)
     one = single(1.0 + 0.0 * y.high)

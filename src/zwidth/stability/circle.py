@@ -232,13 +232,18 @@ def _phase(x: Array, at: _Circle, loop: Loop, fractional: bool, xp: Any) -> tupl
 class Count(NamedTuple):
     """What the count on one circle has seen."""
 
-    full: Array  # every pole is inside
+    missing: Array  # poles that are not inside
     sure: Array  # rounding errors cannot have decided that
     crossings: list[Array]  # the arguments w of the crossovers, and where there is none of any point
 
+    @property
+    def full(self) -> Array:
+        """Every pole is inside."""
+        return self.missing == 0
+
 
 def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> Count:
-    """Whether every pole is inside ``|z| = e^log_r``.
+    """How many poles are not inside ``|z| = e^log_r``.
 
     With ``single`` nothing is sure where there is more than one crossover; that takes half of the time.
     """
@@ -278,7 +283,7 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
         crossings.append(w)
     # Rounding must not have changed the number of crossovers.
     sure = sure & (outer == ends_outer)
-    return Count(stop - start + 2.0 * turn == loop.turns + 2.0, sure, crossings)
+    return Count(loop.turns + 2.0 - (stop - start + 2.0 * turn), sure, crossings)
 
 
 def _tied(sizes: tuple[Array, Array], blur: Array) -> Array:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
@@ -9,23 +11,30 @@ from zwidth.batching import BLOCK, broadcast, elementwise, is_traced, to_caller
 from zwidth.domain import check_scalars
 from zwidth.grouping import NAMES
 from zwidth.numerics.double_double import Complex, Double, chosen, phi_pair, single, two_sum
-from zwidth.stability.circle import loop_of
+from zwidth.stability.circle import count, loop_of
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import kind_of
 from zwidth.stability.proved import Poles, outermost_poles, usable
-from zwidth.stability.radius import both_poles, traced_kernel
+from zwidth.stability.radius import traced_kernel, window
 from zwidth.status import Status
 
 # A bound of rounding errors over the rate, many times what they are: smaller ones leave the digits promised.
 _EXACT = 5e-12
-_STEPS = 8
+_STEPS = 16
+# Errors of the rate over the rate that are left where more digits are used; half a unit of these digits, with room for
+# all operations of a part; and what is lost where numbers become too small.
+_PROMISED = 2e-11
+_LAST = 2.0**-103
+_TINY = 1e-300
 # An error of the radius this small beside the rate leaves no doubt which pole decays most slowly.
 _SURELY = 1e-3
 _ACCURACY = 1e-9
-# Steps of Halley's method with poles that may be the slowest; that at -1 begins close enough.
-_FOLLOWED = 8
-# Farther from the unit circle (in the logarithm of the radius) the sign of the rate is proved with the radius.
-_DOUBTFUL = 1e-8
+# Rivals are looked for where the error of the radius is below this.
+_NEARBY = 1e-6
+# Poles so near to the real axis are taken for single ones; a pair is then a crowd.
+_REAL = 1e-6
+# So near to 1, in units of what the delay allows, P is known well enough by its second order.
+_CLOSE = 0.1
 
 
 def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -81,72 +90,144 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
     for start in range(0, refine.size, BLOCK):
         part = refine[start : start + BLOCK]
         with np.errstate(all="ignore"):
-            rate[part] = refined_rate(*(column[part] for column in (*columns, found.re, found.im)))
-    near = np.flatnonzero(~(np.abs(found.re) > _DOUBTFUL))
-    if near.size:
-        walls = [column[near] for column in columns]
-        with np.errstate(all="ignore"):
-            rate[near] = _beside_circle(rate[near], *walls)
+            walls = [column[part] for column in columns]
+            new, error = _refined(_Factors.of(*walls), _beyond_one(found.re[part], found.im[part]))
+            # A pole at 1 stays there.
+            at_one = (walls[0] == 0) & (found.re[part] == 0)
+            rate[part] = np.where(at_one, 0.0, np.where(error <= _PROMISED * np.abs(new), new, np.nan))
+    loose = np.flatnonzero((found.error > _ACCURACY) | (window(found.re, _ACCURACY) > _PROMISED * np.abs(found.re)))
+    with np.errstate(all="ignore"):
+        for start in range(0, loose.size, BLOCK):
+            part = loose[start : start + BLOCK]
+            walls = [column[part] for column in columns]
+            crowd = ~_alone(found.re[part], found.im[part], found.error[part], walls)
+            rate[part[crowd]] = _slowest(rate[part[crowd]], found.re[part[crowd]], [column[crowd] for column in walls])
     # The steps must have stayed at the pole whose size is proved.
     known = np.abs(rate + found.re) <= found.error
-    known &= (found.error <= _ACCURACY) | (found.error < _SURELY * np.abs(rate))
+    known &= (found.error <= _NEARBY) | (found.error < _SURELY * np.abs(rate))
     rate[~known] = np.nan
     return rate
 
 
-def _beside_circle(rate: Array, alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """The rates of poles next to the unit circle: the slowest motion, on the verdict's side."""
-    # The proof of the radius does not tell apart poles that are all so near.
+def _alone(re: Array, im: Array, error: Array, walls: list[np.ndarray]) -> Array:
+    """Whether a count proves that no other pole is nearly as large."""
+    loop = loop_of(*walls, True)
+    seen = count(re - window(re, _ACCURACY), loop, True)
+    return seen.sure & (error <= _ACCURACY) & (seen.missing == np.where(np.sin(im) < _REAL, 1, 2))
+
+
+def _beyond_one(re: Array, im: Array) -> Array:
+    """``e^(re + j im) - 1``."""
+    half, size = np.sin(0.5 * im), np.exp(re)
+    return (np.expm1(re) - 2.0 * size * half * half) + 1j * (size * np.sin(im))
+
+
+def _slowest(rate: Array, re: Array, walls: list[np.ndarray]) -> Array:
+    """The rates of the slowest motions where several poles may be of one size, and the verdict agrees."""
     # Whole delays as fractions, too: what is alone must not be computed otherwise than among neighbors.
-    both = both_poles(_FOLLOWED, loop_of(alpha, beta, delta, d, True), True)
-    for re, im in (both[:2], both[2:], (0.0 * rate, 0.0 * rate + np.pi)):
-        other = refined_rate(alpha, beta, delta, d, re, im)
-        rate = np.where((other < rate) & (alpha != 0), other, rate)
-    stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
-    # The two agree but for walls within rounding of the circle.
-    return np.where(stable & (rate <= 0), np.finfo(float).tiny, np.where(~stable & (rate > 0), 0.0, rate))
+    factors, loop = _Factors.of(*walls), loop_of(*walls, True)
+    # On a circle poles are where both parts of P are equally large, or real.
+    close, turn = factors.next_to_one(), 0.0 * re + np.pi
+    real = np.where(np.abs(close) * factors.turns < _CLOSE, close, np.expm1(re))
+    starts = real, *(_beyond_one(re, w) for w in (turn, *count(re, loop, True).crossings))
+    rivals = [_refined(factors, start) for start in starts]
+    for new, error in rivals:
+        rate = np.where((error <= _PROMISED * np.abs(new)) & ~(new > rate), new, rate)
+    for new, error in rivals:
+        # What is not near to any pole is no rival.
+        slower = (error < _NEARBY) & (new - error < rate - _PROMISED * np.abs(rate))
+        rate = np.where(slower & ~(error <= _PROMISED * np.abs(new)), np.nan, rate)
+    # The verdict errs within its rounding of the boundary.
+    stable = np.asarray(stable_kernel(*walls, kind_of(walls[3])))
+    return np.where(stable == (rate > 0), rate, np.nan)
 
 
-def refined_rate(alpha: Array, beta: Array, delta: Array, d: Array, re: Array, im: Array) -> Array:
-    """``-log |z|`` of the pole next to ``e^(re + j im)``, from residuals of twice the digits."""
-    whole = np.floor(d)
-    em, start, lead, bend = _plant(delta, d - whole)
-    fractional = d != whole
-    turns = whole + 1.0 + fractional
-    s = two_sum(alpha, beta)
-    half = np.sin(0.5 * im)
-    size = np.exp(re)
-    zeta = (np.expm1(re) - 2.0 * size * half * half) + 1j * (size * np.sin(im))
-    step = 0.0 * zeta
-    for k in range(_STEPS):
-        at = Complex(single(zeta.real), single(zeta.imag))
-        z = at.shifted(single(1.0 + 0.0 * re))
-        device = z.power(turns).times(at).times(at.shifted(em))
-        plant = at.stretched(bend).shifted(lead).times(at).shifted(start)
-        wall = at.stretched(s).shifted(single(alpha))
-        value = device.plus(plant.times(wall)).rounded
+class _Factors(NamedTuple):
+    """P at z = 1 + zeta: ``z^turns zeta (zeta + em) + N (alpha + s zeta)``, ``N = phi1 + lead zeta + bend zeta^2``.
+
+    N is z M of a held delay, M of a whole one. Since em = phi1 delta, P is also ``alpha N + zeta (phi1 b + zeta Q)``
+    with ``Q = 1 + G (zeta + em) + s (lead + bend zeta)``, ``G = (z^turns - 1)/zeta`` and ``b = s + delta``, where
+    nothing cancels next to z = 1.
+    """
+
+    alpha: Array
+    s: Double  # alpha + beta
+    b: Double
+    turns: Array
+    em: Double
+    phi1: Double
+    lead: Double
+    bend: Double
+
+    @classmethod
+    def of(cls, alpha: Array, beta: Array, delta: Array, d: Array) -> _Factors:
+        """Those of walls."""
+        f = d % 1.0
+        b = two_sum(beta, delta).plus(single(alpha))
+        return cls(alpha, two_sum(alpha, beta), b, np.floor(d) + 1.0 + (f != 0), *_plant(delta, f))
+
+    def next_to_one(self) -> Array:
+        """The larger zero, or one of a pair, of P to second order in zeta; slightly beyond, as Newton's steps like."""
+        constant, lead = self.alpha * self.phi1.high, self.lead.high
+        linear = self.phi1.high * self.b.high + self.alpha * lead
+        bend = 1.0 + self.turns * self.em.high + lead * self.s.high + self.alpha * self.bend.high
+        root = np.sqrt(linear * linear - 4.0 * bend * constant + 0j)
+        away = np.where(linear < 0, -linear + root, -2.0 * constant / (0.5 * (linear + root)))
+        return np.where(root.imag != 0, 0.5 * (root - linear) / bend, 0.5 * away / np.where(linear < 0, bend, 1.0))
+
+
+def _refined(at: _Factors, zeta: Array) -> tuple[Array, Array]:
+    """``-log |z|`` of the pole next to ``1 + zeta`` and a bound of its error."""
+    here, rate, error = Complex(single(zeta.real), single(zeta.imag)), np.full(zeta.shape, np.nan), np.inf
+    one = single(np.ones(zeta.shape))
+    size_b, size_s, alpha = np.abs(at.b.high), np.abs(at.s.high), np.abs(at.alpha)
+    for _ in range(_STEPS):
+        z, g = here.shifted(one), here.grown(at.turns)
+        inner = here.stretched(at.bend).shifted(at.lead)
+        tail = here.shifted(at.em).times(g).plus(inner.stretched(at.s)).shifted(one)
+        plant = inner.times(here).shifted(at.phi1)
+        value = (
+            here.times(tail).shifted(at.phi1.times(at.b)).times(here).plus(plant.stretched(single(at.alpha))).rounded
+        )
         # The derivative needs no more than float64.
-        z1, m = 1.0 + zeta, plant.rounded
-        slope = device.rounded * (turns / z1 + 1.0 / zeta + 1.0 / (zeta + em.high))
-        slope = slope + (lead.high + 2.0 * bend.high * zeta) * wall.rounded + m * s.high
-        step = -value / slope
-        # A multiple pole moves by as much as it is uncertain.
-        step = np.where(np.isfinite(step) & (np.abs(step) < 0.5 * np.maximum(np.abs(zeta), 1e-3 / turns)), step, 0.0)
+        zeta, z1, m, lean = here.rounded, z.rounded, plant.rounded, inner.rounded
+        size, r, power = np.abs(zeta), np.abs(z1), 1.0 + zeta * g.rounded
+        turned, steep = power * zeta, lean + at.bend.high * zeta
+        parts = (
+            turned * (at.turns * (zeta + at.em.high) / z1 + 2.0),
+            at.phi1.high * at.b.high + 0j,
+            zeta * at.em.high * g.rounded,
+            zeta * lean * at.s.high,
+            steep * at.alpha,
+            steep * zeta * at.s.high,
+        )
+        slope = sum(parts)
+        count = at.turns + 8.0
+        # What rounding errors may add up to: of G in units of its largest part.
+        growth = np.minimum(at.turns, 2.0 / size) * np.maximum(1.0, r**at.turns)
+        sizes = size * (1.0 + growth * (size + at.em.high) + np.abs(lean) * size_s)
+        sizes = size * (at.phi1.high * size_b + sizes) + np.abs(m) * alpha
+        steepness = np.abs(slope) - 2.0**-50 * count * sum(map(np.abs, parts))
+        # A polynomial of degree N has a zero within N |P/P'| of any point.
+        within = (at.turns + 2.0) * (np.abs(value) + _LAST * count * sizes + _TINY) / steepness
+        # |z|^2 - 1 = 2 Re zeta + |zeta|^2
+        beyond = here.re.scaled(2.0).plus(here.re.times(here.re)).plus(here.im.times(here.im))
+        new = -0.5 * np.log1p(beyond.high) - 0.5 * beyond.low / (1.0 + beyond.high)
+        wide = within / r + _LAST * (np.abs(zeta.real) + size * size)
+        # A circle with z = 1 inside says nothing: steps towards two poles there take long.
+        wide = np.where((steepness > 0) & (wide < 0.5 * size), wide, np.inf)
         # What has arrived stays: a point's value must not depend on how long its neighbors take.
-        moving = np.abs(step) > 4e-16 * np.abs(zeta)
-        if k == _STEPS - 1 or not np.any(moving):
+        moving = ~(error <= _PROMISED * np.abs(rate))
+        if not np.any(moving):
             break
-        zeta = np.where(moving, zeta + step, zeta)
-    # |z|^2 - 1 = 2 Re zeta + |zeta|^2
-    re2, im2 = single(zeta.real), single(zeta.imag)
-    beyond = re2.scaled(2.0).plus(re2.times(re2)).plus(im2.times(im2))
-    change = 2.0 * np.real(np.conj(1.0 + zeta) * step) + np.abs(step) ** 2
-    beyond = beyond.plus(single(change))
-    rate = -0.5 * np.log1p(beyond.high) - 0.5 * beyond.low / (1.0 + beyond.high)
-    at_one = (alpha == 0) & (re == 0)
-    # Steps that do not settle have lost the pole: next to a double one, of walls a last place from none.
-    settled = np.abs(step) <= 4e-15 * np.abs(zeta)
-    return np.where(at_one, 0.0, np.where(settled, rate, np.nan))
+        better = moving & (wide < error)
+        rate, error = np.where(better, new, rate), np.where(better, wide, error)
+        step = -value / slope
+        # Not to another pole, far away.
+        step = step * np.minimum(1.0, np.maximum(size, 1e-3 / at.turns) / np.abs(step))
+        step = np.where(np.isfinite(step), step, 0.0)
+        here = here.plus(Complex(single(step.real), single(step.imag)))
+    return rate, error
 
 
 def _plant(delta: Array, f: Array) -> tuple[Double, Double, Double, Double]:

@@ -128,7 +128,7 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
 
 
 class Step(NamedTuple):
-    """Newton's step for log z, how far from here a pole is at most, and what rounding errors may do to the step."""
+    """Newton's step for log z, how far from here a pole is at most, and how far from the step's end it may be."""
 
     re: Array
     im: Array
@@ -145,7 +145,9 @@ def newton_step(re: Array, im: Array, loop: Loop, fractional: bool) -> Step:
     # A polynomial of degree N has a zero within N |P/P'| of any point.
     poles, slope = loop.turns + (3.0 if fractional else 2.0), xp.sqrt(norm)
     doubt = at.rounding / slope
-    return Step(by.real, by.imag, poles * (xp.sqrt(_square(at.p)) / slope + doubt), doubt)
+    # Of the step itself what the bend leaves: next to a double pole half of it.
+    bent = _square(by) * xp.sqrt(_square(at.second)) / slope
+    return Step(by.real, by.imag, poles * (xp.sqrt(_square(at.p)) / slope + doubt), doubt + bent)
 
 
 def halley_step(re: Array, im: Array, loop: Loop, fractional: bool) -> tuple[Array, Array]:

@@ -22,6 +22,8 @@ _BOTH, _LARGER = 2, 3
 # A step after which a pole is within so much of where it began may be taken without looking again: N |P/P'| bounds
 # the distance before the step, N >= 3, and the step is an N-th of it.
 _AFTER = 1.4
+# Of counts next to a pole: what their rounding allows, and what rates of decay promise.
+_COUNTED, _RELATIVE = 4096.0, 2e-11
 # From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
 # crossovers depend on it.
 _SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
@@ -102,6 +104,12 @@ def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), state, xp)
 
 
+def window(re: Array, tolerance: Any) -> Array:
+    """How far outside of a pole the count finds no other: as near as its rounding allows, for rates of decay."""
+    xp = namespace(re)
+    return xp.minimum(tolerance, xp.maximum(_COUNTED * epsilon(re), _RELATIVE * xp.abs(re)))
+
+
 def certified(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> Found:
     """The pole after one more step, and whether its modulus is proved to be the radius within the tolerance."""
     xp = namespace(re, loop.alpha)
@@ -109,7 +117,7 @@ def certified(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bo
     at_one = (loop.alpha == 0) & ~(re > tolerance)
     step = newton_step(re, im, loop, fractional)
     re, im = (xp.where(at_one, 0.0, part) for part in moved(re, im, step.re, step.im))
-    seen = count(re + tolerance, loop, fractional, single)
+    seen = count(re + window(re, tolerance), loop, fractional, single)
     proved = (at_one | (_AFTER * step.within <= tolerance)) & seen.full & seen.sure
     return Found(re, im, proved, xp.where(at_one, 0.0, step.doubt))
 
