@@ -10,6 +10,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
 
+from zwidth.errors import InputError
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves, select, si_scale
 
@@ -31,6 +32,9 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
 
     Returns:
         The Axes; without ``axes`` those of a new figure, unknown to pyplot.
+
+    Raises:
+        InputError: several Axes, but not one for each delay.
     """
     edges = curves(table, "d", "delta", curve="boundary")
     delays, colors = sorted({edge.d for edge in edges}), style.color_by_value([edge.delta for edge in edges])
@@ -41,8 +45,10 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
     else:
         columns = 2 if len(delays) <= 4 else 3
         panels = style.panels(axes, len(delays), style.WIDTH, 2.4 * -(-len(delays) // columns) + 0.7, columns)
+    apart = len(panels) == len(delays)
+    if not apart and len(panels) > 1:
+        raise InputError(f"axes: got {len(panels)} for {len(delays)} delays; give one for all, or one for each")
     for panel, d in zip(panels, delays, strict=False):
-        apart = len(panels) == len(delays)
         _draw_panel(panel, select(table, d=d) if apart else select(table), colors, scale)
         if apart:
             panel.set_title(f"$d = {d:g}$")

@@ -14,6 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from zwidth import figures
+from zwidth.errors import InputError
 from zwidth.figures import style, table
 from zwidth.studies.outcome import csv_text, stack
 
@@ -189,6 +190,21 @@ def test_every_panel_is_drawn_into_axes_of_ones_own(name):
             name: line.tolist() for name, line in curves(alike).items()
         }
         assert ax.get_xlabel() or name == "draw_step"
+
+
+def test_delays_go_into_one_axes_or_one_each():
+    axes = Figure().subplots(1, 3)
+    (alone,) = figures.draw_boundary(BOUNDARY, axes[0])
+    assert len(curves(alone)) == 6
+    given = stack([outline(0.5, d) for d in (0.0, 1.0, 2.0)])
+    with pytest.raises(InputError, match="got 2 for 3 delays"):
+        figures.draw_boundary(given, axes[:2])
+
+
+def test_responses_that_are_alike_are_two_all_the_same():
+    positions, forces = figures.draw_step(stack([response(), response()]))
+    for ax in (positions, forces):
+        assert [line.get_xdata().size for line in ax.lines if line.get_xdata()[-1] > 50] == [100, 100]
 
 
 def test_every_function_takes_axes_last_and_returns_them():
