@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import BLOCK, broadcast, elementwise, is_traced, to_caller
+from zwidth.batching import broadcast, elementwise, is_traced, to_caller
 from zwidth.domain import check_scalars
 from zwidth.grouping import NAMES
 from zwidth.numerics.double_double import Complex, Double, chosen, phi_pair, single, two_sum
@@ -20,6 +20,7 @@ from zwidth.status import Status
 
 # A bound of rounding errors over the rate, many times what they are: smaller ones leave the digits promised.
 _EXACT = 5e-12
+_PIECE = 1 << 14
 _STEPS = 16
 # Errors of the rate over the rate that are left where more digits are used; half a unit of these digits, with room for
 # all operations of a part; and what is lost where numbers become too small.
@@ -86,22 +87,24 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
     """The rates of decay of outermost poles, with relative accuracy; NaN where it is not known which decays slowest."""
     rate = -found.re
     # What float64 knows well enough needs no more digits.
-    refine = np.flatnonzero((found.doubt > _EXACT * np.abs(rate)) | (found.error > _ACCURACY))
-    for start in range(0, refine.size, BLOCK):
-        part = refine[start : start + BLOCK]
-        with np.errstate(all="ignore"):
+    vague = (found.doubt > _EXACT * np.abs(rate)) | (found.error > _ACCURACY)
+    loose = (found.error > _ACCURACY) | (window(found.re, _ACCURACY) > _PROMISED * np.abs(rate))
+    held = columns[3] % 1.0 != 0.0
+    with np.errstate(all="ignore"):
+        for part in _pieces(vague):
             walls = [column[part] for column in columns]
             new, error = _refined(_Factors.of(*walls), _beyond_one(found.re[part], found.im[part]))
             # A pole at 1 stays there.
             at_one = (walls[0] == 0) & (found.re[part] == 0)
             rate[part] = np.where(at_one, 0.0, np.where(error <= _PROMISED * np.abs(new), new, np.nan))
-    loose = np.flatnonzero((found.error > _ACCURACY) | (window(found.re, _ACCURACY) > _PROMISED * np.abs(found.re)))
-    with np.errstate(all="ignore"):
-        for start in range(0, loose.size, BLOCK):
-            part = loose[start : start + BLOCK]
-            walls = [column[part] for column in columns]
-            crowd = ~_alone(found.re[part], found.im[part], found.error[part], walls)
-            rate[part[crowd]] = _slowest(rate[part[crowd]], found.re[part[crowd]], [column[crowd] for column in walls])
+        for kind in (False, True):
+            for part in _pieces(loose & (held == kind)):
+                loop = loop_of(*(column[part] for column in columns), kind)
+                # Whether a count proves that no other pole is nearly as large.
+                seen = count(found.re[part] - window(found.re[part], _ACCURACY), loop, kind)
+                alone = seen.sure & (seen.missing == np.where(np.sin(found.im[part]) < _REAL, 1, 2))
+                crowd = part[~alone | (found.error[part] > _ACCURACY)]
+                rate[crowd] = _slowest(rate[crowd], found.re[crowd], [column[crowd] for column in columns], kind)
     # The steps must have stayed at the pole whose size is proved.
     known = np.abs(rate + found.re) <= found.error
     known &= (found.error <= _NEARBY) | (found.error < _SURELY * np.abs(rate))
@@ -109,11 +112,10 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
     return rate
 
 
-def _alone(re: Array, im: Array, error: Array, walls: list[np.ndarray]) -> Array:
-    """Whether a count proves that no other pole is nearly as large."""
-    loop = loop_of(*walls, True)
-    seen = count(re - window(re, _ACCURACY), loop, True)
-    return seen.sure & (error <= _ACCURACY) & (seen.missing == np.where(np.sin(im) < _REAL, 1, 2))
+def _pieces(which: np.ndarray) -> list[np.ndarray]:
+    """The places where it is true, by so many that what they need stays in the cache."""
+    places = np.flatnonzero(which)
+    return [places[start : start + _PIECE] for start in range(0, places.size, _PIECE)]
 
 
 def _beyond_one(re: Array, im: Array) -> Array:
@@ -122,14 +124,13 @@ def _beyond_one(re: Array, im: Array) -> Array:
     return (np.expm1(re) - 2.0 * size * half * half) + 1j * (size * np.sin(im))
 
 
-def _slowest(rate: Array, re: Array, walls: list[np.ndarray]) -> Array:
+def _slowest(rate: Array, re: Array, walls: list[np.ndarray], kind: bool) -> Array:
     """The rates of the slowest motions where several poles may be of one size, and the verdict agrees."""
-    # Whole delays as fractions, too: what is alone must not be computed otherwise than among neighbors.
-    factors, loop = _Factors.of(*walls), loop_of(*walls, True)
+    factors = _Factors.of(*walls)
     # On a circle poles are where both parts of P are equally large, or real.
     close, turn = factors.next_to_one(), 0.0 * re + np.pi
     real = np.where(np.abs(close) * factors.turns < _CLOSE, close, np.expm1(re))
-    starts = real, *(_beyond_one(re, w) for w in (turn, *count(re, loop, True).crossings))
+    starts = real, *(_beyond_one(re, w) for w in (turn, *count(re, loop_of(*walls, kind), kind).crossings))
     rivals = [_refined(factors, start) for start in starts]
     for new, error in rivals:
         rate = np.where((error <= _PROMISED * np.abs(new)) & ~(new > rate), new, rate)
