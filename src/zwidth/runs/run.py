@@ -279,7 +279,7 @@ def _pieces(config: Config) -> list[Computation]:
     for study in config.studies:
         if isinstance(study, ComputedStudy):
             alone = sum(type(other) is type(study) for other in config.studies) == 1
-            inputs = {**_inputs(study), "alone": alone}
+            inputs = _inputs(study)
             if study.reads_scene and config.scene is not None:
                 inputs["scene"] = _spelled(config.scene)
             pieces.append(

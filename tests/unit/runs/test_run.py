@@ -317,9 +317,10 @@ def test_another_configuration_is_refused_before_anything_is_computed(finished, 
 
 
 def test_a_study_that_is_added_is_computed_and_one_that_is_removed_stays(finished, both, config):
-    both.write_text(BOTH + "  - {kind: map, name: three, alpha: 0.1, beta: [0.1, 0.4], delta: 0, d: 0}\n")
+    three = "  - {kind: map, name: three, alpha: 0.1, beta: [0.1, 0.4], delta: 0, d: 0}\n"
+    both.write_text(BOTH + three + "  - {kind: sweep, name: more, axes: {alpha: 0.1, beta: 0.1, delta: 0.1, d: 0}}\n")
     result = run(both, out=finished, resume=True)
-    assert [study.state for study in result.studies] == ["kept", "kept", "done", "done"]
+    assert [study.state for study in result.studies] == ["kept", "kept", "done", "done", "done"]
     before = contents(finished)
     assert run(config, out=finished, resume=True).ok
     assert contents(finished)["three.npz"] == before["three.npz"]
