@@ -6,6 +6,7 @@ Exit code 0: done; 1: the work failed; 2: the input was wrong. Errors go to stde
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
 import click
@@ -15,6 +16,7 @@ from zwidth.errors import ZwidthError
 from zwidth.kernel_cache import use_compilation_cache
 
 _EXIT_FAILED, _EXIT_INPUT = 1, 2
+_STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -22,6 +24,13 @@ def main(arguments: list[str] | None = None) -> None:
     use_compilation_cache()
     try:
         cli.main(args=arguments, prog_name="zwidth", standalone_mode=False)
+    except SystemExit as end:
+        if arguments is None and end.code in _STOPPED:
+            # A compiler may be at work in a thread of JAX's, which the usual end of Python would crash.
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os._exit(int(end.code))
+        raise
     except click.exceptions.Abort:
         click.echo("zwidth: stopped", err=True)
         sys.exit(130)
