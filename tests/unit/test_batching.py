@@ -182,3 +182,35 @@ def test_float32_inside_a_transformation_is_said_once(monkeypatch):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         jax.jit(lambda x: pointwise(fragile, ("x",), (x,)))(2.0)
+
+
+def _product(x, y):
+    """x^2 y, and a whole number that no derivative passes through."""
+    return x * x * y, (x > y).astype(np.int32)
+
+
+def test_derivatives_of_an_elementwise_kernel_are_those_of_its_points(x64):
+    def first(x, y):
+        return elementwise(_product, ("x", "y"), (x, y))[0]
+
+    x, y = np.array([1.0, np.nan, 3.0]), np.array([2.0, 1.0, 0.5])
+    by_x, by_y = (jax.vmap(jax.grad(first, k))(x, y) for k in (0, 1))
+    np.testing.assert_array_equal(by_x, 2 * x * y)
+    np.testing.assert_array_equal(by_y, x * x)
+    # An argument that does not move costs nothing, and all of them may.
+    assert jax.grad(lambda x: first(x, 2.0))(3.0) == 12
+    assert jax.jvp(first, (3.0, 2.0), (1.0, 10.0)) == (18.0, 12 + 90)
+    np.testing.assert_array_equal(jax.jit(jax.hessian(lambda v: first(*v)))(np.array([3.0, 2.0])), [[4, 6], [6, 0]])
+    value, count = jax.jit(lambda x: elementwise(_product, ("x", "y"), (x, 1.0)))(2.0)
+    assert (value, count, count.dtype) == (4.0, 1, np.int32)
+
+
+def test_the_first_gradient_hands_out_no_intermediate_results(x64):
+    def long(x, y):
+        for _ in range(50):
+            x = x * y + x
+        return x
+
+    # Outside `jit`, what goes from the value to the gradient: one number an argument.
+    _, pullback = jax.vjp(lambda x, y: elementwise(long, ("x", "y"), (x, y)), 0.5, 0.25)
+    assert len(jax.tree.leaves(pullback)) <= 4

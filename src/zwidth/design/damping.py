@@ -10,9 +10,9 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise, is_traced, pointwise, to_caller
-from zwidth.design.lowest import Cost, lowest, without_slope
 from zwidth.domain import device_status
 from zwidth.grouping import Degree, by_degree
+from zwidth.numerics.minimize import Cost, lowest, without_slope
 from zwidth.stability.curve import column, lobe, peak
 from zwidth.stability.devices import Kind
 from zwidth.stability.labels import is_stable

@@ -28,7 +28,7 @@ from zwidth.stability.curve import (
 )
 from zwidth.stability.devices import ANY, Kind, kind_of
 from zwidth.status import Status
-from zwidth.xp import along, epsilon, frozen, namespace
+from zwidth.xp import along, epsilon, frozen, namespace, repeat
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 _METHODS: tuple[str, ...] = ("auto", "optimistix")
@@ -293,9 +293,13 @@ def _off_lobe(ray: _Ray, curve: Lobe) -> tuple[Array, Array]:
 
 def _follow(x: Array, curve: Lobe, ray: _Ray) -> tuple[Array, Any]:
     """A root that moves with the curve and the line: it stands still in NumPy, which knows no derivative."""
-    for _ in range(0 if namespace(x) is np else _EXACT_STEPS):
+
+    def step(x: Array) -> Array:
         at = wall(x, curve)
-        x = x - ray.offset(at) / ray.offset_slope(at)
+        return x - ray.offset(at) / ray.offset_slope(at)
+
+    xp = namespace(x)
+    x = x if xp is np else repeat(_EXACT_STEPS, step, x, xp)
     return x, wall(x, curve)
 
 

@@ -31,13 +31,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.numerics.roots import bisect
+from zwidth.numerics.roots import newton
 from zwidth.plant import split_delay
 from zwidth.stability.crossover import ARCSINE
 from zwidth.stability.devices import ANY, Kind
 from zwidth.xp import epsilon, frozen, horner, namespace
 
-_STEPS = 3
+# Of the peak, from its fit; of the direction from which it exists, from twice its beta at most.
+_STEPS, _DIRECTION_STEPS = 3, 12
 # Taylor series; on [0, pi/2] the first term left out is below 1e-17.
 SINE = [(-1.0) ** i / factorial(2 * i + 1) for i in range(11)]
 COSINE = [(-1.0) ** i / factorial(2 * i) for i in range(12)]
@@ -83,18 +84,28 @@ def larger_root(linear: Array, square: Array, xp: Any) -> tuple[Array, Array]:
     return xp.where(linear > 0, 0.5 * (root + linear), 0.5 * square / xp.where(other > 0, other, 1.0)), root
 
 
-def turns(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> Turns:
-    """What the wall ``(2 a, beta)`` needs at w = 0 and at w = pi, and where it needs more in between."""
+def _rise(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> tuple[Array, Array, Array]:
+    """At w = 0: what is needed, E, and the derivative of E in beta."""
     f, k, kappa = delay
     xp = namespace(a, f)
     n = k - 1.0
     # Of A at u = 0: the sums 1 + 2 sum cos(i w) and cos(k w), with their derivatives -i^2 in u.
     spring = (1.0 - f) * n * k * (2.0 * n + 1.0) + f * k * (k + 1.0) * (2.0 * k + 1.0)
-    at_zero, _ = larger_root(a * (2.0 * (n + f) + 1.0) - beta, kappa * a * a, xp)
-    rise = beta * ((1.0 - f) * k * k + f * (k + 1.0) ** 2) - a * spring / 3.0
-    pull = 0.125 * kappa * beta * (beta + 2.0 * a)
+    damper = (1.0 - f) * k * k + f * (k + 1.0) ** 2
+    needed, root = larger_root(a * (2.0 * (n + f) + 1.0) - beta, kappa * a * a, xp)
+    rise, by_beta = beta * damper - a * spring / 3.0, damper
     if kind.fractional:
-        rise = rise + pull / xp.where(at_zero > 0, at_zero, 1.0)
+        per = 0.125 * kappa / xp.where(needed > 0, needed, 1.0)
+        pull = per * beta * (beta + 2.0 * a)
+        rise, by_beta = rise + pull, damper + 2.0 * per * (beta + a) + pull / xp.where(root > 0, root, 1.0)
+    return needed, rise, by_beta
+
+
+def turns(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> Turns:
+    """What the wall ``(2 a, beta)`` needs at w = 0 and at w = pi, and where it needs more in between."""
+    f, k, _ = delay
+    xp = namespace(a, f)
+    at_zero, rise, _ = _rise(a, beta, delay, kind)
     b = beta + a
     end = beta * (1.0 - 5.0 * f) - 2.0 * a * f + 0.5 * f * beta * (beta + 2.0 * a) / xp.where(b > 0, b, 1.0)
     return Turns(at_zero, xp.where(beta > 0, rise, -1.0), b * (1.0 - f), (k == 1) & (end >= 0))
@@ -225,13 +236,11 @@ def directions(d: Array) -> Directions:
     xp = namespace(d)
     delay = delay_of(d)
     f, k, _ = delay
-    n = k - 1.0
-    half = 0.5 + 0.0 * d
-    spring = (1.0 - f) * n * k * (2.0 * n + 1.0) + f * k * (k + 1.0) * (2.0 * k + 1.0)
-    damper = (1.0 - f) * k * k + f * (k + 1.0) * (k + 1.0)
-
-    # The slope at w = 0 grows with beta. For alpha = 0 it is 0, which `turns` counts as falling.
-    first = bisect(lambda beta: ~(turns(half, beta, delay).rise > 0), 0.0 * d, spring / (6.0 * damper))
+    half, zero = 0.5 + 0.0 * d, 0.0 * d
+    # E at w = 0 grows with beta. Without the pull of a fraction it vanishes at the first guess.
+    _, short, by_beta = _rise(half, zero, delay, Kind(True, True, False))
+    highest = -short / by_beta
+    first, _ = newton(lambda beta: _rise(half, beta, delay)[1:], zero, highest, highest, _DIRECTION_STEPS)
     # (2 - 9 f) t^2 + (1 - 6 f) t = f
     ends = (k == 1) & (9.0 * f < 2.0)
     below = xp.where(ends, f, 0.0)

@@ -73,29 +73,22 @@ def kkt_kernel(delta: Array, d: Array, delay: str) -> RidgePoint:
     status = device_status(delta, d)
     # NaN goes through the computation and not around it, so that derivatives are NaN as well.
     mask = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    alpha, beta, omega, is_corner, converged = kkt_ridge(delta * mask, d * mask, delay)
-    found = jnp.where(converged, 1.0, jnp.nan)
-    status = jnp.where((status == Status.OK) & ~converged, int(Status.NOT_CONVERGED), status)
-    kind = jnp.where(is_corner, RidgeKind.CORNER, RidgeKind.SMOOTH)
-    return RidgePoint(alpha * found, beta * found, omega * found, kind.astype(jnp.int32), status.astype(jnp.int32))
-
-
-def kkt_ridge(delta: Array, d: Array, delay: str) -> tuple[Array, Array, Array, Array, Array]:
-    """alpha, beta, omega of the ridge of one point, whether it is a corner, and whether it was found."""
     # A solver that sees NaN in one lane may spoil or stop the others; NaN is put back behind it.
-    poison = 0.0 * (delta + d)
-    delta, d = jnp.where(jnp.isnan(delta), 1.0, delta), jnp.where(jnp.isnan(d), 1.0, d)
+    spoiled = 0.0 * (delta * mask + d * mask)
+    delta, d = jnp.where(jnp.isnan(spoiled), 1.0, delta), jnp.where(jnp.isnan(spoiled), 1.0, d)
     loop = stored(frequency_loop(delta, d, delay), delta)
-    at_corner = corner(curve_of(loop.plant), loop.lag)
-    is_corner = at_corner.is_ridge
+    end = corner(curve_of(loop.plant), loop.lag)
     omega, found = _smooth_omega(loop, d, delay)
     smooth = frequency_boundary(omega, loop, delay)
-    return (
-        jnp.where(is_corner, at_corner.alpha, smooth.alpha) + poison,
-        jnp.where(is_corner, at_corner.beta, smooth.beta) + poison,
-        jnp.where(is_corner, jnp.pi, omega) + poison,
-        is_corner,
-        is_corner | found,
+    converged = end.is_ridge | found
+    spoiled = spoiled * jnp.where(converged, 1.0, jnp.nan)
+    status = jnp.where((status == Status.OK) & ~converged, int(Status.NOT_CONVERGED), status)
+    return RidgePoint(
+        jnp.where(end.is_ridge, end.alpha, smooth.alpha) + spoiled,
+        jnp.where(end.is_ridge, end.beta, smooth.beta) + spoiled,
+        jnp.where(end.is_ridge, jnp.pi, omega) + spoiled,
+        jnp.where(end.is_ridge, RidgeKind.CORNER, RidgeKind.SMOOTH).astype(jnp.int32),
+        status.astype(jnp.int32),
     )
 
 

@@ -7,7 +7,7 @@ import pytest
 
 import zwidth
 from zwidth import fastest_damping, fastest_wall, modulus_margin, most_robust_damping
-from zwidth.design.lowest import lowest
+from zwidth.numerics.minimize import lowest
 from zwidth.stability.poles import radius_by_companion
 from zwidth.status import Status
 
