@@ -22,9 +22,9 @@ from zwidth.status import Status
 _EXACT = 5e-12
 _PIECE = 1 << 14
 _STEPS = 16
-# Errors of the rate over the rate that are left where more digits are used; half a unit of these digits, with room for
-# all operations of a part; and what is lost where numbers become too small.
-_PROMISED = 2e-11
+# Errors over the rate with which its pole need not move on, and those that leave it the digits promised.
+_ARRIVED, _PROMISED = 1e-14, 2e-11
+# Half a unit of the digits of pairs, with room for all operations of a part; what numbers lose that are too small.
 _LAST = 2.0**-103
 _TINY = 1e-300
 # An error of the radius this small beside the rate leaves no doubt which pole decays most slowly.
@@ -51,17 +51,18 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         d: delay in periods, >= 0, whole or not (held). All four broadcast.
 
     Returns:
-        Array of the broadcast shape, per period: positive exactly where `zwidth.is_stable` says so, 0 with a pole on
-        the unit circle, negative where the motion grows. NaN for a point out of range, and
-        where poles lie so close together that two counts cannot tell which is the slowest.
+        Array of the broadcast shape, per period: positive where the wall is stable (as `zwidth.is_stable` says with
+        method "certified"; the default method errs within its rounding of the boundary), 0 with a pole at 1, negative
+        where the motion grows. NaN for a point out of range, where it is not known which of several poles is the
+        slowest, and where its digits are not: next to multiple poles, or beyond the 31 digits used.
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
 
     Numerics:
         Relative, not absolute accuracy, 1e-10 or better, however slow the decay: the outermost pole as for
-        `zwidth.spectral_radius`, then Newton steps with residuals of 31 digits. Next to a k-fold pole the k-th root of
-        that is left. Inside `jit` the same in the ambient precision, without the last step: absolute accuracy only.
+        `zwidth.spectral_radius`, Newton steps with residuals of 31 digits, and an error bound by N |P/P'|. Where a
+        count cannot exclude a second pole of nearly that size, all that are near the circle are compared. Inside `jit` the same in the ambient precision, without the last step: absolute accuracy only.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17); Dekker 1971 (residuals of twice the digits).
@@ -87,8 +88,8 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
     """The rates of decay of outermost poles, with relative accuracy; NaN where it is not known which decays slowest."""
     rate = -found.re
     # What float64 knows well enough needs no more digits.
-    vague = (found.doubt > _EXACT * np.abs(rate)) | (found.error > _ACCURACY)
-    loose = (found.error > _ACCURACY) | (window(found.re, _ACCURACY) > _PROMISED * np.abs(rate))
+    vague = found.doubt > _EXACT * np.abs(rate)
+    loose = np.isinf(found.doubt) | (window(found.re, _ACCURACY) > _PROMISED * np.abs(rate))
     held = columns[3] % 1.0 != 0.0
     with np.errstate(all="ignore"):
         for part in _pieces(vague):
@@ -103,7 +104,7 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
                 # Whether a count proves that no other pole is nearly as large.
                 seen = count(found.re[part] - window(found.re[part], _ACCURACY), loop, kind)
                 alone = seen.sure & (seen.missing == np.where(np.sin(found.im[part]) < _REAL, 1, 2))
-                crowd = part[~alone | (found.error[part] > _ACCURACY)]
+                crowd = part[~alone | np.isinf(found.doubt[part])]
                 rate[crowd] = _slowest(rate[crowd], found.re[crowd], [column[crowd] for column in columns], kind)
     # The steps must have stayed at the pole whose size is proved.
     known = np.abs(rate + found.re) <= found.error
@@ -218,7 +219,7 @@ def _refined(at: _Factors, zeta: Array) -> tuple[Array, Array]:
         # A circle with z = 1 inside says nothing: steps towards two poles there take long.
         wide = np.where((steepness > 0) & (wide < 0.5 * size), wide, np.inf)
         # What has arrived stays: a point's value must not depend on how long its neighbors take.
-        moving = ~(error <= _PROMISED * np.abs(rate))
+        moving = ~(error <= _ARRIVED * np.abs(rate))
         if not np.any(moving):
             break
         better = moving & (wide < error)

@@ -89,10 +89,13 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
     """
     check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
     values = (alpha, beta, delta, d)
-    return by_samples(_margins_kernel, _NAMES, values)
+    return by_samples(margins_kernel, _NAMES, values)
 
 
-def _margins_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Margins:
+def margins_kernel(
+    alpha: Array, beta: Array, delta: Array, d: Array, with_delay: bool = True, with_modulus: bool = True
+) -> Margins:
+    """`margins` of arrays of one shape; the two margins that take a search may be left out, as NaN."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d) & (alpha > 0)
     spoiled = poison(ok, alpha, beta, delta, d)
@@ -106,11 +109,14 @@ def _margins_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Margin
     phase = xp.where(decisive, size_and_phase(w, alpha, beta, here)[1], xp.nan)
     stable = stable_at(alpha, beta, here, ANY)
     gain, phase_crossover = _gain_margin(alpha, beta, here, xp)
-    # Elsewhere a wall that is stable is asked about.
-    known = zip((alpha, beta, delta, d, phase), _STABLE_WALL, strict=True)
-    *wall, lag, lead = (xp.where(stable, value, other)[()] for value, other in known)
-    delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
-    distance, closest = modulus(alpha, beta, here)
+    delay = distance = closest = xp.nan * alpha
+    if with_delay:
+        # Elsewhere a wall that is stable is asked about.
+        known = zip((alpha, beta, delta, d, phase), _STABLE_WALL, strict=True)
+        *wall, lag, lead = (xp.where(stable, value, other)[()] for value, other in known)
+        delay = xp.where(stable, _delay_margin(tuple(wall), lag, lead, xp), 0.0)
+    if with_modulus:
+        distance, closest = modulus(alpha, beta, here)
     fields = (
         _on_the_side(gain, 1.0, epsilon(gain), stable, xp),
         _on_the_side(phase * (180.0 / np.pi), 0.0, _LEAST_MARGIN, stable, xp),

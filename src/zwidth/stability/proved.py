@@ -21,7 +21,7 @@ from zwidth.stability.radius_map import SMALLEST_MAP, Map, as_map, followed_pole
 from zwidth.status import Status
 
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
-_LADDER = 10.0 ** np.arange(1, 12)
+_LADDER = 10.0 ** np.arange(12)
 _LARGEST_ERROR = 0.1
 # Closer to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is.
 _DOUBTFUL = 1e-8
@@ -36,7 +36,7 @@ class Poles(NamedTuple):
     re: np.ndarray
     im: np.ndarray
     error: np.ndarray
-    doubt: np.ndarray  # what rounding errors may do to re
+    doubt: np.ndarray  # how far re may be from the pole; infinite where the proof is of the radius alone
 
 
 @cache
@@ -103,7 +103,7 @@ def _patiently(
             if not left.size:
                 return
             here = bounded(found.re[left], factor * accuracy, loop, kind)
-            error[left[here]] = factor * accuracy
+            error[left[here]], found.doubt[left[here]] = factor * accuracy, np.inf
             left, loop = left[~here], type(loop)(*(part[~here] for part in loop))
 
 

@@ -18,7 +18,7 @@ import numpy as np
 from zwidth.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.decay import rates
-from zwidth.stability.margins import margins
+from zwidth.stability.margins import margins_kernel
 from zwidth.stability.passivity import margin_at_one_delay
 from zwidth.stability.proved import outermost_poles, radius_at, usable
 from zwidth.stability.ridge import alpha_max
@@ -88,7 +88,8 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
         found["margin"] = -np.expm1(-rate)
         found["settling_time"] = _settling_time(rate, block)
     if MARGIN_OUTPUTS & set(outputs):
-        found |= dict(zip(_MARGINS, _by_device(_margins, block, shape, _all_devices, leaves=4), strict=True))
+        compute = partial(_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
+        found |= dict(zip(_MARGINS, _by_device(compute, block, shape, _all_devices, leaves=4), strict=True))
         if block.period.size:
             found["delay_margin"] = found["delay_margin"] * block.period[:, None, None]
     if "stable" in outputs:
@@ -199,9 +200,12 @@ def _radius_columns(accuracy: float, columns: Columns) -> Columns:
     return radius, (error <= accuracy).astype(np.float64), rate
 
 
-def _margins(columns: Columns) -> Columns:
+def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Columns:
+    """The four margins; the two that take a search are NaN where nobody asks for them."""
+
     def of_piece(*piece: np.ndarray) -> Columns:
-        found = margins(*piece)
+        with np.errstate(all="ignore"):
+            found = margins_kernel(*piece, with_delay, with_modulus)
         return tuple(np.asarray(getattr(found, name)) for name in _MARGINS)
 
     return in_pieces(of_piece, columns, _PIECE)

@@ -287,7 +287,7 @@ def _computed(outputs: tuple[str, ...]) -> set[str]:
     """The outputs that cost something; the others follow from them."""
     costly = {"spectral_radius" if name in RADIUS_OUTPUTS else name for name in outputs}
     costly = {"passive" if name == "passivity_margin" else name for name in costly}
-    costly = {"modulus_margin" if name in MARGIN_OUTPUTS else name for name in costly}
+    costly = {"gain_margin" if name == "phase_margin" else name for name in costly}
     return {"alpha_max" if OUTPUTS[name].family == "device" else name for name in costly}
 
 
@@ -320,7 +320,11 @@ def _most_periods(study: SweepStudy, grid: Grid) -> float:
 
 def _rate(output: str) -> float:
     """Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it."""
-    return {"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 8e4, "modulus_margin": 5e3}[output]
+    return {
+        **{"alpha_max": 1e6, "stable": 3e8, "passive": 4e6},
+        "spectral_radius": 1e6,
+        **{"gain_margin": 2e5, "phase_margin": 2e5, "delay_margin": 2e4, "modulus_margin": 2e4},
+    }[output]
 
 
 def _size(count: float) -> str:

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import flint
 import jax
 import numpy as np
 import pytest
@@ -11,9 +12,20 @@ import oracles
 import zwidth
 from zwidth.errors import InputError
 from zwidth.numerics.double_double import phi_pair, single
+from zwidth.stability.circle import loop_of
+from zwidth.stability.radius import both_poles
 
 REFERENCE = Path(__file__).resolve().parents[2] / "reference"
 NAMES = ("alpha", "beta", "delta", "d")
+# Once 0 or -5e-16; a double pole next to 1; beta = -delta; a slow pole and a pair of one size.
+FOUND = zip(
+    (1e-60, 2152.8250035942688, 2151.825004026501, np.nextafter(1.0, 2.0)),
+    (5.024833777510824e-35, 1.398206984365602e-17, 1.9514254455461163e-19, 3.587500244316158),
+    (1.0852888887691377e-38, -2.1906036452364306e-10, 2.1906036452364306e-10, 59.0),
+    (7.631510433624652e-09, 0.26362768524208585, 0.0004982256326648892, 5.0),
+    strict=True,
+)
+FOUND = [np.array(column) for column in FOUND]
 
 
 def exact_rate(*wall):
@@ -62,6 +74,93 @@ def test_the_sign_is_that_of_the_verdict():
 )
 def test_slow_loops_keep_their_digits(wall):
     assert zwidth.decay_rate(*wall) == pytest.approx(float(exact_rate(*wall)), rel=1e-13)
+
+
+def ball_rate(alpha, beta, delta, d):
+    """The exact rate of the outermost pole of the printed polynomial, by python-flint's balls."""
+    whole, t = int(d), flint.arb(1) - (flint.arb(d) - int(d))
+    for bits in (400, 1600):
+        with flint.ctx.workprec(2 * bits):
+            x, f = flint.arb(delta), 1 - t
+
+            def phis(x):
+                p1 = -(-x).expm1() / x
+                return p1, (1 - p1) / x
+
+            (p1, p2), (late1, late2) = phis(x), phis(x * t)
+            c, numerator = (-x).exp(), [p1 - p2, p2]
+            if d != whole:
+                early1, early2 = phis(x * f)
+                g0 = t * t * late2, t * late1
+                g1 = f * f * early2 + t * late1 * f * early1, (-x * t).exp() * f * early1
+                numerator = [p1 * g1[1] - c * g1[0], p1 * g0[1] - c * g0[0] + g1[0], g0[0]]
+            arms = flint.arb_poly(numerator) * flint.arb_poly([-flint.arb(beta), flint.arb(alpha) + flint.arb(beta)])
+            lag = whole + 1 + (d != whole)
+            p = flint.acb_poly(arms + flint.arb_poly([0] * lag + [c, -(1 + c), 1]))
+        with flint.ctx.workprec(bits):
+            try:
+                roots = p.roots()
+            except ValueError:
+                continue
+            slope, best = p.derivative(), max(float(abs(z).lower()) for z in roots)
+            rates = []
+            for z in roots:
+                if float(abs(z).upper()) > best - 1e-9:
+                    for _ in range(12):
+                        middle = flint.acb(z.real.mid(), z.imag.mid())
+                        new = middle - p(middle) / slope(z)
+                        z = new if z.contains(new) else z
+                    # A ball of its own that holds its conjugate holds a real root.
+                    rates.append(-abs(z.real if z.imag.contains(0) else z).log())
+            rate = min(rates, key=lambda rate: float(rate.mid()))
+            if rate.rad() < abs(rate.mid()) * flint.arb(1e-13):
+                return float(rate.mid())
+    return np.nan
+
+
+def troubled_walls(count, rng):
+    """Next to ``beta = -delta``, where P nearly loses its linear term at z = 1; with two poles that nearly meet there."""
+    delta, alpha = 10.0 ** rng.uniform(-19, 3, 4 * count), 10.0 ** rng.uniform(-60, -3, 4 * count)
+    d = rng.choice([0.0, 1.0, 3.0, 17.0, 0.25, 1.5, 2.9, np.nextafter(1.0, 2.0)], 4 * count)
+    near = -delta * (1 + rng.integers(-40, 41, 4 * count) * 2.0**-53)
+    beta = np.concatenate([near[:count], -delta[count:] * (1 - 10.0 ** rng.uniform(-16, 0, 3 * count))])
+    least = np.abs(beta + delta)[2 * count :] ** 2 / np.maximum(1, delta[2 * count :])
+    spread = np.concatenate([10.0 ** rng.uniform(-4, 2, count), 0.25 * (1 + 10.0 ** rng.uniform(-9, 0, count))])
+    alpha[2 * count :] = least * spread + 1e-60
+    return alpha, beta, delta, d
+
+
+def walls_with_poles_of_one_size(count, rng):
+    """The slow pole as large as the pair, by bisection in beta; then apart by rounding and more."""
+    delta, d = 10.0 ** rng.uniform(-5, 1, count), rng.choice([0.0, 1.0, 2.0, 5.0, 0.5, 1.25], count)
+    alpha = 10.0 ** rng.uniform(-9, -1, count) / (1 + d)
+    low, high = (zwidth.boundary_point(delta, d, alpha=alpha, side=side).beta for side in ("lower", "upper"))
+
+    def first(beta):
+        slow, _, pair, _ = both_poles(40, loop_of(alpha, beta, delta, d, True), True)
+        return slow > pair
+
+    low, high = np.array(low + 0.02 * (high - low)), np.array(high)
+    with np.errstate(all="ignore"):
+        before = first(low)
+        for _ in range(70):
+            middle = 0.5 * (low + high)
+            same = first(middle) == before
+            low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return alpha, middle * (1 + rng.choice([-1, 0, 1], count) * 10.0 ** rng.uniform(-17, -8, count)), delta, d
+
+
+@pytest.mark.parametrize("draw, count, least", [(troubled_walls, 100, 0.93), (walls_with_poles_of_one_size, 150, 0.97)])
+def test_rates_are_right_or_missing_where_poles_nearly_meet(draw, count, least):
+    walls = draw(count, np.random.default_rng(31))
+    walls = [np.append(column, known) for column, known in zip(walls, FOUND, strict=True)]
+    rate = zwidth.decay_rate(*walls)
+    known = np.isfinite(rate)
+    assert known.mean() > least
+    exact = np.array([ball_rate(*wall) for wall in zip(*(column.tolist() for column in walls), strict=True)])
+    judged = known & np.isfinite(exact)
+    assert judged.sum() > 0.95 * known.sum()
+    np.testing.assert_allclose(rate[judged], exact[judged], rtol=1e-10)
 
 
 def test_without_stiffness_nothing_decays():
