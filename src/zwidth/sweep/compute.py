@@ -205,7 +205,7 @@ def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Columns:
 
     def of_piece(*piece: np.ndarray) -> Columns:
         with np.errstate(all="ignore"):
-            found = margins_kernel(*piece, with_delay, with_modulus)
+            found = margins_kernel(*piece, with_delay=with_delay, with_modulus=with_modulus)
         return tuple(np.asarray(getattr(found, name)) for name in _MARGINS)
 
     return in_pieces(of_piece, columns, _PIECE)
