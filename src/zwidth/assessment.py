@@ -1,4 +1,4 @@
-"""A verdict on one wall: stable or not, how far from the boundary, passive or not, and what would be possible."""
+"""A verdict on one wall of the rigid loop: stable, how far from the boundary, passive, and what is possible."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time response of the device in contact with the wall, exact at the samples and between them.
+"""Time response of the rigid device in contact with the wall, exact at the samples and between them.
 
 Between two instants at which a force changes, the damped mass has the exact solution
 

@@ -1,4 +1,4 @@
-"""When a step response has settled, for ever after: from the modes of the loop, not from where a run was cut.
+"""When a step response has settled, for ever after: from the modes of the rigid loop, not from where a run ends.
 
 The deviation from the final position is a sum of modes, at the samples and between them (T = 1, unit force):
 

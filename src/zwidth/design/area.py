@@ -1,4 +1,4 @@
-"""Z-width as a number: the area of the stable walls in the (alpha, beta) plane."""
+"""Z-width as a number: the area of the stable walls in the (alpha, beta) plane (rigid loop)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which virtual damping to choose for a wanted stiffness: the fastest-settling, and the most robust one."""
+"""Which virtual damping to choose for a stiffness: the fastest-settling, and the most robust one (rigid loop)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Z-width as a number: the area of the passive walls in the (alpha, beta) plane.
+"""Z-width as a number: the area of the passive walls in the (alpha, beta) plane (rigid loop).
 
 In the direction ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)`` the damping that a wall needs is decided
 

@@ -1,4 +1,4 @@
-"""The stiffest wall that every device of a family can render, proved: mass, damping, period and delay uncertain.
+"""The stiffest wall that every device of a family can render, proved (rigid loop): all its four numbers uncertain.
 
 A device found by search bounds the answer from above. From below it is proved: the box of devices is cut until the
 verdict of `zwidth.stability.affine` holds for every device of every part at once.

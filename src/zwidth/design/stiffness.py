@@ -1,4 +1,4 @@
-"""How stiff the wall of a device can be, and what a little more of each of its properties buys."""
+"""How stiff the wall of a device can be, and what a little more of each property buys (rigid loop)."""
 
 from __future__ import annotations
 

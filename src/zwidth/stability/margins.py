@@ -1,4 +1,4 @@
-"""How much gain, phase and delay a wall bears: the margins of control engineering, exact for this loop.
+"""How much gain, phase and delay a wall bears: the margins of control engineering, exact for the rigid loop.
 
 ``|L|`` has one crossover, and the phase there decides (docs/theory/one-crossover.md): each margin is the distance to
 the one place where the loop becomes unstable, and its sign is the verdict.

@@ -1,4 +1,4 @@
-"""The physical damping that a passive wall needs, for any delay: one maximum over frequency, found and proved.
+"""The physical damping that a passive wall of the rigid loop needs, for any delay: one maximum over frequency.
 
 Notation: ``d = n + f``, ``k = n + 1``, ``a = alpha/2``, ``b = beta + alpha/2``, ``u = 1 - cos w`` in (0, 2],
 ``kappa = 4 f (1 - f)``, ``rho e^(-j phi) = (1 - f) + f e^(-jw)``, ``psi = k w + phi``. At one frequency the wall needs

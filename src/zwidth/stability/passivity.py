@@ -1,4 +1,4 @@
-"""Passivity of the sampled wall (Colgate's condition), for any delay.
+"""Passivity of the sampled wall of the rigid loop (Colgate's condition), for any delay.
 
 Per frequency the condition is a lower bound on the physical damping. For whole d, with D = sin((d + 1/2) w)/sin(w/2),
 

@@ -1,4 +1,4 @@
-"""The stable set of one device in the (alpha, beta) plane, as a closed outline whose sides are verified."""
+"""The stable set of one device in the (alpha, beta) plane, an outline whose sides are verified (rigid loop)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The stiffest stable wall, alpha_max(delta, d)."""
+"""The stiffest stable wall of the rigid loop, alpha_max(delta, d)."""
 
 from __future__ import annotations
 

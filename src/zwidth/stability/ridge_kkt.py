@@ -1,4 +1,4 @@
-"""The ridge as a constrained optimum: maximize alpha subject to P(e^(j omega)) = 0, solved by optimistix.
+"""The ridge as a constrained optimum, by optimistix (any loop): maximize alpha subject to P(e^(j omega)) = 0.
 
 This route needs of a loop only its frequency response, affine in (alpha, beta). The unknowns are real:
 

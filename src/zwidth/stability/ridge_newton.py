@@ -1,4 +1,4 @@
-"""The ridge by Newton's method on its closed-form optimality condition, one text for NumPy and JAX.
+"""The ridge of the rigid loop by Newton's method on its closed-form optimality condition.
 
 The curve z = e^(j omega) and its slope are written in ``y = s^2``, ``s = sin(omega/2)``. There the maximum stays a
 regular one at omega = pi, where every derivative in omega vanishes by symmetry, and the corner is the end point s = 1.

@@ -1,4 +1,4 @@
-"""Derivatives of the ridge in closed form.
+"""Derivatives of the rigid loop's ridge in closed form.
 
 At a maximum the frequency's own change does not count (envelope theorem), so that alpha_max moves as the curve does at
 a fixed z. With U = z^D (z - c)/M and alpha = 4 y Im U/sin omega, see `zwidth.stability.ridge_newton`,

@@ -1,4 +1,4 @@
-"""The stiffest stable wall of each virtual damping, in closed form: where a row of the (alpha, beta) plane ends.
+"""Where a row of the (alpha, beta) plane ends: the stiffest wall of each damping, in closed form (rigid loop).
 
 For a held delay d = n + f the stable walls of one (beta, delta, d) are ``0 < alpha < limit``: the limit is the first
 lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md, Theorem

@@ -1,4 +1,4 @@
-"""How fast the stiffest stable wall grows with damping, once the damping is strong: eq. (22)'s slope."""
+"""How fast the stiffest wall of the rigid loop grows with damping, once that is strong: eq. (22)'s slope."""
 
 from __future__ import annotations
 
