@@ -21,7 +21,7 @@ from zwidth.status import Status
 # A bound of rounding errors over the rate, many times what they are: smaller ones leave the digits promised.
 _EXACT = 5e-12
 _PIECE = 1 << 14
-_STEPS = 16
+_STEPS = 24
 # Errors over the rate with which its pole need not move on, and those that leave it the digits promised.
 _ARRIVED, _PROMISED = 1e-14, 2e-11
 # Half a unit of the digits of pairs, with room for all operations of a part; what numbers lose that are too small.
@@ -32,6 +32,8 @@ _SURELY = 1e-3
 _ACCURACY = 1e-9
 # Rivals are looked for where the error of the radius is below this.
 _NEARBY = 1e-6
+# Farther from the unit circle (in the logarithm of the radius) the verdict does not err.
+_DOUBTFUL = 1e-8
 # Poles so near to the real axis are taken for single ones; a pair is then a crowd.
 _REAL = 1e-6
 # So near to 1, in units of what the delay allows, P is known well enough by its second order.
@@ -51,10 +53,10 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         d: delay in periods, >= 0, whole or not (held). All four broadcast.
 
     Returns:
-        Array of the broadcast shape, per period: positive where the wall is stable (as `zwidth.is_stable` says with
-        method "certified"; the default method errs within its rounding of the boundary), 0 with a pole at 1, negative
-        where the motion grows. NaN for a point out of range, where it is not known which of several poles is the
-        slowest, and where its digits are not: next to multiple poles, or beyond the 31 digits used.
+        Array of the broadcast shape, per period: positive exactly where `zwidth.is_stable` says so, 0 with a pole at 1,
+        negative where the motion grows. NaN for a point out of range, where it is not known which of several poles is
+        the slowest, where its digits are not (next to multiple poles, or beyond the 31 digits used), and where the
+        verdict, within its rounding of the boundary, is on the other side.
 
     Raises:
         InputError: an argument is no real number or a scalar out of range, or shapes do not broadcast.
@@ -62,7 +64,8 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     Numerics:
         Relative, not absolute accuracy, 1e-10 or better, however slow the decay: the outermost pole as for
         `zwidth.spectral_radius`, Newton steps with residuals of 31 digits, and an error bound by N |P/P'|. Where a
-        count cannot exclude a second pole of nearly that size, all that are near the circle are compared. Inside `jit` the same in the ambient precision, without the last step: absolute accuracy only.
+        count cannot exclude a second pole of nearly that size, all that are near the circle are compared. Inside `jit`
+        the same in the ambient precision, without the last steps: absolute accuracy only.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17); Dekker 1971 (residuals of twice the digits).
@@ -100,16 +103,23 @@ def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
             rate[part] = np.where(at_one, 0.0, np.where(error <= _PROMISED * np.abs(new), new, np.nan))
         for kind in (False, True):
             for part in _pieces(loose & (held == kind)):
-                loop = loop_of(*(column[part] for column in columns), kind)
+                loop = loop_of(*(column[part] for column in columns), fractional=kind)
                 # Whether a count proves that no other pole is nearly as large.
                 seen = count(found.re[part] - window(found.re[part], _ACCURACY), loop, kind)
                 alone = seen.sure & (seen.missing == np.where(np.sin(found.im[part]) < _REAL, 1, 2))
                 crowd = part[~alone | np.isinf(found.doubt[part])]
-                rate[crowd] = _slowest(rate[crowd], found.re[crowd], [column[crowd] for column in columns], kind)
+                if crowd.size:
+                    rate[crowd] = _slowest(rate[crowd], found.re[crowd], [column[crowd] for column in columns], kind)
     # The steps must have stayed at the pole whose size is proved.
     known = np.abs(rate + found.re) <= found.error
     known &= (found.error <= _NEARBY) | (found.error < _SURELY * np.abs(rate))
     rate[~known] = np.nan
+    # No two functions contradict each other: next to the boundary the verdict is within its rounding, too.
+    near = np.flatnonzero(np.abs(rate) <= _DOUBTFUL)
+    walls = [column[near] for column in columns]
+    with np.errstate(all="ignore"):
+        stable = np.asarray(stable_kernel(*walls, kind=kind_of(walls[3])))
+    rate[near[stable != (rate[near] > 0)]] = np.nan
     return rate
 
 
@@ -126,12 +136,12 @@ def _beyond_one(re: Array, im: Array) -> Array:
 
 
 def _slowest(rate: Array, re: Array, walls: list[np.ndarray], kind: bool) -> Array:
-    """The rates of the slowest motions where several poles may be of one size, and the verdict agrees."""
+    """The rates of the slowest motions where several poles may be of one size."""
     factors = _Factors.of(*walls)
     # On a circle poles are where both parts of P are equally large, or real.
     close, turn = factors.next_to_one(), 0.0 * re + np.pi
     real = np.where(np.abs(close) * factors.turns < _CLOSE, close, np.expm1(re))
-    starts = real, *(_beyond_one(re, w) for w in (turn, *count(re, loop_of(*walls, kind), kind).crossings))
+    starts = real, *(_beyond_one(re, w) for w in (turn, *count(re, loop_of(*walls, fractional=kind), kind).crossings))
     rivals = [_refined(factors, start) for start in starts]
     for new, error in rivals:
         rate = np.where((error <= _PROMISED * np.abs(new)) & ~(new > rate), new, rate)
@@ -139,9 +149,7 @@ def _slowest(rate: Array, re: Array, walls: list[np.ndarray], kind: bool) -> Arr
         # What is not near to any pole is no rival.
         slower = (error < _NEARBY) & (new - error < rate - _PROMISED * np.abs(rate))
         rate = np.where(slower & ~(error <= _PROMISED * np.abs(new)), np.nan, rate)
-    # The verdict errs within its rounding of the boundary.
-    stable = np.asarray(stable_kernel(*walls, kind_of(walls[3])))
-    return np.where(stable == (rate > 0), rate, np.nan)
+    return rate
 
 
 class _Factors(NamedTuple):
@@ -169,7 +177,7 @@ class _Factors(NamedTuple):
         return cls(alpha, two_sum(alpha, beta), b, np.floor(d) + 1.0 + (f != 0), *_plant(delta, f))
 
     def next_to_one(self) -> Array:
-        """The larger zero, or one of a pair, of P to second order in zeta; slightly beyond, as Newton's steps like."""
+        """The larger zero, or one of a pair, of P to second order in zeta."""
         constant, lead = self.alpha * self.phi1.high, self.lead.high
         linear = self.phi1.high * self.b.high + self.alpha * lead
         bend = 1.0 + self.turns * self.em.high + lead * self.s.high + self.alpha * self.bend.high
@@ -181,55 +189,50 @@ class _Factors(NamedTuple):
 def _refined(at: _Factors, zeta: Array) -> tuple[Array, Array]:
     """``-log |z|`` of the pole next to ``1 + zeta`` and a bound of its error."""
     here, rate, error = Complex(single(zeta.real), single(zeta.imag)), np.full(zeta.shape, np.nan), np.inf
-    one = single(np.ones(zeta.shape))
-    size_b, size_s, alpha = np.abs(at.b.high), np.abs(at.s.high), np.abs(at.alpha)
     for _ in range(_STEPS):
-        z, g = here.shifted(one), here.grown(at.turns)
-        inner = here.stretched(at.bend).shifted(at.lead)
-        tail = here.shifted(at.em).times(g).plus(inner.stretched(at.s)).shifted(one)
-        plant = inner.times(here).shifted(at.phi1)
-        value = (
-            here.times(tail).shifted(at.phi1.times(at.b)).times(here).plus(plant.stretched(single(at.alpha))).rounded
-        )
-        # The derivative needs no more than float64.
-        zeta, z1, m, lean = here.rounded, z.rounded, plant.rounded, inner.rounded
-        size, r, power = np.abs(zeta), np.abs(z1), 1.0 + zeta * g.rounded
-        turned, steep = power * zeta, lean + at.bend.high * zeta
-        parts = (
-            turned * (at.turns * (zeta + at.em.high) / z1 + 2.0),
-            at.phi1.high * at.b.high + 0j,
-            zeta * at.em.high * g.rounded,
-            zeta * lean * at.s.high,
-            steep * at.alpha,
-            steep * zeta * at.s.high,
-        )
-        slope = sum(parts)
-        count = at.turns + 8.0
-        # What rounding errors may add up to: of G in units of its largest part.
-        growth = np.minimum(at.turns, 2.0 / size) * np.maximum(1.0, r**at.turns)
-        sizes = size * (1.0 + growth * (size + at.em.high) + np.abs(lean) * size_s)
-        sizes = size * (at.phi1.high * size_b + sizes) + np.abs(m) * alpha
-        steepness = np.abs(slope) - 2.0**-50 * count * sum(map(np.abs, parts))
-        # A polynomial of degree N has a zero within N |P/P'| of any point.
-        within = (at.turns + 2.0) * (np.abs(value) + _LAST * count * sizes + _TINY) / steepness
-        # |z|^2 - 1 = 2 Re zeta + |zeta|^2
-        beyond = here.re.scaled(2.0).plus(here.re.times(here.re)).plus(here.im.times(here.im))
-        new = -0.5 * np.log1p(beyond.high) - 0.5 * beyond.low / (1.0 + beyond.high)
-        wide = within / r + _LAST * (np.abs(zeta.real) + size * size)
-        # A circle with z = 1 inside says nothing: steps towards two poles there take long.
-        wide = np.where((steepness > 0) & (wide < 0.5 * size), wide, np.inf)
+        step, new, wide = _step(at, here)
         # What has arrived stays: a point's value must not depend on how long its neighbors take.
         moving = ~(error <= _ARRIVED * np.abs(rate))
         if not np.any(moving):
             break
         better = moving & (wide < error)
         rate, error = np.where(better, new, rate), np.where(better, wide, error)
-        step = -value / slope
-        # Not to another pole, far away.
-        step = step * np.minimum(1.0, np.maximum(size, 1e-3 / at.turns) / np.abs(step))
-        step = np.where(np.isfinite(step), step, 0.0)
-        here = here.plus(Complex(single(step.real), single(step.imag)))
+        here = here.plus(Complex(single(np.real(step)), single(np.imag(step))))
     return rate, error
+
+
+def _step(at: _Factors, here: Complex) -> tuple[Array, Array, Array]:
+    """Newton's step from ``1 + here``; ``-log |z|`` here, and how far that of a pole is from it at most."""
+    zeta, one, alpha = here.rounded, single(np.ones(here.re.high.shape)), at.alpha
+    z, g = here.shifted(one), here.grown(at.turns)
+    inner = here.stretched(at.bend).shifted(at.lead)
+    tail = here.shifted(at.em).times(g).plus(inner.stretched(at.s)).shifted(one)
+    plant = inner.times(here).shifted(at.phi1)
+    value = here.times(tail).shifted(at.phi1.times(at.b)).times(here).plus(plant.stretched(single(alpha))).rounded
+    # The derivative needs no more than float64.
+    lean, z1, size = inner.rounded, z.rounded, np.abs(zeta)
+    r, turned, steep = np.abs(z1), (1.0 + zeta * g.rounded) * zeta, lean + at.bend.high * zeta
+    em, s, b = at.em.high, at.s.high, at.phi1.high * at.b.high
+    parts = turned * (at.turns * (zeta + em) / z1 + 2.0), b + 0j, zeta * em * g.rounded, zeta * lean * s
+    parts = *parts, steep * alpha, steep * zeta * s
+    slope, count = sum(parts), at.turns + 8.0
+    # What rounding errors may add up to: of G in units of its largest part.
+    growth = np.minimum(at.turns, 2.0 / size) * np.maximum(1.0, r**at.turns)
+    sizes = np.abs(b) + size * (1.0 + growth * (size + em) + np.abs(lean * s))
+    sizes = size * sizes + np.abs(plant.rounded * alpha)
+    steepness = np.abs(slope) - 2.0**-50 * count * sum(map(np.abs, parts))
+    # A polynomial of degree N has a zero within N |P/P'| of any point.
+    within = (at.turns + 2.0) * (np.abs(value) + _LAST * count * sizes + _TINY) / steepness
+    # |z|^2 - 1 = 2 Re zeta + |zeta|^2
+    beyond = here.re.scaled(2.0).plus(here.re.times(here.re)).plus(here.im.times(here.im))
+    rate = -0.5 * np.log1p(beyond.high) - 0.5 * beyond.low / (1.0 + beyond.high)
+    error = within / r + _LAST * (np.abs(here.re.high) + size * size)
+    # A circle with z = 1 inside says nothing: steps towards two poles there take long.
+    error = np.where((steepness > 0) & (error < 0.5 * size), error, np.inf)
+    step = -value / slope
+    # Not to another pole, far away.
+    step = step * np.minimum(1.0, np.maximum(size, 1e-3 / at.turns) / np.abs(step))
+    return np.where(np.isfinite(step), step, 0.0), rate, error
 
 
 def _plant(delta: Array, f: Array) -> tuple[Double, Double, Double, Double]:

@@ -119,7 +119,7 @@ def ball_rate(alpha, beta, delta, d):
 
 
 def troubled_walls(count, rng):
-    """Next to ``beta = -delta``, where P nearly loses its linear term at z = 1; with two poles that nearly meet there."""
+    """Next to ``beta = -delta``, where P nearly loses its linear term at z = 1, and two poles nearly meet there."""
     delta, alpha = 10.0 ** rng.uniform(-19, 3, 4 * count), 10.0 ** rng.uniform(-60, -3, 4 * count)
     d = rng.choice([0.0, 1.0, 3.0, 17.0, 0.25, 1.5, 2.9, np.nextafter(1.0, 2.0)], 4 * count)
     near = -delta * (1 + rng.integers(-40, 41, 4 * count) * 2.0**-53)
@@ -141,6 +141,7 @@ def walls_with_poles_of_one_size(count, rng):
         return slow > pair
 
     low, high = np.array(low + 0.02 * (high - low)), np.array(high)
+    middle = high
     with np.errstate(all="ignore"):
         before = first(low)
         for _ in range(70):
