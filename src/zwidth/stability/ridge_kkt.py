@@ -80,7 +80,7 @@ def kkt_kernel(delta: Array, d: Array, delay: str) -> RidgePoint:
     end = corner(curve_of(loop.plant), loop.lag)
     omega, found = _smooth_omega(loop, d, delay)
     smooth = frequency_boundary(omega, loop, delay)
-    converged = end.is_ridge | found
+    converged = jnp.logical_or(end.is_ridge, found)
     spoiled = spoiled * jnp.where(converged, 1.0, jnp.nan)
     status = jnp.where((status == Status.OK) & ~converged, int(Status.NOT_CONVERGED), status)
     return RidgePoint(
