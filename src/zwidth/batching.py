@@ -192,15 +192,22 @@ def _compiled_elementwise(kernel: Callable[..., Any], static: tuple[Any, ...]) -
     def plain(*arrays: Any) -> Any:
         return kernel(*arrays, *static)
 
-    def by_argument(active: tuple[bool, ...], *arrays: Any) -> tuple[Any, list[Any]]:
-        """The values, and the derivatives in the arguments that move."""
-        value, slopes = None, []
-        for k in (k for k, moves in enumerate(active) if moves):
-            value, slope = jax.jvp(
-                lambda x, k=k: plain(*arrays[:k], x, *arrays[k + 1 :]), (arrays[k],), (jax.numpy.ones_like(arrays[k]),)
-            )
-            slopes.append(slope)
-        return value, slopes
+    def by_argument(active: tuple[bool, ...], *arrays: Any) -> tuple[Any, Any]:
+        """The values, and along a new first axis the derivatives in the arguments that move."""
+        moving = [k for k, moves in enumerate(active) if moves]
+
+        def of_moving(*values: Any) -> Any:
+            known = dict(zip(moving, values, strict=True))
+            return plain(*(known.get(k, array) for k, array in enumerate(arrays)))
+
+        points = tuple(arrays[k] for k in moving)
+        ones = jax.numpy.ones_like(points[0])
+        if len(moving) == 1:
+            value, slopes = jax.jvp(of_moving, points, (ones,))
+            return value, tree_map(lambda leaf: leaf[None], slopes)
+        sides = tuple(side.reshape(-1, *(1,) * ones.ndim) * ones for side in np.eye(len(moving), dtype=ones.dtype))
+        # The values are computed once for all sides.
+        return jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
 
     function = jax.custom_jvp(jax.jit(plain))
     sloped = jax.jit(by_argument, static_argnums=0)
@@ -212,12 +219,12 @@ def _compiled_elementwise(kernel: Callable[..., Any], static: tuple[Any, ...]) -
         value, slopes = sloped(active, *primals)
         moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
 
-        def change(leaf: Any, *by: Any) -> Any:
+        def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            return sum((slope * tangent for slope, tangent in zip(by[1:], moving[1:], strict=True)), by[0] * moving[0])
+            return sum((by[k] * tangent for k, tangent in enumerate(moving[1:], 1)), by[0] * moving[0])
 
-        return value, tree_map(change, value, *slopes)
+        return value, tree_map(change, value, slopes)
 
     function.defjvp(rule, symbolic_zeros=True)
     return function
