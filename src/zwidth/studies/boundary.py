@@ -18,7 +18,6 @@ from zwidth.config.fields import Boolean, one_of
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, figure_layout
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
-from zwidth.stability.bracketing import lobe_end
 from zwidth.stability.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, of_scene, stack
@@ -134,6 +133,8 @@ def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) 
 def _upper_kernel(delta, d, delay: str):
     """The largest stable beta as alpha -> 0: the lobe's end, or the line P(-1) = 0 where it comes first."""
     import jax.numpy as jnp
+
+    from zwidth.stability.bracketing import lobe_end
 
     loop = frequency_loop(delta, d, delay)
     omega = lobe_end(loop, d, delay)
