@@ -1,5 +1,6 @@
 """The promises that no single module can keep: files that exist, pins, scripts, and a silent import."""
 
+import ast
 import os
 import re
 import subprocess
@@ -183,3 +184,12 @@ import zwidth.figures
 print("jax" in sys.modules)
 """)
     assert output.strip() == "False"
+
+
+def test_no_two_types_share_a_name():
+    homes = {}
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name.strip("_"), []).append(path.name)
+    assert {name: files for name, files in homes.items() if len(files) > 1} == {}

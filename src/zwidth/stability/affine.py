@@ -16,7 +16,7 @@ import numpy as np
 
 from zwidth.stability.certified_filter import functions
 from zwidth.stability.crossover import Lag, first_zero, long_verdict, short_verdict
-from zwidth.stability.devices import Device
+from zwidth.stability.devices import DeviceTerms
 from zwidth.stability.enclosure import TINY, UNIT
 
 # What the rounding of radii may have lost.
@@ -159,7 +159,7 @@ def _phi_forms(x: Form) -> tuple[Form, Form, Form]:
     return forms[0], forms[1], forms[2]
 
 
-def plant(delta: Form, f: Form) -> Device:
+def plant(delta: Form, f: Form) -> DeviceTerms:
     """The devices of boxes, in the form of `zwidth.plant.held_plant`."""
     t = 1.0 - f
     x_t, x_f = delta * t, delta * f
@@ -167,7 +167,7 @@ def plant(delta: Form, f: Form) -> Device:
     p1_t, p1_f, p1 = phi2_t + psi_t, phi2_f + psi_f, phi2 + psi
     a1 = t * t * psi_t + t * f * (e_t + p1_t) * p1_f + f * f * phi2_f
     a2, a0 = t * t * phi2_t, e_t * (f * f * psi_f)
-    return Device(delta, None, f, c, delta * p1, p1, phi2, psi, p1_t, psi_t, a2, a1, a0, a2 - a1 + a0, None)
+    return DeviceTerms(delta, None, f, c, delta * p1, p1, phi2, psi, p1_t, psi_t, a2, a1, a0, a2 - a1 + a0, None)
 
 
 def enclose_zero(cubic: tuple[Form, Form, Form, Form]) -> tuple[Form, np.ndarray]:

@@ -20,7 +20,7 @@ import numpy as np
 from zwidth.numerics.phi import PhiFunctions
 from zwidth.plant import discretized
 from zwidth.stability.crossover import Lag, Verdict, first_zero, gain_cubic, long_verdict, short_verdict
-from zwidth.stability.devices import Device
+from zwidth.stability.devices import DeviceTerms
 from zwidth.status import Status
 from zwidth.xp import horner
 
@@ -74,7 +74,7 @@ def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Ver
 
 
 @lru_cache(maxsize=64)
-def device(delta: float, d: float, bits: int) -> Device:
+def device(delta: float, d: float, bits: int) -> DeviceTerms:
     """The device of exact delta and d in balls; whole maps share it."""
     import flint
 
@@ -86,7 +86,7 @@ def device(delta: float, d: float, bits: int) -> Device:
         a0 = p.a0 if f != 0 else None
         at = _phi(x)
         phis = at.phi1, at.phi2, at.psi, late.phi1, late.psi
-        return Device(x, None, f, p.c, p.em, *phis, p.a2, p.a1, a0, p.gap, None)
+        return DeviceTerms(x, None, f, p.c, p.em, *phis, p.a2, p.a1, a0, p.gap, None)
 
 
 def _phi(x: flint.arb) -> PhiFunctions:
@@ -184,8 +184,8 @@ def _rational(alpha: Any, beta: Any, f: Any) -> tuple[list[Any], Any, int]:
     half, t = flint.fmpq(1, 2), 1 - f
     a2, a1, a0 = t * t * half, (1 + 2 * t * f) * half, f * f * half
     numerator, lead = ([a0, a1, a2], 2) if f != 0 else ([a1, a2], 1)
-    nothing: dict[str, Any] = dict.fromkeys(Device._fields)
-    here = Device(**nothing)._replace(
+    nothing: dict[str, Any] = dict.fromkeys(DeviceTerms._fields)
+    here = DeviceTerms(**nothing)._replace(
         delta=flint.fmpq(0), c=flint.fmpq(1), p1=flint.fmpq(1), a2=a2, a1=a1, a0=a0 if f != 0 else None
     )
     cubic = list(gain_cubic(alpha, beta, here))

@@ -26,7 +26,7 @@ from zwidth.domain import WALL_RANGE, wall_status
 from zwidth.numerics.phi import phi_functions
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.crossover import COSINE, SINE, Lag, first_zero, long_verdict, short_verdict
-from zwidth.stability.devices import Device, Kind, device, kind_of
+from zwidth.stability.devices import DeviceTerms, Kind, device, kind_of
 from zwidth.stability.enclosure import TINY, UNIT, Ball
 from zwidth.stability.layout import Points, picked
 from zwidth.status import Status
@@ -77,7 +77,7 @@ def functions(x: Array) -> Any:
     return phi_functions(x, exp)
 
 
-def enclosed_device(delta: Array, d: Array, kind: Kind) -> Device:
+def enclosed_device(delta: Array, d: Array, kind: Kind) -> DeviceTerms:
     """The device of exact delta and d in balls, NaN where they are out of range."""
     here = device(delta, d, kind, functions)
     if kind.fractional and kind.long:

@@ -150,7 +150,7 @@ def _aligned(arrays: list[Array], xp: Any) -> list[Array]:
     return roots + [xp.broadcast_to(array, shape) for array in arrays[2:]]
 
 
-class _Loop(NamedTuple):
+class _Rational(NamedTuple):
     """T and B on the circle z = r (1 + jt)/(1 - jt). Last axes: part (0 is T, 1 is B), factor."""
 
     u: Array  # a factor z - a is (u + jtv)/(1 - jt): u = r - a, v = r + a, both over r + |a|
@@ -195,7 +195,7 @@ def _padded(roots: Array, missing: int, xp: Any) -> Array:
     return xp.concatenate([roots, xp.zeros((*roots.shape[:-1], missing), roots.dtype)], axis=-1)
 
 
-def _loop(roots: Array, gain: Array, turns: Array, radius: Array, xp: Any) -> tuple[_Loop, Array, Array]:
+def _loop(roots: Array, gain: Array, turns: Array, radius: Array, xp: Any) -> tuple[_Rational, Array, Array]:
     """Scale and turn the plane; also the turned roots, and whether a weight too large or small for the type was cut."""
     r = radius[..., None, None]
     scale = r + xp.abs(roots)
@@ -222,10 +222,10 @@ def _loop(roots: Array, gain: Array, turns: Array, radius: Array, xp: Any) -> tu
     quarters = xp.mod(xp.mod(turns, 4.0) * xp.asarray([0.0, 2.0, 1.0, 3.0])[best], 4.0)
     start = angle[..., 0] - angle[..., 1] - xp.where(gain < 0, math.pi, 0.0) - 0.5 * math.pi * quarters
     inside = ((r - roots.real) * (r + roots.real) - roots.imag**2) / scale**2
-    return _Loop(u, v, inside, weight, doubt, turns, start), roots, cut
+    return _Rational(u, v, inside, weight, doubt, turns, start), roots, cut
 
 
-def _alone(loop: _Loop, eps: float, xp: Any) -> tuple[Array, Array]:
+def _alone(loop: _Rational, eps: float, xp: Any) -> tuple[Array, Array]:
     """Whether one part is larger on the whole circle by its least and the other's largest possible size.
 
     Such loops need no crossovers, whose disks are wide where many roots coincide.
@@ -241,7 +241,7 @@ def _alone(loop: _Loop, eps: float, xp: Any) -> tuple[Array, Array]:
     return first & (doubt < 0.1), second & (doubt < 0.1)
 
 
-def _difference(loop: _Loop, t: Array, eps: float, xp: Any) -> tuple[Array, Array]:
+def _difference(loop: _Rational, t: Array, eps: float, xp: Any) -> tuple[Array, Array]:
     """|T|^2 - |B|^2 at the points t, over (1 + |t|)^(2 size), and a bound of its rounding."""
     t = t[..., None, None]
     u, v, jtv = loop.u[..., None, :, :], loop.v[..., None, :, :], 1j * t * loop.v[..., None, :, :]
@@ -260,7 +260,7 @@ def _smallest(xp: Any, like: Array) -> float:
     return math.sqrt(xp.finfo(like.dtype).tiny)
 
 
-def _intervals(loop: _Loop, eps: float, xp: Any) -> tuple[Array, Array, Array, Array]:
+def _intervals(loop: _Rational, eps: float, xp: Any) -> tuple[Array, Array, Array, Array]:
     """Intervals of t that together hold every crossover, as sorted lower and upper ends.
 
     They are infinite where a disk misses the real axis. Also the polynomial's leading coefficient, and whether all this
@@ -307,7 +307,7 @@ def _intervals(loop: _Loop, eps: float, xp: Any) -> tuple[Array, Array, Array, A
     return low, high, leading, proved
 
 
-def _corrections(loop: _Loop, guess: Array, leading: Array, eps: float, xp: Any) -> tuple[Array, Array]:
+def _corrections(loop: _Rational, guess: Array, leading: Array, eps: float, xp: Any) -> tuple[Array, Array]:
     """Weierstrass: value/(leading prod(guess - other guesses)), to be subtracted, and what rounding adds to that."""
     value, noise = _difference(loop, guess, eps, xp)
     far = 1.0 + xp.abs(guess)
@@ -317,7 +317,7 @@ def _corrections(loop: _Loop, guess: Array, leading: Array, eps: float, xp: Any)
     return value * far / scale, noise * far / xp.abs(scale)
 
 
-def _turns_between(loop: _Loop, low: Array, high: Array, eps: float, xp: Any) -> tuple[Array, Array]:
+def _turns_between(loop: _Rational, low: Array, high: Array, eps: float, xp: Any) -> tuple[Array, Array]:
     """m = round((arg T - arg B)/(2 pi)) on every interval, and whether it is one number there."""
     u, v, inside = (value[..., None, :, :] for value in (loop.u, loop.v, loop.inside))
     size = xp.abs(u)
@@ -347,7 +347,7 @@ def _turns_between(loop: _Loop, low: Array, high: Array, eps: float, xp: Any) ->
 
 
 def _larger(
-    loop: _Loop, roots: Array, low: Array, high: Array, leading: Array, m: Array, eps: float, xp: Any
+    loop: _Rational, roots: Array, low: Array, high: Array, leading: Array, m: Array, eps: float, xp: Any
 ) -> tuple[Array, Array, Array, Array]:
     """Whether B is larger: at z = -r, before and after every interval; and whether all of that is told that matters."""
     first = leading < 0

@@ -26,7 +26,7 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import stored
 from zwidth.domain import WALL_RANGE, within
-from zwidth.stability.devices import ANY, Device, Kind, device
+from zwidth.stability.devices import ANY, DeviceTerms, Kind, device
 from zwidth.stability.row_limit import long_curve, short_curve
 from zwidth.xp import horner, namespace, root
 
@@ -185,7 +185,7 @@ class Crossover(NamedTuple):
     exists: Array
 
 
-def gain_crossover(alpha: Array, beta: Array, here: Device) -> Crossover:
+def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> Crossover:
     """The crossover for margins: the nearer of u and 1 + cos w, which then has all its digits."""
     xp = namespace(alpha, here.delta)
     cubic = gain_cubic(alpha, beta, here)
@@ -213,7 +213,7 @@ def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind 
     return stable_at(alpha, beta, stored(here, delta) if kind.fractional and kind.long else here, kind)
 
 
-def stable_at(alpha: Array, beta: Array, here: Device, kind: Kind) -> Array:
+def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: Kind) -> Array:
     """The same on a discretized device."""
     xp = namespace(alpha, here.c)
     plain = here._replace(a0=None)

@@ -19,7 +19,7 @@ from zwidth._types import Array
 from zwidth.batching import tree_map
 from zwidth.numerics.roots import bisect
 from zwidth.plant import Plant
-from zwidth.stability.devices import Device, Kind, device
+from zwidth.stability.devices import DeviceTerms, Kind, device
 from zwidth.stability.ridge_newton import solve, start_of
 from zwidth.stability.row_limit import (
     LONG_FIELDS,
@@ -45,7 +45,7 @@ _END, _TOP = LONG_FIELDS.index("end"), LONG_FIELDS.index("top")
 class Lobe(NamedTuple):
     """The curve of one device; what does not occur among the delays of a kernel is None."""
 
-    here: Device
+    here: DeviceTerms
     d: Array
     is_short: Array | None  # where both forms occur
     short: Any  # `short_curve`
@@ -70,7 +70,7 @@ class Peak(NamedTuple):
     alpha: Array
 
 
-def device_of(delta: Array, d: Array, delay: str, kind: Kind) -> Device:
+def device_of(delta: Array, d: Array, delay: str, kind: Kind) -> DeviceTerms:
     """The device whose curve is meant. A fractional power is the formula of whole delays at any other number."""
     if delay == "held":
         return device(delta, d, kind)

@@ -14,7 +14,7 @@ from zwidth.numerics.double_double import Complex, Double, chosen, phi_pair, sin
 from zwidth.stability.circle import count, loop_of
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import kind_of
-from zwidth.stability.proved import Poles, outermost_poles, usable
+from zwidth.stability.proved import OutermostPoles, outermost_poles, usable
 from zwidth.stability.radius import traced_kernel, window
 from zwidth.status import Status
 
@@ -34,7 +34,7 @@ _ACCURACY = 1e-9
 _NEARBY = 1e-6
 # Farther from the unit circle (in the logarithm of the radius) the verdict does not err.
 _DOUBTFUL = 1e-8
-# Poles so near to the real axis are taken for single ones; a pair is then a crowd.
+# OutermostPoles so near to the real axis are taken for single ones; a pair is then a crowd.
 _REAL = 1e-6
 # So near to 1, in units of what the delay allows, P is known well enough by its second order.
 _CLOSE = 0.1
@@ -87,7 +87,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     return to_caller(rate.reshape(arrays[0].shape), values)
 
 
-def rates(found: Poles, columns: list[np.ndarray]) -> np.ndarray:
+def rates(found: OutermostPoles, columns: list[np.ndarray]) -> np.ndarray:
     """The rates of decay of outermost poles, with relative accuracy; NaN where it is not known which decays slowest."""
     rate = -found.re
     # What float64 knows well enough needs no more digits.

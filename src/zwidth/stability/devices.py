@@ -31,7 +31,7 @@ def kind_of(d: Any) -> Kind:
     return Kind(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
 
 
-class Device(NamedTuple):
+class DeviceTerms(NamedTuple):
     """Delay, plant and phi-functions of one device; NaN throughout where delta or d is out of range."""
 
     delta: Array
@@ -51,8 +51,8 @@ class Device(NamedTuple):
     tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
 
 
-def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.phi_functions) -> Device:
-    """The `Device` of one (delta, d), or of arrays of one shape."""
+def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.phi_functions) -> DeviceTerms:
+    """The `DeviceTerms` of one (delta, d), or of arrays of one shape."""
     xp = namespace(delta, d)
     ok = valid_device(delta, d)
     delta, d = xp.where(ok, delta, np.nan), xp.where(ok, d, np.nan)
@@ -61,7 +61,7 @@ def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.
     late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
     plant = discretized(delta, f if kind.fractional else None, functions)
     tilt = tilt_at_minus_one(plant, whole)
-    return Device(
+    return DeviceTerms(
         *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),
         *(plant.a2, plant.a1, plant.a0, plant.gap, tilt),
     )

@@ -16,7 +16,7 @@ from zwidth.loop import poison, valid_wall
 from zwidth.numerics.roots import false_position, followed
 from zwidth.plant import split_delay
 from zwidth.stability.crossover import gain_crossover, stable_at
-from zwidth.stability.devices import ANY, Device, device
+from zwidth.stability.devices import ANY, DeviceTerms, device
 from zwidth.stability.modulus import modulus
 from zwidth.stability.open_loop import angle_of, by_samples, size_and_phase
 from zwidth.xp import along, epsilon, frozen, namespace
@@ -134,7 +134,7 @@ def _on_the_side(margin: Array, edge: float, least: float, stable: Array, xp: An
     return xp.where(stable, xp.maximum(margin, edge + least), xp.minimum(margin, edge))
 
 
-def _gain_margin(alpha: Array, beta: Array, here: Device, xp: Any) -> tuple[Array, Array]:
+def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple[Array, Array]:
     """The factor on the wall at which its ray leaves the stable set, and the frequency there.
 
     The phase of L does not depend on the factor, and the gain crossover rises with it: the first zero of the phase

@@ -16,7 +16,7 @@ from zwidth._types import Array, ArrayLike
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_wall
 from zwidth.stability.crossover import gain_crossover
-from zwidth.stability.devices import Device, device
+from zwidth.stability.devices import DeviceTerms, device
 from zwidth.stability.open_loop import angle_of, by_samples, size_and_phase
 from zwidth.xp import along, frozen, namespace, repeat
 
@@ -64,7 +64,7 @@ def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     return modulus(alpha, beta, device(delta, d))[0] + poison(ok, *inputs)
 
 
-def squared_distance(w: Array, alpha: Array, beta: Array, here: Device) -> Array:
+def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
     """``|1 + L|^2`` at w in (0, pi]."""
     size, phase = size_and_phase(w, alpha, beta, here)
     half = namespace(phase).sin(0.5 * phase)
@@ -72,7 +72,7 @@ def squared_distance(w: Array, alpha: Array, beta: Array, here: Device) -> Array
     return (1.0 - size) ** 2 + 4.0 * size * half * half
 
 
-def modulus(alpha: Array, beta: Array, here: Device) -> tuple[Array, Array]:
+def modulus(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
     """The least ``|1 + L|`` over (0, pi] and its w, for alpha > 0, elementwise."""
     xp = namespace(alpha, here.c)
     w = frozen(_lowest(*frozen((alpha, beta, here), xp), xp), xp)
@@ -83,7 +83,7 @@ def modulus(alpha: Array, beta: Array, here: Device) -> tuple[Array, Array]:
     return xp.sqrt(xp.maximum(square, 0.0)), w
 
 
-def _moved(w: Array, alpha: Array, beta: Array, here: Device) -> tuple[Array, Array]:
+def _moved(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
     """One Newton step more, 0 but for its derivatives: by how much it lowers the square, and by how much it moves w."""
     import jax
     import jax.numpy as jnp
@@ -101,7 +101,7 @@ def _moved(w: Array, alpha: Array, beta: Array, here: Device) -> tuple[Array, Ar
     return 0.5 * first * move, move
 
 
-def _lowest(alpha: Array, beta: Array, here: Device, xp: Any) -> Array:
+def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
     """w of the minimum."""
 
     def at(level: Array) -> Array:
@@ -110,11 +110,11 @@ def _lowest(alpha: Array, beta: Array, here: Device, xp: Any) -> Array:
         return xp.where(found.exists, angle_of(found), np.pi)
 
     def distance(w: Array) -> Array:
-        fields = Device(*(field[..., None] for field in here))
+        fields = DeviceTerms(*(field[..., None] for field in here))
         return squared_distance(w, alpha[..., None], beta[..., None], fields)
 
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)
-    here = Device(*(xp.asarray(field) for field in here))
+    here = DeviceTerms(*(xp.asarray(field) for field in here))
     center = at(xp.ones_like(alpha))
     # The distance at the crossover is at most 2; at the low end |L| is 3.
     start = at(3.0 * xp.ones_like(alpha))

@@ -52,7 +52,7 @@ class Delay(NamedTuple):
     kappa: Array
 
 
-class Peak(NamedTuple):
+class PeakCondition(NamedTuple):
     """The condition at one frequency."""
 
     slope: Array  # E, of the sign of dN/du
@@ -111,7 +111,7 @@ def turns(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> Turns:
     return Turns(at_zero, xp.where(beta > 0, rise, -1.0), b * (1.0 - f), (k == 1) & (end >= 0))
 
 
-def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> Peak:
+def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> PeakCondition:
     """The condition at ``u = 1 - cos w`` in (0, 2], for n >= 1 in (0, 1]."""
     f, k, kappa = delay
     xp = namespace(u, a)
@@ -146,12 +146,12 @@ def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -
         damper2 = xp.where(undelayed, 4.0 * f, damper2)
     linear, linear1, linear2 = a * spring - beta * damper, a * spring1 - beta * damper1, a * spring2 - beta * damper2
     if not kind.fractional:
-        return Peak(linear1, linear2, linear, linear)
+        return PeakCondition(linear1, linear2, linear, linear)
     gain = beta * (beta + 2.0 * a)
     needed, root = larger_root(linear, kappa * (a * a + 0.5 * gain * u), xp)
     # Stationary where this vanishes; its own slope is that of A there.
     slope = linear1 + 0.125 * kappa * gain / xp.where(needed > 0, needed, 1.0)
-    return Peak(slope, linear2, root, needed)
+    return PeakCondition(slope, linear2, root, needed)
 
 
 def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:

@@ -19,7 +19,7 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import broadcast, elementwise, in_blocks, to_caller, tree_map
 from zwidth.stability.crossover import Crossover
-from zwidth.stability.devices import Device
+from zwidth.stability.devices import DeviceTerms
 from zwidth.xp import is_traced, namespace
 
 
@@ -33,7 +33,7 @@ def angle_of(crossover: Crossover) -> Array:
     return xp.where(near, angle, np.pi - angle)
 
 
-def size_and_phase(w: Array, alpha: Array, beta: Array, here: Device) -> tuple[Array, Array]:
+def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
     """``|L|`` and its phase above -pi, at w in (0, pi]."""
     xp = namespace(w, alpha)
     half = xp.sin(0.5 * w)

@@ -52,7 +52,7 @@ def _limited(margin: Array, alpha: Array) -> Array:
     return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
 
 
-class Table(NamedTuple):
+class PassiveTable(NamedTuple):
     """What all walls of one delay need, as one polynomial of the direction."""
 
     f: float
@@ -65,8 +65,8 @@ class Table(NamedTuple):
 
 
 @lru_cache(maxsize=256)
-def table(d: float) -> Table:
-    """The `Table` of one delay.
+def table(d: float) -> PassiveTable:
+    """The `PassiveTable` of one delay.
 
     Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x = beta
     - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
@@ -90,10 +90,10 @@ def table(d: float) -> Table:
     # By powers, whose coefficients fall as well: Clenshaw's sum loses two digits towards the ends.
     powers = np.polynomial.chebyshev.cheb2poly(terms)
     limit = float(last) if np.isfinite(span) else np.inf
-    return Table(d - np.floor(d), d + 0.5, float(turn.first), width, float(last), limit, powers.tolist())
+    return PassiveTable(d - np.floor(d), d + 0.5, float(turn.first), width, float(last), limit, powers.tolist())
 
 
-def _map_kernel(alpha: Array, beta: Array, delta: Array, known: Table) -> Array:
+def _map_kernel(alpha: Array, beta: Array, delta: Array, known: PassiveTable) -> Array:
     """`passivity_margin` at one delay."""
     xp = namespace(alpha)
     f, at_zero, first, width, last, limit, powers = known

@@ -30,7 +30,7 @@ _BELOW_ONE = 1.0 - 2.0**-53
 PIECE = BLOCK >> 3
 
 
-class Poles(NamedTuple):
+class OutermostPoles(NamedTuple):
     """Outermost poles ``e^(re + j im)`` of flat arrays, the relative error proved, infinite where none is."""
 
     re: np.ndarray
@@ -46,7 +46,7 @@ def _compiled(fractional: bool) -> Any:
     return jax.jit(lambda a, b, c, d, accuracy: quick_kernel(a, b, c, d, accuracy, fractional), compiler_options=WIDE)
 
 
-def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW, patient: bool = True) -> Poles:
+def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW, patient: bool = True) -> OutermostPoles:
     """The outermost poles of equally long columns of alpha, beta, delta and d; up to ``few`` without a compiler.
 
     Without patience some are not proved that could be.
@@ -55,14 +55,14 @@ def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW, 
     if not fractional.any() or fractional.all():
         return _of_one_kind(columns, accuracy, bool(fractional.any()), few, patient)
     # A mixed batch pays for the cubic only where it must.
-    whole = Poles(*(np.empty(fractional.size) for _ in Poles._fields))
+    whole = OutermostPoles(*(np.empty(fractional.size) for _ in OutermostPoles._fields))
     for part in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
         for leaf, found in zip(whole, outermost_poles([c[part] for c in columns], accuracy, few, patient), strict=True):
             leaf[part] = found
     return whole
 
 
-def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int, patient: bool) -> Poles:
+def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int, patient: bool) -> OutermostPoles:
     size = columns[0].size
     with np.errstate(all="ignore"):
         if size == 1 <= few:
@@ -80,13 +80,13 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: in
     return _finished(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind, patient)
 
 
-def _finished(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool, patient: bool) -> Poles:
+def _finished(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool, patient: bool) -> OutermostPoles:
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
     error = np.where(found.proved, accuracy, np.inf)
     left = np.flatnonzero(~found.proved & patient)
     for first in range(0, left.size, FEW):
         _patiently(columns, found, error, left[first : first + FEW], accuracy, kind)
-    return Poles(found.re, found.im, error, found.doubt)
+    return OutermostPoles(found.re, found.im, error, found.doubt)
 
 
 def _patiently(

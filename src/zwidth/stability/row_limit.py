@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.stability.devices import Device
+from zwidth.stability.devices import DeviceTerms
 from zwidth.xp import horner, namespace, repeat
 
 # From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
@@ -69,7 +69,7 @@ def short_place(b: Array, curve: Any) -> tuple[Array, Array]:
     return 2.0 * b * v0 / (linear + xp.sqrt(xp.maximum(square, 0.0))), square >= 0
 
 
-def short_row(beta: Array, device: Device) -> Array:
+def short_row(beta: Array, device: DeviceTerms) -> Array:
     """The limit for d < 1, where the lobe is a quadratic in y; 0 where no alpha is stable, NaN for bad input.
 
     Beyond the corner, the double pole at z = -1, only the line bounds the row.
@@ -110,13 +110,13 @@ def long_curve(here: Any) -> tuple[tuple, tuple, tuple, tuple]:
     return g, (p1 * (p1 + here.f * em), a0 * -4.0), (p1 * p1, (a1 * sigma + corner) * -4.0, corner * 4.0), (b1, b2)
 
 
-def long_fields(device: Device) -> list[Array]:
+def long_fields(device: DeviceTerms) -> list[Array]:
     """The curve alone: the first of `LONG_FIELDS`, up to the lobe's end."""
     g, h, v, base = long_curve(device)
     return [device.delta, device.whole + 0.5, *g, *h, *v, *base]
 
 
-def long_device(device: Device) -> Array:
+def long_device(device: DeviceTerms) -> Array:
     """What rows with d >= 1 need of a device, its lobe's end included: `LONG_FIELDS` along a new first axis."""
     fields = long_fields(device)
     delta, k, g0, _, _, h0, _, v0, _, _, b1, _ = fields
