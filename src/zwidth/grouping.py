@@ -10,6 +10,8 @@ import numpy as np
 from zwidth import batching
 from zwidth._types import ArrayLike
 from zwidth.domain import LONGEST_DELAY
+from zwidth.errors import InputError
+from zwidth.xp import is_traced
 
 NAMES = ("alpha", "beta", "delta", "d")
 
@@ -66,7 +68,7 @@ def by_degree(
     behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any shape, and takes up to
     so many points of a degree without JAX. ``fused``, ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
     """
-    if batching.is_traced(*values):
+    if is_traced(*values):
         return _by_degree_traced(kernel, names, values, static, lead)
     arrays = batching.broadcast(names, values)
     columns = [array.ravel() for array in arrays]
@@ -135,7 +137,7 @@ def _by_degree_traced(kernel: Callable[..., Any], names: tuple, values: tuple, s
         parts.append(jax.vmap(lambda *point, degree=degree: kernel(*point, degree, *static))(*picked))
         places.append(index)
     if not parts:
-        raise batching.InputError(f"{', '.join(names)}: got no point at all inside a JAX transformation")
+        raise InputError(f"{', '.join(names)}: got no point at all inside a JAX transformation")
     order = np.argsort(np.concatenate(places), kind="stable")
 
     def gather(*leaves: jax.Array) -> jax.Array:

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, WithJsonSchema, create_model
+from pydantic import BeforeValidator, PlainSerializer, PlainValidator, ValidationError, WithJsonSchema, create_model
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, describe, problem, problems_of, short, suggestion, validation_error
-from zwidth.config.fields import Strict, ValidationError, repeated
+from zwidth.config.fields import Strict, repeated
 from zwidth.config.numbers import number, whole_number
 from zwidth.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import as_float64, elementwise, is_traced
+from zwidth.batching import as_float64, elementwise
 from zwidth.domain import check_scalars
 from zwidth.loop import poison, valid_device
 from zwidth.stability.curve import lobe, spread, wall
 from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.xp import along, frozen, namespace
+from zwidth.xp import along, frozen, is_traced, namespace
 
 # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic.
 _NODES = 48

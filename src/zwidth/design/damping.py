@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import elementwise, is_traced, pointwise, to_caller
+from zwidth.batching import elementwise, pointwise, to_caller
 from zwidth.domain import device_status
 from zwidth.grouping import Degree, by_degree
 from zwidth.numerics.minimize import Cost, lowest, without_slope
@@ -20,7 +20,7 @@ from zwidth.stability.modulus import margin_kernel
 from zwidth.stability.poles import companion_chunk, radius_kernel
 from zwidth.stability.ridge import occurring
 from zwidth.status import Status
-from zwidth.xp import frozen, namespace
+from zwidth.xp import frozen, is_traced, namespace
 
 # Samples across a column, how many of their dips are refined, and by how many steps of golden section.
 _COLUMN = {"samples": 66, "dips": 3, "steps": 52}

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import elementwise, is_traced
+from zwidth.batching import elementwise
 from zwidth.domain import WALL_RANGE, check_scalars, wall_status, within
 from zwidth.errors import InputError, check_choice
 from zwidth.loop import BoundaryCurve, check_delay_model, frequency_boundary, frequency_loop, poison, valid_device
@@ -28,7 +28,7 @@ from zwidth.stability.curve import (
 )
 from zwidth.stability.devices import ANY, Kind, kind_of
 from zwidth.status import Status
-from zwidth.xp import along, epsilon, frozen, namespace, repeat
+from zwidth.xp import along, epsilon, frozen, is_traced, namespace, repeat
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 _METHODS: tuple[str, ...] = ("auto", "optimistix")

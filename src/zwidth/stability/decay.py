@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import broadcast, elementwise, is_traced, to_caller
+from zwidth.batching import broadcast, elementwise, to_caller
 from zwidth.domain import check_scalars
 from zwidth.grouping import NAMES
 from zwidth.numerics.double_double import Complex, Double, chosen, phi_pair, single, two_sum
@@ -17,6 +17,7 @@ from zwidth.stability.devices import kind_of
 from zwidth.stability.proved import OutermostPoles, outermost_poles, usable
 from zwidth.stability.radius import traced_kernel, window
 from zwidth.status import Status
+from zwidth.xp import is_traced
 
 # A bound of rounding errors over the rate, many times what they are: smaller ones leave the digits promised.
 _EXACT = 5e-12

@@ -21,14 +21,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import FEW, as_float64, elementwise, in_blocks, is_traced, to_caller
+from zwidth.batching import FEW, as_float64, elementwise, in_blocks, to_caller
 from zwidth.domain import LONGEST_DELAY, check_scalars
 from zwidth.errors import InputError
+from zwidth.grouping import NAMES
 from zwidth.loop import poison, valid_wall
 from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.stability.layout import NAMES, lay_out, split
+from zwidth.stability.layout import lay_out, split
 from zwidth.stability.needed_damping import directions, larger_root, needed_damping
-from zwidth.xp import horner, namespace
+from zwidth.xp import horner, is_traced, namespace
 
 # Chebyshev terms: the last one is below 1e-16 for every delay.
 _TERMS = 30

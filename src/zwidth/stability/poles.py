@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import as_float64, in_blocks, is_traced
+from zwidth.batching import as_float64, in_blocks
 from zwidth.domain import LONGEST_DELAY, check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES, Degree, by_degree, degree_of, few_poles
@@ -27,7 +27,7 @@ from zwidth.stability.aberth import (
     with_zero,
 )
 from zwidth.status import Method, Status
-from zwidth.xp import namespace, repeat
+from zwidth.xp import is_traced, namespace, repeat
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 

@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import broadcast, elementwise, is_traced, to_caller
+from zwidth.batching import broadcast, elementwise, to_caller
 from zwidth.domain import check_scalars
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
@@ -16,6 +16,7 @@ from zwidth.stability.poles import radius_and_bound, radius_by_companion
 from zwidth.stability.proved import radii_of
 from zwidth.stability.radius import traced_kernel
 from zwidth.status import Method, Status
+from zwidth.xp import is_traced
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
 RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)
