@@ -58,7 +58,7 @@ def spectral_radius(
         d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast.
         method: "newton" (and "auto") finds the outermost pole and proves each value by counts of the poles inside
             a circle, at a cost that does not grow with d; "companion" computes all poles.
-        accuracy: relative error to prove, 1e-9 by default, at least 1e-12. Newton's method ends with nearly all digits
+        accuracy: relative error to prove, 1e-9 by default, at least 1e-12. Halley's method ends with nearly all digits
             whatever is asked for, so nothing becomes faster by asking for less; "companion" takes any.
         delay: only "held" has poles.
 
