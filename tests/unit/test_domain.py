@@ -31,4 +31,4 @@ def test_ends_of_a_wall(place, sign):
     ):
         wall = [np.float64(0.1), np.float64(0.1)]
         wall[place] = np.float64(sign * value)
-        assert wall_status(*wall, np.float64(0.0), np.float64(0.0)) == status
+        assert wall_status(wall[0], wall[1], np.float64(0.0), np.float64(0.0)) == status
