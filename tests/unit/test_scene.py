@@ -107,6 +107,17 @@ def test_denormalize_refuses_a_negative_delta():
         zwidth.denormalize(mass=1.0, period=1.0, delta=-1)
 
 
+@pytest.mark.parametrize("d", [0.0, 1e-9, 0.5, 1e5])
+@pytest.mark.parametrize("delta", [0.0, 1e-9, 0.5, 1e12])
+def test_denormalize_takes_the_whole_domain_of_a_device(delta, d):
+    """By hand: b = delta m / T and a delay of d T."""
+    back = zwidth.denormalize(mass=0.5, period=0.25, delta=delta, d=d)
+    assert (back.damping, back.delay) == (2.0 * delta, 0.25 * d)
+    for name in ("delta", "d"):
+        with pytest.raises(InputError, match=f"{name}: got -1e-12; it must be finite and at least 0"):
+            zwidth.denormalize(mass=0.5, period=0.25, **{name: -1e-12})
+
+
 def test_a_scene_is_the_same_as_its_numbers():
     scene = zwidth.Scene(
         zwidth.Device(mass=0.1, damping=10.0),

@@ -41,3 +41,11 @@ def test_ends_too_far_apart_are_refused():
 def test_steps_below_the_resolution_are_refused():
     with pytest.raises(ValueError, match="below float64's resolution"):
         axis()({"linear": {"start": 1.0, "stop": 1.0 + 1e-14, "num": 1000}})
+
+
+def test_two_neighbors_may_be_as_close_as_float64_tells_apart():
+    """One step of six units in the last place is an axis, one of three is not."""
+    unit = 2.0**-52
+    assert axis()({"linear": {"start": 1.0, "stop": 1.0 + 6 * unit, "num": 2}}).values()[1] == 1.0 + 6 * unit
+    with pytest.raises(ValueError, match="below float64's resolution"):
+        axis()({"linear": {"start": 1.0, "stop": 1.0 + 3 * unit, "num": 2}})

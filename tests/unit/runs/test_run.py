@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +40,9 @@ def record_of(folder):
 
 
 def test_a_run_writes_what_its_record_lists(config, tmp_path):
+    clock = time.perf_counter()
     result = zwidth.run(config, out=tmp_path / "out")
+    assert 0 < result.seconds <= time.perf_counter() - clock
     assert result.ok
     assert result.folder == tmp_path / "out"
     record = record_of(result.folder)

@@ -1,6 +1,7 @@
 """Ball arithmetic: verdicts against independent poles, and what is exactly on the unit circle."""
 
 import itertools
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ from mpmath import mp
 
 import oracles
 from zwidth.stability import balls
+from zwidth.stability.balls import _rational
 from zwidth.status import Status
 
 flint = pytest.importorskip("flint")
@@ -117,3 +119,17 @@ def test_twice_the_precision_decides_what_is_so_close(bits):
         near = alpha + flint.fmpq(side, 2 ** (bits + 10))
         assert not any(at_precision(near, beta, bits))
         assert at_precision(near, beta, 2 * bits) == (side < 0, side > 0)
+
+
+@pytest.mark.parametrize("f", ["0", "1/3", "1/2", "5/7"])
+def test_the_exact_wall_without_damping_is_that_of_a_mass_under_a_held_force(f):
+    """One period by hand: the old force acts for a share f, the new one for the rest, and each adds speed and way."""
+    f, alpha, beta = Fraction(f), Fraction(3, 10), Fraction(1, 5)
+    _, wall, lead = _rational(*(flint.fmpq(q.numerator, q.denominator) for q in (alpha, beta, f)))
+    for z in (Fraction(2), Fraction(-1), Fraction(3, 7)):
+        speed = f / z + 1 - f
+        way = (f - f * f / 2) / z + (1 - f) ** 2 / 2
+        # The wall pulls with alpha x + beta (x - x/z); x (z - 1)^2 = speed + (z - 1) way, and z^lead clears 1/z.
+        expected = z**lead * (speed + (z - 1) * way) * (alpha + beta - beta / z)
+        got = wall(flint.fmpq(z.numerator, z.denominator))
+        assert Fraction(int(got.p), int(got.q)) == expected

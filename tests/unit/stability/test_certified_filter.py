@@ -14,6 +14,7 @@ from zwidth.stability.certified_filter import enclose_zero, enclosed_device, exp
 from zwidth.stability.crossover import gain_cubic, long_verdict, short_verdict
 from zwidth.stability.devices import kind_of
 from zwidth.stability.enclosure import Ball
+from zwidth.stability.layout import Points
 from zwidth.stability.row_limit import long_curve, short_curve
 
 flint = pytest.importorskip("flint")
@@ -179,3 +180,16 @@ def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
         assert (truth.status == 0).all()
         assert truth.stable[stable].all()
         assert not truth.stable[unstable].any()
+
+
+@pytest.mark.parametrize("error", [0.3, 0.9, 1.1, 3.0, np.nan])
+def test_where_the_computed_end_of_a_row_is_wrong_nothing_wrong_is_proved(error, monkeypatch):
+    """The end only chooses the walls that are tried: whatever it is, the codes are those of the walls one by one."""
+    arrays = np.linspace(0.0, 0.9, 1701)[None, :], np.linspace(-0.3, 1.1, 41)[:, None], np.full((1, 1), 0.2)
+    points = Points(*arrays, np.full((1, 1), 1.5))
+    assert certified_filter.has_rows(points)
+    expected = certified_filter.each_code(points)
+    assert {certified_filter.STABLE, certified_filter.UNSTABLE} <= set(expected.ravel().tolist())
+    computed = certified_filter.row_limits
+    monkeypatch.setattr(certified_filter, "row_limits", lambda *row: computed(*row) * error)
+    np.testing.assert_array_equal(certified_filter.filtered(points), expected)

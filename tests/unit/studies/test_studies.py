@@ -1,5 +1,7 @@
 """What the studies compute, against the library's own functions and pole counts."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -11,6 +13,7 @@ from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
 from zwidth.studies.map import MapStudy
 from zwidth.studies.outcome import csv_text, stack
 from zwidth.studies.passivity import PassivityStudy, passive_edge, unit_outline
+from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy, needed_models, ridge_table, slope_table
 from zwidth.studies.step import StepStudy
 
@@ -150,6 +153,9 @@ def test_a_boundary_study_tables_boundaries_ridge_and_passivity():
     np.testing.assert_allclose(
         table["alpha"][ridge], zwidth.alpha_max(table["delta"][ridge], table["d"][ridge]).alpha, rtol=1e-12
     )
+    for d in (0.0, 1.0):
+        path = table["delta"][ridge & (table["d"] == d)]
+        assert (path.min(), path.max()) == (0.0, 0.5)
     assert set(table["delta"][table["curve"] == "passive"]) == {0.5}
 
 
@@ -176,6 +182,25 @@ def test_step_responses_of_devices_and_walls():
     assert table["label"][0] == "K = 14.90 kN/m, B = 41.60 N s/m"
     np.testing.assert_allclose(table["final_position_m"], expected.final_position * 1e-3**2 / 0.1, rtol=1e-12)
     np.testing.assert_allclose(table["settling_time_s"], expected.settling_time * 1e-3, rtol=1e-12)
+
+
+def test_a_recommendation_is_a_share_of_the_stiffest_wall():
+    """Of the published device m = 0.1 kg, T = 1 ms, delta = 0.1, d = 1; alpha m / T^2 and beta m / T by hand."""
+    device = {"mass": 0.1, "damping": "10 N s/m", "period": "1 ms", "delay": "1 periods"}
+    study = RecommendStudy.model_validate(
+        {"kind": "recommend", "name": "r", "device": device, "stiffness_fraction": 0.6, "duration": "50 periods"}
+    )
+    outcome = study.compute(None, alone=True)
+    found = json.loads(outcome.documents["recommendation.json"])
+    ridge = zwidth.alpha_max(0.1, 1)
+    assert found["maximum"]["stiffness"] == pytest.approx(1e5 * float(ridge.alpha), rel=1e-12)
+    best = found["recommended"]
+    assert best["stiffness"] == pytest.approx(0.6e5 * float(ridge.alpha), rel=1e-12)
+    assert best["virtual_damping"] == pytest.approx(1e2 * float(ridge.beta), rel=1e-12)
+    assert best["stable"] is True
+    # What is judged is also what is simulated.
+    assert set(outcome.table["alpha"]) == {best["alpha"]}
+    assert "| **recommended, 60 % of it** |" in outcome.documents["recommendation.md"]
 
 
 def test_a_response_that_does_not_settle_is_noted():
