@@ -127,6 +127,9 @@ def test_every_device_has_its_boundary(plane):
     assert len(ax.collections) == 4
     for outline, device in zip(ax.collections, range(4), strict=True):
         for alpha, beta in outline.get_paths()[0].vertices[::5]:
+            # The end of a line may lie a rounding error outside of the grid.
+            alpha = np.clip(alpha, part.alpha.min(), part.alpha.max())
+            beta = np.clip(beta, part.beta.min(), part.beta.max())
             # Between points of the grid the margin is all but linear.
             assert abs(float(part.margin.isel(delta=device).interp(alpha=alpha, beta=beta))) < 1e-3
 
