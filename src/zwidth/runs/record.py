@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import secrets
 import shutil
 from collections.abc import Iterable, Iterator
@@ -32,6 +33,9 @@ RUN_FORMAT = 2
 
 # Beside those that can change a result.
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
+
+# As `write_whole`, `Record.staging` and stores call what they have not finished.
+_HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
 
 
 class Record:
@@ -127,6 +131,13 @@ class Record:
         about |= {"precision": "float64", "versions": versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
 
+    def keep_config(self, text: str) -> None:
+        """Write the configuration beside its results, unless a file of somebody's own has the name."""
+        path = self.folder / CONFIG_FILE
+        if not path.exists() or CONFIG_FILE in self.files():
+            self._update({"config_file": CONFIG_FILE})
+            write_whole(path, text.encode("utf-8"))
+
     def note(self, entry: dict[str, Any]) -> None:
         """Write down how a study went, in place of what was there before."""
         self._update({}, entry)
@@ -185,7 +196,9 @@ class Record:
 
     def files(self) -> set[str]:
         """All files that the run has written, by the record."""
-        found = {RUN_FILE, CONFIG_FILE}
+        found = {RUN_FILE}
+        if self.content.get("config_file") or self.content.get("format") == 1:
+            found.add(CONFIG_FILE)
         for entry in self.content.get("studies", ()):
             found |= {str(file) for file in entry.get("files", ())}
         # A name that leads out of the folder was not written by a run.
@@ -209,6 +222,8 @@ class Record:
     def sweep_up(self) -> None:
         """Remove what runs that were killed have left half made."""
         for left in self.folder.glob(".*.partial"):
+            if not _HALF_MADE.fullmatch(left.name):
+                continue
             if left.is_dir():
                 shutil.rmtree(left, ignore_errors=True)
             else:

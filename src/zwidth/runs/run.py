@@ -15,12 +15,12 @@ from typing import Any
 from zwidth.config.study import Study
 from zwidth.errors import InputError
 from zwidth.files.lock import holding
-from zwidth.files.whole import hopeless, write_whole
-from zwidth.runs.record import CONFIG_FILE, Record
+from zwidth.files.whole import hopeless
+from zwidth.runs.record import Record
 from zwidth.runs.result import ProgressCallback, RunResult, StudyEvent, StudyResult
 from zwidth.studies.document import Config, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
-from zwidth.sweep.engine import Progress, compute_sweeps
+from zwidth.sweep.engine import Progress, check_stores, compute_sweeps
 from zwidth.sweep.jobs import Perform
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.resume import remove, store_path
@@ -128,16 +128,17 @@ def run(
             for study, _ in planned:
                 remove(folder, study)
         record.check_same(inputs)
+        check_stores([study for study, _ in planned], folder, going_on=going_on)
         if shard is None:
             record.sweep_up()
         job = _Run(record, progress or (lambda event: None), len(pieces) + len(planned))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
         record.start(name=config.name, description=config.description, config_sha256=digest)
-        write_whole(folder / CONFIG_FILE, text.encode("utf-8"))
+        record.keep_config(text)
         job.do(pieces)
         about = {"name": config.name, "description": config.description, "config": _spelled(config)}
         if planned and not job.over:
-            options = {"resume": resume, "shard": shard, "workers": workers, "scheduler": scheduler}
+            options = {"shard": shard, "workers": workers, "scheduler": scheduler}
             job.sweep(planned, about, perform=perform, **options)
     seconds = time.perf_counter() - clock
     return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), job.hopeless, job.interrupted)

@@ -87,25 +87,22 @@ def compute_sweeps(
     folder: Path,
     about: Mapping[str, Any],
     *,
-    resume: bool,
     shard: tuple[int, int] | None,
     workers: int | None,
     scheduler: str | None,
     perform: Perform | None,
     progress: Callable[[Progress], None],
 ) -> Sweeps:
-    """Compute what is missing in the stores ``<folder>/<study>.zarr``, which are made where they are not there.
+    """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there (`check_stores`).
 
     Args:
         planned: the studies with their plans.
         folder: held by the caller.
         about: ``name``, ``description`` and ``config`` of the configuration, for the stores' attributes.
-        resume, shard, workers, scheduler, progress: as in `zwidth.run`.
+        shard, workers, scheduler, progress: as in `zwidth.run`.
         perform: what computes a chunk instead of `zwidth.sweep.chunks.perform`; for tests.
 
     Raises:
-        StoreExistsError: a store exists and the run does not go on.
-        StoreError: a store is damaged, or was made from another configuration or by other releases.
         InputError: the scheduler does not answer, or its workers do not see the folder.
     """
     if perform is None:
@@ -117,7 +114,7 @@ def compute_sweeps(
             from zwidth.sweep.distributed import connected
 
             client = stack.enter_context(connected(scheduler))
-        stores, repaired = _stores(planned, folder, about, going_on=resume or shard is not None, shard=shard)
+        stores, repaired = _stores(planned, folder, about, shard)
         results = {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
         names = {str(store.path): name for name, store in stores.items()}
         points: dict[Job, int] = {}
@@ -148,32 +145,34 @@ def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
     return tasks if shard is None else tasks[shard[0] - 1 :: shard[1]]
 
 
+def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool) -> None:
+    """Refuse stores that exist, unless the run goes on with them, and those of another study or release.
+
+    Raises:
+        StoreExistsError: a store exists and the run does not go on.
+        StoreError: a store is damaged, or was made from another configuration or by other releases.
+    """
+    for study in studies:
+        path = store_path(folder, study)
+        if not path.exists():
+            continue
+        if not going_on:
+            raise StoreExistsError(
+                f"out: {path} exists already; go on with it with --resume, or choose another folder with --out DIR"
+            )
+        check_same(Store(path), study)
+
+
 def _stores(
-    planned: Sequence[tuple[SweepStudy, Plan]],
-    folder: Path,
-    about: Mapping[str, Any],
-    *,
-    going_on: bool,
-    shard: tuple[int, int] | None,
+    planned: Sequence[tuple[SweepStudy, Plan]], folder: Path, about: Mapping[str, Any], shard: tuple[int, int] | None
 ) -> tuple[dict[str, Store], dict[str, list[str]]]:
     """The stores of all sweeps, made or found, and what was repaired in them."""
-    found = {study.name: store_path(folder, study) for study, _ in planned}
-    found = {name: path for name, path in found.items() if path.exists()}
-    if found and not going_on:
-        raise StoreExistsError(
-            f"out: {next(iter(found.values()))} exists already; go on with it with --resume, or choose another folder "
-            "with --out DIR"
-        )
-    # Everything is checked before anything is made or changed.
-    for study, _ in planned:
-        if study.name in found:
-            check_same(Store(found[study.name]), study)
     stores, repaired = {}, {}
     for study, plan in planned:
         if shard is None:
             sweep_up(folder, study)
-        if study.name in found:
-            stores[study.name] = store = Store(found[study.name])
+        if store_path(folder, study).exists():
+            stores[study.name] = store = Store(store_path(folder, study))
             repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _share(store.plan, shard))]
         else:
             stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)

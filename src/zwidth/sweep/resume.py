@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -115,7 +116,9 @@ def sweep_up(folder: Path, study: SweepStudy) -> None:
 
 
 def remove(folder: Path, study: SweepStudy) -> None:
-    """Make room for a store to be made again; what is no store stays, and is then refused."""
+    """Make room for a store to be made again; what is no store of a sweep stays, and is then refused."""
     path = store_path(folder, study)
-    if (path / "zarr.json").is_file() and not path.is_symlink():
-        shutil.rmtree(path)
+    if path.is_dir() and not path.is_symlink():
+        with suppress(StoreError):
+            Store(path).attributes  # noqa: B018  (raises where the store is not one of ours)
+            shutil.rmtree(path)

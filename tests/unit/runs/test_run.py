@@ -243,6 +243,32 @@ def test_a_strangers_file_in_the_place_of_a_result_is_not_replaced(both, tmp_pat
     assert run(both, out=out, resume=True).ok
 
 
+def test_somebodys_own_config_yaml_is_never_replaced(both, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "config.yaml").write_text("mine", encoding="utf-8")
+    for options in ({}, {"resume": True}, {"overwrite": True}):
+        assert run(both, out=out, **options).ok
+        assert (out / "config.yaml").read_text(encoding="utf-8") == "mine"
+    (out / "config.yaml").unlink()
+    assert run(both, out=out, overwrite=True).ok
+    assert (out / "config.yaml").read_text(encoding="utf-8") == BOTH
+    assert run(both, out=out, overwrite=True).ok
+    assert (out / "config.yaml").read_text(encoding="utf-8") == BOTH
+
+
+def test_a_strangers_store_of_the_same_name_is_never_replaced(both, tmp_path):
+    import zarr
+
+    store = tmp_path / "out" / "swept.zarr"
+    zarr.create_group(store).create_array("mine", data=np.arange(3.0))
+    for options in ({}, {"overwrite": True}):
+        with pytest.raises(StoreExistsError, match=r"swept\.zarr exists already"):
+            run(both, out=tmp_path / "out", **options)
+    assert [path.name for path in (tmp_path / "out").iterdir() if path.name != ".locks"] == ["swept.zarr"]
+    np.testing.assert_array_equal(zarr.open_group(store)["mine"][:], [0, 1, 2])
+
+
 def test_a_record_that_names_files_elsewhere_removes_none(finished, both, tmp_path):
     precious = tmp_path / "precious.txt"
     precious.write_text("mine", encoding="utf-8")
