@@ -90,20 +90,26 @@ def run(
         _print_plan(path, out, memory, workers)
         return
     again = _again(path, out, workers, scheduler, shard)
-    with _ending_on_sigterm() as stopped_by, reporter() as progress:
-        result = run_studies(
-            path,
-            out=out,
-            overwrite=overwrite,
-            resume=resume,
-            workers=workers,
-            scheduler=scheduler,
-            shard=shard,
-            memory=memory,
-            progress=progress,
-        )
-    _tell(result, again)
-    if result.interrupted:
+    with _ending_on_sigterm() as stopped_by:
+        try:
+            with reporter() as progress:
+                result = run_studies(
+                    path,
+                    out=out,
+                    overwrite=overwrite,
+                    resume=resume,
+                    workers=workers,
+                    scheduler=scheduler,
+                    shard=shard,
+                    memory=memory,
+                    progress=progress,
+                )
+        except KeyboardInterrupt:
+            # Before the first study began.
+            result = None
+    if result is not None:
+        _tell(result, again)
+    if result is None or result.interrupted:
         click.echo(f"zwidth: stopped; what is done is kept, go on with: {again}", err=True)
         raise SystemExit(128 + (stopped_by[0] if stopped_by else signal.SIGINT))
     if not result.ok:

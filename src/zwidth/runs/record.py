@@ -173,7 +173,7 @@ class Record:
             shutil.rmtree(stage, ignore_errors=True)
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
-        """Give the files in ``stage`` their names, and take away those that the study had before.
+        """Give the files in ``stage`` their names; when the study is done, take away what else it had before.
 
         Raises:
             StoreExistsError: a file of one of these names is there that no run has written.
@@ -187,12 +187,14 @@ class Record:
                     "with --out DIR"
                 )
         # First the names, so that a run that is killed between two files still knows them for its own.
-        both = {**dict.fromkeys(before.get("files", ()), ""), **files}
+        both = {**before.get("files", {}), **files}
         self.note({**entry, "state": "open", "files": both})
         for file in files:
             os.replace(stage / file, self.folder / file)
-        self._remove(file for file in both if file not in files)
-        self.note({**entry, "files": files})
+        if entry["state"] == "done":
+            self._remove(file for file in both if file not in files)
+            both = files
+        self.note({**entry, "files": both})
 
     def files(self) -> set[str]:
         """All files that the run has written, by the record."""

@@ -7,6 +7,7 @@ import json
 import os
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -122,7 +123,7 @@ def run(
     with holding(folder, shard):
         record = Record(folder)
         record.check_free(overwrite=overwrite, going_on=going_on)
-        inputs = {piece.name: piece.inputs for piece in pieces} | {one.name: _inputs(one) for one, _ in planned}
+        inputs = {piece.name: piece.inputs for piece in pieces} | {one.name: _spelled(one) for one, _ in planned}
         if overwrite:
             record.clear()
             for study, _ in planned:
@@ -215,7 +216,10 @@ class _Run:
                 self.record.keep(stage, entry)
             except Exception as caught:
                 error = error or caught
-                entry |= {"error": _in_words(error), "state": "failed"}
+                before = self.record.entry(piece.name) or {}
+                entry |= {"error": _in_words(error), "state": "failed", "files": before.get("files", {})}
+                with suppress(OSError):
+                    self.record.note(entry)
         if error is not None and hopeless(error):
             self.hopeless = _in_words(error)
         kept = self.record.entry(piece.name)
@@ -271,7 +275,7 @@ class _Run:
 def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
     """What the record says of a sweep; its store knows by itself which of its files are whole."""
     files = {store_path(Path(), study).name: None}
-    return {"name": study.name, "kind": "sweep", "state": state, "inputs": _inputs(study), "files": files}
+    return {"name": study.name, "kind": "sweep", "state": state, "inputs": _spelled(study), "files": files}
 
 
 def _pieces(config: Config) -> list[Computation]:
@@ -280,7 +284,7 @@ def _pieces(config: Config) -> list[Computation]:
     for study in config.studies:
         if isinstance(study, ComputedStudy):
             alone = sum(type(other) is type(study) for other in config.studies) == 1
-            inputs = _inputs(study)
+            inputs = _spelled(study)
             if study.reads_scene and config.scene is not None:
                 inputs["scene"] = _spelled(config.scene)
             pieces.append(
@@ -295,10 +299,6 @@ def _pieces(config: Config) -> list[Computation]:
 
 def _sweeps(config: Config) -> list[SweepStudy]:
     return [study for study in config.studies if isinstance(study, SweepStudy)]
-
-
-def _inputs(study: Any) -> dict[str, Any]:
-    return _spelled(study)
 
 
 def _spelled(model: Any) -> dict[str, Any]:

@@ -239,6 +239,7 @@ def test_a_strangers_file_in_the_place_of_a_result_is_not_replaced(both, tmp_pat
         f"StoreExistsError: out: {out / 'thesis.npz'} was not written by this run; move it away"
     )
     assert (out / "thesis.npz").read_bytes() == b"years of work"
+    assert states(out)["thesis"] == "failed"
     (out / "thesis.npz").unlink()
     assert run(both, out=out, resume=True).ok
 
@@ -324,6 +325,19 @@ def test_what_is_damaged_is_made_again_and_nothing_else(finished, both, damage, 
     assert after["two.npz"] == before["two.npz"]
     np.testing.assert_array_equal(np.load(finished / "one.npz")["alpha"], [0.1, 0.2])
     np.testing.assert_array_equal(np.load(finished / "two.npz")["stable"], values)
+
+
+def test_what_fails_when_it_is_made_again_loses_nothing(finished, both, fail):
+    before = contents(finished)
+    (finished / "one_stable.svg").unlink()
+    assert [study.name for study in run(both, out=finished, resume=True).failed] == ["one"]
+    after = contents(finished)
+    assert {name: after[name] for name in ("one.npz", "one_stable.png")} == {
+        name: before[name] for name in ("one.npz", "one_stable.png")
+    }
+    fail.undo()
+    assert run(both, out=finished, resume=True).ok
+    assert contents(finished).keys() == before.keys()
 
 
 @pytest.mark.parametrize(
