@@ -1,0 +1,214 @@
+"""The edge of the stable set of any linear loop: which parts of the boundary it is, its corners, its highest point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.linear.boundary import Boundary, curve_at, zeros_of
+from zwidth.linear.roots import circle
+from zwidth.stability.ridge import RidgeKind
+
+# The place where an edge ends is told to the last digit by so many rounds over so many places.
+_ROUNDS = 11
+_SHARES = np.arange(1, 32) / 32.0
+# Points of a straight edge, and how far beyond the corners one is looked for.
+_LINE_POINTS, _BEYOND = 257, 0.05
+# Two ends nearer than this share of the plane are one corner.
+_SAME = 1e-7
+
+
+class Edge(NamedTuple):
+    """One part of the edge of the stable set, end to end."""
+
+    w: np.ndarray
+    alpha: np.ndarray
+    beta: np.ndarray
+    line: int  # which of the boundary's lines, or -1 for the curve
+
+
+class Peak(NamedTuple):
+    """The stiffest stable wall: the end of all stable alpha."""
+
+    alpha: float
+    beta: float
+    omega: float
+    kind: RidgeKind
+
+
+@dataclass(frozen=True)
+class Border:
+    """The edge of the stable set of one loop."""
+
+    boundary: Boundary
+
+    @cached_property
+    def curved(self) -> list[Edge]:
+        """The edges on the curve of complex pairs."""
+        b = self.boundary
+        here = curve_at(b.loop, b.w)
+        tops = zeros_of(b.loop, b.w, here.alpha_slope, "alpha_slope")
+        tops = tops[np.isfinite(curve_at(b.loop, tops).alpha)] if tops.size else tops
+        w = np.unique(np.concatenate([b.w, tops]))
+        piece = np.searchsorted(b.infinite, w)
+        held = b.borders(w)
+        edges = []
+        for start, stop in _runs(held, piece):
+            first, last = self._end(w, held, piece, start, -1), self._end(w, held, piece, stop, 1)
+            at = np.unique(np.concatenate([[first], w[start : stop + 1], [last]]))
+            curve = curve_at(b.loop, np.clip(at, 1e-300, np.pi))
+            alpha, beta = curve.alpha.copy(), curve.beta.copy()
+            for k, end in ((0, 0.0), (-1, np.pi)):
+                if at[k] == end:
+                    alpha[k], beta[k] = self._at_end(end)
+            edges.append(Edge(at, alpha, beta, -1))
+        return edges
+
+    def _at_end(self, w: float) -> tuple[float, float]:
+        """The curve's limit at z = 1 or z = -1."""
+        at = circle(np.array([w]))
+        with np.errstate(all="ignore"):
+            q, f = self.boundary.loop.needed(at), self.boundary.loop.estimate.jet(at)
+            beta = q.slope[0].imag / f.slope[0].imag
+            return float(q.value[0].real - beta * f.value[0].real), float(beta)
+
+    def _end(self, w: np.ndarray, held: np.ndarray, piece: np.ndarray, k: int, side: int) -> float:
+        """Where a run of nodes on the edge ends beyond its last node ``k``."""
+        after = k + side
+        if not 0 <= after < w.size:
+            end = 0.0 if side < 0 else np.pi
+            return end if np.all(np.isfinite(self._at_end(end))) else float(w[k])
+        if piece[after] != piece[k]:
+            return float(w[k])
+        return _last_held(self.boundary.borders, float(w[k]), float(w[after]))
+
+    @cached_property
+    def straight(self) -> list[Edge]:
+        """The edges on which a real pole, or a pair at one frequency, is on the circle."""
+        betas = np.concatenate([*(edge.beta for edge in self.curved), self._line_corners()])
+        betas = betas if betas.size else np.zeros(1)
+        size = np.ptp(betas) + 1e-300
+        edges = []
+        for place, line in enumerate(self.boundary.lines):
+            ends = betas.min() - _BEYOND * size, betas.max() + _BEYOND * size
+            corners = np.concatenate([*(edge.beta[[0, -1]] for edge in self.curved), self._line_corners()])
+            beta = np.linspace(*ends, _LINE_POINTS)
+            corners = corners[(corners > ends[0]) & (corners < ends[1])]
+            near = np.concatenate([corners - 1e-6 * size, corners + 1e-6 * size])
+            beta = np.unique(np.concatenate([beta, near]))
+            held = self.boundary.line_borders(place, beta)
+            for start, stop in _runs(held, 0 * held):
+                low = self._line_end(place, beta, start, -1)
+                high = self._line_end(place, beta, stop, 1)
+                both = np.array([low, high])
+                edges.append(Edge(np.full(2, line.w), line.q - both * line.f, both, place))
+        return edges
+
+    def _line_corners(self) -> np.ndarray:
+        """The dampings at which two of the lines meet."""
+        lines = self.boundary.lines
+        pairs = [(a, b) for k, a in enumerate(lines) for b in lines[:k] if abs(a.f - b.f) > 1e-12 * (abs(a.f) + abs(b.f))]
+        return np.array([(a.q - b.q) / (a.f - b.f) for a, b in pairs])
+
+    def _line_end(self, place: int, beta: np.ndarray, k: int, side: int) -> float:
+        after = k + side
+        if not 0 <= after < beta.size:
+            return float(beta[k])
+        return _last_held(lambda at: self.boundary.line_borders(place, at), float(beta[k]), float(beta[after]))
+
+    def peak(self) -> Peak | None:
+        """The stiffest stable wall, None where no wall is stable."""
+        best = None
+        for edge in self.curved:
+            k = int(np.argmax(edge.alpha))
+            w = float(edge.w[k])
+            inner = 0 < k < edge.w.size - 1
+            kind = RidgeKind.SMOOTH if inner else RidgeKind.CORNER
+            if best is None or edge.alpha[k] > best.alpha:
+                best = Peak(float(edge.alpha[k]), float(edge.beta[k]), w, kind)
+        for edge in self.straight:
+            k = int(np.argmax(edge.alpha))
+            if best is None or edge.alpha[k] > best.alpha * (1 + 1e-9) + 1e-300:
+                best = Peak(float(edge.alpha[k]), float(edge.beta[k]), float(edge.w[k]), RidgeKind.CORNER)
+        return best
+
+
+def _last_held(holds: Callable[[np.ndarray], np.ndarray], inside: float, outside: float) -> float:
+    """The last place towards ``outside`` at which a condition still holds; many places are asked at one time."""
+    for _ in range(_ROUNDS):
+        places = inside + (outside - inside) * _SHARES
+        held = holds(places)
+        first = int(np.argmin(held)) if not held.all() else held.size
+        inside, outside = (
+            float(places[first - 1]) if first else inside,
+            float(places[first]) if first < held.size else outside,
+        )
+    return inside
+
+
+def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:
+    """First and last index of every run of true values within one piece."""
+    runs = []
+    start = None
+    for k in range(held.size):
+        if held[k] and start is None:
+            start = k
+        if start is not None and (k + 1 == held.size or not held[k + 1] or piece[k + 1] != piece[k]):
+            runs.append((start, k))
+            start = None
+    return runs
+
+
+class Outline(NamedTuple):
+    """One closed outline of the stable set; a hole where unstable walls lie inside."""
+
+    alpha: np.ndarray
+    beta: np.ndarray
+    hole: bool
+
+    @property
+    def area(self) -> float:
+        """Inside, of the polygon."""
+        return 0.5 * abs(float(np.dot(self.alpha, np.roll(self.beta, -1)) - np.dot(np.roll(self.alpha, -1), self.beta)))
+
+
+def outlines(border: Border) -> list[Outline]:
+    """Join the edges to closed outlines, the largest first."""
+    edges = [*border.curved, *border.straight]
+    if not edges:
+        return []
+    scale = np.array([max(np.ptp(np.concatenate([e[k] for e in edges])), 1e-300) for k in (1, 2)])
+    paths = [np.stack([e.alpha, e.beta], -1) for e in edges]
+    loops = []
+    while paths:
+        path = paths.pop()
+        while True:
+            gaps = [
+                (float(np.abs((path[-1] - other[end]) / scale).max()), k, end)
+                for k, other in enumerate(paths)
+                for end in (0, -1)
+            ]
+            closing = float(np.abs((path[-1] - path[0]) / scale).max())
+            if not gaps or (path.shape[0] > 2 and closing <= min(min(gaps)[0], 1e-3)):
+                break
+            gap, k, end = min(gaps)
+            if gap > 1e-3:
+                break
+            other = paths.pop(k)
+            path = np.concatenate([path, (other if end == 0 else other[::-1])[1:]])
+        loops.append(path)
+    found = [Outline(path[:, 0], path[:, 1], False) for path in loops]
+    found.sort(key=lambda outline: -outline.area)
+    return [o._replace(hole=_inside(found, k) % 2 == 1) for k, o in enumerate(found)]
+
+
+def _inside(found: list[Outline], k: int) -> int:
+    """How many of the larger outlines an outline lies in."""
+    from matplotlib.path import Path
+
+    point = found[k].alpha[0], found[k].beta[0]
+    return sum(bool(Path(np.stack([o.alpha, o.beta], -1)).contains_point(point)) for o in found[:k])

@@ -1,0 +1,360 @@
+"""The boundary curve of any linear loop, cut into arcs on which the damping is monotone; rows of it and their counts.
+
+On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``
+(docs/theory/one-crossover.md tells it for the rigid loop). Between the zeros of ``d beta/dw`` and of Im F beta is
+monotone, so that each row meets an arc once at most. Along a row a pole leaves the circle where
+``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
+
+    poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
+
+with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide. It is counted once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.errors import ZwidthError
+from zwidth.linear.roots import Circle, LinearLoop, circle
+from zwidth.stability.counting import count_poles
+
+# How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
+_STEP = 0.08
+_ROUNDS = 60
+# Shares of a step at which a dip of the slope between two nodes is looked for.
+_INSIDE = np.arange(1, 8) / 8.0
+# Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
+_MOST_STEPS, _ARRIVED = 120, 1e-10
+# Of |q|: less of an imaginary part than that where Im F vanishes is none.
+_NONE = 1e-11
+
+
+class Curve(NamedTuple):
+    """Points of the boundary curve, and what decides their order."""
+
+    alpha: np.ndarray
+    beta: np.ndarray
+    alpha_slope: np.ndarray  # d alpha/dw
+    turn: np.ndarray  # Im q' Im F - Im q Im F', of the sign of d beta/dw
+    fall: np.ndarray  # Im F
+
+
+class Arc(NamedTuple):
+    """A part of the curve on which beta is monotone, by its nodes in ascending beta."""
+
+    w: np.ndarray
+    beta: np.ndarray
+
+    @property
+    def first(self) -> float:
+        """Its lowest angle."""
+        return float(min(self.w[0], self.w[-1]))
+
+
+class Line(NamedTuple):
+    """A frequency at which a whole line ``alpha + beta real(F) = q`` puts poles on the circle."""
+
+    w: float
+    q: float
+    f: float
+    q_turn: float  # Im dq/dw
+    f_turn: float
+    poles: int  # 1 at z = 1 and z = -1, else 2
+
+
+class Crossings(NamedTuple):
+    """Where rows cross the boundary: shape (rows, arcs and lines), NaN where one does not."""
+
+    alpha: np.ndarray
+    w: np.ndarray
+    leaving: np.ndarray  # poles that leave the circle as alpha rises past the crossing; negative for entering ones
+
+
+def curve_at(loop: LinearLoop, w: np.ndarray) -> Curve:
+    """The boundary curve at angles in (0, pi)."""
+    at = circle(w)
+    with np.errstate(all="ignore"):
+        q, f = loop.needed(at), loop.estimate.jet(at)
+        beta = q.value.imag / f.value.imag
+        alpha = q.value.real - beta * f.value.real
+        turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
+        beta_slope = turn / f.value.imag**2
+        alpha_slope = q.slope.real - beta_slope * f.value.real - beta * f.slope.real
+        return Curve(alpha, beta, alpha_slope, turn, f.value.imag)
+
+
+def nodes_of(loop: LinearLoop) -> np.ndarray:
+    """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
+    sizes = np.abs(np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros]))
+    slowest = min([1.0 / (abs(loop.lag) + loop.estimate.window + 1.0), *sizes[sizes > 1e-13]])
+    first = 1e-3 * min(slowest, 1.0)
+    w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - 1e-6, 32)[1:]])
+    for _ in range(_ROUNDS):
+        half = 0.5 * np.diff(w)
+        wide = 2.0 * half * loop.turning(w[:-1] + half, half) > _STEP * 16.0
+        wide |= 2.0 * half * loop.turning(w[:-1] + half, 0.0 * half) > _STEP
+        if not wide.any():
+            break
+        w = np.sort(np.concatenate([w, w[:-1][wide] + half[wide]]))
+    return w
+
+
+@dataclass(frozen=True)
+class Boundary:
+    """The boundary of one loop, laid out for rows."""
+
+    loop: LinearLoop
+    w: np.ndarray
+    arcs: tuple[Arc, ...]
+    lines: tuple[Line, ...]
+    infinite: np.ndarray  # angles at which the curve runs to infinity
+
+    @classmethod
+    def trace(cls, loop: LinearLoop) -> Boundary:
+        """Lay out the curve."""
+        w = nodes_of(loop)
+        here = curve_at(loop, w)
+        w = np.unique(np.concatenate([w, _dips(loop, w, here)]))
+        here = curve_at(loop, w)
+        poles = zeros_of(loop, w, here.fall, "fall")
+        lines = tuple(line for p in poles if (line := _interior_line(loop, p)) is not None)
+        poles = np.array([p for p in poles if all(abs(p - line.w) > 1e-9 for line in lines)])
+        turns = zeros_of(loop, w, here.turn, "turn")
+        turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
+        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns)), (*lines, *_end_lines(loop)), poles)
+
+    def crossings(self, beta: np.ndarray) -> Crossings:
+        """Where the rows of these dampings, shape (rows,), cross the boundary."""
+        rows, places, low, high = [], [], [], []
+        for place, arc in enumerate(self.arcs):
+            row = np.flatnonzero((beta >= arc.beta[0]) & (beta <= arc.beta[-1]))
+            k = np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
+            rows.append(row)
+            places.append(np.full(row.size, place))
+            low.append(arc.w[k - 1])
+            high.append(arc.w[k])
+        row, place = np.concatenate(rows), np.concatenate(places)
+        w, alpha, sign = _solve_rows(self.loop, beta[row], np.concatenate(low), np.concatenate(high))
+        shape = beta.size, len(self.arcs) + len(self.lines)
+        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
+        out.alpha[row, place], out.w[row, place], out.leaving[row, place] = alpha, w, 2.0 * sign
+        for place, line in enumerate(self.lines, len(self.arcs)):
+            out.alpha[:, place] = line.q - beta * line.f
+            out.w[:, place] = line.w
+            out.leaving[:, place] = line.poles * np.sign(line.q_turn - beta * line.f_turn)
+        return out
+
+    def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,)."""
+        return self.base + self._passed(alpha, beta)
+
+    def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> np.ndarray:
+        """Poles that have left below each wall, without those of one column of the crossings."""
+        found = self.crossings(beta)
+        counts = (found.alpha < alpha[:, None]) & (np.arange(found.alpha.shape[1]) != np.reshape(but, (-1, 1)))
+        return np.where(counts, found.leaving, 0.0).sum(-1).astype(int)
+
+    def borders(self, w: np.ndarray) -> np.ndarray:
+        """Whether the stable set lies on one side of the curve at each angle."""
+        here = curve_at(self.loop, w)
+        with np.errstate(all="ignore"):
+            leaves = here.turn * here.fall > 0
+        own = np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
+        finite = np.isfinite(here.alpha) & np.isfinite(here.beta)
+        at = np.where(finite, here.alpha, 0.0), np.where(finite, here.beta, 0.0)
+        return finite & (self.base + self._passed(*at, own) == np.where(leaves, 0, 2))
+
+    def line_borders(self, line: int, beta: np.ndarray) -> np.ndarray:
+        """Whether the stable set lies on one side of a line at each damping."""
+        at = self.lines[line]
+        turn = at.q_turn - beta * at.f_turn
+        others = self.base + self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
+        return others == np.where(turn > 0, 0, at.poles)
+
+    @cached_property
+    def base(self) -> int:
+        """Poles outside far below every crossing; three walls that are counted one by one must agree on it."""
+        told = []
+        for alpha, beta in self._witnesses():
+            outside = outside_by_count(self.loop, alpha, beta)
+            told.append(outside - int(self._passed(np.array([alpha]), np.array([beta]))[0]))
+        if len(set(told)) != 1:
+            raise ZwidthError(f"scene: the boundary does not agree with counted poles ({told}); please report this loop")
+        return told[0]
+
+    def _witnesses(self) -> list[tuple[float, float]]:
+        """Walls far from every crossing of their rows."""
+        spread = np.concatenate([arc.beta[np.isfinite(arc.beta)] for arc in self.arcs])
+        size = np.quantile(np.abs(spread), 0.25) + 1e-12
+        found = []
+        for beta in (0.31 * size, -0.17 * size, 1.37 * size):
+            alpha = np.sort(self.crossings(np.array([beta])).alpha[0])
+            alpha = alpha[np.isfinite(alpha)]
+            ends = np.concatenate([[alpha[0] - 1.0 - abs(alpha[0])], alpha, [alpha[-1] + 1.0 + abs(alpha[-1])]])
+            # Of the gaps between crossings the one that is widest for its height.
+            gap = np.diff(ends) / (np.abs(ends[1:]) + np.abs(ends[:-1]) + 1e-300)
+            best = int(np.argmax(gap))
+            found.append((0.5 * float(ends[best] + ends[best + 1]), float(beta)))
+        return found
+
+
+def outside_by_count(loop: LinearLoop, alpha: float, beta: float) -> int:
+    """Poles of one wall outside the unit circle, counted without the boundary."""
+    from zwidth.linear.polynomial import closed_loop_roots, closed_loop_poles
+
+    zeros, poles, gain, lag = closed_loop_roots(loop, alpha, beta)
+    inside = int(count_poles(zeros, poles, gain=gain, lag=max(lag, 0)))
+    if inside >= 0:
+        return max(poles.size + lag, zeros.size) - inside
+    return int(np.sum(np.abs(closed_loop_poles(loop, alpha, beta)) >= 1.0))
+
+
+def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The angle between two nodes at which each row crosses, its alpha, and whether a pole leaves there (1, else -1).
+
+    ``Im q - beta Im F`` over sin w, by Newton's method kept inside its bracket; who has arrived takes no part any more.
+    """
+    below, above = np.minimum(low, high), np.maximum(low, high)
+    first, last = _residual(loop, beta, below)[0], _residual(loop, beta, above)[0]
+    with np.errstate(all="ignore"):
+        share = first / (first - last)
+    share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
+    found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
+    rising = first < 0
+    here = np.arange(beta.size)
+    x = found.copy()
+    for step in range(_MOST_STEPS):
+        value, slope, _, _ = _residual(loop, beta[here], x)
+        ahead = (value < 0) == rising[here]
+        below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
+        with np.errstate(all="ignore"):
+            new = x - value / slope
+        good = (new > below[here]) & (new < above[here]) & (step % 6 != 5)
+        new = np.where(good | (value == 0), new, 0.5 * (below[here] + above[here]))
+        found[here] = new
+        # A step so short leaves rounding: each next one would be its square.
+        on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
+        if not on.any():
+            break
+        here, x = here[on], new[on]
+    _, _, alpha, leave = _residual(loop, beta, found)
+    return found, alpha, np.where(leave > 0, 1.0, -1.0)
+
+
+def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``Im(q - beta F)/sin w`` with its limits at 0 and pi, its derivative, ``Re(q - beta F)`` and ``Im(q' - beta F')``."""
+    at = circle(w)
+    with np.errstate(all="ignore"):
+        q, f = loop.needed(at), loop.estimate.jet(at)
+        value, slope = q.value - beta * f.value, q.slope - beta * f.slope
+        sine, cosine = np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
+        end = sine == 0
+        safe = np.where(end, 1.0, sine)
+        ratio = np.where(end, slope.imag / cosine, value.imag / safe)
+        return ratio, (slope.imag - ratio * cosine) / safe, value.real, slope.imag
+
+
+def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
+    """Zeros of a field of the curve between nodes where its sign changes, by bisection."""
+    k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
+    low, high, sign = w[k], w[k + 1], values[k] > 0
+    if not k.size:
+        return low
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        same = (getattr(curve_at(loop, middle), field) > 0) == sign
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return 0.5 * (low + high)
+
+
+def _dips(loop: LinearLoop, w: np.ndarray, here: Curve) -> np.ndarray:
+    """Nodes to add where d beta/dw keeps its sign from one node to the next but may not do so between them.
+
+    The curve changes so little over a step that the slope is nearly a parabola there; where an end's tangent leads
+    below a tenth of it, the step is looked at in eighths.
+    """
+    values = here.turn
+    same = (values[:-1] > 0) == (values[1:] > 0)
+    step = np.diff(w)
+    # Slopes at the nodes by differences of the three around them.
+    inner = np.gradient(values, w)
+    first = np.abs(values[:-1]) + np.sign(values[:-1]) * inner[:-1] * step / 2
+    last = np.abs(values[1:]) - np.sign(values[1:]) * inner[1:] * step / 2
+    lowest = np.minimum(first, last)
+    near = same & (lowest < 0.25 * np.minimum(np.abs(values[:-1]), np.abs(values[1:])))
+    k = np.flatnonzero(near)
+    return (w[k, None] + step[k, None] * _INSIDE).ravel()
+
+
+def _interior_line(loop: LinearLoop, w: float) -> Line | None:
+    """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
+    at = circle(np.array([w]))
+    q, f = loop.needed(at), loop.estimate.jet(at)
+    if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
+        return None
+    value, turn = float(q.value[0].real), float(q.slope[0].imag)
+    return Line(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
+
+
+def _end_lines(loop: LinearLoop) -> list[Line]:
+    """The lines of real poles at z = 1 and z = -1; where the device does not move there is none."""
+    lines = []
+    for w in (0.0, np.pi):
+        at = circle(np.array([w]))
+        with np.errstate(all="ignore"):
+            q, f = loop.needed(at), loop.estimate.jet(at)
+        numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
+        if np.all(np.isfinite(numbers)) and abs(numbers[0]) < 1e14:
+            lines.append(Line(w, *(float(n) for n in numbers), 1))
+    return lines
+
+
+def _arcs(loop: LinearLoop, w: np.ndarray, here: Curve, poles: np.ndarray, turns: np.ndarray) -> list[Arc]:
+    """Cut the curve where beta turns or runs to infinity."""
+    cuts = np.sort(np.concatenate([poles, turns]))
+    ends = np.concatenate([[0.0], cuts, [np.pi]])
+    at_pole = {float(p) for p in poles}
+    limits = _end_limits(loop)
+    arcs = []
+    for a, b in zip(ends[:-1], ends[1:], strict=True):
+        inner = (w > a) & (w < b)
+        nodes, beta, slope = w[inner], here.beta[inner], here.turn[inner]
+        if not nodes.size:
+            nodes = np.array([0.5 * (a + b)])
+            middle = curve_at(loop, nodes)
+            beta, slope = middle.beta, middle.turn
+        rising = np.sum(np.sign(slope)) > 0
+        first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
+        last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
+        nodes, beta = np.concatenate([[a], nodes, [b]]), np.concatenate([[first], beta, [last]])
+        if not rising:
+            nodes, beta = nodes[::-1], beta[::-1]
+        # Next to a limit or an extreme rounding may leave a node out of order; without it nothing is lost.
+        good = np.maximum.accumulate(beta) == beta
+        good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
+        good[[0, -1]] = True
+        if beta[0] <= beta[-1]:
+            arcs.append(Arc(nodes[good], beta[good]))
+    return arcs
+
+
+def _end_limits(loop: LinearLoop) -> dict[float, float]:
+    """``Im q'/Im F'``, the limit of beta, at 0 and at pi; infinite or NaN where there is none."""
+    at = circle(np.array([0.0, np.pi]))
+    with np.errstate(all="ignore"):
+        q, f = loop.needed(at), loop.estimate.jet(at)
+        steep = np.abs(f.slope.imag) > 1e-12 * (1.0 + np.abs(f.slope))
+        limit = np.where(steep & np.isfinite(q.slope.imag), q.slope.imag / f.slope.imag, np.nan)
+    return {0.0: float(limit[0]), float(np.pi): float(limit[1])}
+
+
+def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
+    if w in at_pole:
+        return side * np.inf
+    if w in limits:
+        return limits[w] if np.isfinite(limits[w]) else side * np.inf
+    return float(curve_at(loop, np.array([w])).beta[0])

@@ -1,0 +1,136 @@
+"""A loop by its roots, on the unit circle (any loop): what its device answers, what its velocity estimate answers.
+
+Normalized to T = 1 and m = 1, the loop of a wall is affine in (alpha, beta),
+
+    P(z) = D + alpha N1 + beta N2 = 0   exactly where   alpha + beta F(z) = q(z) = -1/G(z)
+
+with G from the wall's force to the sampled position and F from position to the velocity estimate. Roots are kept by
+their offsets ``1 - root``: next to z = 1, where slow loops live, a root itself has lost its digits.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Jet(NamedTuple):
+    """A complex function of w and its derivative."""
+
+    value: np.ndarray
+    slope: np.ndarray
+
+    def times(self, other: Jet) -> Jet:
+        """The product."""
+        return Jet(self.value * other.value, self.slope * other.value + self.value * other.slope)
+
+    def over(self, other: Jet) -> Jet:
+        """The quotient."""
+        value = self.value / other.value
+        return Jet(value, (self.slope - value * other.slope) / other.value)
+
+
+class Circle(NamedTuple):
+    """Points ``z = e^(jw)``, and z - 1 with all its digits."""
+
+    w: np.ndarray
+    z: np.ndarray
+    before: np.ndarray
+
+
+def circle(w: np.ndarray) -> Circle:
+    """The points of the unit circle at the angles ``w``, exactly -1 at pi."""
+    half = 0.5 * w
+    s, c = np.sin(half), np.where(w >= np.pi, 0.0, np.cos(half))
+    before = -2.0 * s * s + 2j * s * c
+    return Circle(w, 1.0 + before, before)
+
+
+def lag_jet(at: Circle, turns: float) -> Jet:
+    """``z^turns``."""
+    # At pi a whole number of half turns is a sign.
+    even = 1.0 - 2.0 * (turns % 2)
+    value = np.where(at.w >= np.pi, even + 0j, np.exp(1j * turns * at.w))
+    return Jet(value, 1j * turns * value)
+
+
+def product_jet(at: Circle, offsets: np.ndarray, factor: float) -> Jet:
+    """``factor prod(z - root)`` of roots given by their offsets from 1."""
+    value = np.full(at.w.shape, complex(factor))
+    slope = np.zeros(at.w.shape, complex)
+    turn = 1j * at.z
+    for offset in offsets:
+        one = at.before + offset
+        value, slope = value * one, slope * one + value * turn
+    return Jet(value, slope)
+
+
+def _no_roots() -> np.ndarray:
+    return np.zeros(0, complex)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The velocity estimate F: a difference over ``window`` periods, then a filter.
+
+    ``F(z) = gain prod(z - zeros)/(z^lag prod(z - poles)) (1 - z^-window)/window``, without the last factor for a window
+    of 0.
+    """
+
+    window: int = 1
+    gain: float = 1.0
+    lag: int = 0
+    zeros: np.ndarray = field(default_factory=_no_roots)
+    poles: np.ndarray = field(default_factory=_no_roots)
+
+    def jet(self, at: Circle) -> Jet:
+        """F and its derivative in w."""
+        parts = Jet(np.full(at.w.shape, complex(self.gain)), np.zeros(at.w.shape, complex))
+        if self.zeros.size or self.poles.size or self.lag:
+            filtered = product_jet(at, self.zeros, self.gain).over(product_jet(at, self.poles, 1.0))
+            parts = filtered.times(lag_jet(at, -self.lag))
+        if self.window:
+            back = lag_jet(at, -self.window)
+            n = self.window
+            s = np.sin(0.5 * n * at.w)
+            value = np.where(at.w >= np.pi, 1.0 - back.value, 2.0 * s * s - 1j * back.value.imag) / n
+            parts = parts.times(Jet(value, -back.slope / n))
+        return parts
+
+    @property
+    def degree(self) -> int:
+        """By how much the estimate turns in all, a bound for how fast it varies."""
+        return self.window + abs(self.lag) + self.zeros.size + self.poles.size
+
+
+@dataclass(frozen=True)
+class LinearLoop:
+    """A loop without its wall: ``G(z) = gain prod(z - zeros)/(z^lag prod(z - poles))`` and the velocity estimate F."""
+
+    gain: float
+    lag: int
+    zeros: np.ndarray
+    poles: np.ndarray
+    estimate: Estimate
+
+    def needed(self, at: Circle) -> Jet:
+        """``q = -1/G``: what the wall must answer to put a pole at z."""
+        over = product_jet(at, self.poles, -1.0).over(product_jet(at, self.zeros, self.gain))
+        return over.times(lag_jet(at, self.lag))
+
+    @property
+    def order(self) -> int:
+        """How many poles the closed loop has."""
+        filtered = self.estimate
+        return self.poles.size + max(self.lag, 0) + filtered.poles.size + filtered.window + max(filtered.lag, 0)
+
+    def turning(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
+        """How fast q and F vary at most within ``reach`` of w, relative to themselves."""
+        before = circle(w).before[..., None]
+        roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
+        far = np.abs(before + roots) - reach[..., None]
+        floor = np.maximum(1e-3 * np.abs(roots.real), 1e-9)
+        near = (1.0 / np.maximum(far, floor)).sum(-1)
+        return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0
