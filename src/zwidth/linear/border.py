@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.linear.boundary import Boundary, curve_at, zeros_of
-from zwidth.linear.roots import circle
+from zwidth.linear_loop import circle
 from zwidth.stability.ridge import RidgeKind
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.

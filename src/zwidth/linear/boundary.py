@@ -19,7 +19,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.errors import ZwidthError
-from zwidth.linear.roots import Circle, LinearLoop, circle
+from zwidth.linear_loop import Circle, LinearLoop, circle
 from zwidth.stability.counting import count_poles
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.

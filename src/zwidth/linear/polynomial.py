@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.linear.roots import LinearLoop
+from zwidth.linear_loop import LinearLoop
 
 
 class AffinePolynomial(NamedTuple):

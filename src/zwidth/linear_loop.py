@@ -11,9 +11,11 @@ their offsets ``1 - root``: next to z = 1, where slow loops live, a root itself 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from zwidth.xp import namespace
 
 
 class Jet(NamedTuple):
@@ -42,8 +44,9 @@ class Circle(NamedTuple):
 
 def circle(w: np.ndarray) -> Circle:
     """The points of the unit circle at the angles ``w``, exactly -1 at pi."""
+    xp = namespace(w)
     half = 0.5 * w
-    s, c = np.sin(half), np.where(w >= np.pi, 0.0, np.cos(half))
+    s, c = xp.sin(half), xp.where(w >= np.pi, 0.0, xp.cos(half))
     before = -2.0 * s * s + 2j * s * c
     return Circle(w, 1.0 + before, before)
 
@@ -52,14 +55,15 @@ def lag_jet(at: Circle, turns: float) -> Jet:
     """``z^turns``."""
     # At pi a whole number of half turns is a sign.
     even = 1.0 - 2.0 * (turns % 2)
-    value = np.where(at.w >= np.pi, even + 0j, np.exp(1j * turns * at.w))
+    xp = namespace(at.w)
+    value = xp.where(at.w >= np.pi, even + 0j, xp.exp(1j * turns * at.w))
     return Jet(value, 1j * turns * value)
 
 
-def product_jet(at: Circle, offsets: np.ndarray, factor: float) -> Jet:
+def product_jet(at: Circle, offsets: Any, factor: Any) -> Jet:
     """``factor prod(z - root)`` of roots given by their offsets from 1."""
-    value = np.full(at.w.shape, complex(factor))
-    slope = np.zeros(at.w.shape, complex)
+    value = 0.0 * at.z + factor
+    slope = 0.0 * at.z
     turn = 1j * at.z
     for offset in offsets:
         one = at.before + offset
@@ -80,22 +84,24 @@ class Estimate:
     """
 
     window: int = 1
-    gain: float = 1.0
+    gain: Any = 1.0
     lag: int = 0
-    zeros: np.ndarray = field(default_factory=_no_roots)
-    poles: np.ndarray = field(default_factory=_no_roots)
+    zeros: Any = field(default_factory=_no_roots)
+    poles: Any = field(default_factory=_no_roots)
 
     def jet(self, at: Circle) -> Jet:
         """F and its derivative in w."""
-        parts = Jet(np.full(at.w.shape, complex(self.gain)), np.zeros(at.w.shape, complex))
-        if self.zeros.size or self.poles.size or self.lag:
-            filtered = product_jet(at, self.zeros, self.gain).over(product_jet(at, self.poles, 1.0))
-            parts = filtered.times(lag_jet(at, -self.lag))
+        xp = namespace(at.w)
+        parts = product_jet(at, self.zeros, self.gain)
+        if self.poles.size:
+            parts = parts.over(product_jet(at, self.poles, 1.0))
+        if self.lag:
+            parts = parts.times(lag_jet(at, -self.lag))
         if self.window:
             back = lag_jet(at, -self.window)
             n = self.window
-            s = np.sin(0.5 * n * at.w)
-            value = np.where(at.w >= np.pi, 1.0 - back.value, 2.0 * s * s - 1j * back.value.imag) / n
+            s = xp.sin(0.5 * n * at.w)
+            value = xp.where(at.w >= np.pi, 1.0 - back.value, 2.0 * s * s - 1j * back.value.imag) / n
             parts = parts.times(Jet(value, -back.slope / n))
         return parts
 

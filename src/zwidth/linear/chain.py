@@ -1,0 +1,263 @@
+"""From parts to a loop: the chain of masses of device, tip and hand, discretized exactly (any loop).
+
+Bodies stand in a row, each with a damper and a spring to ground, linked by springs and dampers; the wall's force acts
+on the first. In units of T and of the first body's mass, with ``u`` the force held over a period,
+
+    x' = A x + B u,   x = (x1, e2, e3, v1, e2', e3'),   e the extensions of the links
+
+so that no small sum of large spring forces is ever formed. Between samples the motion is the matrix exponential. From
+held force to sampled position, with zeta = z - 1, Psi = e^A - 1 = A phi1(A) and Gamma(t) the answer to a force held
+for t (docs/theory/scenes.md):
+
+    G(z) = C (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)) / z^(n+1),   d = n + f
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.errors import InputError
+from zwidth.linear_loop import Circle, Estimate, Jet, LinearLoop, circle, lag_jet
+from zwidth.plant import held_plant, undelayed_plant
+from zwidth.xp import namespace
+
+# Stiffer links than this, in units of the first mass over T^2, move so fast that e^A keeps no digits.
+_STIFFEST = 1e8
+
+
+class Body(NamedTuple):
+    """A mass with its damper and spring to ground, in units of T and of the first mass."""
+
+    mass: Any
+    damping: Any
+    stiffness: Any
+
+
+class Link(NamedTuple):
+    """What connects a body with the next one."""
+
+    stiffness: Any
+    damping: Any
+
+
+@dataclass(frozen=True)
+class Chain:
+    """Bodies in a row, the sensor on one of them, and the wall's force on the first."""
+
+    bodies: tuple[Body, ...]
+    links: tuple[Link, ...]
+    sensor: int
+    d: Any
+    whole: int
+    estimate: Estimate
+
+    @property
+    def rigid(self) -> bool:
+        """Whether it is one mass with a damper."""
+        ground = self.bodies[0].stiffness
+        return len(self.bodies) == 1 and isinstance(ground, float) and ground == 0.0
+
+
+def chain_of(scene: Any) -> Chain:
+    """The chain of a scene, normalized by its period and by the mass the wall's force acts on."""
+    device, timing, hand = scene.device, scene.timing, scene.operator
+    period = timing.period
+    masses = [(device.mass, device.damping, 0.0)]
+    links = []
+    if device.coupling is not None:
+        tip = device.coupling
+        masses.append((tip.mass, 0.0, 0.0))
+        links.append((tip.stiffness, tip.damping))
+    if hand is not None and hand.rigid:
+        mass, damping, stiffness = masses[-1]
+        masses[-1] = (mass + hand.mass, damping + hand.damping, stiffness + hand.stiffness)
+    elif hand is not None:
+        masses.append((hand.mass, hand.damping, hand.stiffness))
+        links.append((hand.coupling_stiffness, hand.coupling_damping))
+    unit = masses[0][0]
+    force, rub = period * period / unit, period / unit
+    bodies = tuple(Body(m / unit, b * rub, k * force) for m, b, k in masses)
+    tied = tuple(Link(k * force, c * rub) for k, c in links)
+    sensor = 1 if device.coupling is not None and device.coupling.sensor == "tip" else 0
+    return Chain(bodies, tied, sensor, scene.d, scene.whole_delay, scene.velocity.estimate(period))
+
+
+def rates(chain: Chain) -> tuple[Any, Any]:
+    """A and B of the chain."""
+    xp = namespace(*(value for part in (*chain.bodies, *chain.links) for value in part))
+    count = len(chain.bodies)
+    zero = 0.0 * (chain.bodies[0].mass + chain.bodies[-1].damping)
+    size = 2 * count
+
+    def row(**_: Any) -> list[Any]:
+        return [zero] * size
+
+    accelerations = []
+    for k, body in enumerate(chain.bodies):
+        force = row()
+        for j in range(k + 1):
+            force[j] = force[j] - body.stiffness
+            force[count + j] = force[count + j] - body.damping
+        if k:
+            link = chain.links[k - 1]
+            force[k], force[count + k] = force[k] - link.stiffness, force[count + k] - link.damping
+        if k + 1 < count:
+            link = chain.links[k]
+            force[k + 1], force[count + k + 1] = force[k + 1] + link.stiffness, force[count + k + 1] + link.damping
+        accelerations.append([value / body.mass for value in force])
+    rows = []
+    for k in range(count):
+        speed = row()
+        speed[count + k] = zero + 1.0
+        rows.append(speed)
+    for k in range(count):
+        before = accelerations[k - 1] if k else row()
+        rows.append([a - b for a, b in zip(accelerations[k], before, strict=True)])
+    first = 1.0 / chain.bodies[0].mass + zero
+    pushed = [zero] * count + [first] + ([-first] + [zero] * (count - 2) if count > 1 else [])
+    return xp.stack([xp.stack([xp.asarray(v) for v in r]) for r in rows]), xp.stack([xp.asarray(v) for v in pushed])
+
+
+def _flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
+    """``e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
+    xp = namespace(rate, time)
+    size = rate.shape[0]
+    if xp is np:
+        from scipy.linalg import expm
+    else:
+        from jax.scipy.linalg import expm
+    # Of [[A, 1], [0, 0]] the exponential holds phi1(A), and e^A - 1 = A phi1(A) keeps the digits of slow motions.
+    top = xp.concatenate([rate * time, xp.eye(size)], axis=1)
+    block = xp.concatenate([top, xp.zeros((size, 2 * size))], axis=0)
+    phi1 = expm(block)[:size, size:]
+    return rate * time @ phi1, time * (phi1 @ push)
+
+
+class Sampled(NamedTuple):
+    """The chain between two samples; the sensor's row is C."""
+
+    psi: Any
+    full: Any
+    late: Any | None  # Gamma(1 - f), None for whole delays
+    sensor: Any
+
+
+def sampled(chain: Chain) -> Sampled:
+    """Discretize exactly."""
+    rate, push = rates(chain)
+    xp = namespace(rate)
+    psi, full = _flow(rate, push, 1.0)
+    fraction = chain.d - chain.whole
+    held = isinstance(fraction, float | np.floating) and fraction == 0.0
+    late = None if held else _flow(rate, push, 1.0 - fraction)[1]
+    count = len(chain.bodies)
+    sensor = xp.asarray([1.0] * (chain.sensor + 1) + [0.0] * (2 * count - chain.sensor - 1))
+    return Sampled(psi, full, late, sensor)
+
+
+def needed(chain: Chain, w: Any, parts: Sampled | None = None) -> Any:
+    """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
+    at: Circle = circle(w)
+    if chain.rigid:
+        return _rigid_needed(chain, at)
+    parts = parts or sampled(chain)
+    xp = namespace(parts.psi, w)
+    force = parts.full + 0j if parts.late is None else at.before * parts.late + parts.full
+    turns = chain.whole if parts.late is None else chain.whole + 1
+    moved = xp.linalg.solve(at.before * xp.eye(parts.psi.shape[0]) - parts.psi, force)
+    return -lag_jet(at, turns).value / (parts.sensor @ moved)
+
+
+def _rigid_needed(chain: Chain, at: Circle) -> Any:
+    fraction = chain.d - chain.whole
+    whole = isinstance(fraction, float | np.floating) and fraction == 0.0
+    delta = chain.bodies[0].damping
+    plant = undelayed_plant(delta) if whole else held_plant(delta, fraction)
+    # N(z)/z = a2 z + a1 + a0/z, around z = 1.
+    answer = plant.a2 * at.z + plant.a1 + plant.a0 / at.z
+    return -lag_jet(at, chain.whole).value * at.before * (at.before + plant.em) / answer
+
+
+def dynamic_stiffness(chain: Chain) -> np.ndarray:
+    """The characteristic polynomial in s, highest power first: sums of positive terms, so that slow roots are exact."""
+    top, bottom = np.zeros(0), np.ones(1)
+    for k in reversed(range(len(chain.bodies))):
+        body = chain.bodies[k]
+        own = np.array([body.mass, body.damping, body.stiffness], float)
+        if not top.size:
+            top = own
+            continue
+        link = np.array([chain.links[k].damping, chain.links[k].stiffness], float)
+        bottom = np.polyadd(np.convolve(link, bottom), top)
+        top = np.convolve(link, top)
+        # The series of link and what follows stands on ``bottom``.
+        top = np.polyadd(np.convolve(own, bottom), top)
+    return np.trim_zeros(top, "f")
+
+
+def _continuous_poles(chain: Chain) -> np.ndarray:
+    polynomial = dynamic_stiffness(chain)
+    still = polynomial.size - 1 - int(np.flatnonzero(polynomial)[-1])
+    roots = np.roots(polynomial[: polynomial.size - still]).astype(complex)
+    slope = np.polyder(polynomial[: polynomial.size - still])
+    for _ in range(2):
+        with np.errstate(all="ignore"):
+            step = np.polyval(polynomial[: polynomial.size - still], roots) / np.polyval(slope, roots)
+        roots = roots - np.where(np.isfinite(step) & (np.abs(step) < 1e-3 * np.abs(roots)), step, 0.0)
+    return np.concatenate([np.zeros(still, complex), roots])
+
+
+def linear_loop(chain: Chain) -> LinearLoop:
+    """The loop of a chain by its roots."""
+    if chain.rigid:
+        return _rigid_loop(chain)
+    stiffest = max(float(link.stiffness) / min(float(b.mass) for b in chain.bodies) for link in (*chain.links, Link(0.0, 0.0)))
+    if stiffest > _STIFFEST:
+        raise InputError(
+            f"coupling.stiffness: a link that rings {np.sqrt(stiffest) / (2 * np.pi):.3g} times a period cannot be "
+            "resolved; leave the coupling out, so stiff a link is rigid"
+        )
+    parts = sampled(chain)
+    poles = -np.expm1(_continuous_poles(chain))
+    den = np.atleast_1d(np.poly(-poles)).real
+    top = _numerator(parts, parts.full, den)
+    lag = chain.whole
+    if parts.late is not None:
+        top = np.polyadd(np.append(_numerator(parts, parts.late, den), 0.0), top)
+        lag += 1
+    top = np.trim_zeros(top, "f")
+    return LinearLoop(float(top[0]), lag, -_polished_roots(top), poles, chain.estimate)
+
+
+def _numerator(parts: Sampled, push: np.ndarray, den: np.ndarray) -> np.ndarray:
+    """The numerator in zeta of ``C (zeta - Psi)^-1 push``, by its Markov parameters."""
+    markov, state = [], push
+    for _ in range(den.size - 1):
+        markov.append(parts.sensor @ state)
+        state = parts.psi @ state
+    return np.convolve(den, markov)[: den.size - 1]
+
+
+def _polished_roots(polynomial: np.ndarray) -> np.ndarray:
+    roots = np.roots(polynomial).astype(complex)
+    slope = np.polyder(polynomial)
+    with np.errstate(all="ignore"):
+        step = np.polyval(polynomial, roots) / np.polyval(slope, roots)
+    return roots - np.where(np.isfinite(step) & (np.abs(step) < 1e-3 * np.abs(roots)), step, 0.0)
+
+
+def _rigid_loop(chain: Chain) -> LinearLoop:
+    delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.whole)
+    if fraction == 0:
+        plant = undelayed_plant(delta)
+        # At delta = 0 the zero is at -1 exactly.
+        zeros = np.array([2.0 + plant.gap * -1.0 / plant.a2 + 0j])
+        return LinearLoop(float(plant.a2), chain.whole, zeros, np.array([0.0, plant.em], complex), chain.estimate)
+    plant = held_plant(delta, fraction)
+    root = np.sqrt(max(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0))
+    far = -0.5 * (plant.a1 + root)
+    zeros = np.array([1.0 - far / plant.a2, 1.0 - plant.a0 / far], complex)
+    return LinearLoop(float(plant.a2), chain.whole + 1, zeros, np.array([0.0, plant.em], complex), chain.estimate)

@@ -1,0 +1,61 @@
+"""The hand that holds the device: part of its mass, or behind a spring and damper of its own.
+
+A rigid grasp adds mass, damping and a spring to ground to the body that is held (the tip, where there is a coupling).
+Behind a spring and damper the hand is a further mass, with its own damper and spring to ground.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from zwidth.errors import InputError
+from zwidth.parts.checks import check_number
+
+
+@dataclass(frozen=True)
+class Operator:
+    """The operator's hand.
+
+    Args:
+        mass: in kg, >= 0; > 0 behind a spring.
+        damping: to ground, in N s/m, >= 0.
+        stiffness: to ground, in N/m, >= 0.
+        coupling_stiffness: of the spring between hand and device, in N/m, > 0; None for a rigid grasp.
+        coupling_damping: of the damper beside it, in N s/m, >= 0.
+
+    References:
+        A hand of 0.554 kg, 6.45 N s/m and 135 N/m: Sci. Rep. 5:18004 (2015), Fig. 3 (one trial).
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.Operator(mass=0.554, damping=6.45, stiffness=135).rigid
+        True
+    """
+
+    mass: Any = 0.0
+    damping: Any = 0.0
+    stiffness: Any = 0.0
+    coupling_stiffness: Any = None
+    coupling_damping: Any = 0.0
+
+    def __post_init__(self) -> None:
+        for name, unit in (("mass", "kg"), ("damping", "N s/m"), ("stiffness", "N/m"), ("coupling_damping", "N s/m")):
+            least_open = name == "mass" and not self.rigid
+            value = check_number(f"operator.{name}", getattr(self, name), unit, low_open=least_open)
+            object.__setattr__(self, name, value)
+        if self.rigid:
+            damped = self.coupling_damping
+            if isinstance(damped, float) and damped:
+                raise InputError(
+                    f"operator.coupling_damping: got {damped!r} without a spring beside it; give "
+                    "operator.coupling_stiffness as well, or add the damping to the device"
+                )
+            return
+        value = check_number("operator.coupling_stiffness", self.coupling_stiffness, "N/m", low_open=True)
+        object.__setattr__(self, "coupling_stiffness", value)
+
+    @property
+    def rigid(self) -> bool:
+        """Whether the grasp is rigid."""
+        return self.coupling_stiffness is None

@@ -1,0 +1,241 @@
+"""Velocity estimates: what a program makes of the sampled positions, and feeds to the wall's damper.
+
+Each is ``F(z)`` from position in m to velocity in m/s, and says what the loop is to know of it: `Estimate`, for T = 1.
+A filter's coded period is the one its formulas were written for. Where it is not the loop's, the difference is divided
+by the wrong time and the cut-off lies elsewhere: that is what the loop then does, and what is computed here.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from zwidth.errors import InputError
+from zwidth.linear_loop import Estimate
+from zwidth.parts.checks import check_number, check_whole
+from zwidth.xp import is_jax, namespace
+
+_LONGEST_WINDOW, _HIGHEST_ORDER = 1000, 8
+
+
+def _check_period(owner: Any) -> None:
+    if owner.coded_period is not None:
+        value = check_number("velocity.coded_period", owner.coded_period, "s", low_open=True)
+        object.__setattr__(owner, "coded_period", value)
+
+
+@dataclass(frozen=True)
+class BackwardDifference:
+    """``v = (x_k - x_(k-1))/T``, the default and the paper's.
+
+    Args:
+        coded_period: the period the difference is divided by, in s; the loop's where left out.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section II.
+    """
+
+    coded_period: Any = None
+
+    def __post_init__(self) -> None:
+        _check_period(self)
+
+    def estimate(self, period: Any) -> Estimate:
+        """The estimate for a loop of this period, normalized."""
+        return Estimate(window=1, gain=_ratio(period, self.coded_period))
+
+
+@dataclass(frozen=True)
+class WindowedDifference:
+    """``v = (x_k - x_(k-n))/(n T)``, the mean velocity of the last n periods.
+
+    Args:
+        samples: n, from 1 (the backward difference) to 1000.
+        coded_period: the period in the formula, in s; the loop's where left out.
+
+    References:
+        chai3d/chai3d ``src/devices/CGenericHapticDevice.cpp`` (15 ms), Force Dimension SDK ``dhdc.h`` (20 ms).
+    """
+
+    samples: int
+    coded_period: Any = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "samples", check_whole("velocity.samples", self.samples, 1, _LONGEST_WINDOW))
+        _check_period(self)
+
+    def estimate(self, period: Any) -> Estimate:
+        """The estimate for a loop of this period, normalized."""
+        return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
+
+
+@dataclass(frozen=True)
+class LowPass:
+    """The backward difference behind one or two equal first-order low-passes: ``v <- p v + (1 - p) input`` each.
+
+    ``p = exp(-T/tau)``, ``tau = 1/(2 pi cutoff)``; ``F = (1 - 1/z)/T ((1 - p) z/(z - p))^order``.
+
+    Args:
+        cutoff: in Hz, > 0 and at most half the sampling rate; or
+        time_constant: tau in s, > 0.
+        order: 1 or 2.
+        coded_period: the period that p and the difference were written for, in s; the loop's where left out.
+
+    References:
+        HannesRovina/HapticHumanRobotInterfaces-Lab ``Firmware/src/haptic_controller.c``; bgromov/Hapkit3.0 ``hapkit3.h``.
+    """
+
+    cutoff: Any = None
+    time_constant: Any = None
+    order: int = 1
+    coded_period: Any = None
+
+    def __post_init__(self) -> None:
+        if (self.cutoff is None) == (self.time_constant is None):
+            raise InputError("velocity: give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them")
+        name, unit = ("cutoff", "Hz") if self.time_constant is None else ("time_constant", "s")
+        value = check_number(f"velocity.{name}", getattr(self, name), unit, low_open=True)
+        object.__setattr__(self, name, value)
+        object.__setattr__(self, "order", check_whole("velocity.order", self.order, 1, 2))
+        _check_period(self)
+
+    def estimate(self, period: Any) -> Estimate:
+        """The estimate for a loop of this period, normalized."""
+        coded = period if self.coded_period is None else self.coded_period
+        if self.time_constant is None:
+            check_cutoff(self.cutoff, coded)
+            decay = 2.0 * np.pi * self.cutoff * coded
+        else:
+            decay = coded / self.time_constant
+        xp = namespace(decay)
+        offset = -xp.expm1(-decay)
+        poles = xp.stack([xp.asarray(offset) + 0j] * self.order)
+        gain = offset**self.order * _ratio(period, self.coded_period)
+        return Estimate(1, gain, -self.order, poles=poles)
+
+
+@dataclass(frozen=True)
+class Butterworth:
+    """The backward difference behind a Butterworth low-pass, as `scipy.signal.butter` designs it.
+
+    Args:
+        cutoff: in Hz, > 0 and below half the sampling rate.
+        order: 1 to 8.
+        coded_period: the period it was designed for, in s; the loop's where left out.
+
+    References:
+        mahilab/HapticPaddle ``src/main.cpp`` (order 4, 25 Hz at 1 kHz); Butterworth 1930, Wireless Engineer 7.
+    """
+
+    cutoff: Any
+    order: int = 2
+    coded_period: Any = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "cutoff", check_number("velocity.cutoff", self.cutoff, "Hz", low_open=True))
+        object.__setattr__(self, "order", check_whole("velocity.order", self.order, 1, _HIGHEST_ORDER))
+        _check_period(self)
+
+    def estimate(self, period: Any) -> Estimate:
+        """The estimate for a loop of this period, normalized."""
+        coded = period if self.coded_period is None else self.coded_period
+        check_cutoff(self.cutoff, coded)
+        # The bilinear transform, warped so that the cut-off stays: s = (z - 1)/(z + 1), poles on a circle.
+        xp = namespace(self.cutoff, coded)
+        size = xp.tan(np.pi * self.cutoff * coded)
+        angles = np.pi * (2.0 * np.arange(self.order) + 1.0 + self.order) / (2.0 * self.order)
+        analog = size * xp.asarray(np.exp(1j * angles))
+        offsets = -2.0 * analog / (1.0 - analog)
+        gain = xp.prod(offsets).real * 0.5**self.order * _ratio(period, self.coded_period)
+        return Estimate(1, gain, zeros=np.full(self.order, 2.0 + 0j), poles=offsets)
+
+
+@dataclass(frozen=True)
+class VelocityFilter:
+    """Any linear estimate ``F(z) = numerator/denominator``, from position in m to velocity in m/s.
+
+    Args:
+        numerator: coefficients, highest power first, in 1/s.
+        denominator: likewise, of at least the numerator's degree (a filter cannot see the future), stable.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.VelocityFilter([1000, -1000], [1, 0]).estimate(1e-3).gain
+        1.0
+    """
+
+    numerator: Any
+    denominator: Any
+
+    def __post_init__(self) -> None:
+        for name in ("numerator", "denominator"):
+            try:
+                values = np.atleast_1d(np.asarray(getattr(self, name), float))
+            except (TypeError, ValueError) as error:
+                raise InputError(f"velocity.{name}: a list of real coefficients is needed") from error
+            values = np.trim_zeros(values, "f") if values.ndim == 1 else values
+            if values.ndim != 1 or not values.size or not np.all(np.isfinite(values)):
+                raise InputError(
+                    f"velocity.{name}: got {getattr(self, name)!r}; a list of finite coefficients, highest power "
+                    "first, not all 0, is needed"
+                )
+            object.__setattr__(self, name, tuple(values.tolist()))
+        if len(self.numerator) > len(self.denominator):
+            raise InputError(
+                f"velocity.numerator: degree {len(self.numerator) - 1} above the denominator's "
+                f"{len(self.denominator) - 1} needs samples of the future; multiply the denominator by z"
+            )
+        largest = np.max(np.abs(1.0 - self._roots[1]), initial=0.0)
+        if largest >= 1.0:
+            raise InputError(
+                f"velocity.denominator: a pole of magnitude {largest:.6g}; a filter with a pole on or outside the "
+                "unit circle never forgets, and no wall makes such a loop stable"
+            )
+
+    @cached_property
+    def _roots(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """Zeros and poles by their offsets from 1, and by how many powers of z the denominator exceeds both."""
+        top, bottom = np.array(self.numerator), np.array(self.denominator)
+        behind = _trailing(bottom) - _trailing(top)
+        top, bottom = np.trim_zeros(top, "b"), np.trim_zeros(bottom, "b")
+        return _offsets(top), _offsets(bottom), behind
+
+    def estimate(self, period: Any) -> Estimate:
+        """The estimate for a loop of this period, normalized."""
+        zeros, poles, lag = self._roots
+        return Estimate(0, self.numerator[0] / self.denominator[0] * period, lag, zeros, poles)
+
+
+Velocity: TypeAlias = BackwardDifference | WindowedDifference | LowPass | Butterworth | VelocityFilter
+
+
+def check_cutoff(cutoff: Any, period: Any) -> None:
+    """Refuse a cut-off that a filter of this period cannot have."""
+    if is_jax(cutoff) or is_jax(period):
+        return
+    if cutoff * period >= 0.5:
+        raise InputError(
+            f"velocity.cutoff: got {cutoff:g} Hz; it must lie below half the sampling rate, {0.5 / period:g} Hz here; "
+            "a filter that high does nothing, leave it out"
+        )
+
+
+def _ratio(period: Any, coded: Any) -> Any:
+    return 1.0 if coded is None else period / coded
+
+
+def _trailing(polynomial: np.ndarray) -> int:
+    return polynomial.size - int(np.flatnonzero(polynomial)[-1]) - 1
+
+
+def _offsets(polynomial: np.ndarray) -> np.ndarray:
+    """Roots by their offsets from 1, found in powers of z - 1: next to 1 they keep their digits."""
+    if polynomial.size < 2:
+        return np.zeros(0, complex)
+    shifted = np.polynomial.polynomial.Polynomial(polynomial[::-1])(np.polynomial.polynomial.Polynomial([1.0, 1.0])).coef
+    scale = np.abs(polynomial).sum()
+    shifted = np.where(np.abs(shifted) <= 4 * polynomial.size * np.finfo(float).eps * scale, 0.0, shifted)
+    return -np.polynomial.polynomial.polyroots(shifted) + 0j
