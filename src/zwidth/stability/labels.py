@@ -52,7 +52,7 @@ def is_stable(
         d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast; axes along which an argument
             does not vary cost nothing: for a map pass alpha of shape (1, N) and beta of shape (M, 1).
         method: "crossover" asks for the phase where the loop gain is one, in closed form; "companion" computes all
-            poles; "certified" never guesses (`zwidth.stability_of` names the points it leaves open). "auto" is
+            poles; "certified" never guesses (`zwidth.decide_stability` names the points it leaves open). "auto" is
             "crossover", which on a map of one device compares alpha with the end of its row, the same closed form.
         delay: only "held" has poles.
 
@@ -87,7 +87,7 @@ def is_stable(
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
 
 
-def stability_of(
+def decide_stability(
     alpha: ArrayLike,
     beta: ArrayLike,
     delta: ArrayLike,
@@ -99,12 +99,7 @@ def stability_of(
     """Tell which walls are stable, and for each point how that was decided.
 
     Args:
-        alpha: normalized stiffness K T^2/m.
-        beta: normalized virtual damping B T/m.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0. All four broadcast.
-        method: as for `zwidth.is_stable`.
-        delay: only "held" has poles.
+        alpha, beta, delta, d, method, delay: as for `zwidth.is_stable`.
 
     Returns:
         Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
@@ -112,27 +107,30 @@ def stability_of(
         False there); ``method``, the `Method` that decided. Arrays may be read-only.
 
     Raises:
-        InputError: an argument is no real number or traced, a scalar is out of range, shapes do not broadcast, or a
-            name is unknown.
+        InputError: as for `zwidth.is_stable`, and for traced values.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
 
     Example:
         >>> import zwidth
-        >>> zwidth.stability_of([0.1, float("nan")], 0.4, 0.1, 1).status
+        >>> zwidth.decide_stability([0.1, float("nan")], 0.4, 0.1, 1).status
         array([0, 1], dtype=int32)
     """
     values = (alpha, beta, delta, d)
     _check(method, delay, values)
     if is_traced(*values):
-        raise InputError("stability_of: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+        raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
     laid = lay_out(values)
     stable, used, status = _decide(laid.points, method)
     ranged = wall_status(*laid.points)
     status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
     codes = (np.broadcast_to(status, laid.points.shape).astype(np.int32), np.asarray(used, np.int32))
     return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
+
+
+# Deprecated: the name goes with version 0.2.
+stability_of = decide_stability
 
 
 def _check(method: str, delay: str, values: tuple[ArrayLike, ...]) -> None:

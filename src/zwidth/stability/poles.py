@@ -241,10 +241,10 @@ def poles(
         TracedDelayError: d is traced.
 
     Numerics:
-        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k); `poles_of` has
-        bounds. Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is 0; then Newton steps
-        on the factored polynomial. Aberth's iteration works on that polynomial too, O(degree^2) a step. Few points need
-        no JAX; many are compiled once for every degree.
+        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k);
+        `enclose_poles` has bounds. Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is
+        0; then Newton steps on the factored polynomial. Aberth's iteration works on that polynomial too, O(degree^2) a
+        step. Few points need no JAX; many are compiled once for every degree.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17); Aberth 1973; Smith 1970.
@@ -265,7 +265,7 @@ def poles(
     return _found(values, method).z
 
 
-def poles_of(
+def enclose_poles(
     alpha: ArrayLike,
     beta: ArrayLike,
     delta: ArrayLike,
@@ -277,12 +277,7 @@ def poles_of(
     """Return the poles of the closed loop with discs in which they lie.
 
     Args:
-        alpha: normalized stiffness K T^2/m.
-        beta: normalized virtual damping B T/m.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0. All four broadcast.
-        method: as for `zwidth.poles`.
-        delay: only "held" has poles.
+        alpha, beta, delta, d, method, delay: as for `zwidth.poles`.
 
     Returns:
         Poles: ``z`` as `zwidth.poles` has it; ``within``, of the same shape: where the status is OK, exactly one pole
@@ -297,13 +292,13 @@ def poles_of(
         Smith 1970, on discs that contain the zeros of a polynomial.
 
     Example:
-        >>> from zwidth.stability.poles import poles_of
-        >>> bool(poles_of(0.5, 0.5, 0.1, 1).within.max() < 1e-12)
+        >>> from zwidth.stability.poles import enclose_poles
+        >>> bool(enclose_poles(0.5, 0.5, 0.1, 1).within.max() < 1e-12)
         True
     """
     values = (alpha, beta, delta, d)
     if is_traced(*values):
-        raise InputError("poles_of: got traced values; inside a JAX transformation use `zwidth.poles`")
+        raise InputError("enclose_poles: got traced values; inside a JAX transformation use `zwidth.poles`")
     _check(values, delay, method)
     return _found(values, method)
 
