@@ -7,14 +7,14 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import BLOCK, FEW, elementwise, in_blocks, in_strips, is_number, to_caller
+from zwidth.batching import BLOCK, FEW, compile_strips, elementwise, is_number, map_blocks, to_caller
 from zwidth.domain import check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.boundary_map import boundary_map
 from zwidth.stability.crossover import stable_kernel
-from zwidth.stability.devices import ANY, kind_of
+from zwidth.stability.devices import classify_delays
 from zwidth.stability.layout import Points, lay_out
 from zwidth.stability.poles import unstable_poles
 from zwidth.status import Method, Status
@@ -82,7 +82,7 @@ def is_stable(
     if is_traced(*values):
         return _traced(values, method)
     if method in ("auto", "crossover") and all(map(is_number, values)):
-        return elementwise(stable_kernel, NAMES, values, (kind_of(d),))
+        return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
     laid = lay_out(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
 
@@ -133,8 +133,8 @@ def decide_stability(
 stability_of = decide_stability
 
 
-def _check(method: str, delay: str, values: tuple[ArrayLike, ...]) -> None:
-    check_has_poles(delay)
+def _check(method: str, delay_model: str, values: tuple[ArrayLike, ...]) -> None:
+    check_has_poles(delay_model)
     check_choice("method", method, STABILITY_METHODS)
     check_scalars(**dict(zip(NAMES, values, strict=True)))
 
@@ -148,7 +148,7 @@ def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
     if method == "companion":
         return unstable_poles(*values) == 0
     d = values[3]
-    return elementwise(stable_kernel, NAMES, values, (ANY if is_traced(d) else kind_of(d),))
+    return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
@@ -167,8 +167,8 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
 def _by_crossover(points: Points) -> np.ndarray:
     if points.is_dense:
         return boundary_map(points)
-    shape, kind = points.shape, kind_of(points.d)
+    shape, kind = points.shape, classify_delays(points.d)
     if points.size <= FEW:
         with np.errstate(all="ignore"):
             return np.broadcast_to(stable_kernel(*points, kind), shape)
-    return in_blocks(in_strips(stable_kernel, (kind,)), points.columns(), BLOCK).reshape(shape)
+    return map_blocks(compile_strips(stable_kernel, (kind,)), points.columns(), BLOCK).reshape(shape)

@@ -13,7 +13,7 @@ from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.poles import radius_and_bound, radius_by_companion
-from zwidth.stability.proved import radii_of
+from zwidth.stability.proved import prove_radii
 from zwidth.stability.radius import traced_kernel
 from zwidth.status import Method, Status
 from zwidth.xp import is_traced
@@ -93,7 +93,7 @@ def spectral_radius(
     if is_traced(*values):
         return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
     arrays = broadcast(NAMES, values)
-    return to_caller(radii_of(arrays, wanted)[0].reshape(arrays[0].shape), values)
+    return to_caller(prove_radii(arrays, wanted)[0].reshape(arrays[0].shape), values)
 
 
 def _exp(value: Array) -> Array:
@@ -153,7 +153,7 @@ def bound_radius(
     if method == "companion":
         return Radius(*radius_and_bound(*values))
     arrays = broadcast(NAMES, values)
-    radius, proved, status = radii_of(arrays, wanted)
+    radius, proved, status = prove_radii(arrays, wanted)
     ok = status == Status.OK
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
     error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
@@ -163,8 +163,8 @@ def bound_radius(
     return to_caller(Radius(*(leaf.reshape(arrays[0].shape) for leaf in leaves)), values)
 
 
-def _check_radius(method: str, accuracy: float | None, delay: str) -> float:
-    check_has_poles(delay)
+def _check_radius(method: str, accuracy: float | None, delay_model: str) -> float:
+    check_has_poles(delay_model)
     check_choice("method", method, RADIUS_METHODS)
     if accuracy is None:
         return _DEFAULT_ACCURACY

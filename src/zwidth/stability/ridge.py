@@ -8,13 +8,13 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import as_float64, elementwise, pointwise
+from zwidth.batching import elementwise, pointwise
 from zwidth.domain import check_scalars, device_status
 from zwidth.errors import check_choice
 from zwidth.loop import check_delay_model
 from zwidth.plant import Plant, split_delay, undelayed_plant
-from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.stability.ridge_newton import Ridge, is_undelayed, start_of
+from zwidth.stability.devices import ANY, Kind, classify_delays
+from zwidth.stability.ridge_newton import Ridge, guess_start, is_undelayed
 from zwidth.stability.ridge_slopes import (
     alpha_by_lag,
     alpha_change,
@@ -23,7 +23,7 @@ from zwidth.stability.ridge_slopes import (
     plant_slopes,
 )
 from zwidth.status import Status
-from zwidth.xp import epsilon, is_traced, namespace
+from zwidth.xp import epsilon, namespace
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
@@ -92,19 +92,12 @@ def alpha_max(
         from zwidth.stability.ridge_kkt import kkt_kernel
 
         return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
-    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, occurring(d)), block=_BLOCK)
+    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)
 
 
-def occurring(d: ArrayLike) -> Kind:
-    """Which delays there are among concrete ones; every kind is possible where they are traced."""
-    if isinstance(d, float | int):
-        return Kind(not d >= 1, d >= 1, d % 1.0 != 0)
-    return ANY if is_traced(d) else kind_of(as_float64("d", d))
-
-
-def ridge_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> RidgePoint:
+def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgePoint:
     """`alpha_max`, elementwise."""
-    return _point(*_solved(delta, d, delay, kind)[:2])
+    return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
 
 
 class RidgeSlopes(NamedTuple):
@@ -115,12 +108,12 @@ class RidgeSlopes(NamedTuple):
     by_d: Array
 
 
-def slopes_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> RidgeSlopes:
+def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgeSlopes:
     """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
-    ridge, status, plant, lag, (delta, f) = _solved(delta, d, delay, kind)
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
     by_delta, by_f = plant_slopes(delta, f)
-    undelayed = is_undelayed(delay, kind)
-    fractional = delay == "fractional_power"
+    undelayed = is_undelayed(delay_model, kind)
+    fractional = delay_model == "fractional_power"
     by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
     mask = found(ridge)
     return RidgeSlopes(
@@ -128,7 +121,9 @@ def slopes_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> Ridge
     )
 
 
-def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
+def _solve_ridge(
+    delta: Array, d: Array, delay_model: str, kind: Kind
+) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
     """The ridge, its status, the plant behind a lag, and the plant's damping and fraction."""
     xp = namespace(delta, d)
     status = device_status(delta, d)
@@ -138,12 +133,12 @@ def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Arra
     whole, f = split_delay(d)
     if not kind.fractional:
         # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
-        delay = "held"
-    if delay == "fractional_power":
+        delay_model = "held"
+    if delay_model == "fractional_power":
         whole, f = d, 0.0 * d
-    start = start_of(delta, d, f, kind)
-    plant = differentiable_plant(delta, f) if kind.fractional and delay == "held" else undelayed_plant(delta)
-    ridge = differentiable_ridge(plant, whole, start, delay, kind)
+    start = guess_start(delta, d, f, kind)
+    plant = differentiable_plant(delta, f) if kind.fractional and delay_model == "held" else undelayed_plant(delta)
+    ridge = differentiable_ridge(plant, whole, start, delay_model, kind)
     return ridge, status, plant, whole, (delta, f)
 
 

@@ -7,7 +7,7 @@ import zwidth
 from zwidth.stability.layout import Points, fold
 from zwidth.stability.proved import outermost_poles
 from zwidth.stability.radii import bound_radius
-from zwidth.stability.radius_map import SMALLEST_MAP, as_map, followed_poles, nodes_of
+from zwidth.stability.radius_map import SMALLEST_MAP, as_map, followed_poles, lay_nodes
 from zwidth.status import Status
 
 ALPHA, BETA = np.linspace(-0.1, 1.5, 203), np.linspace(-0.3, 1.5, 157)
@@ -56,7 +56,7 @@ def test_nearly_all_points_need_no_search(d):
     alpha, beta = np.linspace(0.001, 1.5 / (1.0 + d), 320), np.linspace(0.0, 1.5 / (1.0 + d), 320)[:, None]
     area = as_area(alpha, beta, 0.1, d)
     assert area is not None
-    nodes = nodes_of(area)
+    nodes = lay_nodes(area)
     found = outermost_poles(nodes, 1e-9)
     _, ok = followed_poles(area, nodes, found.re, found.im, 1e-9, d % 1.0 != 0.0)
     assert ok.shape == (1, 320, 320)
