@@ -17,12 +17,11 @@ import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike
 from zwidth.batching import concrete_delay
-from zwidth.domain import check_scalars, device_status, wall_status
+from zwidth.domain import check_scalars, poison, valid_wall
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import Degree, few_poles, map_by_degree
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 from zwidth.scene import normalize
-from zwidth.status import Status
 from zwidth.xp import horner, namespace
 
 
@@ -178,24 +177,6 @@ def line_at_minus_one(delta: Array, d: Array) -> Array:
     plant = held_plant(delta, fraction)
     sign = 1.0 - 2.0 * namespace(whole).mod(whole, 2.0)
     return sign * 2.0 * (1.0 + plant.c) / plant.gap
-
-
-def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Whether a point lies where the model is computed, see `zwidth.domain`."""
-    return wall_status(alpha, beta, delta, d) == Status.OK
-
-
-def valid_device(delta: Array, d: Array) -> Array:
-    """Whether a device and its delay lie where the model is computed, see `zwidth.domain`."""
-    return device_status(delta, d) == Status.OK
-
-
-def poison(ok: Array, *inputs: Array) -> Array:
-    """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
-    xp = namespace(ok, *inputs)
-    # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
-    total = sum(xp.where(ok, 0.0, value) for value in inputs)
-    return xp.where(ok, 0.0, xp.nan) * total * (1.0 + total)
 
 
 def check_delay_model(delay_model: str) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike, DelayModel
 from zwidth.batching import refuse_masked
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, within
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, void, within
 from zwidth.errors import InputError, check_choice
 from zwidth.status import Status
 from zwidth.xp import frozen, is_jax, is_traced, namespace
@@ -118,11 +118,7 @@ def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: Arr
 def _formula_at(*arguments: Any) -> tuple[Array, ...]:
     """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
     *values, formula, names = arguments
-    xp = namespace(*values)
-    # Multiplied, not chosen: the derivatives of what is out of range are then NaN as well.
-    pairs = zip(names, values, strict=True)
-    good = (value * xp.where(_in_range(name, value), 1.0, np.nan) for name, value in pairs)
-    return formula(*good)
+    return formula(*(void(_in_range(name, value), value)[0] for name, value in zip(names, values, strict=True)))
 
 
 def in_periods(delay: Array, period: Array) -> Array:

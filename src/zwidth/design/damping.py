@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise, pointwise, to_caller
-from zwidth.domain import device_status
+from zwidth.domain import device_status, void
 from zwidth.grouping import Degree, map_by_degree
 from zwidth.numerics.minimize import Cost, lowest, without_slope
 from zwidth.stability.curve import column, lobe, peak
@@ -219,6 +219,5 @@ def _wall_kernel(delta: Array, d: Array, degree: Degree) -> FastestWall:
         return jnp.where(exists, radius, 1.0), beta
 
     alpha, radius, beta = lowest(jax.vmap(best_damping), jnp.zeros_like(delta), top.alpha, **_WALL)
-    bad = jnp.where(status == Status.OK, 0.0, jnp.nan).astype(alpha.dtype)
-    alpha, beta, radius = without_slope((alpha + bad, beta + bad, radius + bad), (delta, d))
+    alpha, beta, radius = without_slope(void(status == Status.OK, alpha, beta, radius), (delta, d))
     return FastestWall(alpha, beta, radius, status.astype(jnp.int32))

@@ -20,9 +20,8 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise
 from zwidth.design.stiffness import check_stiffness, checked_device
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, within
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, poison, within
 from zwidth.errors import InputError
-from zwidth.loop import poison
 from zwidth.numerics.roots import last_cell, newton
 from zwidth.scene import denormalize, in_periods, normalize, quantity_status
 from zwidth.stability.devices import ANY, Kind, classify_delays

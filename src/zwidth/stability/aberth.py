@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.domain import poison, valid_wall
 from zwidth.grouping import Degree
-from zwidth.loop import choose_plant, poison, valid_wall
+from zwidth.loop import choose_plant
 from zwidth.xp import epsilon, namespace, repeat
 
 # With half as many more as there are poles, all but some 2 walls in 1,000 are settled.

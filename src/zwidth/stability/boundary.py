@@ -8,9 +8,9 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import elementwise
-from zwidth.domain import WALL_RANGE, check_scalars, wall_status, within
+from zwidth.domain import WALL_RANGE, check_scalars, poison, valid_device, wall_status, within
 from zwidth.errors import InputError, check_choice
-from zwidth.loop import Wall, check_delay_model, frequency_boundary, frequency_loop, poison, valid_device
+from zwidth.loop import Wall, check_delay_model, frequency_boundary, frequency_loop
 from zwidth.numerics.roots import bisect, newton
 from zwidth.stability.crossover import stable_at
 from zwidth.stability.curve import (

@@ -15,7 +15,8 @@ import optimistix
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
-from zwidth.loop import FrequencyLoop, Wall, frequency_boundary, frequency_loop, poison
+from zwidth.domain import poison
+from zwidth.loop import FrequencyLoop, Wall, frequency_boundary, frequency_loop
 from zwidth.stability.boundary import BoundaryPoint, line_status
 from zwidth.stability.bracketing import bisect, lobe_end
 from zwidth.stability.crossover import stable_kernel

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.loop import valid_wall
+from zwidth.domain import valid_wall, void
 from zwidth.plant import held_plant, split_delay, undelayed_plant
 from zwidth.stability.crossover import ARCSINE
 from zwidth.xp import epsilon, horner, namespace
@@ -58,9 +58,8 @@ def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: b
     else:
         plant = undelayed_plant(delta)
         h, q = plant.a1, 0.0 * plant.a1
-    spoiled = xp.where(ok, 0.0, np.nan)
-    wall = alpha + spoiled, beta + spoiled, alpha + beta
-    return Loop(*wall, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
+    alpha, beta, s = void(ok, alpha, beta, alpha + beta)
+    return Loop(alpha, beta, s, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
 
 
 def angle(re: Array, im: Array) -> Array:

@@ -8,10 +8,11 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.batching import as_float64
-from zwidth.loop import tilt_at_minus_one, valid_device
+from zwidth.domain import valid_device, void
+from zwidth.loop import tilt_at_minus_one
 from zwidth.numerics import phi
 from zwidth.plant import Functions, discretize, split_delay
-from zwidth.xp import is_traced, namespace
+from zwidth.xp import is_traced
 
 
 class Kind(NamedTuple):
@@ -58,9 +59,7 @@ class DeviceTerms(NamedTuple):
 
 def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.phi_functions) -> DeviceTerms:
     """The `DeviceTerms` of one (delta, d), or of arrays of one shape."""
-    xp = namespace(delta, d)
-    ok = valid_device(delta, d)
-    delta, d = xp.where(ok, delta, np.nan), xp.where(ok, d, np.nan)
+    delta, d = void(valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
     at = functions(delta)
     late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at

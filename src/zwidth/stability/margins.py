@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.domain import check_scalars
-from zwidth.loop import poison, valid_wall
+from zwidth.domain import check_scalars, poison, valid_wall
 from zwidth.numerics.roots import false_position, follow_root
 from zwidth.plant import split_delay
 from zwidth.stability.crossover import gain_crossover, stable_at

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.domain import check_scalars
-from zwidth.loop import poison, valid_wall
+from zwidth.domain import check_scalars, poison, valid_wall
 from zwidth.stability.crossover import gain_crossover
 from zwidth.stability.devices import DeviceTerms, device
 from zwidth.stability.open_loop import by_samples, find_angle, size_and_phase

@@ -22,10 +22,9 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import FEW, as_float64, elementwise, map_blocks, to_caller
-from zwidth.domain import LONGEST_DELAY, check_scalars
+from zwidth.domain import LONGEST_DELAY, check_scalars, poison, valid_wall
 from zwidth.errors import InputError
 from zwidth.grouping import NAMES
-from zwidth.loop import poison, valid_wall
 from zwidth.stability.devices import ANY, Kind, classify_delays
 from zwidth.stability.layout import lay_out, split
 from zwidth.stability.needed_damping import directions, larger_root, needed_damping

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.loop import poison, valid_wall
+from zwidth.domain import poison, valid_wall, void
 from zwidth.stability.circle import Loop, angle, count, factor_loop
 from zwidth.stability.pole_step import halley_step, move_pole, newton_step
 from zwidth.xp import epsilon, frozen, namespace, repeat
@@ -175,7 +175,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
         step = newton_step(re, im, loop, fractional)
         re, im = re + step.re, im + step.im
     known = simple | has_bound(start, eps**0.25, still, fractional)
-    change = (re - start) * xp.where(simple, 1.0, np.nan)
+    (change,) = void(simple, re - start)
     value = frozen(xp.where(simple, re, start), xp)
     value = xp.where(simple, value + (change - frozen(change, xp)), value + 0.0 * change)
     return xp.where(known, value, np.nan) + poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

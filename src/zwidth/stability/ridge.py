@@ -9,7 +9,7 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import elementwise, pointwise
-from zwidth.domain import check_scalars, device_status
+from zwidth.domain import check_scalars, device_status, void
 from zwidth.errors import check_choice
 from zwidth.loop import check_delay_model
 from zwidth.plant import Plant, split_delay, undelayed_plant
@@ -115,21 +115,17 @@ def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) ->
     undelayed = is_undelayed(delay_model, kind)
     fractional = delay_model == "fractional_power"
     by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
-    mask = found(ridge)
-    return RidgeSlopes(
-        _point(ridge, status), alpha_change(ridge.s, plant, lag, by_delta, undelayed) * mask, by_d * mask
-    )
+    by_delta = alpha_change(ridge.s, plant, lag, by_delta, undelayed)
+    by_delta, by_d = void(converged(ridge), by_delta, by_d)
+    return RidgeSlopes(_point(ridge, status), by_delta, by_d)
 
 
 def _solve_ridge(
     delta: Array, d: Array, delay_model: str, kind: Kind
 ) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
     """The ridge, its status, the plant behind a lag, and the plant's damping and fraction."""
-    xp = namespace(delta, d)
     status = device_status(delta, d)
-    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
-    mask = xp.where(status == Status.OK, 1.0, np.nan)
-    delta, d = delta * mask, d * mask
+    delta, d = void(status == Status.OK, delta, d)
     whole, f = split_delay(d)
     if not kind.fractional:
         # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
@@ -142,17 +138,16 @@ def _solve_ridge(
     return ridge, status, plant, whole, (delta, f)
 
 
-def found(ridge: Ridge) -> Array:
-    """1, or NaN where the solver did not converge."""
+def converged(ridge: Ridge) -> Array:
+    """Whether the solver has arrived."""
     # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
-    xp = namespace(ridge.s)
-    return xp.where(xp.abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s, 1.0, np.nan)
+    return namespace(ridge.s).abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
 
 
 def _point(ridge: Ridge, status: Array) -> RidgePoint:
     xp = namespace(ridge.alpha)
-    mask = found(ridge)
-    status = xp.where((status == Status.OK) & xp.isnan(mask), int(Status.NOT_CONVERGED), status)
+    arrived = converged(ridge)
+    status = xp.where((status == Status.OK) & ~arrived, int(Status.NOT_CONVERGED), status)
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
-    values = (ridge.alpha * mask, ridge.beta * mask, ridge.omega * mask)
-    return RidgePoint(*values, kind.astype(np.int32), status.astype(np.int32))
+    alpha, beta, omega = void(arrived, ridge.alpha, ridge.beta, ridge.omega)
+    return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))

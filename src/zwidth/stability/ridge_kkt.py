@@ -19,7 +19,7 @@ import optimistix
 
 from zwidth._types import Array
 from zwidth.batching import store_once
-from zwidth.domain import device_status
+from zwidth.domain import device_status, poison
 from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
 from zwidth.stability.bracketing import bisect, lobe_end
 from zwidth.stability.ridge import RidgeKind, RidgePoint
@@ -71,18 +71,16 @@ def kkt_residual(unknowns: Array, args: KktArguments) -> Array:
 def kkt_kernel(delta: Array, d: Array, delay_model: str) -> RidgePoint:
     """`zwidth.alpha_max` of one point by this route."""
     status = device_status(delta, d)
-    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
-    mask = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    # A solver that sees NaN in one lane may spoil or stop the others; NaN is put back behind it.
-    spoiled = 0.0 * (delta * mask + d * mask)
-    delta, d = jnp.where(jnp.isnan(spoiled), 1.0, delta), jnp.where(jnp.isnan(spoiled), 1.0, d)
+    ok, inputs = status == Status.OK, (delta, d)
+    # A solver that sees NaN in one lane may stop the others.
+    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
     loop = store_once(frequency_loop(delta, d, delay_model), delta)
     end = corner(expand_curve(loop.plant), loop.lag)
     omega, found = _smooth_omega(loop, d, delay_model)
     smooth = frequency_boundary(omega, loop, delay_model)
     converged = jnp.logical_or(end.is_ridge, found)
-    spoiled = spoiled * jnp.where(converged, 1.0, jnp.nan)
-    status = jnp.where((status == Status.OK) & ~converged, int(Status.NOT_CONVERGED), status)
+    spoiled = poison(ok & converged, *inputs)
+    status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
     return RidgePoint(
         jnp.where(end.is_ridge, end.alpha, smooth.alpha) + spoiled,
         jnp.where(end.is_ridge, end.beta, smooth.beta) + spoiled,
