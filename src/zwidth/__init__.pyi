@@ -44,6 +44,7 @@ from .stability.boundary import boundary as boundary
 from .stability.boundary import boundary_point as boundary_point
 from .stability.counting import count_poles as count_poles
 from .stability.decay import decay_rate as decay_rate
+from .stability.labels import decide_stability as decide_stability
 from .stability.labels import is_stable as is_stable
 from .stability.labels import stability_of as stability_of
 from .stability.margins import Margins as Margins

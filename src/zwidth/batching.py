@@ -38,7 +38,7 @@ _LEAST = 1 << 4
 
 
 @contextmanager
-def concretely() -> Iterator[None]:
+def compute_concretely() -> Iterator[None]:
     """Compute in float64 and at once, though the caller may be inside a JAX transformation that traces other values.
 
     The settings belong to the thread and end with the block.
@@ -94,7 +94,7 @@ def to_caller(result: Any, values: tuple[ArrayLike, ...]) -> Any:
         import jax.numpy as jnp
 
         # Without this a caller with JAX's default precision would lose half of the digits on the way out.
-        with concretely():
+        with compute_concretely():
             return tree_map(jnp.asarray, result)
     return tree_map(lambda leaf: np.asarray(leaf)[()], result)
 
@@ -130,7 +130,7 @@ def elementwise(
             with np.errstate(all="ignore"):
                 return tree_map(_plain, kernel(*numbers, *static))
     if is_traced(*values):
-        return _compiled_elementwise(kernel, static)(*traced_columns(values))
+        return _compile_elementwise(kernel, static)(*traced_columns(values))
     arrays = broadcast(names, values)
     if arrays[0].size <= few:
         with np.errstate(all="ignore"):
@@ -138,7 +138,7 @@ def elementwise(
         # A copy: a view of an argument, or of one value, could not be written to.
         return to_caller(tree_map(lambda leaf: np.array(np.broadcast_to(leaf, arrays[0].shape)), result), values)
     shape = arrays[0].shape
-    flat = in_blocks(_compiled_elementwise(kernel, static), [array.reshape(-1) for array in arrays], block)
+    flat = map_blocks(_compile_elementwise(kernel, static), [array.reshape(-1) for array in arrays], block)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)
 
 
@@ -181,7 +181,7 @@ def _stack_level() -> int:
 
 
 @cache
-def _compiled_elementwise(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+def _compile_elementwise(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
     """A kernel compiled, with its derivatives as one product for each argument.
 
     A point depends on itself alone, so that all there is to differentiate is a few numbers a point. Left to itself,
@@ -240,8 +240,8 @@ def _no_change(leaf: Any) -> Any:
 
 
 @cache
-def in_strips(kernel: Callable[..., Any], static: tuple[Any, ...] = ()) -> Callable[..., Any]:
-    """An elementwise kernel compiled for `in_blocks`; columns of one value stay single numbers."""
+def compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...] = ()) -> Callable[..., Any]:
+    """An elementwise kernel compiled for `map_blocks`; columns of one value stay single numbers."""
     import jax
 
     def strips(*columns: Any) -> Any:
@@ -260,13 +260,13 @@ def in_strips(kernel: Callable[..., Any], static: tuple[Any, ...] = ()) -> Calla
     return jax.jit(strips, compiler_options={"xla_cpu_prefer_vector_width": 512})
 
 
-def in_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int, threads: int | None = None) -> Any:
+def map_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int, threads: int | None = None) -> Any:
     """Apply a compiled elementwise function to equally long columns, block by block on every processor.
 
     One array of a million points would be up to five times slower: what the function holds meanwhile leaves the cache.
     Columns of one value are handed over as they are.
     """
-    return _in_pieces(function, columns, _padded_size(_length(columns), block, _LEAST), threads)
+    return _map_pieces(function, columns, _padded_size(_length(columns), block, _LEAST), threads)
 
 
 # Kernels that iterate over long formulas compile 2 to 5 times faster without XLA's fusion, and run no slower:
@@ -275,7 +275,7 @@ _UNFUSED = {"xla_disable_hlo_passes": "fusion"}
 
 
 @cache
-def _compiled(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
+def _compile_pointwise(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
     import jax
 
     options = None if fused else _UNFUSED
@@ -315,15 +315,15 @@ def map_flat(
     never shorter than ``least``: the compiler treats very short ones differently, to the last place.
     """
     size = _padded_size(columns[0].size, chunk, least)
-    return _in_pieces(_compiled(kernel, static, fused), columns, size, threads)
+    return _map_pieces(_compile_pointwise(kernel, static, fused), columns, size, threads)
 
 
-def _in_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None) -> Any:
+def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None) -> Any:
     count = _length(columns)
     flagged = [(column, column.size == 1 < count) for column in columns]
 
     def run(start: int) -> Any:
-        with concretely():
+        with compute_concretely():
             parts = (column if shared else _piece(column, start, size) for column, shared in flagged)
             return tree_map(np.asarray, function(*parts))
 
@@ -361,14 +361,14 @@ def pointwise(
 ) -> Any:
     """Broadcast ``values``, apply the one-point JAX ``kernel`` to each point, and restore the common shape."""
     if is_traced(*values):
-        return _traced(kernel, values, static)
+        return _map_traced(kernel, values, static)
     arrays = broadcast(names, values)
     shape = arrays[0].shape
     flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, fused, least)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 
-def _traced(kernel: Callable[..., Any], values: tuple[ArrayLike, ...], static: tuple[Any, ...]) -> Any:
+def _map_traced(kernel: Callable[..., Any], values: tuple[ArrayLike, ...], static: tuple[Any, ...]) -> Any:
     import jax
 
     arrays = traced_columns(values)
@@ -379,7 +379,7 @@ def _traced(kernel: Callable[..., Any], values: tuple[ArrayLike, ...], static: t
     return jax.tree.map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat)
 
 
-def stored(values: Any, witness: Array) -> Any:
+def store_once(values: Any, witness: Array) -> Any:
     """``values``, computed once: for a kernel in which many later steps use them.
 
     XLA:CPU repeats a chain of cheap operations in every loop it makes out of the operations behind it, but never a

@@ -53,6 +53,36 @@ def _status(valid: Array, inside: Array, xp: Any) -> Array:
     return status.astype(np.int32)
 
 
+def valid_device(delta: Array, d: Array) -> Array:
+    """Whether a device and its delay lie where the model is computed."""
+    return device_status(delta, d) == Status.OK
+
+
+def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """Whether a wall on a device lies where the model is computed."""
+    return wall_status(alpha, beta, delta, d) == Status.OK
+
+
+# A bad point is NaN, and so are its derivatives: `where(ok, value, nan)` alone would give it the derivative 0, a finite
+# number that means nothing. What may compute with NaN is voided before; what may not (a solver, a search, an
+# exponent) gets harmless numbers, and its results are poisoned behind.
+
+
+def void(ok: Array, *values: Array) -> tuple[Array, ...]:
+    """The values where ``ok``, else NaN: so is what is computed with them, derivatives included."""
+    xp = namespace(ok, *values)
+    factor = xp.where(ok, 1.0, np.nan)
+    return tuple(value * factor for value in values)
+
+
+def poison(ok: Array, *inputs: Array) -> Array:
+    """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
+    xp = namespace(ok, *inputs)
+    # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
+    total = sum(xp.where(ok, 0.0, value) for value in inputs)
+    return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
+
+
 # Every other name is one of a wall's numbers.
 _LARGEST = {"delta": LARGEST_DAMPING, "d": LONGEST_DELAY}
 

@@ -28,7 +28,7 @@ class Degree(NamedTuple):
         return self.whole + (4 if self.fractional else 3)
 
 
-def degree_of(d: float) -> Degree:
+def find_degree(d: float) -> Degree:
     """The `Degree` of one concrete delay; an impossible delay gets the smallest one."""
     if not (np.isfinite(d) and d >= 0):
         return Degree(0, False)
@@ -48,7 +48,7 @@ def groups(d: np.ndarray) -> Iterator[tuple[Degree, np.ndarray]]:
         yield Degree(int(value // 2), bool(value % 2)), np.flatnonzero(code == value)
 
 
-def by_degree(
+def map_by_degree(
     kernel: Callable[..., Any],
     values: tuple[ArrayLike, ...],
     *,
@@ -69,7 +69,7 @@ def by_degree(
     so many points of a degree without JAX. ``fused``, ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
     """
     if is_traced(*values):
-        return _by_degree_traced(kernel, names, values, static, lead)
+        return _map_traced(kernel, names, values, static, lead)
     arrays = batching.broadcast(names, values)
     columns = [array.ravel() for array in arrays]
     parts, places = [], []
@@ -122,7 +122,7 @@ def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
     return filled
 
 
-def _by_degree_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static: tuple, lead: bool) -> Any:
+def _map_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static: tuple, lead: bool) -> Any:
     import jax
     import jax.numpy as jnp
 

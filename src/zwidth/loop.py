@@ -17,12 +17,11 @@ import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike
 from zwidth.batching import concrete_delay
-from zwidth.domain import check_scalars, device_status, wall_status
+from zwidth.domain import check_scalars, poison, valid_wall
 from zwidth.errors import InputError, check_choice
-from zwidth.grouping import Degree, by_degree, few_poles
+from zwidth.grouping import Degree, few_poles, map_by_degree
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
 from zwidth.scene import normalize
-from zwidth.status import Status
 from zwidth.xp import horner, namespace
 
 
@@ -34,14 +33,14 @@ class Affine(NamedTuple):
     N2: Array
 
 
-def plant_of(delta: Array, d: Array, degree: Degree) -> Plant:
+def choose_plant(delta: Array, d: Array, degree: Degree) -> Plant:
     """The plant with the part of the delay that is not whole periods."""
     return held_plant(delta, d - degree.whole) if degree.fractional else undelayed_plant(delta)
 
 
 def affine(delta: Array, d: Array, degree: Degree) -> Affine:
     """The three coefficient vectors of devices of one degree, along a new last axis of degree.poles + 1."""
-    plant = plant_of(delta, d, degree)
+    plant = choose_plant(delta, d, degree)
     xp = namespace(plant.a2)
     zero, one = 0.0 * plant.a2, 0.0 * plant.a2 + 1.0
     head = [one, -(1.0 + plant.c), plant.c]
@@ -63,8 +62,8 @@ def coefficients(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degr
     return parts.D + alpha[..., None] * parts.N1 + beta[..., None] * parts.N2
 
 
-class BoundaryCurve(NamedTuple):
-    """A point of the boundary curve: the wall whose loop has a pole pair at e^(+-j omega)."""
+class Wall(NamedTuple):
+    """A wall by its normalized stiffness and damping, or an array of them."""
 
     alpha: Array
     beta: Array
@@ -77,15 +76,15 @@ class FrequencyLoop(NamedTuple):
     lag: Array  # whole periods of delay; the whole exponent d in the fractional-power model
 
 
-def frequency_loop(delta: Array, d: Array, delay: str) -> FrequencyLoop:
+def frequency_loop(delta: Array, d: Array, delay_model: str) -> FrequencyLoop:
     """The loop of one (delta, d) for evaluation on the unit circle."""
-    if delay == "fractional_power":
+    if delay_model == "fractional_power":
         return FrequencyLoop(undelayed_plant(delta), d)
     whole, fraction = split_delay(d)
     return FrequencyLoop(held_plant(delta, fraction), whole)
 
 
-def frequency_boundary(omega: Array, loop: FrequencyLoop, delay: str) -> BoundaryCurve:
+def frequency_boundary(omega: Array, loop: FrequencyLoop, delay_model: str) -> Wall:
     """The wall (alpha, beta) that puts a pole at z = e^(j omega), in closed form, for one point.
 
     On the unit circle P = 0 is a real linear 2x2 system. With s = sin(omega/2), C = cos(omega/2), M = N(z)/z,
@@ -112,15 +111,15 @@ def frequency_boundary(omega: Array, loop: FrequencyLoop, delay: str) -> Boundar
     # sin_w/C = 2 s
     im_g_over_c = 2.0 * s * (re_m - re_z * im_m_over_sin) / norm
     sin_k, cos_k = xp.sin(k * omega), xp.cos(k * omega)
-    ratio = _cosine_ratio(omega, whole, c_safe, delay)
+    ratio = _cosine_ratio(omega, whole, c_safe, delay_model)
     beta = -(ratio * re_g - sin_k * im_g_over_c)
     alpha = 2.0 * s * (sin_k * re_g + cos_k * im_g_over_c * cos_half - s * beta)
-    return BoundaryCurve(*_limits_at_pi(alpha, beta, finite, omega, whole))
+    return Wall(*_limits_at_pi(alpha, beta, finite, omega, whole))
 
 
-def _cosine_ratio(omega: Array, lag: Array, cos_half: Array, delay: str) -> Array:
+def _cosine_ratio(omega: Array, lag: Array, cos_half: Array, delay_model: str) -> Array:
     """``cos((lag + 1/2) omega)/cos(omega/2)``, finite at pi for a whole lag."""
-    if delay == "held":
+    if delay_model == "held":
         return _whole_cosine_ratio(omega, lag, cos_half)
     # With lag = n + e, n the nearest whole number: only the part with sin(e omega) is unbounded towards pi, and it
     # vanishes with e.
@@ -180,33 +179,15 @@ def line_at_minus_one(delta: Array, d: Array) -> Array:
     return sign * 2.0 * (1.0 + plant.c) / plant.gap
 
 
-def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """Whether a point lies where the model is computed, see `zwidth.domain`."""
-    return wall_status(alpha, beta, delta, d) == Status.OK
-
-
-def valid_device(delta: Array, d: Array) -> Array:
-    """Whether a device and its delay lie where the model is computed, see `zwidth.domain`."""
-    return device_status(delta, d) == Status.OK
-
-
-def poison(ok: Array, *inputs: Array) -> Array:
-    """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
-    xp = namespace(ok, *inputs)
-    # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
-    total = sum(xp.where(ok, 0.0, value) for value in inputs)
-    return xp.where(ok, 0.0, xp.nan) * total * (1.0 + total)
-
-
-def check_delay_model(delay: str) -> None:
+def check_delay_model(delay_model: str) -> None:
     """Raise `InputError` unless the name of a delay model is known."""
-    check_choice("delay", delay, DELAY_MODELS)
+    check_choice("delay", delay_model, DELAY_MODELS)
 
 
-def check_has_poles(delay: str) -> None:
+def check_has_poles(delay_model: str) -> None:
     """Refuse the fractional power where poles are asked for."""
-    check_delay_model(delay)
-    if delay == "fractional_power":
+    check_delay_model(delay_model)
+    if delay_model == "fractional_power":
         raise InputError(
             "delay: 'fractional_power' has no poles (z^d has other sheets, always with roots outside the unit "
             "circle); use delay='held' for poles, radius and stability, or ask for the boundary or the ridge"
@@ -249,7 +230,7 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
     """
     check_has_poles(delay)
     check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
-    return by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
+    return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
 
 
 def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
@@ -359,7 +340,7 @@ def closed_loop_transfer(
     )
     names = ("mass", "period", "alpha", "beta", "delta", "d")
     values = (mass, period, alpha, beta, delta, float(delay))
-    return by_degree(_closed_loop_kernel, values, names=names, few=few_poles)
+    return map_by_degree(_closed_loop_kernel, values, names=names, few=few_poles)
 
 
 def _closed_loop_kernel(

@@ -42,15 +42,15 @@ class Plant(NamedTuple):
 
 def held_plant(delta: Array, fraction: Array) -> Plant:
     """Discretize for a delay whose fractional part is ``fraction``, in [0, 1)."""
-    return discretized(delta, fraction, phi.phi_functions)
+    return discretize(delta, fraction, phi.phi_functions)
 
 
 def undelayed_plant(delta: Array) -> Plant:
     """Discretize without the fractional part: N(z) = z (phi2 z + psi)."""
-    return discretized(delta, None, phi.phi_functions)
+    return discretize(delta, None, phi.phi_functions)
 
 
-def discretized(delta: Any, fraction: Any, functions: Functions) -> Plant:
+def discretize(delta: Any, fraction: Any, functions: Functions) -> Plant:
     """The plant in any arithmetic whose phi-functions are given; ``fraction`` is None for whole delays."""
     at = functions(delta)
     if fraction is None:

@@ -61,7 +61,7 @@ class Sharpened:
 
 def published_numbers() -> list[Comparison]:
     """Compare every number that the paper prints with the computed one."""
-    return [*_undamped(), *_example(), *_factors(), _line()]
+    return [*_compare_undamped(), *_example(), *_factors(), _line()]
 
 
 def _ridge(delta: float, d: float) -> tuple[float, float]:
@@ -69,7 +69,7 @@ def _ridge(delta: float, d: float) -> tuple[float, float]:
     return float(point.alpha), float(point.beta)
 
 
-def _undamped() -> list[Comparison]:
+def _compare_undamped() -> list[Comparison]:
     """Remark 4: K_max T^2/m without physical damping."""
     printed = ((0, "eq. (24)", "0.6863"), (1, "eq. (25)", "0.1445"))
     return [Comparison(f"alpha_max(delta = 0, d = {d})", where, text, _ridge(0.0, d)[0]) for d, where, text in printed]

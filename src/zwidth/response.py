@@ -17,7 +17,7 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
-from zwidth.grouping import degree_of
+from zwidth.grouping import find_degree
 from zwidth.numerics import phi
 from zwidth.scene import Scene
 from zwidth.settling import advance, settling_time
@@ -48,7 +48,7 @@ def _run(alpha: float, beta: float, delta: float, d: float, applied: float, peri
 
     In plain floats: a period takes a microsecond or two, less than importing a compiler for most runs.
     """
-    lag = degree_of(d).whole
+    lag = find_degree(d).whole
     f = d - lag
     # x and v after each part of a period are linear in x, v and the force: three numbers a part.
     parts = []
@@ -71,7 +71,7 @@ def _run(alpha: float, beta: float, delta: float, d: float, applied: float, peri
     return _Samples(*np.array(rows).T)
 
 
-def _between(samples: _Samples, fractions: np.ndarray, delta: float, f: float, applied: float) -> tuple[Array, ...]:
+def _interpolate(samples: _Samples, fractions: np.ndarray, delta: float, f: float, applied: float) -> tuple[Array, ...]:
     """Position, velocity and force at the instants ``fractions`` of every period; rows are periods."""
     x, v, older, newer = (column[:, None] for column in samples)
     x_bend, v_bend = advance(x, v, applied + older, np.float64(f), delta)
@@ -139,7 +139,7 @@ def step_response(
     fractions = np.arange(substeps) / substeps
     with np.errstate(all="ignore"):
         samples = _run(alpha, beta, delta, d, force, int(periods))
-        history = _between(samples, fractions, delta, d - math.floor(d), force)
+        history = _interpolate(samples, fractions, delta, d - math.floor(d), force)
     position, velocity, wall_force = (np.broadcast_to(part, (periods, substeps)).ravel() for part in history)
     time = (np.arange(periods)[:, None] + fractions).ravel()
     final = force / alpha if alpha != 0 else math.nan

@@ -15,7 +15,7 @@ import numpy as np
 
 from zwidth._types import DELAY_MODELS, Array, ArrayLike, DelayModel
 from zwidth.batching import refuse_masked
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, within
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, void, within
 from zwidth.errors import InputError, check_choice
 from zwidth.status import Status
 from zwidth.xp import frozen, is_jax, is_traced, namespace
@@ -57,7 +57,7 @@ _RANGES: dict[str, tuple[str, float, bool, tuple[float, float]]] = {
 }
 
 
-def _checked(name: str, value: ArrayLike) -> ArrayLike:
+def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
     """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
     if is_traced(value):
         return value
@@ -98,9 +98,9 @@ def quantity_status(**values: Array) -> Array:
     return xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
 
 
-def _converted(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
+def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
     """Check the arguments, put NaN where an array's entry is out of range, and apply ``formula``."""
-    checked = {name: _checked(name, value) for name, value in values.items()}
+    checked = {name: _check_quantity(name, value) for name, value in values.items()}
     try:
         np.broadcast_shapes(*(np.shape(value) for value in checked.values()))
     except ValueError as error:
@@ -118,11 +118,7 @@ def _converted(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -
 def _formula_at(*arguments: Any) -> tuple[Array, ...]:
     """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
     *values, formula, names = arguments
-    xp = namespace(*values)
-    # Multiplied, not chosen: the derivatives of what is out of range are then NaN as well.
-    pairs = zip(names, values, strict=True)
-    good = (value * xp.where(_in_range(name, value), 1.0, np.nan) for name, value in pairs)
-    return formula(*good)
+    return formula(*(void(_in_range(name, value), value)[0] for name, value in zip(names, values, strict=True)))
 
 
 def in_periods(delay: Array, period: Array) -> Array:
@@ -138,7 +134,7 @@ def in_periods(delay: Array, period: Array) -> Array:
     return quotient - frozen(xp.where(near & (whole > 0), quotient - whole, 0.0), xp)
 
 
-def _to_normalized(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
+def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
     """Eqs. (14), (16)."""
     return (
         stiffness * period * period / mass,
@@ -148,7 +144,7 @@ def _to_normalized(mass, damping, period, delay, stiffness, virtual_damping) -> 
     )
 
 
-def _to_physical(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
+def _denormalize(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
     """Eqs. (14), (16) solved for the SI quantities, in the order of `Physical`."""
     rate = mass / period
     return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
@@ -192,8 +188,8 @@ def normalize(
         >>> print(f"{wall.alpha:.3f} {wall.delta:.1f} {wall.d:.0f}")
         0.149 0.1 1
     """
-    numbers = _converted(
-        _to_normalized,
+    numbers = _convert_quantities(
+        _normalize,
         mass=mass,
         damping=damping,
         period=period,
@@ -239,14 +235,14 @@ def denormalize(
         >>> print(f"{zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.149).stiffness:.0f} N/m")
         14900 N/m
     """
-    numbers = _converted(_to_physical, mass=mass, period=period, alpha=alpha, beta=beta, delta=delta, d=d)
+    numbers = _convert_quantities(_denormalize, mass=mass, period=period, alpha=alpha, beta=beta, delta=delta, d=d)
     return Physical(*numbers)
 
 
 def _require_scalar(name: str, value: float) -> None:
     if np.ndim(value) != 0:
         raise InputError(f"{name}: got an array of shape {np.shape(value)}; a scene holds single numbers")
-    _checked(name, value)
+    _check_quantity(name, value)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.grouping import degree_of
+from zwidth.grouping import find_degree
 from zwidth.loop import coefficients
 from zwidth.numerics import phi
 from zwidth.numerics.roots import bisect
@@ -70,7 +70,7 @@ def advance(x: Array, v: Array, force: Array, t: Array, delta: float) -> tuple[A
 
 def modes(alpha: float, beta: float, delta: float, d: float) -> Modes | None:
     """The modes of a stable wall; None where rounding keeps them from standing for its motion."""
-    degree = degree_of(d)
+    degree = find_degree(d)
     n, f = degree.whole, d - degree.whole
     z = np.asarray(poles(alpha, beta, delta, d), dtype=complex)
     z = z[np.abs(z) > 1e-300]
@@ -137,7 +137,7 @@ def _last_outside(found: Modes, instants: np.ndarray, last: int, allowed: float)
         k = np.arange(max(stop - rows, 0), stop)
         size = np.abs(np.real((found.z ** k[:, None]) @ shape.T)).ravel()
         time = (k[:, None] + instants).ravel()
-        near = _peaks_between(found, time, size, allowed)
+        near = _find_peaks(found, time, size, allowed)
         outside = np.flatnonzero(size > allowed)
         latest = max(near, float(time[outside[-1]]) if outside.size else -1.0)
         if latest < 0:
@@ -149,7 +149,7 @@ def _last_outside(found: Modes, instants: np.ndarray, last: int, allowed: float)
     return 0.0
 
 
-def _peaks_between(found: Modes, time: np.ndarray, size: np.ndarray, allowed: float) -> float:
+def _find_peaks(found: Modes, time: np.ndarray, size: np.ndarray, allowed: float) -> float:
     """The last instant outside the band between the instants looked at, -1 where there is none."""
     inner = np.arange(1, size.size - 1)
     peak = (size[inner] >= size[inner - 1]) & (size[inner] >= size[inner + 1])

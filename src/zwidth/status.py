@@ -27,7 +27,7 @@ class Status(IntEnum):
 
 
 class Method(IntEnum):
-    """What decided a point, in `zwidth.stability_of`, `zwidth.stability.radii.radius_of` and `.poles.poles_of`."""
+    """What decided a point, in `zwidth.decide_stability`, `bound_radius` and `enclose_poles`."""
 
     COMPANION = 0
     CROSSOVER = 1

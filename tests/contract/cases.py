@@ -126,7 +126,7 @@ CASES = [
     of_walls(zwidth.spectral_radius),
     of_walls(zwidth.decay_rate),
     of_walls(zwidth.is_stable, derivatives=None, value="False where bad"),
-    of_walls(zwidth.stability_of, derivatives=None, value="False where bad, and why", refuses_tracing=True),
+    of_walls(zwidth.decide_stability, derivatives=None, value="False where bad, and why", refuses_tracing=True),
     of_walls(zwidth.is_passive, derivatives=None, value="False where bad"),
     of_walls(zwidth.passivity_margin),
     of_walls(zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/stability/test_margins.py"),
@@ -184,6 +184,7 @@ OTHERS = {
     "robust_wall": "boxes of devices: tests/unit/design/test_robust.py",
     "run": "a configuration: tests/unit/runs/test_run.py",
     "stable_region": "one device: tests/unit/stability/test_region.py",
+    "stability_of": "the former name of `decide_stability`",
     "step_response": "one wall: tests/unit/test_response.py",
     "use_compilation_cache": "a setting: tests/unit/test_kernel_cache.py",
 }

@@ -18,7 +18,7 @@ import pytest
 import zwidth
 from zwidth.domain import wall_status
 from zwidth.settling import settling_time
-from zwidth.stability.radii import radius_of
+from zwidth.stability.radii import bound_radius
 from zwidth.status import Status
 
 # Walls that are judged at one time: few enough for NumPy, so that nothing is compiled.
@@ -127,8 +127,8 @@ class Facts(NamedTuple):
 def facts_of(walls: Walls) -> Facts:
     """Ask every function about every wall."""
     alpha, beta, delta, d = walls
-    certified = zwidth.stability_of(*walls, method="certified")
-    found = radius_of(*walls)
+    certified = zwidth.decide_stability(*walls, method="certified")
+    found = bound_radius(*walls)
     column = np.where(alpha > 0, alpha, np.nan)
     return Facts(
         walls,

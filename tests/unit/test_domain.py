@@ -1,9 +1,10 @@
 """The ends of the domain belong to it, and the next number beyond does not."""
 
+import jax
 import numpy as np
 import pytest
 
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE, device_status, wall_status
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE, device_status, poison, void, wall_status
 from zwidth.status import Status
 
 
@@ -32,3 +33,14 @@ def test_ends_of_a_wall(place, sign):
         wall = [np.float64(0.1), np.float64(0.1)]
         wall[place] = np.float64(sign * value)
         assert wall_status(wall[0], wall[1], np.float64(0.0), np.float64(0.0)) == status
+
+
+@pytest.mark.parametrize("mark", [lambda ok, x: void(ok, x)[0] ** 2, lambda ok, x: x * x + poison(ok, x)])
+def test_a_bad_point_is_nan_with_its_derivatives_and_a_good_one_untouched(mark):
+    for order in range(3):
+        value = lambda x: mark(x < 2.0, x)  # noqa: E731
+        for _ in range(order):
+            value = jax.grad(value)
+        assert np.isnan(value(3.0))
+        assert np.isfinite(value(1.0))
+    assert mark(np.True_, np.float64(1.0)) == 1.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zwidth.errors import InputError
-from zwidth.grouping import Degree, by_degree, degree_of, groups
+from zwidth.grouping import Degree, find_degree, groups, map_by_degree
 
 DELAYS = np.array([2.0, 0.0, 0.5, 2.0, np.nan, 1e-300, 7.25, 0.0, -1.0, np.inf])
 DEGREES = [(2, False), (0, False), (0, True), (2, False), (0, False), (0, True), (7, True), (0, False)]
@@ -19,7 +19,7 @@ def numbers(alpha, beta, delta, d, degree):
 
 @pytest.mark.parametrize("d, expected", list(zip(DELAYS[:8], DEGREES, strict=True)))
 def test_degree_of_one_delay(d, expected):
-    assert degree_of(d) == Degree(*expected)
+    assert find_degree(d) == Degree(*expected)
 
 
 @pytest.mark.parametrize("whole, fractional, poles", [(0, False, 3), (0, True, 4), (5, False, 8), (5, True, 9)])
@@ -28,22 +28,22 @@ def test_count_of_poles(whole, fractional, poles):
 
 
 def test_a_delay_an_ulp_from_a_whole_number_keeps_its_fraction():
-    assert degree_of(np.nextafter(3.0, 0.0)) == Degree(2, True)
-    assert degree_of(np.nextafter(3.0, 4.0)) == Degree(3, True)
-    assert degree_of(500) == Degree(500, False)
+    assert find_degree(np.nextafter(3.0, 0.0)) == Degree(2, True)
+    assert find_degree(np.nextafter(3.0, 4.0)) == Degree(3, True)
+    assert find_degree(500) == Degree(500, False)
 
 
 def test_every_point_is_in_one_group():
     found = list(groups(DELAYS))
     assert sorted(np.concatenate([index for _, index in found])) == list(range(DELAYS.size))
     for degree, index in found:
-        assert all(degree == degree_of(d) for d in DELAYS[index])
+        assert all(degree == find_degree(d) for d in DELAYS[index])
 
 
 def test_points_come_back_to_their_places():
     delays = np.array([[2.0, 0.0, 0.5], [0.0, 7.25, 2.0]])
     alpha = np.arange(6.0).reshape(2, 3)
-    scalars, vectors = by_degree(numbers, (alpha, 0.0, 0.0, delays))
+    scalars, vectors = map_by_degree(numbers, (alpha, 0.0, 0.0, delays))
     np.testing.assert_array_equal(scalars, alpha)
     assert vectors.shape == (2, 3, 11)
     expected = [[5, 3, 4], [3, 11, 5]]
@@ -52,20 +52,20 @@ def test_points_come_back_to_their_places():
 
 
 def test_filling_in_front_is_zeros():
-    _, vectors = by_degree(numbers, (0.0, 0.0, 0.0, np.array([0, 2])), lead=True)
+    _, vectors = map_by_degree(numbers, (0.0, 0.0, 0.0, np.array([0, 2])), lead=True)
     np.testing.assert_array_equal(vectors, [[0, 0, 3, 3, 3], [5, 5, 5, 5, 5]])
 
 
 @pytest.mark.parametrize("shape", [(), (0,), (2, 0), (1, 1)])
 def test_shapes(shape):
-    scalars, vectors = by_degree(numbers, (np.ones(shape), 0.0, 0.0, 1))
+    scalars, vectors = map_by_degree(numbers, (np.ones(shape), 0.0, 0.0, 1))
     assert np.shape(scalars) == shape
     assert vectors.shape == (*shape, 4 if np.size(scalars) else 3)
 
 
 def test_traced_points_are_grouped_too():
     delays = np.array([2.0, 0.0, 0.5])
-    function = jax.jit(lambda alpha: by_degree(numbers, (alpha, 0.0, 0.0, delays)))
+    function = jax.jit(lambda alpha: map_by_degree(numbers, (alpha, 0.0, 0.0, delays)))
     scalars, vectors = function(jnp.arange(3.0))
     np.testing.assert_array_equal(scalars, [0, 1, 2])
     np.testing.assert_array_equal(np.isfinite(vectors).sum(-1), [5, 3, 4])
@@ -73,4 +73,4 @@ def test_traced_points_are_grouped_too():
 
 def test_no_traced_points_are_refused():
     with pytest.raises(InputError, match="no point at all"):
-        jax.jit(lambda alpha: by_degree(numbers, (alpha, 0.0, 0.0, 1.0)))(jnp.ones(0))
+        jax.jit(lambda alpha: map_by_degree(numbers, (alpha, 0.0, 0.0, 1.0)))(jnp.ones(0))

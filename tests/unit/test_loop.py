@@ -11,7 +11,7 @@ import oracles
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError, TracedDelayError
-from zwidth.grouping import degree_of
+from zwidth.grouping import find_degree
 from zwidth.loop import affine, char_poly_si, closed_loop_transfer
 
 WALLS = [(0.5, 0.5), (1e-8, -0.3), (40.0, -7.0), (-0.1, 0.0), (0.0, 1.0)]
@@ -82,7 +82,7 @@ def test_a_delay_of_hundreds_of_periods():
 
 def test_affine_parts_add_up_to_the_polynomial(x64):
     for d in (0.0, 3.0, 2.25):
-        parts = affine(jax.numpy.float64(0.7), jax.numpy.float64(d), degree_of(d))
+        parts = affine(jax.numpy.float64(0.7), jax.numpy.float64(d), find_degree(d))
         with mp.workdps(oracles.DIGITS):
             free = oracles.polynomial(0, 0, 0.7, d)
             spring = [left - right for left, right in zip(oracles.polynomial(1, 0, 0.7, d), free, strict=True)]

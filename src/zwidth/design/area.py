@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import as_float64, elementwise
-from zwidth.domain import check_scalars
-from zwidth.loop import poison, valid_device
+from zwidth.batching import elementwise
+from zwidth.domain import check_scalars, poison, valid_device
 from zwidth.stability.curve import lobe, spread, wall
-from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.xp import along, frozen, is_traced, namespace
+from zwidth.stability.devices import Kind, classify_delays
+from zwidth.xp import along, frozen, namespace
 
 # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic.
 _NODES = 48
@@ -46,7 +45,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         0.9096
     """
     check_scalars(delta=delta, d=d)
-    kind = ANY if is_traced(d) else kind_of(as_float64("d", d))
+    kind = classify_delays(d)
     return elementwise(_area_kernel, ("delta", "d"), (delta, d), (kind,), few=_FEW, block=_BLOCK)
 
 

@@ -10,15 +10,14 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise, pointwise, to_caller
-from zwidth.domain import device_status
-from zwidth.grouping import Degree, by_degree
+from zwidth.domain import device_status, void
+from zwidth.grouping import Degree, map_by_degree
 from zwidth.numerics.minimize import Cost, lowest, without_slope
 from zwidth.stability.curve import column, lobe, peak
-from zwidth.stability.devices import Kind
+from zwidth.stability.devices import Kind, classify_delays
 from zwidth.stability.labels import is_stable
 from zwidth.stability.modulus import margin_kernel
 from zwidth.stability.poles import companion_chunk, radius_kernel
-from zwidth.stability.ridge import occurring
 from zwidth.status import Status
 from zwidth.xp import frozen, is_traced, namespace
 
@@ -73,8 +72,8 @@ def fastest_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Damping
         0.452 0.609
     """
     inputs = (alpha, delta, d)
-    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (occurring(d),))
-    found = by_degree(
+    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (classify_delays(d),))
+    found = map_by_degree(
         _fastest_kernel,
         (alpha, lower, upper, delta, d),
         names=("alpha", "lower", "upper", "delta", "d"),
@@ -125,7 +124,7 @@ def most_robust_damping(alpha: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Dam
         np.True_
     """
     inputs = (alpha, delta, d)
-    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (occurring(d),))
+    lower, upper, status = elementwise(_column_kernel, _NAMES, inputs, (classify_delays(d),))
     names = ("alpha", "lower", "upper", "delta", "d")
     found = pointwise(_robust_kernel, names, (alpha, lower, upper, delta, d), (), _CHUNK, least=_LEAST)
     # The margin says nothing of the side of the boundary.
@@ -204,7 +203,7 @@ def fastest_wall(delta: ArrayLike, d: ArrayLike) -> FastestWall:
         >>> print(f"{wall.alpha:.2f} {wall.beta:.2f} {wall.spectral_radius:.2f}")
         0.07 0.41 0.59
     """
-    return by_degree(_wall_kernel, (delta, d), names=("delta", "d"), chunk=companion_chunk, threads=_THREADS)
+    return map_by_degree(_wall_kernel, (delta, d), names=("delta", "d"), chunk=companion_chunk, threads=_THREADS)
 
 
 def _wall_kernel(delta: Array, d: Array, degree: Degree) -> FastestWall:
@@ -220,6 +219,5 @@ def _wall_kernel(delta: Array, d: Array, degree: Degree) -> FastestWall:
         return jnp.where(exists, radius, 1.0), beta
 
     alpha, radius, beta = lowest(jax.vmap(best_damping), jnp.zeros_like(delta), top.alpha, **_WALL)
-    bad = jnp.where(status == Status.OK, 0.0, jnp.nan).astype(alpha.dtype)
-    alpha, beta, radius = without_slope((alpha + bad, beta + bad, radius + bad), (delta, d))
+    alpha, beta, radius = without_slope(void(status == Status.OK, alpha, beta, radius), (delta, d))
     return FastestWall(alpha, beta, radius, status.astype(jnp.int32))

@@ -18,8 +18,7 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise
-from zwidth.domain import check_scalars
-from zwidth.loop import poison, valid_device
+from zwidth.domain import check_scalars, poison, valid_device
 from zwidth.stability.needed_damping import directions, needed_damping
 from zwidth.xp import along, frozen, namespace
 

@@ -20,13 +20,12 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise
 from zwidth.design.stiffness import check_stiffness, checked_device
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, within
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, poison, within
 from zwidth.errors import InputError
-from zwidth.loop import poison
 from zwidth.numerics.roots import last_cell, newton
 from zwidth.scene import denormalize, in_periods, normalize, quantity_status
-from zwidth.stability.devices import ANY, Kind
-from zwidth.stability.ridge import occurring, ridge_kernel, slopes_kernel
+from zwidth.stability.devices import ANY, Kind, classify_delays
+from zwidth.stability.ridge import ridge_kernel, slopes_kernel
 from zwidth.status import Status
 from zwidth.xp import frozen, namespace
 
@@ -89,7 +88,7 @@ class _Path(NamedTuple):
         return ratio - 1.0, -self.outwards * ratio * slope
 
 
-def _solved(
+def _solve_requirement(
     path: _Path,
     bracket: tuple[Array, Array],
     unit: Array,
@@ -145,7 +144,7 @@ def _safe(**quantities: Array) -> tuple[Any, ...]:
 
 def _answer(kernel: Any, known: ArrayLike | None = None, /, **values: ArrayLike) -> Requirement:
     """Apply a kernel; ``known`` are the delays in periods where the question fixes them."""
-    kind = ANY if known is None else occurring(known)
+    kind = ANY if known is None else classify_delays(known)
     return elementwise(kernel, tuple(values), tuple(values.values()), (kind,), few=_FEW, block=_BLOCK)
 
 
@@ -189,7 +188,7 @@ def _damping_kernel(stiffness: Array, mass: Array, period: Array, delay: Array, 
     # In delta.
     enough = xp.minimum(wanted * (d + 1.0) / _LEAST, LARGEST_DAMPING)
     path = _Path(xp.ones_like(d)[()], d, 1.0 / wanted, kind, a=1, outwards=-1)
-    return _solved(path, (0.0 * d, enough), rate, given, inputs, start=_LEAST * enough, free=True)
+    return _solve_requirement(path, (0.0 * d, enough), rate, given, inputs, start=_LEAST * enough, free=True)
 
 
 def required_period(
@@ -253,7 +252,7 @@ def _period_in_periods_kernel(stiffness: Array, mass: Array, damping: Array, d: 
     shortest, longest = (_period_at(bound, stiffness, mass, damping, d + 1.0) for bound in (_LEAST, _MOST))
     path = _Path(damping / mass, d, mass / stiffness, kind, a=1, p=-2)
     between = xp.sqrt(shortest) * xp.sqrt(longest)
-    return _solved(path, (shortest, longest), xp.ones_like(d)[()], given, inputs, start=between)
+    return _solve_requirement(path, (shortest, longest), xp.ones_like(d)[()], given, inputs, start=between)
 
 
 def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array, kind: Kind) -> Requirement:
@@ -265,7 +264,7 @@ def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array, 
     # A delay of 1e5 periods, the longest that the model takes, is as good as continuous time, to 1e-5 of K.
     shortest = xp.where(delay > 0, xp.maximum(1.001 * delay / LONGEST_DELAY, 1e-6 * without_delay), without_delay)
     path = _Path(damping / mass, delay, mass / stiffness, kind, a=1, b=-1, p=-2)
-    return _solved(path, (xp.minimum(shortest, longest), longest), xp.ones_like(delay)[()], given, inputs)
+    return _solve_requirement(path, (xp.minimum(shortest, longest), longest), xp.ones_like(delay)[()], given, inputs)
 
 
 def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike) -> Requirement:
@@ -305,7 +304,7 @@ def _delay_kernel(stiffness: Array, mass: Array, damping: Array, period: Array, 
     # alpha_max < 6 (1/D^2 + delta/D) at D = d + 1
     longest = xp.minimum(xp.maximum(_period_at(_MOST, wanted, 1.0, delta, 1.0), 1.5) - 1.0, LONGEST_DELAY)
     path = _Path(delta, xp.ones_like(delta)[()], 1.0 / wanted, kind, b=1)
-    return _solved(path, (0.0 * delta, longest), period, given, inputs, offset=1.0)
+    return _solve_requirement(path, (0.0 * delta, longest), period, given, inputs, offset=1.0)
 
 
 def required_mass(
@@ -351,4 +350,4 @@ def _mass_kernel(stiffness: Array, damping: Array, period: Array, delay: Array, 
     # No device so light that the damping drowns its mass is needed to see where K_max rises.
     lightest = xp.minimum(xp.maximum(lightest, 1e-12 * heaviest), 0.01 * heaviest)
     path = _Path(damping * period, d, 1.0 / (stiffness * period * period), kind, a=-1, p=1, outwards=-1)
-    return _solved(path, (lightest, heaviest), xp.ones_like(d)[()], given, inputs, free=True)
+    return _solve_requirement(path, (lightest, heaviest), xp.ones_like(d)[()], given, inputs, free=True)

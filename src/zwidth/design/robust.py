@@ -187,7 +187,7 @@ def _box_status(low: np.ndarray, high: np.ndarray) -> Status:
     return Status.OK if within(np.concatenate([low, high]), SI_RANGE).all() else Status.OUT_OF_RANGE
 
 
-def _normalized(devices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _normalize_devices(devices: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """N/m a unit of alpha, delta and d of devices, rows of (m, b, T, t_d)."""
     mass, damping, period, delay = devices.T
     return mass / period / period, damping * period / mass, delay / period
@@ -200,7 +200,7 @@ def _stiffest(devices: np.ndarray) -> np.ndarray:
 
 def _stable_dampings(stiffness: float, devices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The ends of the stable B at one K; NaN where none is stable."""
-    spring, delta, d = _normalized(devices)
+    spring, delta, d = _normalize_devices(devices)
     alpha, damper = stiffness / spring, spring * devices[:, 2]
     lower, upper = (boundary_point(delta, d, alpha=alpha, side=side).beta for side in ("lower", "upper"))
     return np.asarray(lower) * damper, np.asarray(upper) * damper
@@ -272,19 +272,19 @@ def _prove(stiffness: float, damping: Callable[[np.ndarray], np.ndarray], low: n
         looked_at += len(lows)
         centers = 0.5 * (lows + highs)
         wall = damping(centers)
-        spring, delta, d = _normalized(centers)
+        spring, delta, d = _normalize_devices(centers)
         fails = ~np.asarray(is_stable(stiffness / spring, wall / spring / centers[:, 2], delta, d))
         if fails.any() or looked_at > _MOST_PARTS:
             return _Proof(False, centers[fails])
         mass, friction, period, delay = quantities(lows, highs)
         ratio = period / mass
         proved = stable_everywhere(period * ratio * stiffness, ratio * wall, friction * ratio, delay / period)
-        lows, highs = _halved(lows[~proved], highs[~proved])
+        lows, highs = _halve_boxes(lows[~proved], highs[~proved])
         waiting += [(lows[i : i + _AT_ONCE], highs[i : i + _AT_ONCE]) for i in range(0, len(lows), _AT_ONCE)]
     return _Proof(True, np.empty((0, 4)))
 
 
-def _halved(lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _halve_boxes(lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Cut each part in two, across the quantity whose width matters most."""
     mass, damping, period, delay = (0.5 * (lows + highs)).T
     width = (highs - lows).T
@@ -359,7 +359,7 @@ def _wall(low: np.ndarray, high: np.ndarray) -> tuple:
                 break
 
             def row_end(candidates: np.ndarray, damping: float = damping) -> np.ndarray:
-                spring, delta, d = _normalized(candidates)
+                spring, delta, d = _normalize_devices(candidates)
                 ends = boundary_point(delta, d, beta=damping / spring / candidates[:, 2])
                 return np.where(ends.status == Status.OK, np.asarray(ends.alpha) * spring, 0.0)
 

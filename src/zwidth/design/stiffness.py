@@ -14,8 +14,8 @@ from zwidth.errors import InputError
 from zwidth.formatting import with_unit
 from zwidth.loop import check_delay_model
 from zwidth.scene import Normalized, normalize, quantity_status
-from zwidth.stability.devices import Kind
-from zwidth.stability.ridge import occurring, ridge_kernel, slopes_kernel
+from zwidth.stability.devices import Kind, classify_delays
+from zwidth.stability.ridge import ridge_kernel, slopes_kernel
 from zwidth.status import Status
 from zwidth.xp import is_traced, namespace
 
@@ -66,7 +66,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
     """
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
     values = (mass, period, device.delta, device.d)
-    return elementwise(_max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (occurring(device.d),))
+    return elementwise(_max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (classify_delays(device.d),))
 
 
 def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: Kind) -> Array:
@@ -124,7 +124,7 @@ def sensitivities(
     check_delay_model(delay_model)
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
     values = (mass, damping, period, delay, device.delta, device.d)
-    return elementwise(_sensitivities_kernel, _NAMES, values, (delay_model, occurring(device.d)))
+    return elementwise(_sensitivities_kernel, _NAMES, values, (delay_model, classify_delays(device.d)))
 
 
 def _sensitivities_kernel(

@@ -50,7 +50,7 @@ class Double(NamedTuple):
         return _normal(*_normal(first, second)).plus(single(rest.high / other.high))
 
 
-def chosen(which: Array, new: Double, old: Double) -> Double:
+def select(which: Array, new: Double, old: Double) -> Double:
     """One pair or the other, place by place."""
     return Double(np.where(which, new.high, old.high), np.where(which, new.low, old.low))
 
@@ -115,7 +115,7 @@ class Complex(NamedTuple):
             result = result.times(result.times(self).shifted(two))
             more = result.plus(result.times(self)).shifted(one)
             odd = (left >> bit) & 1 == 1
-            result = Complex(*(chosen(odd, new, old) for new, old in zip(more, result, strict=True)))
+            result = Complex(*(select(odd, new, old) for new, old in zip(more, result, strict=True)))
         return result
 
     @property
@@ -154,5 +154,5 @@ def phi_pair(x: Double) -> PhiPair:
         rest = two.minus(em)
         doubled = em.times(rest), phi1.times(rest).scaled(0.5), phi1.times(phi1).plus(phi2.scaled(2.0)).scaled(0.25)
         left = done < halvings
-        em, phi1, phi2 = (chosen(left, *pair) for pair in zip(doubled, (em, phi1, phi2), strict=True))
+        em, phi1, phi2 = (select(left, *pair) for pair in zip(doubled, (em, phi1, phi2), strict=True))
     return PhiPair(em, phi1, phi2)

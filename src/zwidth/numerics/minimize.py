@@ -72,7 +72,7 @@ def lowest(cost: Cost, lower: Array, upper: Array, *, samples: int, dips: int, s
         # Before the last sample the brackets mean nothing, and are shrunk all the same.
         brackets = jax.lax.cond(
             index == rounds - 1,
-            lambda: _dips_of(dips, grid, *known),
+            lambda: _gather_dips(dips, grid, *known),
             lambda: brackets.shrunk(trial, *reached),
         )
         return known, brackets
@@ -82,7 +82,7 @@ def lowest(cost: Cost, lower: Array, upper: Array, *, samples: int, dips: int, s
     return found.middle[best], found.value[best], jax.tree.map(lambda leaf: leaf[best], found.rest)
 
 
-def _dips_of(count: int, grid: Array, values: Array, rest: Any) -> _Dips:
+def _gather_dips(count: int, grid: Array, values: Array, rest: Any) -> _Dips:
     """The lowest dips among the samples; fewer dips than ``count`` are filled up with other samples."""
     padded = jnp.pad(values, 1, constant_values=jnp.inf)
     is_dip = (values <= padded[:-2]) & (values <= padded[2:])

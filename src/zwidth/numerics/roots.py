@@ -145,7 +145,7 @@ def false_position(
     return fori_loop(0, steps, step, at).best
 
 
-def followed(function: Function, root: Array, usable: Callable[[Array, Array], Array]) -> Array:
+def follow_root(function: Function, root: Array, usable: Callable[[Array, Array], Array]) -> Array:
     """A zero, in JAX with its derivatives in whatever the function depends on, to the second order.
 
     Each of two Newton steps makes one order exact; one is taken where ``usable(slope, step)``.

@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.domain import poison, valid_wall
 from zwidth.grouping import Degree
-from zwidth.loop import plant_of, poison, valid_wall
+from zwidth.loop import choose_plant
 from zwidth.xp import epsilon, namespace, repeat
 
 # With half as many more as there are poles, all but some 2 walls in 1,000 are settled.
@@ -62,7 +63,7 @@ class ProductForm(NamedTuple):
 def product_form(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> ProductForm:
     """The polynomial of every wall, with a new first axis for its poles; of walls with ``spring`` beta is 0."""
     xp = namespace(alpha, beta, delta, d)
-    plant = plant_of(delta, d, degree)
+    plant = choose_plant(delta, d, degree)
     n = (plant.a2, plant.a1, plant.a0)[: 3 if degree.fractional else 2]
     c, alpha, beta, *n = (xp.asarray(part)[None] for part in (plant.c, alpha, beta, *n))
     return ProductForm(degree.poles - 2 - spring, c, tuple(n), alpha, None if spring else beta)
@@ -135,7 +136,7 @@ def split(z: Array) -> Cartesian:
     return Cartesian(z.real, z.imag)
 
 
-def _doubled(x: Array) -> Array:
+def _double_exactly(x: Array) -> Array:
     """The poles twice in a row, so that every other pole of each is found by a shift."""
     twice = namespace(x).concatenate([x, x])
     if isinstance(x, np.ndarray):
@@ -148,7 +149,7 @@ def _doubled(x: Array) -> Array:
 
 def _differences(z: Array) -> list[Cartesian]:
     """From each pole the ones that follow it, nearest in number first."""
-    twice, count = _doubled(z), z.shape[0]
+    twice, count = _double_exactly(z), z.shape[0]
     return [split(z - twice[k : k + count]) for k in range(1, count)]
 
 
@@ -191,7 +192,7 @@ def discs(z: Array, form: ProductForm) -> tuple[Array, Array, Array]:
     size = xp.abs(value.re) + xp.abs(value.im)
     # A thousandth more than N, for the rounding of q.
     within = 1.001 * form.poles * (size + bound) / q
-    twice = _doubled(within)
+    twice = _double_exactly(within)
     disjoint = xp.isfinite(within)
     for k, distance in enumerate(apart[: form.poles // 2], start=1):
         disjoint = disjoint & (distance > within + twice[k : k + form.poles])
@@ -199,7 +200,7 @@ def discs(z: Array, form: ProductForm) -> tuple[Array, Array, Array]:
     return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
 
 
-def in_range(
+def replace_invalid(
     alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree
 ) -> tuple[tuple[Array, Array, Array, Array], Array]:
     """Walls that can be computed, and what to add to the results of those that could not."""
@@ -220,7 +221,7 @@ def aberth_kernel(
     alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool
 ) -> tuple[Array, Array, Array]:
     """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
-    walls, spoiled = in_range(alpha, beta, delta, d, degree)
+    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
     form = product_form(*walls, degree, spring)
     xp = namespace(form.c)
     z = repeat(_FIRST_STEPS + form.poles // 2, lambda z: _step(z, form), _start(form), xp)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from zwidth.numerics.phi import PhiFunctions
-from zwidth.plant import discretized
+from zwidth.plant import discretize
 from zwidth.stability.crossover import Lag, Verdict, first_zero, gain_cubic, long_verdict, short_verdict
 from zwidth.stability.devices import DeviceTerms
 from zwidth.status import Status
@@ -82,7 +82,7 @@ def device(delta: float, d: float, bits: int) -> DeviceTerms:
     with flint.ctx.workprec(bits + _EXTRA_BITS):
         x, f = flint.arb(delta), flint.arb(d - int(d))
         late = _phi(x * (1 - f))
-        p = discretized(x, f if f != 0 else None, _phi)
+        p = discretize(x, f if f != 0 else None, _phi)
         a0 = p.a0 if f != 0 else None
         at = _phi(x)
         phis = at.phi1, at.phi2, at.psi, late.phi1, late.psi

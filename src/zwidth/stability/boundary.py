@@ -8,9 +8,9 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import elementwise
-from zwidth.domain import WALL_RANGE, check_scalars, wall_status, within
+from zwidth.domain import WALL_RANGE, check_scalars, poison, valid_device, wall_status, within
 from zwidth.errors import InputError, check_choice
-from zwidth.loop import BoundaryCurve, check_delay_model, frequency_boundary, frequency_loop, poison, valid_device
+from zwidth.loop import Wall, check_delay_model, frequency_boundary, frequency_loop
 from zwidth.numerics.roots import bisect, newton
 from zwidth.stability.crossover import stable_at
 from zwidth.stability.curve import (
@@ -26,9 +26,9 @@ from zwidth.stability.curve import (
     spread,
     wall,
 )
-from zwidth.stability.devices import ANY, Kind, kind_of
+from zwidth.stability.devices import classify_delays
 from zwidth.status import Status
-from zwidth.xp import along, epsilon, frozen, is_traced, namespace, repeat
+from zwidth.xp import along, epsilon, frozen, namespace, repeat
 
 PointMethod: TypeAlias = Literal["auto", "optimistix"]
 _METHODS: tuple[str, ...] = ("auto", "optimistix")
@@ -41,7 +41,7 @@ _EXACT_STEPS = 2
 _NEAREST_PI = 1e-3
 
 
-def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> BoundaryCurve:
+def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held") -> Wall:
     """Return the wall that puts a pole pair of the loop at ``e^(+-j omega)``, in closed form.
 
     With ``q = -z^n (z - 1)(z - c)/(n0(z) + n1(z)/z)`` on ``z = e^(j omega)``: ``beta = Im q / sin omega``,
@@ -55,7 +55,7 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
         delay: "held" (exact) or "fractional_power" (the paper's z^(1+d), principal branch).
 
     Returns:
-        BoundaryCurve with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega = 0 and pi the
+        Wall with ``alpha`` and ``beta`` of the broadcast shape; NaN out of range. At omega = 0 and pi the
         values are the limits. They are finite unless the curve runs to infinity at pi: where N(-1) = 0, as for
         delta = 0 and whole d (for held delays between whole numbers it vanishes at one damping, if at all), and for a
         fractional power.
@@ -77,13 +77,13 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
     return elementwise(_boundary_kernel, ("omega", "delta", "d"), (omega, delta, d), (delay,))
 
 
-def _boundary_kernel(omega: Array, delta: Array, d: Array, delay: str) -> BoundaryCurve:
+def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> Wall:
     xp = namespace(omega, delta, d)
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
     spoiled = poison(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
-    curve = frequency_boundary(omega, frequency_loop(delta, d, delay), delay)
-    return BoundaryCurve(curve.alpha + spoiled, curve.beta + spoiled)
+    curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model), delay_model)
+    return Wall(curve.alpha + spoiled, curve.beta + spoiled)
 
 
 class BoundaryPoint(NamedTuple):
@@ -170,7 +170,7 @@ def boundary_point(
         from zwidth.stability.boundary_solve import solved_point
 
         return solved_point(names, everything, line, delay)
-    return elementwise(_point_kernel, ("delta", "d", *names), everything, (line, delay, _kind(d)))
+    return elementwise(_point_kernel, ("delta", "d", *names), everything, (line, delay, classify_delays(d)))
 
 
 def _four(ray: Any) -> tuple[ArrayLike, ...]:
@@ -182,15 +182,6 @@ def _four(ray: Any) -> tuple[ArrayLike, ...]:
     if len(parts) != 4:
         raise InputError(f"ray: got {ray!r}; give the four numbers (alpha0, beta0, dalpha, dbeta)")
     return parts
-
-
-def _kind(d: ArrayLike) -> Kind:
-    """Which delays occur, as far as that is known before the kernel runs."""
-    try:
-        return ANY if is_traced(d) else kind_of(np.asarray(d, np.float64))
-    except (TypeError, ValueError):
-        # `elementwise` says what is wrong with it.
-        return ANY
 
 
 class _Ray(NamedTuple):
@@ -219,7 +210,7 @@ def _as_ray(line: str, numbers: tuple[Array, ...]) -> _Ray:
 
 
 def _point_kernel(delta: Array, d: Array, *arguments: Any) -> BoundaryPoint:
-    *numbers, line, delay, kind = arguments
+    *numbers, line, delay_model, kind = arguments
     xp = namespace(delta, d, *numbers)
     inputs = (delta, d, *numbers)
     ray = _as_ray(line, tuple(numbers))
@@ -227,17 +218,17 @@ def _point_kernel(delta: Array, d: Array, *arguments: Any) -> BoundaryPoint:
     if line == "ray":
         size = xp.where(given == int(Status.OK), xp.maximum(xp.abs(ray.dalpha), xp.abs(ray.dbeta)), 1.0)
         ray = ray._replace(dalpha=ray.dalpha / size, dbeta=ray.dbeta / size)
-    curve = lobe(delta, d, delay, kind)
-    creeping = creeps(delay, kind)
+    curve = lobe(delta, d, delay_model, kind)
+    creeping = creeps(delay_model, kind)
     from_b = ray._replace(beta=ray.beta + delta)
     fixed, still, still_b = frozen((curve, ray, from_b), xp)
     undecided = delta != delta
     row = None
     if line in ("row", "ray"):
-        row = frozen(row_end(still.beta, fixed, delay, kind), xp)
+        row = frozen(row_end(still.beta, fixed, delay_model, kind), xp)
         x, on_lobe, exists = row.x, row.meets, (row.meets | row.beyond) & (row.alpha > 0)
     else:
-        top = peak(fixed, delay, kind)
+        top = peak(fixed, delay_model, kind)
         exists = (still.alpha > 0) & (still.alpha < top.alpha)
         goal = xp.where(exists, still.alpha, 0.5 * top.alpha)
         x, cut = frozen(column_end(goal, top, fixed, line == "upper", creeping), xp)
@@ -245,7 +236,7 @@ def _point_kernel(delta: Array, d: Array, *arguments: Any) -> BoundaryPoint:
     if line == "ray" and row is not None:
         # For a held delay the verdict of `zwidth.is_stable` itself.
         inside = (ray.alpha > 0) & exists & (ray.alpha < row.alpha)
-        exists = stable_at(ray.alpha, ray.beta, curve.here, kind) if delay == "held" else inside
+        exists = stable_at(ray.alpha, ray.beta, curve.here, kind) if delay_model == "held" else inside
         x, on_lobe, single = frozen(_first_crossing(still_b, row, fixed, creeping), xp)
         undecided = on_lobe & ~single
     smooth, at = _follow(x, curve, from_b)
@@ -328,7 +319,7 @@ def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tupl
     upwards = ray.dbeta >= 0
     low, high = xp.where(upwards, row.x, 0.0), xp.where(upwards, curve.end, row.x)
     # Places even in the square of omega, in which the start of the lobe is straight.
-    square = _squared(curve, xp)
+    square = _starts_straight(curve, xp)
     first, last = xp.where(square, low * low, low), xp.where(square, high * high, high)
     share = along(np.linspace(0.0, 1.0, _PLACES + 1), first)
     even = first[..., None] + (last - first)[..., None] * share
@@ -364,7 +355,7 @@ def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tupl
     return x, leaves, single & (last <= epsilon(x) ** 0.5 * x)
 
 
-def _squared(curve: Lobe, xp: Any) -> Array:
+def _starts_straight(curve: Lobe, xp: Any) -> Array:
     if curve.is_short is not None:
         return ~curve.is_short
     return curve.end == curve.end if curve.short is None else curve.end != curve.end

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import BLOCK, concretely, in_blocks, in_strips
+from zwidth.batching import BLOCK, compile_strips, compute_concretely, map_blocks
 from zwidth.domain import WALL_RANGE, within
 from zwidth.stability.devices import device
 from zwidth.stability.layout import Points, assemble, split
@@ -45,7 +45,7 @@ def boundary_map(points: Points) -> np.ndarray:
 
 
 @cache
-def _compiled(name: str) -> Any:
+def _compile_kernel(name: str) -> Any:
     import jax
     import jax.numpy as jnp
 
@@ -68,7 +68,7 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0)
             with np.errstate(all="ignore"):
                 return np.asarray(kernel(points[0], *np.broadcast_arrays(*points[1:])))
         whole = np.broadcast_arrays(*points)
-        limits = in_blocks(in_strips(kernel), [array.reshape(-1) for array in whole], BLOCK)
+        limits = map_blocks(compile_strips(kernel), [array.reshape(-1) for array in whole], BLOCK)
         return limits.reshape(whole[0].shape)
 
     return assemble(split((beta, delta, d), d >= 1), shape, np.float64, of)
@@ -94,8 +94,8 @@ def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
             return _copied_rows(values, limit)
         if alpha.size < _NEVER:
             return _compare_places(alpha, limit)
-    with concretely():
-        return np.asarray(_compiled("between")(alpha, limit))
+    with compute_concretely():
+        return np.asarray(_compile_kernel("between")(alpha, limit))
 
 
 def _copied_rows(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
@@ -126,5 +126,5 @@ def _compare_places(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
     place[order] = np.arange(values.size, dtype=np.int16)
     place = np.where(values > 0, place, np.int16(_NEVER))
     count = _below(values[order], limit).astype(np.int16)
-    with concretely():
-        return np.asarray(_compiled("less")(place.reshape(alpha.shape), count.reshape(limit.shape)))
+    with compute_concretely():
+        return np.asarray(_compile_kernel("less")(place.reshape(alpha.shape), count.reshape(limit.shape)))

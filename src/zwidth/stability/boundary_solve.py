@@ -15,7 +15,8 @@ import optimistix
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import pointwise
-from zwidth.loop import BoundaryCurve, FrequencyLoop, frequency_boundary, frequency_loop, poison
+from zwidth.domain import poison
+from zwidth.loop import FrequencyLoop, Wall, frequency_boundary, frequency_loop
 from zwidth.stability.boundary import BoundaryPoint, line_status
 from zwidth.stability.bracketing import bisect, lobe_end
 from zwidth.stability.crossover import stable_kernel
@@ -27,7 +28,7 @@ from zwidth.status import Status
 _CODES = {"lower": 0.0, "upper": 1.0, "row": 2.0, "ray": 3.0}
 
 
-def solved_point(names: tuple[str, ...], values: tuple[ArrayLike, ...], line: str, delay: str) -> BoundaryPoint:
+def solved_point(names: tuple[str, ...], values: tuple[ArrayLike, ...], line: str, delay_model: str) -> BoundaryPoint:
     """`zwidth.boundary_point` of (delta, d) and the numbers of one line, solved anew."""
     delta, d, *numbers = values
     if line == "row":
@@ -35,7 +36,7 @@ def solved_point(names: tuple[str, ...], values: tuple[ArrayLike, ...], line: st
     elif line != "ray":
         numbers, names = [numbers[0], 0.0, 0.0, 1.0], ("alpha", "beta0", "dalpha", "dbeta")
     everything = (delta, d, *numbers, _CODES[line])
-    return pointwise(_point_kernel, ("delta", "d", *names, "line"), everything, (delay,), fused=False)
+    return pointwise(_point_kernel, ("delta", "d", *names, "line"), everything, (delay_model,), fused=False)
 
 
 class _Line(NamedTuple):
@@ -46,34 +47,34 @@ class _Line(NamedTuple):
     dalpha: Array
     dbeta: Array
 
-    def offset(self, wall: BoundaryCurve) -> Array:
+    def offset(self, wall: Wall) -> Array:
         """Zero where a wall lies on the line, of opposite sign on its two sides."""
         return self.dalpha * (wall.beta - self.beta) - self.dbeta * (wall.alpha - self.alpha)
 
-    def distance(self, wall: BoundaryCurve) -> Array:
+    def distance(self, wall: Wall) -> Array:
         """How far along the line a wall on it lies, in lengths of the direction."""
         along = (wall.alpha - self.alpha) * self.dalpha + (wall.beta - self.beta) * self.dbeta
         return along / (self.dalpha**2 + self.dbeta**2)
 
 
 def _point_kernel(*arguments: Any) -> BoundaryPoint:
-    *inputs, code, delay = arguments
+    *inputs, code, delay_model = arguments
     given = line_status(*inputs)
     ok = given == int(Status.OK)
     delta, d, *direction = (jnp.where(ok, value, 1.0) for value in inputs)
-    line, loop = _Line(*direction), frequency_loop(delta, d, delay)
+    line, loop = _Line(*direction), frequency_loop(delta, d, delay_model)
     is_row, is_ray, is_upper = (code == _CODES[name] for name in ("row", "ray", "upper"))
-    ridge = jax.lax.stop_gradient(ridge_kernel(delta, d, delay))
-    end = lobe_end(loop, d, delay)
+    ridge = jax.lax.stop_gradient(ridge_kernel(delta, d, delay_model))
+    end = lobe_end(loop, d, delay_model)
     # A ray upwards leaves behind the end of its origin's row, one downwards before it.
     row = _Line(line.alpha, line.beta, jnp.ones_like(d), jnp.zeros_like(d))
-    row_omega, on_row = _crossing(row, jnp.zeros_like(end), end, loop, delay)
+    row_omega, on_row = _crossing(row, jnp.zeros_like(end), end, loop, delay_model)
     row_omega = jnp.where(on_row, row_omega, end)
     split = jnp.where(is_ray, row_omega, ridge.omega)
     beyond = is_upper | (is_ray & (line.dbeta >= 0))
     low, high = jnp.where(beyond, split, 0.0), jnp.where(beyond | is_row, end, split)
-    start, on_lobe = _crossing(line, low, high, loop, delay)
-    omega, distance, converged = _polish(line, start, loop, delay)
+    start, on_lobe = _crossing(line, low, high, loop, delay_model)
+    omega, distance, converged = _polish(line, start, loop, delay_model)
     ahead = on_lobe & ((distance > 0) | ~(is_row | is_ray))
     at_one, at_minus_one = _real_pole_crossings(line, loop, is_ray, is_row | is_ray)
     real = jnp.where(code == _CODES["lower"], jnp.inf, jnp.minimum(at_one, at_minus_one))
@@ -83,8 +84,8 @@ def _point_kernel(*arguments: Any) -> BoundaryPoint:
     # A stable wall before the point, on the same line.
     begins = line.alpha + jnp.where(is_row, 0.5 * distance, 0.0) * line.dalpha
     starts = stable_kernel(begins, line.beta, delta, d)
-    if delay != "held":
-        inside = on_row & (begins > 0) & (begins < frequency_boundary(row_omega, loop, delay).alpha)
+    if delay_model != "held":
+        inside = on_row & (begins > 0) & (begins < frequency_boundary(row_omega, loop, delay_model).alpha)
         starts = jnp.where(d == 0, starts, inside)
     on_column = (line.alpha > 0) & (line.alpha < ridge.alpha)
     exists = (ahead | is_real) & jnp.where(is_row | is_ray, starts, on_column)
@@ -100,9 +101,11 @@ def _point_kernel(*arguments: Any) -> BoundaryPoint:
     )
 
 
-def _crossing(line: _Line, low: Array, high: Array, loop: FrequencyLoop, delay: str) -> tuple[Array, Array]:
+def _crossing(line: _Line, low: Array, high: Array, loop: FrequencyLoop, delay_model: str) -> tuple[Array, Array]:
     """Where the lobe crosses a line between two frequencies, and whether it does."""
-    return bisect(lambda omega, line, loop: line.offset(frequency_boundary(omega, loop, delay)), low, high, line, loop)
+    return bisect(
+        lambda omega, line, loop: line.offset(frequency_boundary(omega, loop, delay_model)), low, high, line, loop
+    )
 
 
 def _real_pole_crossings(line: _Line, loop: FrequencyLoop, is_ray: Array, forward: Array) -> tuple[Array, Array]:
@@ -119,9 +122,9 @@ def _real_pole_crossings(line: _Line, loop: FrequencyLoop, is_ray: Array, forwar
     )
 
 
-def _polish(line: _Line, start: Array, loop: FrequencyLoop, delay: str) -> tuple[Array, Array, Array]:
+def _polish(line: _Line, start: Array, loop: FrequencyLoop, delay_model: str) -> tuple[Array, Array, Array]:
     """Solve P = 0 for the frequency and the distance along the line; whether that ended where it started."""
-    distance = jax.lax.stop_gradient(line.distance(frequency_boundary(start, loop, delay)))
+    distance = jax.lax.stop_gradient(line.distance(frequency_boundary(start, loop, delay_model)))
     scale = jnp.where(distance == 0, 1.0, jnp.abs(distance))
 
     def residual(unknowns: Array, args: tuple[_Line, FrequencyLoop]) -> Array:
@@ -140,7 +143,7 @@ def _polish(line: _Line, start: Array, loop: FrequencyLoop, delay: str) -> tuple
     )
     omega, distance = solution.value[1], solution.value[0] * scale
     # Of a very soft wall the frequency is below what a bracket resolves.
-    wall = frequency_boundary(omega, loop, delay)
+    wall = frequency_boundary(omega, loop, delay_model)
     missed = jnp.abs(line.offset(wall)) / jnp.hypot(line.dalpha, line.dbeta)
     near = float(jnp.finfo(start.dtype).eps) ** 0.5
     hit = missed <= 0.1 * near * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 
 from zwidth._types import Array
 from zwidth.loop import FrequencyLoop, frequency_boundary
-from zwidth.stability.ridge_newton import corner, curve_of
+from zwidth.stability.ridge_newton import corner, expand_curve
 
 # Each step halves the bracket: 52 of them leave one unit in the last place of a float64.
 _STEPS = 52
@@ -48,8 +48,10 @@ def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: Ar
     return jax.lax.stop_gradient(root), state.sign != 0
 
 
-def lobe_end(loop: FrequencyLoop, d: Array, delay: str) -> Array:
+def lobe_end(loop: FrequencyLoop, d: Array, delay_model: str) -> Array:
     """The frequency at which the boundary curve first returns to alpha = 0, pi where it reaches the corner before."""
     limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
-    end, found = bisect(lambda omega, loop: frequency_boundary(omega, loop, delay).alpha, 1e-6 * limit, limit, loop)
-    return jnp.where(found & ~corner(curve_of(loop.plant), loop.lag).reached, end, jnp.pi)
+    end, found = bisect(
+        lambda omega, loop: frequency_boundary(omega, loop, delay_model).alpha, 1e-6 * limit, limit, loop
+    )
+    return jnp.where(found & ~corner(expand_curve(loop.plant), loop.lag).reached, end, jnp.pi)

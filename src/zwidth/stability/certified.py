@@ -10,7 +10,7 @@ from zwidth._types import ArrayLike
 from zwidth.domain import wall_status
 from zwidth.errors import InputError
 from zwidth.stability import balls
-from zwidth.stability.certified_filter import OPEN, STABLE, UNSTABLE, filtered
+from zwidth.stability.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
 from zwidth.stability.layout import Points, lay_out
 from zwidth.status import Status
 
@@ -70,19 +70,19 @@ def certified_stable(
         raise InputError(f"max_bits: got {max_bits}, 64 or more is needed")
     laid = lay_out((alpha, beta, delta, d))
     points, shape = laid.points, laid.points.shape
-    code = filtered(points)
+    code = filter_walls(points)
     stable, status, bits = np.asarray(code == STABLE), np.zeros(shape, np.int32), np.zeros(shape, np.int32)
     rest = np.flatnonzero(code >= OPEN)
     if rest.size:
         # A single index, because a point without axes has no other.
         flat = [np.broadcast_to(array, shape).reshape(-1)[rest] for array in points]
-        settled = _settled(Points(*flat), code.reshape(-1)[rest] & 3, max_bits)
+        settled = _settle_points(Points(*flat), code.reshape(-1)[rest] & 3, max_bits)
         for result, values in zip((stable, status, bits), settled, strict=True):
             result.reshape(-1)[rest] = values
     return CertifiedResult(*map(laid.spread, (stable, status, bits)))
 
 
-def _settled(points: Points, verdict: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _settle_points(points: Points, verdict: np.ndarray, max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Decide what the filter left open or marked as special, one axis of points: by signs, then by balls."""
     alpha, beta, delta, _ = points
     bits = np.zeros(alpha.size, np.int32)

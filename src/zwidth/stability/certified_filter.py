@@ -21,14 +21,14 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import BLOCK, FEW, in_blocks, in_strips, stored
+from zwidth.batching import BLOCK, FEW, compile_strips, map_blocks, store_once
 from zwidth.domain import WALL_RANGE, wall_status
 from zwidth.numerics.phi import phi_functions
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.crossover import COSINE, SINE, Lag, first_zero, long_verdict, short_verdict
-from zwidth.stability.devices import DeviceTerms, Kind, device, kind_of
+from zwidth.stability.devices import DeviceTerms, Kind, classify_delays, device
 from zwidth.stability.enclosure import TINY, UNIT, Ball
-from zwidth.stability.layout import Points, picked
+from zwidth.stability.layout import Points, pick_points
 from zwidth.status import Status
 from zwidth.xp import horner, namespace
 
@@ -82,7 +82,7 @@ def enclosed_device(delta: Array, d: Array, kind: Kind) -> DeviceTerms:
     here = device(delta, d, kind, functions)
     if kind.fractional and kind.long:
         # Several loops of the compiler use it.
-        here = stored(here, delta)
+        here = store_once(here, delta)
 
     def within(mid: Array, units: float) -> Ball:
         return Ball(mid, (units * UNIT) * abs(mid) + TINY)
@@ -159,13 +159,13 @@ def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) ->
 
 def each_code(points: Points) -> np.ndarray:
     """The code of every point, point by point."""
-    shape, kind = points.shape, kind_of(points.d)
+    shape, kind = points.shape, classify_delays(points.d)
     if points.size <= FEW:
         # NumPy is several times faster with scalars than with arrays without axes.
         with np.errstate(all="ignore"):
             alpha, beta, delta, d = (array[()] for array in points)
             return np.broadcast_to(wall_codes(alpha, beta, delta, d, kind), shape).copy()
-    code = in_blocks(in_strips(wall_codes, (kind,)), points.columns(), BLOCK).reshape(shape)
+    code = map_blocks(compile_strips(wall_codes, (kind,)), points.columns(), BLOCK).reshape(shape)
     if np.signbit(points.delta).any() or np.signbit(points.d).any():
         code |= np.where((points.delta < 0) | (points.d < 0), SPECIAL, 0).astype(np.uint8)
     return code
@@ -175,7 +175,7 @@ def each_code(points: Points) -> np.ndarray:
 _ASIDE = 1e-9
 
 
-def filtered(points: Points) -> np.ndarray:
+def filter_walls(points: Points) -> np.ndarray:
     """The code of every point, of the broadcast shape.
 
     On every row (beta, delta, d) the stable walls are one interval, 0 < alpha < limit (docs/theory/one-lobe.md): what
@@ -206,7 +206,7 @@ def filtered(points: Points) -> np.ndarray:
         code[~np.broadcast_to(known & usual, points.shape)] = OPEN
     rest = code == OPEN
     if rest.any():
-        code[rest] = each_code(picked(points, rest))
+        code[rest] = each_code(pick_points(points, rest))
     return code
 
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.loop import valid_wall
+from zwidth.domain import valid_wall, void
 from zwidth.plant import held_plant, split_delay, undelayed_plant
 from zwidth.stability.crossover import ARCSINE
 from zwidth.xp import epsilon, horner, namespace
@@ -45,7 +45,7 @@ class Loop(NamedTuple):
     q: Array  # 0 for whole delays
 
 
-def loop_of(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Loop:
+def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Loop:
     """The factors of P; ``fractional`` says whether any delay has a fraction."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d)
@@ -58,9 +58,8 @@ def loop_of(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool)
     else:
         plant = undelayed_plant(delta)
         h, q = plant.a1, 0.0 * plant.a1
-    spoiled = xp.where(ok, 0.0, np.nan)
-    wall = alpha + spoiled, beta + spoiled, alpha + beta
-    return Loop(*wall, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
+    alpha, beta, s = void(ok, alpha, beta, alpha + beta)
+    return Loop(alpha, beta, s, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
 
 
 def angle(re: Array, im: Array) -> Array:
@@ -76,7 +75,7 @@ def angle(re: Array, im: Array) -> Array:
     return xp.where(im < 0, -value, value)
 
 
-def turn_of(x: Array, y: Array, xp: Any) -> Array:
+def find_turn(x: Array, y: Array, xp: Any) -> Array:
     """The w of ``x = sin^2(w/2)`` and y = 1 - x."""
     if xp is np:
         return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
@@ -156,10 +155,10 @@ def _cubic_zeros(at: _Circle, xp: Any) -> list[Array]:
     low, high = (xp.where(xp.isfinite(x), xp.clip(x, 0.0, 1.0), 0.0) for x in (low, high))
     ends = [0.0 * h0, xp.minimum(low, high), xp.maximum(low, high), 0.0 * h0 + 1.0]
     values = [at.value(x) for x in ends]
-    return [_between(ends[k], ends[k + 1], values[k], values[k + 1], at, xp) for k in range(3)]
+    return [_find_zero_between(ends[k], ends[k + 1], values[k], values[k + 1], at, xp) for k in range(3)]
 
 
-def _between(low: Array, high: Array, first: Array, last: Array, at: _Circle, xp: Any) -> Array:
+def _find_zero_between(low: Array, high: Array, first: Array, last: Array, at: _Circle, xp: Any) -> Array:
     """The zero of a monotone piece of a cubic: each step solves for the parabola that touches it twice."""
     exists = (first < 0) != (last < 0)
     if xp is np and not np.any(exists):
@@ -215,7 +214,7 @@ def _phase(x: Array, at: _Circle, loop: Loop, fractional: bool, xp: Any) -> tupl
     v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
     phase = angle(v_re, v_im)
     phase = xp.where((v_im < 0) & (q_im >= 0), phase + 2.0 * np.pi, phase)
-    w = turn_of(x, y, xp)
+    w = find_turn(x, y, xp)
     theta = loop.turns * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
     if fractional:
         # arg(1 + q/z) = arg(z + q) - w, in [-pi, 0]
@@ -252,7 +251,7 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
     outer, ends_outer = at.first[0] > at.first[1], at.last[0] > at.last[1]
     eps = epsilon(log_r)
     blur = 4.0 * eps * (loop.turns + 8.0)
-    sure = ~(_tied(at.first, blur) | _tied(at.last, blur))
+    sure = ~(_may_cancel(at.first, blur) | _may_cancel(at.last, blur))
     if single:
         x, alone = _only_zero(at, fractional, xp)
         zeros = [xp.where(outer != ends_outer, x, -1.0)]
@@ -286,6 +285,6 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
     return Count(loop.turns + 2.0 - (stop - start + 2.0 * turn), sure, crossings)
 
 
-def _tied(sizes: tuple[Array, Array], blur: Array) -> Array:
+def _may_cancel(sizes: tuple[Array, Array], blur: Array) -> Array:
     """Whether T and B may cancel but for rounding errors where the circle meets the real axis."""
     return namespace(blur).abs(sizes[0] - sizes[1]) <= blur * sizes[1]

@@ -76,8 +76,8 @@ def count_poles(zeros: ArrayLike, poles: ArrayLike, gain: ArrayLike, lag: ArrayL
     if is_traced(*members):
         xp = namespace(*members)
         traced = [xp.asarray(value, dtype=_kind(name)) for name, value in values.items()]
-        return _count(_aligned(traced, xp), xp)
-    columns = _aligned([_checked(name, value) for name, value in values.items()], np)
+        return _count(_align_coefficients(traced, xp), xp)
+    columns = _align_coefficients([_check_coefficients(name, value) for name, value in values.items()], np)
     shape = columns[2].shape
     size = math.prod(shape)
     columns = [column.reshape(size, *column.shape[len(shape) :]) for column in columns]
@@ -103,7 +103,7 @@ def _kind(name: str) -> type:
     return complex if name in ("zeros", "poles") else float
 
 
-def _checked(name: str, value: ArrayLike) -> np.ndarray:
+def _check_coefficients(name: str, value: ArrayLike) -> np.ndarray:
     """Convert one concrete argument, or say what is wrong with it."""
     kind = _kind(name)
     what = "real or complex" if kind is complex else "real"
@@ -137,7 +137,7 @@ def _in_range(name: str, value: Array, xp: Any) -> Array:
     return good
 
 
-def _aligned(arrays: list[Array], xp: Any) -> list[Array]:
+def _align_coefficients(arrays: list[Array], xp: Any) -> list[Array]:
     """Give every argument the common leading shape."""
     heads = [array.shape[:-1] for array in arrays[:2]] + [array.shape for array in arrays[2:]]
     try:
@@ -172,13 +172,13 @@ def _count(columns: list[Array], xp: Any) -> Array:
     # Factors z make the shorter product as long as the other.
     size = max(poles.shape[-1], zeros.shape[-1])
     missing = size - poles.shape[-1], size - zeros.shape[-1]
-    roots = xp.stack([_padded(poles, missing[0], xp), _padded(zeros, missing[1], xp)], axis=-2)
+    roots = xp.stack([_pad_roots(poles, missing[0], xp), _pad_roots(zeros, missing[1], xp)], axis=-2)
     roots = xp.where(good[..., None, None], roots, 0.0)
     turns = lag + (missing[1] - missing[0])
     loop, roots, cut = _loop(roots, gain, turns, radius, xp)
     low, high, leading, proved = _intervals(loop, eps, xp)
     met = xp.isfinite(low)
-    m, clear = _turns_between(loop, low, high, eps, xp)
+    m, clear = _count_turns(loop, low, high, eps, xp)
     b_first, before, after, told = _larger(loop, roots, low, high, leading, m, eps, xp)
     t_alone, b_alone = _alone(loop, eps, xp)
 
@@ -191,7 +191,7 @@ def _count(columns: list[Array], xp: Any) -> Array:
     return xp.where(good & (sure | t_alone | b_alone), total, -1.0).astype(int)
 
 
-def _padded(roots: Array, missing: int, xp: Any) -> Array:
+def _pad_roots(roots: Array, missing: int, xp: Any) -> Array:
     return xp.concatenate([roots, xp.zeros((*roots.shape[:-1], missing), roots.dtype)], axis=-1)
 
 
@@ -317,7 +317,7 @@ def _corrections(loop: _Rational, guess: Array, leading: Array, eps: float, xp: 
     return value * far / scale, noise * far / xp.abs(scale)
 
 
-def _turns_between(loop: _Rational, low: Array, high: Array, eps: float, xp: Any) -> tuple[Array, Array]:
+def _count_turns(loop: _Rational, low: Array, high: Array, eps: float, xp: Any) -> tuple[Array, Array]:
     """m = round((arg T - arg B)/(2 pi)) on every interval, and whether it is one number there."""
     u, v, inside = (value[..., None, :, :] for value in (loop.u, loop.v, loop.inside))
     size = xp.abs(u)

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import stored
+from zwidth.batching import store_once
 from zwidth.domain import WALL_RANGE, within
 from zwidth.stability.devices import ANY, DeviceTerms, Kind, device
 from zwidth.stability.row_limit import long_curve, short_curve
@@ -210,7 +210,7 @@ def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind 
     """Whether each wall is stable, elementwise; False for what is NaN."""
     here = device(delta, d, kind)
     # With a fraction several loops of the compiler use it.
-    return stable_at(alpha, beta, stored(here, delta) if kind.fractional and kind.long else here, kind)
+    return stable_at(alpha, beta, store_once(here, delta) if kind.fractional and kind.long else here, kind)
 
 
 def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: Kind) -> Array:

@@ -20,7 +20,7 @@ from zwidth.batching import tree_map
 from zwidth.numerics.roots import bisect
 from zwidth.plant import Plant
 from zwidth.stability.devices import DeviceTerms, Kind, device
-from zwidth.stability.ridge_newton import solve, start_of
+from zwidth.stability.ridge_newton import guess_start, solve
 from zwidth.stability.row_limit import (
     LONG_FIELDS,
     Angles,
@@ -31,7 +31,7 @@ from zwidth.stability.row_limit import (
     short_curve,
     short_place,
     short_row,
-    turned,
+    turn_angles,
 )
 from zwidth.xp import frozen, horner, namespace, repeat
 
@@ -54,7 +54,7 @@ class Lobe(NamedTuple):
     to_corner: Array  # whether it ends at omega = pi with alpha > 0
 
 
-class Wall(NamedTuple):
+class LobePoint(NamedTuple):
     """A point of the curve, and how it moves with x."""
 
     alpha: Array
@@ -70,27 +70,27 @@ class Peak(NamedTuple):
     alpha: Array
 
 
-def device_of(delta: Array, d: Array, delay: str, kind: Kind) -> DeviceTerms:
+def describe_device(delta: Array, d: Array, delay_model: str, kind: Kind) -> DeviceTerms:
     """The device whose curve is meant. A fractional power is the formula of whole delays at any other number."""
-    if delay == "held":
+    if delay_model == "held":
         return device(delta, d, kind)
     return device(delta, 0.0 * d, Kind(True, False, False))._replace(whole=d)
 
 
-def creeps(delay: str, kind: Kind) -> bool:
+def creeps(delay_model: str, kind: Kind) -> bool:
     """Whether there may be a fractional power of less than one, whose lobe ends within any distance of pi.
 
     No fit holds for it: it is solved by halving.
     """
-    return delay == "fractional_power" and kind.short and kind.fractional
+    return delay_model == "fractional_power" and kind.short and kind.fractional
 
 
-def lobe(delta: Array, d: Array, delay: str, kind: Kind) -> Lobe:
+def lobe(delta: Array, d: Array, delay_model: str, kind: Kind) -> Lobe:
     """The lobe of a device, or of arrays of one shape, from the delays that `Kind` says may occur."""
     xp = namespace(delta, d)
-    here = device_of(delta, d, delay, kind)
-    creeping = creeps(delay, kind)
-    is_short = here.whole < 1 if delay == "held" else here.whole == 0
+    here = describe_device(delta, d, delay_model, kind)
+    creeping = creeps(delay_model, kind)
+    is_short = here.whole < 1 if delay_model == "held" else here.whole == 0
     short, long, ends = None, None, []
     to_corner = here.delta < 0
     if kind.short:
@@ -121,7 +121,7 @@ def _short_end(short: Any) -> tuple[Array, Array]:
     return xp.where(beyond, 1.0, root), beyond
 
 
-def wall(x: Array, lobe: Lobe) -> Wall:
+def wall(x: Array, lobe: Lobe) -> LobePoint:
     """The point of the curve at one place."""
     if lobe.long is None:
         return _short_wall(x, lobe.short)
@@ -131,25 +131,25 @@ def wall(x: Array, lobe: Lobe) -> Wall:
     # Each form gets a place that is harmless where the other one holds.
     low = _short_wall(xp.where(lobe.is_short, x, 0.25), lobe.short)
     high = _long_wall(xp.where(lobe.is_short, xp.minimum(1.0, 1.0 / lobe.long[1]), x), lobe.long)
-    return Wall(*(xp.where(lobe.is_short, mine, other) for mine, other in zip(low, high, strict=True)))
+    return LobePoint(*(xp.where(lobe.is_short, mine, other) for mine, other in zip(low, high, strict=True)))
 
 
-def _short_wall(y: Array, short: Any) -> Wall:
+def _short_wall(y: Array, short: Any) -> LobePoint:
     (u0, u1), size, (a, s, t) = short
     dV, over = size[1] + 2.0 * y * size[2], 1.0 / horner(y, size)
     alpha, b = 4.0 * y * (a + y * (s + y * t)) * over, y * (u0 + y * u1) * over
     d_alpha = (4.0 * (a + y * (2.0 * s + 3.0 * y * t)) - alpha * dV) * over
-    return Wall(alpha, b, d_alpha, (u0 + 2.0 * y * u1 - b * dV) * over)
+    return LobePoint(alpha, b, d_alpha, (u0 + 2.0 * y * u1 - b * dV) * over)
 
 
-def _long_wall(omega: Array, fields: Any) -> Wall:
+def _long_wall(omega: Array, fields: Any) -> LobePoint:
     at = Angles(omega, fields)
-    turn = turned(at, fields[1] + 0.5)
+    turn = turn_angles(at, fields[1] + 0.5)
     total, d_total, scale, d_scale = offset(at, fields)
     over = 1.0 / scale
     alpha, b = 2.0 * at.s * turn.across * over, total * over
     d_alpha = (at.c * turn.across + 2.0 * at.s * turn.d_across - alpha * d_scale) * over
-    return Wall(alpha, b, d_alpha, (d_total - b * d_scale) * over)
+    return LobePoint(alpha, b, d_alpha, (d_total - b * d_scale) * over)
 
 
 def frequency(x: Array, lobe: Lobe) -> Array:
@@ -184,7 +184,7 @@ class RowEnd(NamedTuple):
     alpha: Array  # the stiffest stable one, for held delays what `zwidth.is_stable` compares with
 
 
-def row_end(beta: Array, lobe: Lobe, delay: str, kind: Kind) -> RowEnd:
+def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: Kind) -> RowEnd:
     """The end of a row: the one zero of ``b - beta - delta``."""
     xp = namespace(beta, lobe.d)
     b = beta + lobe.here.delta
@@ -195,7 +195,7 @@ def row_end(beta: Array, lobe: Lobe, delay: str, kind: Kind) -> RowEnd:
     if lobe.long is not None:
         alpha, x = long_row_point(beta, lobe.long)
         top = lobe.long[_TOP]
-        if creeps(delay, kind):
+        if creeps(delay_model, kind):
             x = bisect(lambda x: wall(x, lobe).b < b, _SMALLEST * lobe.end, lobe.end, geometric=True)
             top = wall(lobe.end, lobe).b
         ends.append(RowEnd(x, b < top, b != b, alpha))
@@ -204,17 +204,17 @@ def row_end(beta: Array, lobe: Lobe, delay: str, kind: Kind) -> RowEnd:
         row = RowEnd(*(xp.where(lobe.is_short, mine, other) for mine, other in zip(*ends, strict=True)))
     meets, beyond = (b > 0) & row.meets, (b > 0) & ~row.meets & row.beyond
     x = xp.where(meets, row.x, xp.where(b > 0, lobe.end, 0.0))
-    if delay == "held":
+    if delay_model == "held":
         return RowEnd(x, meets, beyond, row.alpha)
     return RowEnd(x, meets, beyond, xp.where(beyond, on_line(lobe) - 2.0 * beta, wall(x, lobe).alpha))
 
 
-def peak(lobe: Lobe, delay: str, kind: Kind) -> Peak:
+def peak(lobe: Lobe, delay_model: str, kind: Kind) -> Peak:
     """The largest alpha of the lobe: the ridge, which may be the corner."""
     here = lobe.here
     plant = Plant(here.c, here.em, here.a2, here.a1, here.a0, here.gap)
-    start = start_of(here.delta, lobe.d, here.f, kind)
-    ridge = solve(plant, here.whole, start, delay if kind.fractional else "held", kind)
+    start = guess_start(here.delta, lobe.d, here.f, kind)
+    ridge = solve(plant, here.whole, start, delay_model if kind.fractional else "held", kind)
     if lobe.short is None:
         return Peak(ridge.omega, ridge.alpha)
     y = ridge.s * ridge.s

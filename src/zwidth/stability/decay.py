@@ -10,10 +10,10 @@ from zwidth._types import Array, ArrayLike
 from zwidth.batching import broadcast, elementwise, to_caller
 from zwidth.domain import check_scalars
 from zwidth.grouping import NAMES
-from zwidth.numerics.double_double import Complex, Double, chosen, phi_pair, single, two_sum
-from zwidth.stability.circle import count, loop_of
+from zwidth.numerics.double_double import Complex, Double, phi_pair, select, single, two_sum
+from zwidth.stability.circle import count, factor_loop
 from zwidth.stability.crossover import stable_kernel
-from zwidth.stability.devices import kind_of
+from zwidth.stability.devices import classify_delays
 from zwidth.stability.proved import OutermostPoles, outermost_poles, usable
 from zwidth.stability.radius import traced_kernel, window
 from zwidth.status import Status
@@ -98,13 +98,13 @@ def rates(found: OutermostPoles, columns: list[np.ndarray]) -> np.ndarray:
     with np.errstate(all="ignore"):
         for part in _pieces(vague):
             walls = [column[part] for column in columns]
-            new, error = _refined(_Factors.of(*walls), _beyond_one(found.re[part], found.im[part]))
+            new, error = _refine_poles(_Factors.of(*walls), _beyond_one(found.re[part], found.im[part]))
             # A pole at 1 stays there.
             at_one = (walls[0] == 0) & (found.re[part] == 0)
             rate[part] = np.where(at_one, 0.0, np.where(error <= _PROMISED * np.abs(new), new, np.nan))
         for kind in (False, True):
             for part in _pieces(loose & (held == kind)):
-                loop = loop_of(*(column[part] for column in columns), fractional=kind)
+                loop = factor_loop(*(column[part] for column in columns), fractional=kind)
                 # Whether a count proves that no other pole is nearly as large.
                 seen = count(found.re[part] - window(found.re[part], _ACCURACY), loop, kind)
                 alone = seen.sure & (seen.missing == np.where(np.sin(found.im[part]) < _REAL, 1, 2))
@@ -119,7 +119,7 @@ def rates(found: OutermostPoles, columns: list[np.ndarray]) -> np.ndarray:
     near = np.flatnonzero(np.abs(rate) <= _DOUBTFUL)
     walls = [column[near] for column in columns]
     with np.errstate(all="ignore"):
-        stable = np.asarray(stable_kernel(*walls, kind=kind_of(walls[3])))
+        stable = np.asarray(stable_kernel(*walls, kind=classify_delays(walls[3])))
     rate[near[stable != (rate[near] > 0)]] = np.nan
     return rate
 
@@ -142,8 +142,11 @@ def _slowest(rate: Array, re: Array, walls: list[np.ndarray], kind: bool) -> Arr
     # On a circle poles are where both parts of P are equally large, or real.
     close, turn = factors.next_to_one(), 0.0 * re + np.pi
     real = np.where(np.abs(close) * factors.turns < _CLOSE, close, np.expm1(re))
-    starts = real, *(_beyond_one(re, w) for w in (turn, *count(re, loop_of(*walls, fractional=kind), kind).crossings))
-    rivals = [_refined(factors, start) for start in starts]
+    starts = (
+        real,
+        *(_beyond_one(re, w) for w in (turn, *count(re, factor_loop(*walls, fractional=kind), kind).crossings)),
+    )
+    rivals = [_refine_poles(factors, start) for start in starts]
     for new, error in rivals:
         rate = np.where((error <= _PROMISED * np.abs(new)) & ~(new > rate), new, rate)
     for new, error in rivals:
@@ -187,7 +190,7 @@ class _Factors(NamedTuple):
         return np.where(root.imag != 0, 0.5 * (root - linear) / bend, 0.5 * away / np.where(linear < 0, bend, 1.0))
 
 
-def _refined(at: _Factors, zeta: Array) -> tuple[Array, Array]:
+def _refine_poles(at: _Factors, zeta: Array) -> tuple[Array, Array]:
     """``-log |z|`` of the pole next to ``1 + zeta`` and a bound of its error."""
     here, rate, error = Complex(single(zeta.real), single(zeta.imag)), np.full(zeta.shape, np.nan), np.inf
     for _ in range(_STEPS):
@@ -251,4 +254,4 @@ def _plant(delta: Array, f: Array) -> tuple[Double, Double, Double, Double]:
     a1 = t.times(t).times(late.phi1.minus(late.phi2)).plus(overlap).plus(fraction.times(fraction).times(early.phi2))
     held = f != 0
     lead, bend = a2.scaled(2.0).plus(a1), a2
-    return whole.em, whole.phi1, chosen(held, lead, whole.phi2), chosen(held, bend, zero)
+    return whole.em, whole.phi1, select(held, lead, whole.phi2), select(held, bend, zero)

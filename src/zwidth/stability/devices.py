@@ -7,10 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.loop import tilt_at_minus_one, valid_device
+from zwidth.batching import as_float64
+from zwidth.domain import valid_device, void
+from zwidth.loop import tilt_at_minus_one
 from zwidth.numerics import phi
-from zwidth.plant import Functions, discretized, split_delay
-from zwidth.xp import namespace
+from zwidth.plant import Functions, discretize, split_delay
+from zwidth.xp import is_traced
 
 
 class Kind(NamedTuple):
@@ -24,9 +26,13 @@ class Kind(NamedTuple):
 ANY = Kind(True, True, True)
 
 
-def kind_of(d: Any) -> Kind:
-    """The `Kind` of a concrete array of delays; what is no delay counts as short."""
-    d = np.asarray(d)
+def classify_delays(d: Any) -> Kind:
+    """The `Kind` of an array of delays, `ANY` where they are traced; what is no delay counts as short."""
+    if is_traced(d):
+        return ANY
+    if isinstance(d, float | int):
+        return Kind(not d >= 1, d >= 1, d % 1.0 != 0)
+    d = as_float64("d", d)
     long = d >= 1
     return Kind(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
 
@@ -53,13 +59,11 @@ class DeviceTerms(NamedTuple):
 
 def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.phi_functions) -> DeviceTerms:
     """The `DeviceTerms` of one (delta, d), or of arrays of one shape."""
-    xp = namespace(delta, d)
-    ok = valid_device(delta, d)
-    delta, d = xp.where(ok, delta, np.nan), xp.where(ok, d, np.nan)
+    delta, d = void(valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
     at = functions(delta)
     late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
-    plant = discretized(delta, f if kind.fractional else None, functions)
+    plant = discretize(delta, f if kind.fractional else None, functions)
     tilt = tilt_at_minus_one(plant, whole)
     return DeviceTerms(
         *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),

@@ -7,14 +7,14 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import BLOCK, FEW, elementwise, in_blocks, in_strips, is_number, to_caller
+from zwidth.batching import BLOCK, FEW, compile_strips, elementwise, is_number, map_blocks, to_caller
 from zwidth.domain import check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.boundary_map import boundary_map
 from zwidth.stability.crossover import stable_kernel
-from zwidth.stability.devices import ANY, kind_of
+from zwidth.stability.devices import classify_delays
 from zwidth.stability.layout import Points, lay_out
 from zwidth.stability.poles import unstable_poles
 from zwidth.status import Method, Status
@@ -52,7 +52,7 @@ def is_stable(
         d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast; axes along which an argument
             does not vary cost nothing: for a map pass alpha of shape (1, N) and beta of shape (M, 1).
         method: "crossover" asks for the phase where the loop gain is one, in closed form; "companion" computes all
-            poles; "certified" never guesses (`zwidth.stability_of` names the points it leaves open). "auto" is
+            poles; "certified" never guesses (`zwidth.decide_stability` names the points it leaves open). "auto" is
             "crossover", which on a map of one device compares alpha with the end of its row, the same closed form.
         delay: only "held" has poles.
 
@@ -82,12 +82,12 @@ def is_stable(
     if is_traced(*values):
         return _traced(values, method)
     if method in ("auto", "crossover") and all(map(is_number, values)):
-        return elementwise(stable_kernel, NAMES, values, (kind_of(d),))
+        return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
     laid = lay_out(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
 
 
-def stability_of(
+def decide_stability(
     alpha: ArrayLike,
     beta: ArrayLike,
     delta: ArrayLike,
@@ -99,12 +99,7 @@ def stability_of(
     """Tell which walls are stable, and for each point how that was decided.
 
     Args:
-        alpha: normalized stiffness K T^2/m.
-        beta: normalized virtual damping B T/m.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0. All four broadcast.
-        method: as for `zwidth.is_stable`.
-        delay: only "held" has poles.
+        alpha, beta, delta, d, method, delay: as for `zwidth.is_stable`.
 
     Returns:
         Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
@@ -112,21 +107,20 @@ def stability_of(
         False there); ``method``, the `Method` that decided. Arrays may be read-only.
 
     Raises:
-        InputError: an argument is no real number or traced, a scalar is out of range, shapes do not broadcast, or a
-            name is unknown.
+        InputError: as for `zwidth.is_stable`, and for traced values.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
 
     Example:
         >>> import zwidth
-        >>> zwidth.stability_of([0.1, float("nan")], 0.4, 0.1, 1).status
+        >>> zwidth.decide_stability([0.1, float("nan")], 0.4, 0.1, 1).status
         array([0, 1], dtype=int32)
     """
     values = (alpha, beta, delta, d)
     _check(method, delay, values)
     if is_traced(*values):
-        raise InputError("stability_of: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+        raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
     laid = lay_out(values)
     stable, used, status = _decide(laid.points, method)
     ranged = wall_status(*laid.points)
@@ -135,8 +129,12 @@ def stability_of(
     return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
 
 
-def _check(method: str, delay: str, values: tuple[ArrayLike, ...]) -> None:
-    check_has_poles(delay)
+# Deprecated: the name goes with version 0.2.
+stability_of = decide_stability
+
+
+def _check(method: str, delay_model: str, values: tuple[ArrayLike, ...]) -> None:
+    check_has_poles(delay_model)
     check_choice("method", method, STABILITY_METHODS)
     check_scalars(**dict(zip(NAMES, values, strict=True)))
 
@@ -150,7 +148,7 @@ def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
     if method == "companion":
         return unstable_poles(*values) == 0
     d = values[3]
-    return elementwise(stable_kernel, NAMES, values, (ANY if is_traced(d) else kind_of(d),))
+    return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
@@ -169,8 +167,8 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
 def _by_crossover(points: Points) -> np.ndarray:
     if points.is_dense:
         return boundary_map(points)
-    shape, kind = points.shape, kind_of(points.d)
+    shape, kind = points.shape, classify_delays(points.d)
     if points.size <= FEW:
         with np.errstate(all="ignore"):
             return np.broadcast_to(stable_kernel(*points, kind), shape)
-    return in_blocks(in_strips(stable_kernel, (kind,)), points.columns(), BLOCK).reshape(shape)
+    return map_blocks(compile_strips(stable_kernel, (kind,)), points.columns(), BLOCK).reshape(shape)

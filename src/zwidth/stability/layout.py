@@ -94,7 +94,7 @@ def _repeats(array: np.ndarray, axis: int) -> bool:
     return bool(np.array_equal(first, array.take([-1], axis=axis)) and (array == first).all())
 
 
-def picked(points: Points, mask: np.ndarray) -> Points:
+def pick_points(points: Points, mask: np.ndarray) -> Points:
     """The points of a mask of the broadcast shape, listed; what is the same for all of them stays a single value."""
     shape = points.shape
     return Points(*(a.reshape(1) if a.size == 1 and shape else np.broadcast_to(a, shape)[mask] for a in points))

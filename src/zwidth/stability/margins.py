@@ -11,14 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.domain import check_scalars
-from zwidth.loop import poison, valid_wall
-from zwidth.numerics.roots import false_position, followed
+from zwidth.domain import check_scalars, poison, valid_wall
+from zwidth.numerics.roots import false_position, follow_root
 from zwidth.plant import split_delay
 from zwidth.stability.crossover import gain_crossover, stable_at
 from zwidth.stability.devices import ANY, DeviceTerms, device
 from zwidth.stability.modulus import modulus
-from zwidth.stability.open_loop import angle_of, by_samples, size_and_phase
+from zwidth.stability.open_loop import by_samples, find_angle, size_and_phase
 from zwidth.xp import along, epsilon, frozen, namespace
 
 _NAMES = ("alpha", "beta", "delta", "d")
@@ -104,7 +103,7 @@ def margins_kernel(
     here = device(delta, d)
     crossover = gain_crossover(alpha, beta, here)
     crosses = crossover.exists
-    w = xp.where(crosses, angle_of(crossover), 1.0)
+    w = xp.where(crosses, find_angle(crossover), 1.0)
     decisive = crosses & (beta > -delta)
     phase = xp.where(decisive, size_and_phase(w, alpha, beta, here)[1], xp.nan)
     stable = stable_at(alpha, beta, here, ANY)
@@ -158,7 +157,7 @@ def _gain_margin(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> tuple
     found = false_position(
         lambda x: frozen(phase(x), xp), bracket[0], bracket[1], bracket[2], -1.0 + 0.0 * low, _STEPS, 1e-15
     )
-    w = xp.minimum(xp.exp(followed(phase, found, _falling)), np.pi)
+    w = xp.minimum(xp.exp(follow_root(phase, found, _falling)), np.pi)
     first = 1.0 / size_and_phase(w, alpha, beta, here)[0]
     line = xp.abs(here.gap * (alpha + 2.0 * beta))
     last = xp.where(line > 0, 2.0 * (1.0 + here.c) / xp.where(line > 0, line, 1.0), xp.inf)
@@ -181,7 +180,7 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     whole, fraction = split_delay(d)
     nodes = along(np.minimum(np.arange(_FRACTIONS + 1) / _FRACTIONS, 1.0 - epsilon(d)), xp.asarray(d))
     grid = nodes + 0.0 * d[..., None]
-    phases, crossings, exist = _undelayed(grid, *(value[..., None] + 0.0 * grid for value in still))
+    phases, crossings, exist = _bound_undelayed(grid, *(value[..., None] + 0.0 * grid for value in still))
     periods = xp.where(exist, phases / crossings, -xp.inf)
     # One period on, f = 0 again, but for n: exactly so, whatever the rounding.
     periods = xp.concatenate([periods[..., :-1], periods[..., :1] - 1.0], axis=-1)
@@ -203,20 +202,20 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
     at_low = xp.where(here_first, frozen(phase, xp), at_low)[()]
 
     def excess(f: Array, *wall: Array) -> Array:
-        phase, w, exists = _undelayed(f, *wall)
+        phase, w, exists = _bound_undelayed(f, *wall)
         return xp.where(exists, phase - there * w, _NO_CROSSOVER)
 
     high, at_high = sample(grid, place), xp.minimum(sample(excess_of, place), 0.0)
     # The delay is known to a rounding error of the whole of it.
     width = 4e-16 * (1.0 + there)
     f = false_position(lambda f: excess(f, *still), low, high, at_low, at_high, _STEPS, width)
-    return there + followed(lambda f: excess(f, *wall), f, _falling) - d
+    return there + follow_root(lambda f: excess(f, *wall), f, _falling) - d
 
 
-def _undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
+def _bound_undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
     """Below one period of delay: the phase at the crossover, the crossover, and whether there is one."""
     xp = namespace(f, alpha)
     here = device(delta, f)
     crossover = gain_crossover(alpha, beta, here)
-    w = xp.where(crossover.exists, angle_of(crossover), 1.0)
+    w = xp.where(crossover.exists, find_angle(crossover), 1.0)
     return size_and_phase(w, alpha, beta, here)[1], w, crossover.exists

@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.domain import check_scalars
-from zwidth.loop import poison, valid_wall
+from zwidth.domain import check_scalars, poison, valid_wall
 from zwidth.stability.crossover import gain_crossover
 from zwidth.stability.devices import DeviceTerms, device
-from zwidth.stability.open_loop import angle_of, by_samples, size_and_phase
+from zwidth.stability.open_loop import by_samples, find_angle, size_and_phase
 from zwidth.xp import along, frozen, namespace, repeat
 
 # Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
@@ -78,12 +77,12 @@ def modulus(alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]
     w = frozen(_lowest(*frozen((alpha, beta, here), xp), xp), xp)
     square = squared_distance(w, alpha, beta, here)
     if xp is not np:
-        gained, moved = _moved(w, alpha, beta, here)
+        gained, moved = _shift_frequency(w, alpha, beta, here)
         square, w = square - gained, w - moved
     return xp.sqrt(xp.maximum(square, 0.0)), w
 
 
-def _moved(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
+def _shift_frequency(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:
     """One Newton step more, 0 but for its derivatives: by how much it lowers the square, and by how much it moves w."""
     import jax
     import jax.numpy as jnp
@@ -107,7 +106,7 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
     def at(level: Array) -> Array:
         """Where |L| has a value; pi if it is larger everywhere."""
         found = gain_crossover(alpha / level, beta / level, here)
-        return xp.where(found.exists, angle_of(found), np.pi)
+        return xp.where(found.exists, find_angle(found), np.pi)
 
     def distance(w: Array) -> Array:
         fields = DeviceTerms(*(field[..., None] for field in here))
@@ -130,10 +129,10 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
     beyond = center[..., None] * (high / center)[..., None] ** part
     grid = xp.sort(xp.concatenate([turns, decades, beyond], axis=-1), axis=-1)
     values = distance(grid)
-    return _refined(grid, values, distance, xp)
+    return _refine_minimum(grid, values, distance, xp)
 
 
-def _refined(grid: Array, values: Array, distance: Any, xp: Any) -> Array:
+def _refine_minimum(grid: Array, values: Array, distance: Any, xp: Any) -> Array:
     """The lowest of the lowest dips, each zoomed in on."""
     edge = xp.full_like(values[..., :1], np.inf)
     before, after = xp.concatenate([edge, values[..., :-1]], -1), xp.concatenate([values[..., 1:], edge], -1)

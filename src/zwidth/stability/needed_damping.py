@@ -70,7 +70,7 @@ class Turns(NamedTuple):
     reaches_pi: Array  # n = 0 only
 
 
-def delay_of(d: Array) -> Delay:
+def describe_delay(d: Array) -> Delay:
     """The `Delay` of d >= 0."""
     n, f = split_delay(d)
     return Delay(f, n + 1.0, 4.0 * f * (1.0 - f))
@@ -202,7 +202,7 @@ def needed_damping(alpha: Array, beta: Array, d: Array, kind: Kind = ANY) -> Arr
     xp = namespace(alpha, beta, d)
     if not (kind.long or kind.fractional):
         return 0.5 * alpha + xp.abs(beta)
-    delay = delay_of(d)
+    delay = describe_delay(d)
     scale = frozen(alpha + xp.abs(beta), xp)
     scale = xp.where(scale > 0, scale, 1.0)
     a, beta = 0.5 * alpha / scale, beta / scale
@@ -234,7 +234,7 @@ class Directions(NamedTuple):
 def directions(d: Array) -> Directions:
     """The `Directions` of a delay; ``last`` is infinite from f = 2/9 on."""
     xp = namespace(d)
-    delay = delay_of(d)
+    delay = describe_delay(d)
     f, k, _ = delay
     half, zero = 0.5 + 0.0 * d, 0.0 * d
     # E at w = 0 grows with beta. Without the pull of a fraction it vanishes at the first guess.

@@ -17,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import broadcast, elementwise, in_blocks, to_caller, tree_map
+from zwidth.batching import broadcast, elementwise, map_blocks, to_caller, tree_map
 from zwidth.stability.crossover import Crossover
 from zwidth.stability.devices import DeviceTerms
 from zwidth.xp import is_traced, namespace
 
 
-def angle_of(crossover: Crossover) -> Array:
+def find_angle(crossover: Crossover) -> Array:
     """w of u and 2 - u, from the smaller of them."""
     xp = namespace(crossover.u)
     near = crossover.u <= 1.0
@@ -67,5 +67,5 @@ def by_samples(kernel: Callable[..., Any], names: tuple[str, ...], values: tuple
         with np.errstate(all="ignore"):
             return kernel(*columns)
 
-    flat = in_blocks(quietly, [array.reshape(-1) for array in arrays], _BLOCK)
+    flat = map_blocks(quietly, [array.reshape(-1) for array in arrays], _BLOCK)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)

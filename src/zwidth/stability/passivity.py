@@ -21,12 +21,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import FEW, as_float64, elementwise, in_blocks, to_caller
-from zwidth.domain import LONGEST_DELAY, check_scalars
+from zwidth.batching import FEW, as_float64, elementwise, map_blocks, to_caller
+from zwidth.domain import LONGEST_DELAY, check_scalars, poison, valid_wall
 from zwidth.errors import InputError
 from zwidth.grouping import NAMES
-from zwidth.loop import poison, valid_wall
-from zwidth.stability.devices import ANY, Kind, kind_of
+from zwidth.stability.devices import ANY, Kind, classify_delays
 from zwidth.stability.layout import lay_out, split
 from zwidth.stability.needed_damping import directions, larger_root, needed_damping
 from zwidth.xp import horner, is_traced, namespace
@@ -44,10 +43,10 @@ def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind
     ok = valid_wall(alpha, beta, delta, d)
     stiff, damper, delay = xp.where(ok, xp.maximum(alpha, 0.0), 0.0), xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
     margin = delta - needed_damping(stiff, damper, delay, kind)
-    return _limited(margin, alpha) + poison(ok, alpha, beta, delta, d)
+    return _limit_margin(margin, alpha) + poison(ok, alpha, beta, delta, d)
 
 
-def _limited(margin: Array, alpha: Array) -> Array:
+def _limit_margin(margin: Array, alpha: Array) -> Array:
     """A spring of negative stiffness gives unbounded energy, which the frequency condition does not see."""
     xp = namespace(margin, alpha)
     return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
@@ -84,7 +83,7 @@ def table(d: float) -> PassiveTable:
     alpha = 1.0 - place
     beta = turn.first * alpha + place * width
     with np.errstate(all="ignore"):
-        needed = needed_damping(alpha, beta, np.full(_TERMS, d), kind_of(d))
+        needed = needed_damping(alpha, beta, np.full(_TERMS, d), classify_delays(d))
     # place width + alpha width is the width.
     terms = cosines @ needed * (2.0 / (_TERMS * width))
     terms[0] *= 0.5
@@ -108,7 +107,7 @@ def _map_kernel(alpha: Array, beta: Array, delta: Array, known: PassiveTable) ->
     zero, _ = larger_root(at_zero * stiff - beta, f * (1.0 - f) * stiff * stiff, xp)
     pi = (1.0 - f) * (beta + 0.5 * stiff)
     needed = xp.where(beyond > 0, xp.where(place < limit, inside, pi), zero)
-    return xp.where(ok, _limited(delta - needed, alpha), xp.nan)
+    return xp.where(ok, _limit_margin(delta - needed, alpha), xp.nan)
 
 
 @cache
@@ -138,7 +137,7 @@ def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
             continue
         columns = np.broadcast_arrays(*arrays)
         known = table(float(delay))
-        flat = in_blocks(
+        flat = map_blocks(
             lambda *part, known=known: _compiled_map()(*part, known), [c.reshape(-1) for c in columns], _MAP_BLOCK
         )
         out[place] = flat.reshape(columns[0].shape)
@@ -183,7 +182,7 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         if found is not None:
             return found
     delay = as_float64("d", d)
-    kind = kind_of(delay)
+    kind = classify_delays(delay)
     # Compiled, one text serves every delay.
     return elementwise(_margin_kernel, NAMES, values, (kind if kind == _NO_DELAY or delay.size <= FEW else ANY,))
 
@@ -236,7 +235,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
 
     def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         alpha, beta = unit * np.cos(angles), np.sin(angles)
-        needed = needed_damping(alpha, beta, np.full(angles.shape, float(delay)), kind_of(delay))
+        needed = needed_damping(alpha, beta, np.full(angles.shape, float(delay)), classify_delays(delay))
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi

@@ -160,10 +160,10 @@ def halley_step(re: Array, im: Array, loop: Loop, fractional: bool) -> tuple[Arr
     by = by * bent.conjugate() * (-1.0 / _square(bent))
     size = xp.sqrt(_square(by)) * (loop.turns + 1.0)
     shorter = _LONGEST / xp.maximum(size, _LONGEST)
-    return moved(re, im, by.real * shorter, by.imag * shorter)
+    return move_pole(re, im, by.real * shorter, by.imag * shorter)
 
 
-def moved(re: Array, im: Array, by_re: Array, by_im: Array) -> tuple[Array, Array]:
+def move_pole(re: Array, im: Array, by_re: Array, by_im: Array) -> tuple[Array, Array]:
     """The next place in the upper half plane: past the real axis the conjugate is meant."""
     xp = namespace(re)
     im = xp.abs(im + by_im)

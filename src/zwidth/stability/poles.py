@@ -10,18 +10,18 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 import numpy as np
 
 from zwidth._types import Array, ArrayLike
-from zwidth.batching import as_float64, in_blocks
+from zwidth.batching import as_float64, map_blocks
 from zwidth.domain import LONGEST_DELAY, check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
-from zwidth.grouping import NAMES, Degree, by_degree, degree_of, few_poles
+from zwidth.grouping import NAMES, Degree, few_poles, find_degree, map_by_degree
 from zwidth.loop import check_has_poles, coefficients
 from zwidth.stability.aberth import (
     aberth_kernel,
     discs,
     evaluate,
-    in_range,
     join,
     product_form,
+    replace_invalid,
     rounding,
     split,
     with_zero,
@@ -70,11 +70,11 @@ def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degre
     matrices = _matrices(alpha, beta, delta, d, degree, spring)
     xp = namespace(matrices)
     z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
-    return _polished(z, alpha, beta, delta, d, degree, spring)
+    return _polish_poles(z, alpha, beta, delta, d, degree, spring)
 
 
 def _matrices(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
-    monic = coefficients(*in_range(alpha, beta, delta, d, degree)[0], degree)
+    monic = coefficients(*replace_invalid(alpha, beta, delta, d, degree)[0], degree)
     return companion(monic[..., :-1] if spring else monic)
 
 
@@ -88,10 +88,10 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
         return np.concatenate([_eigenvalues(half) for half in np.array_split(matrices, 2)])
 
 
-def _polished(z: Array, alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
+def _polish_poles(z: Array, alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
     """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
-    walls, spoiled = in_range(alpha, beta, delta, d, degree)
+    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
     form = product_form(*walls, degree, spring)
 
     def step(z: Array) -> Array:
@@ -132,7 +132,7 @@ def check_degree(d: ArrayLike) -> None:
         return
     delays = as_float64("d", d)
     longest = float(np.max(delays, where=delays <= LONGEST_DELAY, initial=0.0))
-    poles = degree_of(longest).poles
+    poles = find_degree(longest).poles
     if poles > MOST_POLES:
         raise InputError(
             f"d: got {longest:g}; its {poles} poles would take about {8e-6 * poles**2:.0f} MB and "
@@ -141,8 +141,8 @@ def check_degree(d: ArrayLike) -> None:
         )
 
 
-def _check(values: tuple[ArrayLike, ...], delay: str = "held", method: str = "companion") -> None:
-    check_has_poles(delay)
+def _check(values: tuple[ArrayLike, ...], delay_model: str = "held", method: str = "companion") -> None:
+    check_has_poles(delay_model)
     check_choice("method", method, get_args(PoleMethod))
     check_scalars(**dict(zip(NAMES, values, strict=True)))
     check_degree(values[3])
@@ -153,8 +153,8 @@ def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ...]) -> 
     _check(values)
     static = (is_spring(values[1]),)
     if is_traced(*values):
-        return by_degree(_inside_jax(kernel), values, static=(*static, pole_kernel))
-    return by_degree(_by_companion, values, static=(*static, kernel), few=lambda degree: sys.maxsize)
+        return map_by_degree(_inside_jax(kernel), values, static=(*static, pole_kernel))
+    return map_by_degree(_by_companion, values, static=(*static, kernel), few=lambda degree: sys.maxsize)
 
 
 @cache
@@ -181,17 +181,17 @@ def _by_companion(*arguments: Any) -> Any:
         with np.errstate(all="ignore"):
             return kernel(*walls, degree, spring, find)
 
-    return block(*columns) if few else in_blocks(block, columns, _block(_MATRICES // degree.poles**2))
+    return block(*columns) if few else map_blocks(block, columns, _block(_MATRICES // degree.poles**2))
 
 
 def _compiled_around_lapack(*arguments: Any) -> np.ndarray:
     *walls, degree, spring = arguments
-    before, after = _compiled(_matrices, degree, spring), _compiled(_polished, degree, spring)
+    before, after = _compile_by_degree(_matrices, degree, spring), _compile_by_degree(_polish_poles, degree, spring)
     return np.asarray(after(_eigenvalues(np.asarray(before(*walls))), *walls))
 
 
 @cache
-def _compiled(kernel: Callable[..., Any], degree: Degree, spring: bool) -> Any:
+def _compile_by_degree(kernel: Callable[..., Any], degree: Degree, spring: bool) -> Any:
     import jax
 
     return jax.jit(lambda *arrays: kernel(*arrays, degree, spring), compiler_options=_WIDE)
@@ -241,10 +241,10 @@ def poles(
         TracedDelayError: d is traced.
 
     Numerics:
-        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k); `poles_of` has
-        bounds. Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is 0; then Newton steps
-        on the factored polynomial. Aberth's iteration works on that polynomial too, O(degree^2) a step. Few points need
-        no JAX; many are compiled once for every degree.
+        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k);
+        `enclose_poles` has bounds. Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is
+        0; then Newton steps on the factored polynomial. Aberth's iteration works on that polynomial too, O(degree^2) a
+        step. Few points need no JAX; many are compiled once for every degree.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17); Aberth 1973; Smith 1970.
@@ -265,7 +265,7 @@ def poles(
     return _found(values, method).z
 
 
-def poles_of(
+def enclose_poles(
     alpha: ArrayLike,
     beta: ArrayLike,
     delta: ArrayLike,
@@ -277,12 +277,7 @@ def poles_of(
     """Return the poles of the closed loop with discs in which they lie.
 
     Args:
-        alpha: normalized stiffness K T^2/m.
-        beta: normalized virtual damping B T/m.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0. All four broadcast.
-        method: as for `zwidth.poles`.
-        delay: only "held" has poles.
+        alpha, beta, delta, d, method, delay: as for `zwidth.poles`.
 
     Returns:
         Poles: ``z`` as `zwidth.poles` has it; ``within``, of the same shape: where the status is OK, exactly one pole
@@ -297,20 +292,20 @@ def poles_of(
         Smith 1970, on discs that contain the zeros of a polynomial.
 
     Example:
-        >>> from zwidth.stability.poles import poles_of
-        >>> bool(poles_of(0.5, 0.5, 0.1, 1).within.max() < 1e-12)
+        >>> from zwidth.stability.poles import enclose_poles
+        >>> bool(enclose_poles(0.5, 0.5, 0.1, 1).within.max() < 1e-12)
         True
     """
     values = (alpha, beta, delta, d)
     if is_traced(*values):
-        raise InputError("poles_of: got traced values; inside a JAX transformation use `zwidth.poles`")
+        raise InputError("enclose_poles: got traced values; inside a JAX transformation use `zwidth.poles`")
     _check(values, delay, method)
     return _found(values, method)
 
 
 def _found(values: tuple[ArrayLike, ...], method: str) -> Poles:
     static = (is_spring(values[1]), method)
-    return by_degree(_found_on_host, values, static=static, few=lambda degree: sys.maxsize)
+    return map_by_degree(_found_on_host, values, static=static, few=lambda degree: sys.maxsize)
 
 
 def _found_on_host(*arguments: Any) -> Poles:
@@ -327,7 +322,7 @@ def _found_on_host(*arguments: Any) -> Poles:
             z, within, proved = aberth_kernel(alpha, beta, delta, d, degree, spring)
         else:
             block = _block(_NUMBERS // degree.poles)
-            z, within, proved = in_blocks(_compiled(aberth_kernel, degree, spring), columns, block)
+            z, within, proved = map_blocks(_compile_by_degree(aberth_kernel, degree, spring), columns, block)
         used = np.full_like(of_input, Method.ABERTH)
         left = np.flatnonzero(~proved & (of_input == Status.OK))
         if left.size:
@@ -344,7 +339,7 @@ def _disc_kernel(
     """Poles, their discs, and whether these are disjoint."""
     z = find(alpha, beta, delta, d, degree, spring)
     xp = namespace(z)
-    walls, spoiled = in_range(alpha, beta, delta, d, degree)
+    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
     first = xp.moveaxis(z[..., :-1] if spring else z, -1, 0)
     within, proved, _ = discs(first, product_form(*walls, degree, spring))
     return z, with_zero(xp.moveaxis(within, 0, -1), spring) + spoiled[..., None], proved

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.batching import BLOCK, FEW, in_blocks
+from zwidth.batching import BLOCK, FEW, map_blocks
 from zwidth.domain import wall_status
-from zwidth.stability.circle import loop_of
+from zwidth.stability.circle import factor_loop
 from zwidth.stability.crossover import stable_kernel
-from zwidth.stability.devices import kind_of
+from zwidth.stability.devices import classify_delays
 from zwidth.stability.layout import Points, fold
-from zwidth.stability.radius import WIDE, Found, bounded, certified, quick_kernel, search
-from zwidth.stability.radius_map import SMALLEST_MAP, Map, as_map, followed_poles, nodes_of
+from zwidth.stability.radius import WIDE, Found, certify_pole, has_bound, quick_kernel, search
+from zwidth.stability.radius_map import SMALLEST_MAP, Map, as_map, followed_poles, lay_nodes
 from zwidth.status import Status
 
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
@@ -40,7 +40,7 @@ class OutermostPoles(NamedTuple):
 
 
 @cache
-def _compiled(fractional: bool) -> Any:
+def _compile_quick(fractional: bool) -> Any:
     import jax
 
     return jax.jit(lambda a, b, c, d, accuracy: quick_kernel(a, b, c, d, accuracy, fractional), compiler_options=WIDE)
@@ -76,11 +76,13 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: in
             # Always of one size: other batches may round differently.
             short = max(0, PIECE - size)
             padded = [np.pad(c, (0, short), mode="edge") for c in (*columns, np.full(size, accuracy))]
-            found = [leaf[:size] for leaf in in_blocks(_compiled(kind), padded, PIECE)]
-    return _finished(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind, patient)
+            found = [leaf[:size] for leaf in map_blocks(_compile_quick(kind), padded, PIECE)]
+    return _finish_poles(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind, patient)
 
 
-def _finished(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool, patient: bool) -> OutermostPoles:
+def _finish_poles(
+    columns: list[np.ndarray], found: Found, accuracy: float, kind: bool, patient: bool
+) -> OutermostPoles:
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
     error = np.where(found.proved, accuracy, np.inf)
     left = np.flatnonzero(~found.proved & patient)
@@ -94,20 +96,20 @@ def _patiently(
 ) -> None:
     with np.errstate(all="ignore"):
         alpha, beta, delta, d = (column[left] for column in columns)
-        loop = loop_of(alpha, beta, delta, d, kind)
-        again = certified(found.re[left], found.im[left], accuracy, loop, kind, False)
-        left, loop = _stored(found, error, left, loop, again, again.proved, accuracy)
+        loop = factor_loop(alpha, beta, delta, d, kind)
+        again = certify_pole(found.re[left], found.im[left], accuracy, loop, kind, False)
+        left, loop = _store_poles(found, error, left, loop, again, again.proved, accuracy)
         if left.size:
-            left, loop = _stored(found, error, left, loop, search(accuracy, loop, kind), True, accuracy)
+            left, loop = _store_poles(found, error, left, loop, search(accuracy, loop, kind), True, accuracy)
         for factor in _LADDER[accuracy * _LADDER <= _LARGEST_ERROR]:
             if not left.size:
                 return
-            here = bounded(found.re[left], factor * accuracy, loop, kind)
+            here = has_bound(found.re[left], factor * accuracy, loop, kind)
             error[left[here]], found.doubt[left[here]] = factor * accuracy, np.inf
             left, loop = left[~here], type(loop)(*(part[~here] for part in loop))
 
 
-def _stored(
+def _store_poles(
     found: Found, error: np.ndarray, left: np.ndarray, loop: Any, new: Found, good: Any, accuracy: float
 ) -> tuple[np.ndarray, Any]:
     """Keep new poles where they are good; what is not proved by them is left."""
@@ -135,7 +137,7 @@ def _by_map(area: Map, accuracy: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _map_poles(area: Map, accuracy: float, kind: bool) -> tuple[np.ndarray, np.ndarray]:
     """The same of devices whose delays are all whole, or none; axes as in the map."""
-    nodes = nodes_of(area)
+    nodes = lay_nodes(area)
     start = outermost_poles(nodes, accuracy, patient=False)
     re, proved = followed_poles(area, nodes, start.re, start.im, accuracy, kind)
     error = np.where(proved, accuracy, np.inf)
@@ -145,7 +147,7 @@ def _map_poles(area: Map, accuracy: float, kind: bool) -> tuple[np.ndarray, np.n
     return re, error
 
 
-def radii_of(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def prove_radii(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Radii, relative errors (infinite where none is proved) and status of arrays of one shape, flat."""
     area = as_map(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
     if area is not None and area.good():
@@ -174,7 +176,7 @@ def radius_at(re: np.ndarray, error: np.ndarray, arrays: list[np.ndarray]) -> np
     if near.size:
         alpha, beta, delta, d = (array.reshape(-1)[near] for array in arrays)
         with np.errstate(all="ignore"):
-            stable = np.asarray(stable_kernel(alpha, beta, delta, d, kind_of(d)))
+            stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
         # The largest number below 1 is as near to the truth as 1 itself.
         radius[near] = np.where(stable, np.minimum(radius[near], _BELOW_ONE), np.maximum(radius[near], 1.0))
     return radius

@@ -13,7 +13,7 @@ from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES
 from zwidth.loop import check_has_poles
 from zwidth.stability.poles import radius_and_bound, radius_by_companion
-from zwidth.stability.proved import radii_of
+from zwidth.stability.proved import prove_radii
 from zwidth.stability.radius import traced_kernel
 from zwidth.status import Method, Status
 from zwidth.xp import is_traced
@@ -74,7 +74,7 @@ def spectral_radius(
     Numerics:
         Float64 when called directly, few points without JAX; the ambient precision inside `jit`, where d may be traced.
         Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple one.
-        Error bounds and certificates come from `radius_of`: next to a k-fold pole the radius is known to about
+        Error bounds and certificates come from `bound_radius`: next to a k-fold pole the radius is known to about
         1e-16^(1/k). How slowly a loop decays that is stable by less than 1e-16, `decay_rate` tells.
 
     References:
@@ -93,7 +93,7 @@ def spectral_radius(
     if is_traced(*values):
         return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
     arrays = broadcast(NAMES, values)
-    return to_caller(radii_of(arrays, wanted)[0].reshape(arrays[0].shape), values)
+    return to_caller(prove_radii(arrays, wanted)[0].reshape(arrays[0].shape), values)
 
 
 def _exp(value: Array) -> Array:
@@ -109,7 +109,7 @@ def _has_fraction(d: ArrayLike) -> bool:
     return bool(np.any(delays != np.floor(delays)))
 
 
-def radius_of(
+def bound_radius(
     alpha: ArrayLike,
     beta: ArrayLike,
     delta: ArrayLike,
@@ -122,13 +122,7 @@ def radius_of(
     """Return the spectral radius with an error bound for every point.
 
     Args:
-        alpha: normalized stiffness K T^2/m.
-        beta: normalized virtual damping B T/m.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0. All four broadcast.
-        method: as for `zwidth.spectral_radius`.
-        accuracy: as for `zwidth.spectral_radius`.
-        delay: only "held" has poles.
+        alpha, beta, delta, d, method, accuracy, delay: as for `zwidth.spectral_radius`.
 
     Returns:
         Radius: ``radius``; ``error``, absolute: where ``certified``, all poles were counted inside ``radius + error``,
@@ -140,26 +134,26 @@ def radius_of(
         largest computed pole to a true one, and nothing is certified. ``method``: a `Method`.
 
     Raises:
-        InputError: an argument is no real number or traced, a scalar is out of range, shapes do not broadcast, a name
-            is unknown, or the accuracy is out of reach.
+        InputError: as for `zwidth.spectral_radius`, and for traced values.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
 
     Example:
-        >>> from zwidth.stability.radii import radius_of
-        >>> found = radius_of(0.5, 0.5, 0.1, 1)
+        >>> from zwidth.stability.radii import bound_radius
+        >>> found = bound_radius(0.5, 0.5, 0.1, 1)
         >>> bool(found.certified), f"{found.radius:.6f}"
         (True, '1.207346')
     """
     values = (alpha, beta, delta, d)
     wanted = _check_radius(method, accuracy, delay)
-    _refuse_traced(values, "radius_of", "spectral_radius")
+    if is_traced(*values):
+        raise InputError("bound_radius: got traced values; inside a JAX transformation use `zwidth.spectral_radius`")
     check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
     if method == "companion":
         return Radius(*radius_and_bound(*values))
     arrays = broadcast(NAMES, values)
-    radius, proved, status = radii_of(arrays, wanted)
+    radius, proved, status = prove_radii(arrays, wanted)
     ok = status == Status.OK
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
     error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
@@ -169,8 +163,8 @@ def radius_of(
     return to_caller(Radius(*(leaf.reshape(arrays[0].shape) for leaf in leaves)), values)
 
 
-def _check_radius(method: str, accuracy: float | None, delay: str) -> float:
-    check_has_poles(delay)
+def _check_radius(method: str, accuracy: float | None, delay_model: str) -> float:
+    check_has_poles(delay_model)
     check_choice("method", method, RADIUS_METHODS)
     if accuracy is None:
         return _DEFAULT_ACCURACY
@@ -183,8 +177,3 @@ def _check_radius(method: str, accuracy: float | None, delay: str) -> float:
             f"method={method!r}; 'companion' takes any"
         )
     return float(number)
-
-
-def _refuse_traced(values: tuple[ArrayLike, ...], name: str, instead: str) -> None:
-    if is_traced(*values):
-        raise InputError(f"{name}: got traced values; inside a JAX transformation use `zwidth.{instead}`")

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.loop import poison, valid_wall
-from zwidth.stability.circle import Loop, angle, count, loop_of
-from zwidth.stability.pole_step import halley_step, moved, newton_step
+from zwidth.domain import poison, valid_wall, void
+from zwidth.stability.circle import Loop, angle, count, factor_loop
+from zwidth.stability.pole_step import halley_step, move_pole, newton_step
 from zwidth.xp import epsilon, frozen, namespace, repeat
 
 # Steps on both starts, then on the larger of the two.
@@ -110,13 +110,13 @@ def window(re: Array, tolerance: Any) -> Array:
     return xp.minimum(tolerance, xp.maximum(_COUNTED * epsilon(re), _RELATIVE * xp.abs(re)))
 
 
-def certified(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> Found:
+def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> Found:
     """The pole after one more step, and whether its modulus is proved to be the radius within the tolerance."""
     xp = namespace(re, loop.alpha)
     # A wall without stiffness has a pole at 1.
     at_one = (loop.alpha == 0) & ~(re > tolerance)
     step = newton_step(re, im, loop, fractional)
-    re, im = (xp.where(at_one, 0.0, part) for part in moved(re, im, step.re, step.im))
+    re, im = (xp.where(at_one, 0.0, part) for part in move_pole(re, im, step.re, step.im))
     seen = count(re + window(re, tolerance), loop, fractional, single)
     proved = (at_one | (_AFTER * step.within <= tolerance)) & seen.full & seen.sure
     return Found(re, im, proved, xp.where(at_one, 0.0, step.doubt))
@@ -124,11 +124,11 @@ def certified(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bo
 
 def quick_kernel(alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool) -> Found:
     """The outermost pole of most points."""
-    loop = loop_of(alpha, beta, delta, d, fractional)
-    return certified(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
+    loop = factor_loop(alpha, beta, delta, d, fractional)
+    return certify_pole(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
-def bounded(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:
+def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:
     """Whether two counts prove that the radius is ``e^log_r`` within a relative tolerance."""
     above, below = (count(log_r + by, loop, fractional) for by in (tolerance, -tolerance))
     return above.full & above.sure & ~below.full & below.sure
@@ -151,7 +151,7 @@ def search(tolerance: Array, loop: Loop, fractional: bool) -> Found:
         within = newton_step(radius, place, loop, fractional).within
         im, best = xp.where(within < best, place, im), xp.minimum(within, best)
     at = repeat(_POLISHING, lambda at: halley_step(*at, loop, fractional), (radius, im), xp)
-    found = certified(*at, tolerance, loop, fractional, False)
+    found = certify_pole(*at, tolerance, loop, fractional, False)
     # Next to multiple poles the steps end anywhere; the counts still know the radius.
     return found._replace(re=xp.where(found.proved, found.re, radius))
 
@@ -164,18 +164,18 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     from jax.lax import cond
 
     xp = namespace(alpha, beta, delta, d)
-    still = loop_of(*frozen((alpha, beta, delta, d), xp), fractional)
+    still = factor_loop(*frozen((alpha, beta, delta, d), xp), fractional)
     eps = epsilon(still.c)
-    found = certified(*candidate(still, fractional), eps**0.58, still, fractional, False)
+    found = certify_pole(*candidate(still, fractional), eps**0.58, still, fractional, False)
     late = cond(found.proved.all(), lambda: found, lambda: search(eps**0.58, still, fractional))
     start, im, simple, _ = frozen(Found(*(xp.where(found.proved, *pair) for pair in zip(found, late, strict=True))), xp)
-    loop, re = loop_of(alpha, beta, delta, d, fractional), start
+    loop, re = factor_loop(alpha, beta, delta, d, fractional), start
     # Each step doubles the order to which the derivatives are right: two make first and second ones exact.
     for _ in range(2):
         step = newton_step(re, im, loop, fractional)
         re, im = re + step.re, im + step.im
-    known = simple | bounded(start, eps**0.25, still, fractional)
-    change = (re - start) * xp.where(simple, 1.0, np.nan)
+    known = simple | has_bound(start, eps**0.25, still, fractional)
+    (change,) = void(simple, re - start)
     value = frozen(xp.where(simple, re, start), xp)
     value = xp.where(simple, value + (change - frozen(change, xp)), value + 0.0 * change)
     return xp.where(known, value, np.nan) + poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

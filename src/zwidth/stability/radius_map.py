@@ -15,12 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import concretely, processors
+from zwidth.batching import compute_concretely, processors
 from zwidth.domain import wall_status
-from zwidth.stability.circle import Loop, loop_of
+from zwidth.stability.circle import Loop, factor_loop
 from zwidth.stability.layout import Points
-from zwidth.stability.pole_step import halley_step, moved, value_at
-from zwidth.stability.radius import WIDE, certified
+from zwidth.stability.pole_step import halley_step, move_pole, value_at
+from zwidth.stability.radius import WIDE, certify_pole
 
 # Points along each side of a cell.
 _CELL = 16
@@ -91,10 +91,10 @@ def _cells(fractional: bool) -> Any:
         alpha, beta = alpha[None, :, :], beta[:, None, :]
         loop = Loop(alpha, beta, alpha + beta, *device)
         da, db = alpha - middle, beta - beside
-        start = moved(re + (da * re_alpha + db * re_beta), im, 0.0, da * im_alpha + db * im_beta)
+        start = move_pole(re + (da * re_alpha + db * re_beta), im, 0.0, da * im_alpha + db * im_beta)
         for _ in range(_STEPS):
             start = halley_step(*start, loop, fractional)
-        found = certified(*start, tolerance, loop, fractional, fractional)
+        found = certify_pole(*start, tolerance, loop, fractional, fractional)
         return found.re, found.proved
 
     return jax.jit(kernel, compiler_options=WIDE)
@@ -103,7 +103,7 @@ def _cells(fractional: bool) -> Any:
 def _fields(nodes: list[np.ndarray], re: np.ndarray, im: np.ndarray, fractional: bool) -> np.ndarray:
     """What the cells need of their nodes: the pole, how it moves with alpha and beta, the device."""
     with np.errstate(all="ignore"):
-        loop = loop_of(nodes[0], nodes[1], nodes[2], nodes[3], fractional)
+        loop = factor_loop(nodes[0], nodes[1], nodes[2], nodes[3], fractional)
         at = value_at(re, im, loop, fractional)
         back = at.first.conjugate() * (-1.0 / (at.first.real**2 + at.first.imag**2))
     alpha, beta = at.by_alpha * back, at.by_beta * back
@@ -116,7 +116,7 @@ def _cut(values: np.ndarray) -> np.ndarray:
     return np.concatenate([values, np.full(missing, values[-1])]).reshape(-1, _CELL)
 
 
-def nodes_of(area: Map) -> list[np.ndarray]:
+def lay_nodes(area: Map) -> list[np.ndarray]:
     """alpha, beta, delta and d of the cells' middles: device by device, row by row."""
     across, down = _cut(area.alpha), _cut(area.beta)
     middles = (down[:, _CELL // 2][None, :, None], across[:, _CELL // 2][None, None, :])
@@ -137,7 +137,7 @@ def followed_poles(
     def piece(start: int) -> None:
         index = np.minimum(np.arange(start, start + _LIST), re.size - 1)
         at = np.unravel_index(index, grid)
-        with concretely():
+        with compute_concretely():
             found = run(across[:, at[2]], down[:, at[1]], fields[:, index], tolerance)
             for tile, leaf in zip(tiles, found, strict=True):
                 tile[at[0], at[1], :, at[2], :] = np.asarray(leaf).transpose(2, 0, 1)

@@ -15,7 +15,7 @@ from zwidth.loop import check_delay_model
 from zwidth.stability import curve
 from zwidth.stability.boundary import boundary
 from zwidth.stability.crossover import stable_kernel
-from zwidth.stability.devices import kind_of
+from zwidth.stability.devices import classify_delays
 
 # How far from a vertex, relative, the verdict is asked.
 _AWAY = 1e-6
@@ -55,7 +55,7 @@ def lobe(delta: float, d: float, *, delay: DelayModel = "held", points: int = 40
     check_scalars(delta=float(delta), d=float(d))
     if not isinstance(points, int | np.integer) or isinstance(points, bool) or points < 8:
         raise InputError(f"points: got {points!r}; a whole number of at least 8 is needed")
-    kind = kind_of(d)
+    kind = classify_delays(d)
     with np.errstate(all="ignore"):
         numbers = np.float64(delta), np.float64(d)
         whole = curve.lobe(*numbers, delay, kind)
@@ -124,6 +124,8 @@ def _edge_is_right(alpha: np.ndarray, beta: np.ndarray, delta: float, d: float) 
         dampings.append(middle[1] + size * (beta[inner] - middle[1]))
     columns = np.concatenate(walls), np.concatenate(dampings)
     with np.errstate(all="ignore"):
-        stable = stable_kernel(*columns, np.full_like(columns[0], delta), np.full_like(columns[0], d), kind_of(d))
+        stable = stable_kernel(
+            *columns, np.full_like(columns[0], delta), np.full_like(columns[0], d), classify_delays(d)
+        )
     count = alpha.size - 2
     return bool(np.array_equal(stable, [False, True, True, False] + [True] * count + [False] * count))

@@ -8,13 +8,13 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import as_float64, elementwise, pointwise
-from zwidth.domain import check_scalars, device_status
+from zwidth.batching import elementwise, pointwise
+from zwidth.domain import check_scalars, device_status, void
 from zwidth.errors import check_choice
 from zwidth.loop import check_delay_model
 from zwidth.plant import Plant, split_delay, undelayed_plant
-from zwidth.stability.devices import ANY, Kind, kind_of
-from zwidth.stability.ridge_newton import Ridge, is_undelayed, start_of
+from zwidth.stability.devices import ANY, Kind, classify_delays
+from zwidth.stability.ridge_newton import Ridge, guess_start, is_undelayed
 from zwidth.stability.ridge_slopes import (
     alpha_by_lag,
     alpha_change,
@@ -23,7 +23,7 @@ from zwidth.stability.ridge_slopes import (
     plant_slopes,
 )
 from zwidth.status import Status
-from zwidth.xp import epsilon, is_traced, namespace
+from zwidth.xp import epsilon, namespace
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
@@ -92,19 +92,12 @@ def alpha_max(
         from zwidth.stability.ridge_kkt import kkt_kernel
 
         return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
-    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, occurring(d)), block=_BLOCK)
+    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)
 
 
-def occurring(d: ArrayLike) -> Kind:
-    """Which delays there are among concrete ones; every kind is possible where they are traced."""
-    if isinstance(d, float | int):
-        return Kind(not d >= 1, d >= 1, d % 1.0 != 0)
-    return ANY if is_traced(d) else kind_of(as_float64("d", d))
-
-
-def ridge_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> RidgePoint:
+def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgePoint:
     """`alpha_max`, elementwise."""
-    return _point(*_solved(delta, d, delay, kind)[:2])
+    return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
 
 
 class RidgeSlopes(NamedTuple):
@@ -115,49 +108,46 @@ class RidgeSlopes(NamedTuple):
     by_d: Array
 
 
-def slopes_kernel(delta: Array, d: Array, delay: str, kind: Kind = ANY) -> RidgeSlopes:
+def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgeSlopes:
     """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
-    ridge, status, plant, lag, (delta, f) = _solved(delta, d, delay, kind)
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
     by_delta, by_f = plant_slopes(delta, f)
-    undelayed = is_undelayed(delay, kind)
-    fractional = delay == "fractional_power"
+    undelayed = is_undelayed(delay_model, kind)
+    fractional = delay_model == "fractional_power"
     by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
-    mask = found(ridge)
-    return RidgeSlopes(
-        _point(ridge, status), alpha_change(ridge.s, plant, lag, by_delta, undelayed) * mask, by_d * mask
-    )
+    by_delta = alpha_change(ridge.s, plant, lag, by_delta, undelayed)
+    by_delta, by_d = void(converged(ridge), by_delta, by_d)
+    return RidgeSlopes(_point(ridge, status), by_delta, by_d)
 
 
-def _solved(delta: Array, d: Array, delay: str, kind: Kind) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
+def _solve_ridge(
+    delta: Array, d: Array, delay_model: str, kind: Kind
+) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
     """The ridge, its status, the plant behind a lag, and the plant's damping and fraction."""
-    xp = namespace(delta, d)
     status = device_status(delta, d)
-    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
-    mask = xp.where(status == Status.OK, 1.0, np.nan)
-    delta, d = delta * mask, d * mask
+    delta, d = void(status == Status.OK, delta, d)
     whole, f = split_delay(d)
     if not kind.fractional:
         # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
-        delay = "held"
-    if delay == "fractional_power":
+        delay_model = "held"
+    if delay_model == "fractional_power":
         whole, f = d, 0.0 * d
-    start = start_of(delta, d, f, kind)
-    plant = differentiable_plant(delta, f) if kind.fractional and delay == "held" else undelayed_plant(delta)
-    ridge = differentiable_ridge(plant, whole, start, delay, kind)
+    start = guess_start(delta, d, f, kind)
+    plant = differentiable_plant(delta, f) if kind.fractional and delay_model == "held" else undelayed_plant(delta)
+    ridge = differentiable_ridge(plant, whole, start, delay_model, kind)
     return ridge, status, plant, whole, (delta, f)
 
 
-def found(ridge: Ridge) -> Array:
-    """1, or NaN where the solver did not converge."""
+def converged(ridge: Ridge) -> Array:
+    """Whether the solver has arrived."""
     # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
-    xp = namespace(ridge.s)
-    return xp.where(xp.abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s, 1.0, np.nan)
+    return namespace(ridge.s).abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
 
 
 def _point(ridge: Ridge, status: Array) -> RidgePoint:
     xp = namespace(ridge.alpha)
-    mask = found(ridge)
-    status = xp.where((status == Status.OK) & xp.isnan(mask), int(Status.NOT_CONVERGED), status)
+    arrived = converged(ridge)
+    status = xp.where((status == Status.OK) & ~arrived, int(Status.NOT_CONVERGED), status)
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
-    values = (ridge.alpha * mask, ridge.beta * mask, ridge.omega * mask)
-    return RidgePoint(*values, kind.astype(np.int32), status.astype(np.int32))
+    alpha, beta, omega = void(arrived, ridge.alpha, ridge.beta, ridge.omega)
+    return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))

@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import optimistix
 
 from zwidth._types import Array
-from zwidth.batching import stored
-from zwidth.domain import device_status
+from zwidth.batching import store_once
+from zwidth.domain import device_status, poison
 from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
 from zwidth.stability.bracketing import bisect, lobe_end
 from zwidth.stability.ridge import RidgeKind, RidgePoint
-from zwidth.stability.ridge_newton import corner, curve_of
+from zwidth.stability.ridge_newton import corner, expand_curve
 from zwidth.status import Status
 
 _MAX_STEPS = 16
@@ -68,21 +68,19 @@ def kkt_residual(unknowns: Array, args: KktArguments) -> Array:
     return jnp.stack([value[0], value[1], stationary])
 
 
-def kkt_kernel(delta: Array, d: Array, delay: str) -> RidgePoint:
+def kkt_kernel(delta: Array, d: Array, delay_model: str) -> RidgePoint:
     """`zwidth.alpha_max` of one point by this route."""
     status = device_status(delta, d)
-    # NaN goes through the computation and not around it, so that derivatives are NaN as well.
-    mask = jnp.where(status == Status.OK, 1.0, jnp.nan)
-    # A solver that sees NaN in one lane may spoil or stop the others; NaN is put back behind it.
-    spoiled = 0.0 * (delta * mask + d * mask)
-    delta, d = jnp.where(jnp.isnan(spoiled), 1.0, delta), jnp.where(jnp.isnan(spoiled), 1.0, d)
-    loop = stored(frequency_loop(delta, d, delay), delta)
-    end = corner(curve_of(loop.plant), loop.lag)
-    omega, found = _smooth_omega(loop, d, delay)
-    smooth = frequency_boundary(omega, loop, delay)
+    ok, inputs = status == Status.OK, (delta, d)
+    # A solver that sees NaN in one lane may stop the others.
+    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
+    loop = store_once(frequency_loop(delta, d, delay_model), delta)
+    end = corner(expand_curve(loop.plant), loop.lag)
+    omega, found = _smooth_omega(loop, d, delay_model)
+    smooth = frequency_boundary(omega, loop, delay_model)
     converged = jnp.logical_or(end.is_ridge, found)
-    spoiled = spoiled * jnp.where(converged, 1.0, jnp.nan)
-    status = jnp.where((status == Status.OK) & ~converged, int(Status.NOT_CONVERGED), status)
+    spoiled = poison(ok & converged, *inputs)
+    status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
     return RidgePoint(
         jnp.where(end.is_ridge, end.alpha, smooth.alpha) + spoiled,
         jnp.where(end.is_ridge, end.beta, smooth.beta) + spoiled,
@@ -92,18 +90,18 @@ def kkt_kernel(delta: Array, d: Array, delay: str) -> RidgePoint:
     )
 
 
-def _smooth_omega(loop: FrequencyLoop, d: Array, delay: str) -> tuple[Array, Array]:
+def _smooth_omega(loop: FrequencyLoop, d: Array, delay_model: str) -> tuple[Array, Array]:
     """The frequency of the smooth optimum of one point, differentiable in ``loop``, and whether it was found."""
 
     def slope(omega: Array, loop: FrequencyLoop) -> Array:
-        return jax.grad(lambda w: frequency_boundary(w, loop, delay).alpha)(omega)
+        return jax.grad(lambda w: frequency_boundary(w, loop, delay_model).alpha)(omega)
 
-    end = stored(lobe_end(loop, d, delay), d)
+    end = store_once(lobe_end(loop, d, delay_model), d)
     # Below, the slope is positive; at pi itself it vanishes by symmetry whatever the optimum.
     upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
     start, bracketed = bisect(slope, 1e-6 * end, upper, loop)
-    start = stored(start, d)
-    wall = jax.lax.stop_gradient(stored(frequency_boundary(start, loop, delay), d))
+    start = store_once(start, d)
+    wall = jax.lax.stop_gradient(store_once(frequency_boundary(start, loop, delay_model), d))
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(wall.alpha.dtype).tiny)
     scale_beta = jnp.maximum(jnp.abs(wall.beta), scale_alpha)
     tolerance = float(16 * jnp.finfo(start.dtype).eps)
@@ -115,7 +113,7 @@ def _smooth_omega(loop: FrequencyLoop, d: Array, delay: str) -> tuple[Array, Arr
         max_steps=_MAX_STEPS,
         throw=False,
     )
-    omega = stored(solution.value[2], d)
+    omega = store_once(solution.value[2], d)
     # Rounding can keep Newton from its last tolerance; what counts is that it stayed where the bracket put it.
     close = jnp.abs(omega - start) <= 1e-5 * end
     return omega, bracketed & close

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import stored
+from zwidth.batching import store_once
 from zwidth.plant import Plant
 from zwidth.stability.crossover import ARCSINE
 from zwidth.stability.devices import ANY, Kind
@@ -50,7 +50,7 @@ class Curve(NamedTuple):
     gap: Array  # N(-1)
 
 
-def curve_of(plant: Plant) -> Curve:
+def expand_curve(plant: Plant) -> Curve:
     """The curve of one plant; every coefficient is free of cancellation where the ridge can be."""
     c, em, a2, a1, a0, gap = plant
     b = a2 + a0
@@ -205,7 +205,7 @@ def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Arra
     return horner(t, [horner(u, list(row)) for row in rows])
 
 
-def start_of(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
+def guess_start(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
     """Where to begin for one (delta, d); ``strength`` 1 stands for delta -> infinity."""
     xp = namespace(delta, d)
     delta, d, f = frozen((delta, d, fraction), xp)
@@ -283,17 +283,17 @@ def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Ar
     return s, s - state[0]
 
 
-def is_undelayed(delay: str, kind: Kind) -> bool:
+def is_undelayed(delay_model: str, kind: Kind) -> bool:
     """Whether every D is 1."""
-    return delay == "held" and not kind.long
+    return delay_model == "held" and not kind.long
 
 
-def solve(plant: Plant, lag: Array, start: Start, delay: str, kind: Kind) -> Ridge:
+def solve(plant: Plant, lag: Array, start: Start, delay_model: str, kind: Kind) -> Ridge:
     """The ridge of one plant behind ``lag`` periods (whole in the held model)."""
     xp = namespace(plant.a2, lag)
-    undelayed = is_undelayed(delay, kind)
-    curve = curve_of(stored(plant, start.scale))
-    if delay == "fractional_power":
+    undelayed = is_undelayed(delay_model, kind)
+    curve = expand_curve(store_once(plant, start.scale))
+    if delay_model == "fractional_power":
         s, last = _solve_fractional(curve, lag, start)
     else:
         s, last = _solve_held(curve, lag, start, undelayed)

@@ -21,7 +21,17 @@ from zwidth._types import Array
 from zwidth.numerics import phi
 from zwidth.plant import Plant, held_plant
 from zwidth.stability.devices import Kind
-from zwidth.stability.ridge_newton import Ridge, Start, curve_of, is_undelayed, sides, solve, stationarity, wall, wave
+from zwidth.stability.ridge_newton import (
+    Ridge,
+    Start,
+    expand_curve,
+    is_undelayed,
+    sides,
+    solve,
+    stationarity,
+    wall,
+    wave,
+)
 from zwidth.xp import horner, namespace
 
 # -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `zwidth.numerics.phi`
@@ -55,7 +65,7 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
 def alpha_change(s: Array, plant: Plant, lag: Array, change: Plant, undelayed: bool = False) -> Array:
     """How alpha moves at a fixed s (1 at a corner) when the plant does."""
     xp = namespace(s, plant.a2)
-    curve = curve_of(plant)
+    curve = expand_curve(plant)
     at = wave(s, lag, undelayed)
     g1, g2, m, rho = sides(at, curve)
     y, q, tau, kappa = at.y, at.q, at.tau, at.kappa
@@ -80,14 +90,14 @@ def differentiable_plant(delta: Array, fraction: Array) -> Plant:
     return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
 
 
-def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay: str, kind: Kind) -> Ridge:
+def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: str, kind: Kind) -> Ridge:
     """`zwidth.stability.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
     if namespace(plant.a2, lag) is np:
-        return solve(plant, lag, start, delay, kind)
+        return solve(plant, lag, start, delay_model, kind)
     import jax.numpy as jnp
 
-    ridge = _jax_ridge()(plant, lag, start, delay, kind)
-    if delay == "held":
+    ridge = _jax_ridge()(plant, lag, start, delay_model, kind)
+    if delay_model == "held":
         return ridge
     # The corner is left like -d^(2/3) as soon as d > 0: all three fall with infinite slope.
     corner = ridge.s >= 1.0
@@ -118,18 +128,18 @@ def _jax_ridge() -> Any:
     function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
 
     @function.defjvp
-    def rule(delay: str, kind: Kind, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
+    def rule(delay_model: str, kind: Kind, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # The rule calls the function itself and is made of differentiable formulas: hence right to any order.
         plant, lag, start = primals
         change, lag_change = tangents[:2]
-        ridge = function(plant, lag, start, delay, kind)
+        ridge = function(plant, lag, start, delay_model, kind)
         corner = ridge.s >= 1.0
-        undelayed = is_undelayed(delay, kind)
+        undelayed = is_undelayed(delay_model, kind)
         alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
-        if delay == "fractional_power":
+        if delay_model == "fractional_power":
             alpha += jnp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
-        curve, curve_change = jax.jvp(curve_of, (plant,), (change,))
-        along = (curve_change, lag_change if delay == "fractional_power" else jnp.zeros_like(lag))
+        curve, curve_change = jax.jvp(expand_curve, (plant,), (change,))
+        along = (curve_change, lag_change if delay_model == "fractional_power" else jnp.zeros_like(lag))
         # Whole periods do not move.
         _, first = jax.jvp(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along)
         _, second = stationarity(ridge.s, curve, lag, undelayed)

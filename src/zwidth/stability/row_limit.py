@@ -180,7 +180,7 @@ class _Turned(NamedTuple):
     dF: Array
 
 
-def turned(at: Angles, turns: Array) -> _Turned:
+def turn_angles(at: Angles, turns: Array) -> _Turned:
     # (n + 1) w = k w + w/2
     sine = at.sin_k * at.c + at.cos_k * at.s
     cosine = at.cos_k * at.c - at.sin_k * at.s
@@ -202,7 +202,7 @@ def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
 
     def step(omega: Array) -> Array:
         at = Angles(omega, fields)
-        x = turned(at, turns)
+        x = turn_angles(at, turns)
         size = at.E * at.E + x.F * x.F
         # Less than a quarter turn away sin cos is a safe stand-in for the phase left; farther off, creep up.
         left = xp.where(x.along < 0, x.across * x.along, -0.2 * size)
@@ -235,7 +235,7 @@ def long_row_point(beta: Array, fields: Array) -> tuple[Array, Array]:
     for _ in range(_ROW_STEPS):
         omega = xp.clip(omega - _newton_step(goal, Angles(omega, fields), fields), 0.0, end)
     at = Angles(omega, fields)
-    x = turned(at, fields[1] + 0.5)
+    x = turn_angles(at, fields[1] + 0.5)
     numerator, denominator = 2.0 * at.s * x.across, at.c * at.V
     # The last step is taken in alpha itself.
     step = _newton_step(goal, at, fields)

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
-
 from zwidth._types import Array, ArrayLike, DelayModel
 from zwidth.batching import elementwise
-from zwidth.domain import check_scalars, device_status
+from zwidth.domain import check_scalars, valid_device, void
 from zwidth.loop import check_delay_model
 from zwidth.plant import Plant, split_delay
-from zwidth.stability.devices import ANY, Kind
-from zwidth.stability.ridge import found, occurring
-from zwidth.stability.ridge_newton import start_of
+from zwidth.stability.devices import ANY, Kind, classify_delays
+from zwidth.stability.ridge import converged
+from zwidth.stability.ridge_newton import guess_start
 from zwidth.stability.ridge_slopes import differentiable_ridge
-from zwidth.status import Status
-from zwidth.xp import namespace
 
 
 def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
@@ -53,17 +49,16 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
     """
     check_delay_model(delay)
     check_scalars(d=d)
-    return elementwise(slope_kernel, ("d",), (d,), (delay, occurring(d)))
+    return elementwise(slope_kernel, ("d",), (d,), (delay, classify_delays(d)))
 
 
-def slope_kernel(d: Array, delay: str, kind: Kind = ANY) -> Array:
+def slope_kernel(d: Array, delay_model: str, kind: Kind = ANY) -> Array:
     """`stiffness_slope`, elementwise."""
-    xp = namespace(d)
-    d = d * xp.where(device_status(0.0 * d, d) == Status.OK, 1.0, np.nan)
+    (d,) = void(valid_device(0.0 * d, d), d)
     zero = 0.0 * d
-    lag, f = split_delay(d) if delay == "held" else (d, zero)
+    lag, f = split_delay(d) if delay_model == "held" else (d, zero)
     # delta N(z) for delta -> infinity: the velocity follows the force at once, e^-delta and its like vanish.
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
-    start = start_of(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
-    ridge = differentiable_ridge(plant, lag, start, delay, kind)
-    return ridge.alpha * found(ridge)
+    start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
+    ridge = differentiable_ridge(plant, lag, start, delay_model, kind)
+    return void(converged(ridge), ridge.alpha)[0]

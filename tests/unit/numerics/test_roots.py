@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from zwidth.numerics.roots import bisect, false_position, followed, last_cell, newton
+from zwidth.numerics.roots import bisect, false_position, follow_root, last_cell, newton
 
 
 def solve(value, slope, inner, outer, offset=0.0):
@@ -69,7 +69,7 @@ def test_false_position_and_its_derivative(x64):
     assert found == pytest.approx(-np.log(0.3), rel=1e-15)
 
     def root(shift):
-        return followed(lambda x: function(x, shift), jax.numpy.asarray(found), lambda slope, step: slope < 0)
+        return follow_root(lambda x: function(x, shift), jax.numpy.asarray(found), lambda slope, step: slope < 0)
 
     assert jax.grad(root)(0.3) == pytest.approx(-1 / 0.3, rel=1e-14)
     assert jax.grad(jax.grad(root))(0.3) == pytest.approx(1 / 0.09, rel=1e-13)

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from mpmath import mp, mpf
+from zwidth.stability.certify_pole import certified_stable
 
 import zwidth
 from zwidth.batching import FEW
 from zwidth.domain import wall_status
 from zwidth.errors import InputError
 from zwidth.stability import balls
-from zwidth.stability.certified import certified_stable
-from zwidth.stability.certified_filter import OPEN, SPECIAL, each_code, filtered, has_rows
+from zwidth.stability.certified_filter import OPEN, SPECIAL, each_code, filter_walls, has_rows
 from zwidth.stability.crossover import Verdict
 from zwidth.stability.layout import lay_out
 from zwidth.status import Status
@@ -71,7 +71,7 @@ def test_compiled_and_plain_filters_agree_with_the_labels():
     points = adversarial()
     columns = [np.tile(points[name], 2) for name in NAMES]
     assert columns[0].size > FEW
-    code, label = filtered(lay_out(tuple(columns)).points), np.tile(points["label"], 2)
+    code, label = filter_walls(lay_out(tuple(columns)).points), np.tile(points["label"], 2)
     decided = code < OPEN
     assert decided.mean() > 0.7
     np.testing.assert_array_equal(code[decided] == 1, label[decided] == STABLE)
@@ -185,7 +185,7 @@ def test_rows_of_a_map_are_labelled_as_point_by_point(delta, d):
     beta = np.append(scale * np.linspace(-1.1, 3.0, 120), [0.0, -delta, 1e70, np.nan])
     points = lay_out((alpha, beta[:, None], delta, d)).points
     assert has_rows(points)
-    by_row, alone = filtered(points), each_code(points)
+    by_row, alone = filter_walls(points), each_code(points)
     np.testing.assert_array_equal(by_row >= SPECIAL, alone >= SPECIAL)
     decided = ((by_row & 3) != OPEN) & ((alone & 3) != OPEN)
     np.testing.assert_array_equal(by_row[decided], alone[decided])
@@ -198,7 +198,7 @@ def test_rows_of_several_devices_are_kept_apart():
     delta, d = np.array([0.0, 0.1, 3.0])[:, None, None], np.array([0.0, 0.5, 1.0, 3.0])[:, None, None, None]
     points = lay_out((alpha, beta, delta, d)).points
     assert has_rows(points)
-    np.testing.assert_array_equal(filtered(points), each_code(points))
+    np.testing.assert_array_equal(filter_walls(points), each_code(points))
 
 
 def test_no_search_where_alpha_shares_its_axis():
@@ -284,7 +284,7 @@ def test_strong_damping_and_fractions_next_to_nothing(d):
 def test_the_extra_is_loaded_only_when_needed():
     code = """
 import sys
-import zwidth.stability.certified as certified
+import zwidth.stability.certify_pole as certified
 result = certified.certified_stable(0.3, 0.5, 0.0, 0)
 assert bool(result.stable), result
 assert "flint" not in sys.modules

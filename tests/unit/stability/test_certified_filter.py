@@ -12,7 +12,7 @@ from zwidth.stability import balls, certified_filter, enclosure
 from zwidth.stability.certified import certified_stable
 from zwidth.stability.certified_filter import enclose_zero, enclosed_device, exp, functions, take_lag
 from zwidth.stability.crossover import gain_cubic, long_verdict, short_verdict
-from zwidth.stability.devices import kind_of
+from zwidth.stability.devices import classify_delays
 from zwidth.stability.enclosure import Ball
 from zwidth.stability.layout import Points
 from zwidth.stability.row_limit import long_curve, short_curve
@@ -61,7 +61,7 @@ def test_every_intermediate_of_the_crossover_is_enclosed(d):
     alpha, beta, delta, d = walls(60, 11, d)
     a, b = Ball(alpha), Ball(beta)
     with np.errstate(all="ignore"):
-        here = enclosed_device(delta, d, kind_of(d))
+        here = enclosed_device(delta, d, classify_delays(d))
         cubic = gain_cubic(a, b, here)
         u, found = enclose_zero(cubic)
         lag = take_lag(u, np.floor(d))
@@ -90,7 +90,7 @@ def test_every_intermediate_of_the_crossover_is_enclosed(d):
 @pytest.mark.parametrize("d", [0.0, 0.5, 1e-9, 5e-324, 0.125, 0.93, 1.0 - 2.0**-53])
 def test_every_number_of_a_short_device_is_enclosed(d):
     with np.errstate(all="ignore"):
-        here = enclosed_device(DELTAS, np.full(DELTAS.size, d), kind_of(d))
+        here = enclosed_device(DELTAS, np.full(DELTAS.size, d), classify_delays(d))
     for index, delta in enumerate(DELTAS):
         assert escaped(*numbers(here, balls.device(float(delta), d, 1600)), index) == 0
 
@@ -99,7 +99,7 @@ def test_bounds_too_small_are_noticed(monkeypatch):
     _, _, delta, d = walls(60, 11, [1.5, 4.2, 2.5])
     monkeypatch.setattr(enclosure, "UNIT", 2.0**-58)
     monkeypatch.setattr(certified_filter, "UNIT", 2.0**-58)
-    here = enclosed_device(delta, d, kind_of(d))
+    here = enclosed_device(delta, d, classify_delays(d))
     assert sum(escaped(*numbers(here, balls.device(delta[i], d[i], BITS)), i) for i in range(60)) > 10
 
 
@@ -121,7 +121,7 @@ def test_device_is_that_of_the_printed_formulas():
         for f in (0.0, 1e-7, 0.4, 0.999):
             with mp.workdps(oracles.digits_for(delta)):
                 exact = oracles.numerator(delta, f)[: 3 if f else 2]
-                here = enclosed_device(np.float64(delta), np.float64(f), kind_of(f))
+                here = enclosed_device(np.float64(delta), np.float64(f), classify_delays(f))
                 for ball, value in zip((here.a2, here.a1, here.a0), exact, strict=False):
                     assert abs(mpf(float(ball.mid)) - value) <= mpf(float(ball.radius))
                 assert abs(mpf(float(here.c.mid)) - mp.exp(-mpf(delta))) <= mpf(float(here.c.radius))
@@ -165,7 +165,7 @@ def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
     width = 10.0 ** rng.uniform(-5, -1, 400)
     boxes = [Ball(x, 1.001 * width * np.abs(x)) for x in (alpha, beta)]
     with np.errstate(all="ignore"):
-        here = enclosed_device(delta, np.full(400, d), kind_of(d))
+        here = enclosed_device(delta, np.full(400, d), classify_delays(d))
         if d < 1:
             verdict = short_verdict(*boxes, here)
         else:

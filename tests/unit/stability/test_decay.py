@@ -12,7 +12,7 @@ import oracles
 import zwidth
 from zwidth.errors import InputError
 from zwidth.numerics.double_double import phi_pair, single
-from zwidth.stability.circle import loop_of
+from zwidth.stability.circle import factor_loop
 from zwidth.stability.radius import both_poles
 
 REFERENCE = Path(__file__).resolve().parents[2] / "reference"
@@ -137,7 +137,7 @@ def walls_with_poles_of_one_size(count, rng):
     low, high = (zwidth.boundary_point(delta, d, alpha=alpha, side=side).beta for side in ("lower", "upper"))
 
     def first(beta):
-        slow, _, pair, _ = both_poles(40, loop_of(alpha, beta, delta, d, True), True)
+        slow, _, pair, _ = both_poles(40, factor_loop(alpha, beta, delta, d, True), True)
         return slow > pair
 
     low, high = np.array(low + 0.02 * (high - low)), np.array(high)

@@ -5,7 +5,7 @@ import pytest
 
 import zwidth
 from zwidth.bench import extremes
-from zwidth.stability.radii import radius_of
+from zwidth.stability.radii import bound_radius
 from zwidth.status import Status
 
 # method -> the farthest relative distance from the boundary at which a label may be wrong.
@@ -36,17 +36,17 @@ def test_bad_input_among_good(method):
     bad = [np.nan, np.inf, -np.inf]
     alpha = np.array([0.1, *bad, 0.1, 0.1, 0.1, 0.1, 0.1])
     delta = np.array([0.1, 0.1, 0.1, 0.1, *bad, -1.0, 0.1])
-    found = zwidth.stability_of(alpha, 0.3, delta, 1.0, method=method)
+    found = zwidth.decide_stability(alpha, 0.3, delta, 1.0, method=method)
     assert found.status.tolist() == [0, *[Status.INVALID_INPUT] * 7, 0]
     assert found.stable.tolist() == [True, *[False] * 7, True]
     for d in (np.nan, np.inf, -1.0):
-        assert zwidth.stability_of(0.1, 0.3, 0.1, d, method=method).status == Status.INVALID_INPUT
+        assert zwidth.decide_stability(0.1, 0.3, 0.1, d, method=method).status == Status.INVALID_INPUT
 
 
 @pytest.mark.parametrize("delta", extremes.DELTAS, ids=str)
 def test_the_radius_of_a_stiff_wall_and_a_soft_one(delta):
     walls = (np.array([1e-30, 1e3 * (1 + delta)]), 0.1 * (1 + delta), delta, 0.0)
-    found = radius_of(*walls, method="newton")
+    found = bound_radius(*walls, method="newton")
     assert (found.status == Status.OK).all()
     # The soft wall's slowest pole is at 1, to rounding; the stiff one's is far outside.
     assert found.radius[0] == pytest.approx(1.0, abs=1e-8)

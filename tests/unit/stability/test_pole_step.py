@@ -5,7 +5,7 @@ import pytest
 from mpmath import mp
 
 import oracles
-from zwidth.stability.circle import loop_of
+from zwidth.stability.circle import factor_loop
 from zwidth.stability.pole_step import halley_step, newton_step
 
 
@@ -26,7 +26,7 @@ def walls(d, count=12):
 
 
 def loop_at(alpha, beta, delta, d):
-    return loop_of(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d), d % 1.0 != 0.0)
+    return factor_loop(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d), d % 1.0 != 0.0)
 
 
 @pytest.mark.parametrize("d", [0.0, 3.0, 0.5, 2.25])

@@ -12,7 +12,7 @@ import oracles
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
-from zwidth.stability.poles import _eigenvalues, companion, poles_of, radius_by_companion, unstable_poles
+from zwidth.stability.poles import _eigenvalues, companion, enclose_poles, radius_by_companion, unstable_poles
 from zwidth.status import Method, Status
 
 LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
@@ -183,7 +183,7 @@ def many_walls(count=600):
 
 def test_the_iteration_is_right_to_the_last_digits_wherever_eigenvalues_are():
     walls = many_walls()
-    found, peer = (poles_of(*walls, method=method) for method in ("aberth", "companion"))
+    found, peer = (enclose_poles(*walls, method=method) for method in ("aberth", "companion"))
     assert (found.status == Status.OK).mean() > 0.99
     assert (found.method == Method.ABERTH).mean() > 0.8
     wrong, checked = [], 0
@@ -215,11 +215,11 @@ def test_compiled_and_not_compiled_walls_have_the_same_poles(d, beta):
     rng = np.random.default_rng(4)
     count = 5000
     walls = (rng.uniform(0, 0.5, count), rng.uniform(0, 0.6, count) if beta is None else beta, 0.3, d)
-    found, peer = poles_of(*walls), poles_of(*walls, method="companion")
+    found, peer = enclose_poles(*walls), enclose_poles(*walls, method="companion")
     assert (found.method == Method.ABERTH).mean() > 0.99
     assert (peer.method == Method.COMPANION).all()
     for k in (0, 7, 4999):
-        few = poles_of(walls[0][k], walls[1] if beta is not None else walls[1][k], 0.3, d, method="aberth").z
+        few = enclose_poles(walls[0][k], walls[1] if beta is not None else walls[1][k], 0.3, d, method="aberth").z
         for z in (peer.z[k], few):
             np.testing.assert_allclose(np.sort_complex(found.z[k].round(9)), np.sort_complex(z.round(9)), atol=1e-8)
     proved = (found.status == Status.OK) & (peer.status == Status.OK)
@@ -234,7 +234,7 @@ def test_compiled_and_not_compiled_walls_have_the_same_poles(d, beta):
 @pytest.mark.parametrize("method", ["aberth", "companion"])
 def test_discs_do_not_claim_two_poles_that_are_one(method):
     # At beta = 0, delta = 0, d = 0 two poles are those of z^2 - (2 - alpha/2) z + 1 + alpha/2: double at alpha = 16.
-    found = poles_of([16.0, 15.0], 0.0, 0.0, 0.0, method=method)
+    found = enclose_poles([16.0, 15.0], 0.0, 0.0, 0.0, method=method)
     np.testing.assert_array_equal(found.status, [Status.NOT_CONVERGED, Status.OK])
     np.testing.assert_allclose(np.sort(found.z[0].real), [-3, -3, 0], rtol=tol.DOUBLE_POLE.float64)
     assert found.method[0] == Method.COMPANION
@@ -242,7 +242,7 @@ def test_discs_do_not_claim_two_poles_that_are_one(method):
 
 def test_a_bad_wall_leaves_its_neighbors_alone():
     for method in ("aberth", "companion"):
-        found = poles_of([0.1, np.nan, 0.1, 1e300], 0.2, [0.3, 0.3, -1.0, 0.3], 1, method=method)
+        found = enclose_poles([0.1, np.nan, 0.1, 1e300], 0.2, [0.3, 0.3, -1.0, 0.3], 1, method=method)
         np.testing.assert_array_equal(
             found.status, [0, Status.INVALID_INPUT, Status.INVALID_INPUT, Status.OUT_OF_RANGE]
         )
@@ -263,4 +263,4 @@ def test_what_cannot_be_asked_for_is_refused():
     with pytest.raises(InputError, match="aberth"):
         jax.jit(lambda alpha: zwidth.poles(alpha, 0.1, 0.1, 1, method="aberth"))(0.1)
     with pytest.raises(InputError, match="traced"):
-        jax.jit(lambda alpha: poles_of(alpha, 0.1, 0.1, 1).z)(0.1)
+        jax.jit(lambda alpha: enclose_poles(alpha, 0.1, 0.1, 1).z)(0.1)

@@ -13,7 +13,7 @@ import oracles
 import tolerances as tol
 import zwidth
 from zwidth.errors import InputError
-from zwidth.stability.radii import radius_of
+from zwidth.stability.radii import bound_radius
 from zwidth.status import Method, Status
 
 LABELS = Path(__file__).resolve().parents[2] / "reference" / "labels.npz"
@@ -28,10 +28,12 @@ def labels():
 
 @pytest.mark.parametrize("method, accuracy", METHODS)
 def test_scattered_points_keep_their_bounds(labels, method, accuracy):
-    found = radius_of(*(labels[name] for name in ("alpha", "beta", "delta", "d")), method=method, accuracy=accuracy)
+    found = bound_radius(*(labels[name] for name in ("alpha", "beta", "delta", "d")), method=method, accuracy=accuracy)
     if accuracy == 1e-12:
         labels = {name: values[labels["d"] <= 4] for name, values in labels.items()}
-        found = radius_of(*(labels[name] for name in ("alpha", "beta", "delta", "d")), method=method, accuracy=accuracy)
+        found = bound_radius(
+            *(labels[name] for name in ("alpha", "beta", "delta", "d")), method=method, accuracy=accuracy
+        )
     ok = found.status == Status.OK
     # At 1e-12 rounding may decide a count next to poles that are nearly multiple.
     assert ok.all() if accuracy != 1e-12 else ok.mean() > 0.97
@@ -56,7 +58,7 @@ def test_maps_keep_their_bounds(d, transposed):
     # Not whole cells, and both stable and unstable walls, real largest poles and pairs.
     alpha, beta = np.linspace(-0.2, 1.5, 150), np.linspace(-0.5, 1.5, 117)
     axes = (alpha[:, None], beta) if transposed else (alpha, beta[:, None])
-    found = radius_of(*axes, 0.1, d, method="newton")
+    found = bound_radius(*axes, 0.1, d, method="newton")
     assert found.radius.shape == np.broadcast_shapes(*(axis.shape for axis in axes))
     assert found.certified.mean() > 0.999
     peer = zwidth.spectral_radius(*axes, 0.1, d, method="companion")
@@ -71,17 +73,17 @@ def test_maps_keep_their_bounds(d, transposed):
 
 def test_several_devices_in_one_call_are_several_maps():
     alpha, beta = np.linspace(0.01, 1.0, 128), np.linspace(0.0, 1.0, 128)[:, None]
-    both = radius_of(alpha, beta, np.array([0.1, 0.5])[:, None, None], 0.0, method="newton")
+    both = bound_radius(alpha, beta, np.array([0.1, 0.5])[:, None, None], 0.0, method="newton")
     for delta, radius in zip((0.1, 0.5), both.radius, strict=True):
-        np.testing.assert_array_equal(radius, radius_of(alpha, beta, delta, 0.0, method="newton").radius)
+        np.testing.assert_array_equal(radius, bound_radius(alpha, beta, delta, 0.0, method="newton").radius)
 
 
 def test_mixed_delays_single_points_and_none():
-    assert radius_of(0.5, 0.5, 0.1, 1.5, method="newton").radius == pytest.approx(
+    assert bound_radius(0.5, 0.5, 0.1, 1.5, method="newton").radius == pytest.approx(
         float(exact_radius(0.5, 0.5, 0.1, 1.5)), rel=1e-9
     )
-    assert radius_of([], 0.5, 0.1, 1.5, method="newton").radius.shape == (0,)
-    mixed = radius_of(0.5, 0.5, 0.1, [0.0, 1.5, 4.0])
+    assert bound_radius([], 0.5, 0.1, 1.5, method="newton").radius.shape == (0,)
+    mixed = bound_radius(0.5, 0.5, 0.1, [0.0, 1.5, 4.0])
     expected = [float(exact_radius(0.5, 0.5, 0.1, d)) for d in (0.0, 1.5, 4.0)]
     np.testing.assert_allclose(mixed.radius, expected, rtol=1e-9)
 
@@ -90,10 +92,10 @@ def test_mixed_delays_single_points_and_none():
 def test_bad_points_leave_the_others_alone(method, accuracy):
     alpha = np.array([0.1, np.nan, 0.2, np.inf, 0.3])
     delta = np.array([0.1, 0.1, -1.0, 0.1, 0.1])
-    found = radius_of(alpha, 0.3, delta, 1.5, method=method, accuracy=accuracy)
+    found = bound_radius(alpha, 0.3, delta, 1.5, method=method, accuracy=accuracy)
     assert found.status.tolist() == [0, 1, 1, 1, 0]
     assert np.isnan(found.radius).tolist() == [False, True, True, True, False]
-    alone = radius_of(alpha[[0, 4]], 0.3, 0.1, 1.5, method=method, accuracy=accuracy)
+    alone = bound_radius(alpha[[0, 4]], 0.3, 0.1, 1.5, method=method, accuracy=accuracy)
     np.testing.assert_array_equal(found.radius[[0, 4]], alone.radius)
 
 
@@ -101,7 +103,7 @@ def test_double_poles_are_not_certified():
     # The corner of the undamped loop is not reached at d = 1: take the ridge of a heavily damped device.
     top = zwidth.alpha_max(5.0, 0.0)
     assert top.kind == 1
-    found = radius_of(top.alpha, top.beta, 5.0, 0.0, method="newton")
+    found = bound_radius(top.alpha, top.beta, 5.0, 0.0, method="newton")
     assert not found.certified
     assert found.status == Status.NOT_CONVERGED
     assert 1e-9 < found.error < 1e-3
@@ -187,7 +189,7 @@ def test_triple_poles_keep_their_bounds():
         alpha, beta = float(2 * (3 * r**2 - 1)), float(2 * r**3)
     rng = np.random.default_rng(5)
     alpha = alpha * (1 + np.concatenate([[0.0], 10.0 ** rng.uniform(-16, -3, 60) * rng.choice([-1, 1], 60)]))
-    found = radius_of(alpha, beta, 0.0, 0.0)
+    found = bound_radius(alpha, beta, 0.0, 0.0)
     assert found.error[0] > 1e-7 * found.radius[0]
     for k in range(61):
         assert abs(found.radius[k] - exact_radius(alpha[k], beta, 0.0, 0.0)) <= found.error[k]
@@ -197,7 +199,7 @@ def test_radii_of_the_adversarial_walls_keep_their_bounds():
     with np.load(LABELS.parent / "adversarial.npz") as file:
         walls = [file[name] for name in ("alpha", "beta", "delta", "d")]
         exact = 1.0 + file["margin"]
-    found = radius_of(*walls)
+    found = bound_radius(*walls)
     judged = np.isfinite(found.error) & np.isfinite(exact)
     assert judged.mean() > 0.85
     # The reference itself is rounded to 1 + margin.
@@ -205,6 +207,6 @@ def test_radii_of_the_adversarial_walls_keep_their_bounds():
 
 
 def test_a_wall_without_stiffness_keeps_its_pole_at_one_exactly():
-    found = radius_of(0.0, np.linspace(0.0, 0.5, 9), 0.1, 1.5, method="newton")
+    found = bound_radius(0.0, np.linspace(0.0, 0.5, 9), 0.1, 1.5, method="newton")
     assert found.certified.any()
     np.testing.assert_array_equal(found.radius[found.certified], 1.0)

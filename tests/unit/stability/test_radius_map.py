@@ -6,8 +6,8 @@ import pytest
 import zwidth
 from zwidth.stability.layout import Points, fold
 from zwidth.stability.proved import outermost_poles
-from zwidth.stability.radii import radius_of
-from zwidth.stability.radius_map import SMALLEST_MAP, as_map, followed_poles, nodes_of
+from zwidth.stability.radii import bound_radius
+from zwidth.stability.radius_map import SMALLEST_MAP, as_map, followed_poles, lay_nodes
 from zwidth.status import Status
 
 ALPHA, BETA = np.linspace(-0.1, 1.5, 203), np.linspace(-0.3, 1.5, 157)
@@ -21,7 +21,7 @@ def check_against_points(found, walls, seed, count=1500):
     """Both routes prove their values independently of each other: they differ by their errors at most."""
     rng = np.random.default_rng(seed)
     places = tuple(rng.integers(0, length, count) for length in found.radius.shape)
-    alone = radius_of(*(np.broadcast_to(wall, found.radius.shape)[places] for wall in walls))
+    alone = bound_radius(*(np.broadcast_to(wall, found.radius.shape)[places] for wall in walls))
     differ = np.abs(found.radius[places] - alone.radius)
     assert (differ <= found.error[places] + alone.error).all()
     # Where both are proved nearly all digits agree: Newton's method ends at the same pole.
@@ -33,7 +33,7 @@ def check_against_points(found, walls, seed, count=1500):
 @pytest.mark.parametrize("d", [np.array([0.0, 4.0, 60.0]), 1.5])
 def test_maps_have_the_values_of_single_points(d):
     walls = (ALPHA, BETA[:, None], 0.1, np.reshape(d, (-1, 1, 1)))
-    found = radius_of(*walls)
+    found = bound_radius(*walls)
     assert found.certified.mean() > 0.99
     np.testing.assert_array_equal(found.certified, found.status == Status.OK)
     check_against_points(found, walls, 1)
@@ -42,7 +42,7 @@ def test_maps_have_the_values_of_single_points(d):
 def test_axes_in_any_order_and_delays_of_both_kinds():
     delays = np.array([1.5, 0.0, 4.0])
     walls = (ALPHA[:, None, None], BETA, 0.1, delays[:, None])
-    found = radius_of(*walls)
+    found = bound_radius(*walls)
     assert found.radius.shape == (ALPHA.size, delays.size, BETA.size)
     check_against_points(found, walls, 2)
     for k, delay in enumerate(delays):
@@ -56,7 +56,7 @@ def test_nearly_all_points_need_no_search(d):
     alpha, beta = np.linspace(0.001, 1.5 / (1.0 + d), 320), np.linspace(0.0, 1.5 / (1.0 + d), 320)[:, None]
     area = as_area(alpha, beta, 0.1, d)
     assert area is not None
-    nodes = nodes_of(area)
+    nodes = lay_nodes(area)
     found = outermost_poles(nodes, 1e-9)
     _, ok = followed_poles(area, nodes, found.re, found.im, 1e-9, d % 1.0 != 0.0)
     assert ok.shape == (1, 320, 320)
@@ -65,7 +65,7 @@ def test_nearly_all_points_need_no_search(d):
 
 def test_bad_values_on_an_axis_leave_the_others_alone():
     alpha = np.where(np.arange(ALPHA.size) == 5, np.nan, ALPHA)
-    found = radius_of(alpha, BETA[:, None], 0.1, 0.0)
+    found = bound_radius(alpha, BETA[:, None], 0.1, 0.0)
     assert (found.status[:, 5] == Status.INVALID_INPUT).all()
     assert np.isnan(found.radius[:, 5]).all()
     good = np.delete(np.arange(ALPHA.size), 5)
