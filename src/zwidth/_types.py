@@ -9,4 +9,4 @@ ArrayLike: TypeAlias = Any
 Array: TypeAlias = Any
 DelayModel: TypeAlias = Literal["held", "fractional_power"]
 
-DELAY_MODELS: tuple[str, ...] = ("held", "fractional_power")
+DELAY_MODELS: tuple[DelayModel, ...] = ("held", "fractional_power")

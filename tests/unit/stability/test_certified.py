@@ -4,9 +4,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp, mpf
+from mpmath import mpf
 
 import zwidth
 from zwidth.batching import FEW
@@ -69,9 +70,9 @@ def test_every_adversarial_label_is_found():
 def test_compiled_and_plain_filters_agree_with_the_labels():
     # More points than NumPy is given, by repetition; the compiled filter's labels must be right as well.
     points = adversarial()
-    columns = [np.tile(points[name], 2) for name in NAMES]
-    assert columns[0].size > FEW
-    code, label = filtered(lay_out(tuple(columns)).points), np.tile(points["label"], 2)
+    alpha, beta, delta, d = (np.tile(points[name], 2) for name in NAMES)
+    assert alpha.size > FEW
+    code, label = filtered(lay_out((alpha, beta, delta, d)).points), np.tile(points["label"], 2)
     decided = code < OPEN
     assert decided.mean() > 0.7
     np.testing.assert_array_equal(code[decided] == 1, label[decided] == STABLE)
