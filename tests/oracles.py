@@ -7,7 +7,7 @@ forms that the library uses. Where a printed formula cancels, more digits are ca
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mpmath import mp, mpc, mpf
@@ -59,7 +59,7 @@ def numerator(delta, fraction) -> tuple[mpf, mpf, mpf]:
 def polynomial(alpha, beta, delta, d) -> list[mpf]:
     """P of a held delay, highest power first: degree 3 + d for whole d, 4 + n otherwise."""
     alpha, beta, delta, d = mpf(alpha), mpf(beta), mpf(delta), mpf(d)
-    n = int(mp.floor(d))
+    n = int(mp.floor(d).real)
     f = d - n
     c = phi(delta).c
     g = list(numerator(delta, f))
@@ -118,6 +118,11 @@ def boundary(omega, delta, d, delay: str = "held") -> tuple[mpf, mpf]:
     return alpha, beta
 
 
+def complex_number(real: Any, imag: Any = 0) -> mpc:
+    """A complex number of any two parts; type checkers infer of mpmath's own class that they are whole."""
+    return mpc(real, imag)
+
+
 def evaluate(coefficients, z) -> mpc:
     """Horner's rule, highest power first."""
     total = mpc(0)
@@ -130,7 +135,7 @@ def roots(coefficients) -> list[mpc]:
     """All roots of a polynomial with simple roots, highest power first: NumPy's, finished by Newton's method."""
     degree = len(coefficients) - 1
     derivative = [(degree - k) * coefficient for k, coefficient in enumerate(coefficients[:-1])]
-    found = [mpc(root) for root in np.roots(np.array([float(coefficient) for coefficient in coefficients]))]
+    found: list[Any] = [mpc(root) for root in np.roots(np.array([float(coefficient) for coefficient in coefficients]))]
     for _ in range(8):
         found = [root - evaluate(coefficients, root) / evaluate(derivative, root) for root in found]
     distances = [abs(a - b) for k, a in enumerate(found) for b in found[:k]]
@@ -138,13 +143,13 @@ def roots(coefficients) -> list[mpc]:
     return found
 
 
-def relative_error(got, exact, floor=0) -> float:
+def relative_error(got, exact, floor: float = 0) -> float:
     """|got - exact| over |exact| (or over ``floor``, where that is larger)."""
     scale = max(abs(exact), mpf(floor))
     difference = abs(mpf(float(got)) - exact)
     return float(difference / scale) if scale else float(difference)
 
 
-def worst(got, exact, floor=0) -> float:
+def worst(got, exact, floor: float = 0) -> float:
     """The largest `relative_error` of two sequences."""
     return max(relative_error(g, e, floor) for g, e in zip(np.ravel(got), exact, strict=True))

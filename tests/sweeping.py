@@ -17,6 +17,7 @@ from zwidth.studies.document import Config
 from zwidth.sweep import plan
 from zwidth.sweep.chunks import perform
 from zwidth.sweep.store import find_stores, open_dataset
+from zwidth.sweep.study import SweepStudy
 
 AXES = {
     "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 40}},
@@ -64,6 +65,13 @@ def cut(monkeypatch, walls, devices):
 
 def config_of(*studies, name="test"):
     return Config.model_validate({"version": 1, "name": name, "studies": list(studies) or [study()]})
+
+
+def sweep_of(described) -> SweepStudy:
+    """A sweep as described, checked and complete."""
+    (sweep,) = config_of(described).studies
+    assert isinstance(sweep, SweepStudy)
+    return sweep
 
 
 def run_sweeps(config, out, **options):

@@ -64,4 +64,5 @@ from .status import Status as Status
 from .studies.document import load_config as load_config
 from .sweep.store import open_dataset as open_dataset
 
+__all__: list[str]
 __version__: str

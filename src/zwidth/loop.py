@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth._types import DELAY_MODELS, Array, ArrayLike
+from zwidth._types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
 from zwidth.batching import concrete_delay
 from zwidth.domain import check_scalars, poison, valid_wall
 from zwidth.errors import InputError, check_choice
@@ -28,17 +28,17 @@ from zwidth.xp import horner, namespace
 class Affine(NamedTuple):
     """``P = D + alpha N1 + beta N2``: three coefficient vectors of one length, highest power first."""
 
-    D: Array
-    N1: Array
-    N2: Array
+    D: Coefficients
+    N1: Coefficients
+    N2: Coefficients
 
 
-def choose_plant(delta: Array, d: Array, degree: Degree) -> Plant:
+def choose_plant(delta: Reals, d: Reals, degree: Degree) -> Plant:
     """The plant with the part of the delay that is not whole periods."""
     return held_plant(delta, d - degree.whole) if degree.fractional else undelayed_plant(delta)
 
 
-def affine(delta: Array, d: Array, degree: Degree) -> Affine:
+def affine(delta: Reals, d: Reals, degree: Degree) -> Affine:
     """The three coefficient vectors of devices of one degree, along a new last axis of degree.poles + 1."""
     plant = choose_plant(delta, d, degree)
     xp = namespace(plant.a2)
@@ -56,7 +56,7 @@ def affine(delta: Array, d: Array, degree: Degree) -> Affine:
     return Affine(*(xp.stack(row, axis=-1) for row in rows))
 
 
-def coefficients(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
+def coefficients(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
     """Coefficients of P, highest power first, along a new last axis of degree.poles + 1; P is monic."""
     parts = affine(delta, d, degree)
     return parts.D + alpha[..., None] * parts.N1 + beta[..., None] * parts.N2
@@ -65,8 +65,8 @@ def coefficients(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degr
 class Wall(NamedTuple):
     """A wall by its normalized stiffness and damping, or an array of them."""
 
-    alpha: Array
-    beta: Array
+    alpha: Reals
+    beta: Reals
 
 
 class FrequencyLoop(NamedTuple):
@@ -84,7 +84,7 @@ def frequency_loop(delta: Array, d: Array, delay_model: str) -> FrequencyLoop:
     return FrequencyLoop(held_plant(delta, fraction), whole)
 
 
-def frequency_boundary(omega: Array, loop: FrequencyLoop, delay_model: str) -> Wall:
+def frequency_boundary(omega: Reals, loop: FrequencyLoop, delay_model: str) -> Wall:
     """The wall (alpha, beta) that puts a pole at z = e^(j omega), in closed form, for one point.
 
     On the unit circle P = 0 is a real linear 2x2 system. With s = sin(omega/2), C = cos(omega/2), M = N(z)/z,
@@ -194,7 +194,9 @@ def check_has_poles(delay_model: str) -> None:
         )
 
 
-def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: str = "held") -> Array:
+def char_poly(
+    alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: str = "held"
+) -> Coefficients:
     """Return the coefficients of the monic characteristic polynomial, highest power first.
 
     ``P(z) = z^(2+n) (z - 1)(z - c) + (z n0(z) + n1(z)) (alpha z + beta (z - 1))``, d = n + f, ``c = e^-delta``; for
@@ -233,7 +235,7 @@ def char_poly(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike,
     return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
 
 
-def _char_poly_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree) -> Array:
+def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
     ok = valid_wall(alpha, beta, delta, d)
     spoiled = poison(ok, alpha, beta, delta, d)[..., None]
     xp = namespace(alpha, beta, delta, d)
@@ -248,7 +250,7 @@ def char_poly_si(
     stiffness: ArrayLike,
     virtual_damping: ArrayLike,
     delay: ArrayLike = 0.0,
-) -> Array:
+) -> Coefficients:
     """Return the monic characteristic polynomial of a loop in SI units, highest power first.
 
     Eq. (11) over its leading coefficient ``-T b^2``, which leaves its zeros alone and, unlike (11) itself, has the
@@ -344,7 +346,7 @@ def closed_loop_transfer(
 
 
 def _closed_loop_kernel(
-    mass: Array, period: Array, alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree
+    mass: Reals, period: Reals, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree
 ) -> Transfer:
     xp = namespace(delta)
     plant = undelayed_plant(delta)

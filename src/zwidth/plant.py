@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from zwidth._types import Array, ArrayLike
+from zwidth._types import Array, ArrayLike, Coefficients
 from zwidth.batching import pointwise
 from zwidth.numerics import phi
 from zwidth.scene import normalize
@@ -78,7 +78,7 @@ class Transfer(NamedTuple):
     """A discrete transfer function, coefficients highest power first along the last axis."""
 
     numerator: Array
-    denominator: Array
+    denominator: Coefficients
 
 
 def velocity_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) -> Transfer:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth._types import Array
+from zwidth._types import Array, Samples
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.grouping import find_degree
@@ -26,10 +26,10 @@ from zwidth.settling import advance, settling_time
 class StepResponse(NamedTuple):
     """The response to a constant force that sets in at time 0; arrays of one time axis."""
 
-    time: np.ndarray
-    position: np.ndarray
-    velocity: np.ndarray
-    wall_force: np.ndarray
+    time: Samples
+    position: Samples
+    velocity: Samples
+    wall_force: Samples
     final_position: float
     settling_time: float
 

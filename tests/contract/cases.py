@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
 import zwidth
+
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -90,11 +92,15 @@ def of_devices(name, call, line=None, **options):
     return Case(name, call, {**line, **DEVICE}, bad, beyond, domain=DEVICES, **options)
 
 
+def only(names, values: dict[str, Value]) -> dict[str, Value]:
+    return {name: value for name, value in values.items() if name in names}
+
+
 def of_quantities(call, names, name=None, **options):
     names = set(names) | ({"stiffness"} if call.__name__ not in ("max_stiffness", "sensitivities") else set())
     columns = {**WANTED, **SI_DEVICE}
     bad, beyond = {"stiffness": -1.0, **BAD_SI}, {"stiffness": 1e31, **BEYOND_SI}
-    good, bad, beyond = ({k: v for k, v in kept.items() if k in names} for kept in (columns, bad, beyond))
+    good, bad, beyond = (only(names, columns), only(names, bad), only(names, beyond))
     return Case(name or call.__name__, call, good, bad, beyond, domain=QUANTITIES, strict=True, **options)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import control
 import numpy as np
 import pytest
@@ -68,9 +70,9 @@ def discrete_plant(loop: Loop) -> tuple[np.ndarray, np.ndarray]:
     a, b = continuous(loop)
     # ss2tf subtracts polynomials of order one: a numerator in SI units, 1e-9 say, would lose nine digits.
     position = np.array([[loop.mass / loop.period**2, 0.0]])
-    system = scipy.signal.cont2discrete((a, b, position, np.zeros((1, 1))), loop.period, "zoh")
+    system: Any = scipy.signal.cont2discrete((a, b, position, np.zeros((1, 1))), loop.period, "zoh")
     numerator, denominator = scipy.signal.ss2tf(*system[:4])
-    return numerator.ravel()[1:], denominator
+    return numerator.ravel()[1:], np.asarray(denominator)
 
 
 def test_poles_agree_with_scipy_signal(ours):
@@ -85,13 +87,16 @@ def test_poles_agree_with_scipy_signal(ours):
         assert np.nanmax(np.abs(ours[loop])) == pytest.approx(peer, rel=tolerance), loop
 
 
-def control_loop(loop: Loop) -> control.TransferFunction:
+def control_loop(loop: Loop) -> control.StateSpace:
     """python-control's closed loop from the applied force to position."""
     a, b = continuous(loop)
     plant = control.c2d(control.ss(a, b, [[1.0, 0.0]], [[0.0]]), loop.period, "zoh")
     damper = loop.virtual_damping / loop.period
     wall = control.tf([loop.stiffness + damper, -damper], np.eye(1, 2 + loop.whole)[0], loop.period)
-    return control.feedback(plant, control.tf2ss(wall))
+    realized: Any = control.tf2ss(wall)
+    closed = control.feedback(plant, realized)
+    assert isinstance(closed, control.StateSpace)
+    return closed
 
 
 def test_poles_agree_with_python_control(ours):

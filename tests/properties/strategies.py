@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import strategies as st
 
 
-def magnitudes(low: int, high: int) -> st.SearchStrategy[float]:
+def magnitudes(low: float, high: float) -> st.SearchStrategy[float]:
     """Powers of ten, evenly by exponent."""
     return st.floats(low, high).map(lambda exponent: 10.0**exponent)
 

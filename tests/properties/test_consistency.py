@@ -40,8 +40,8 @@ class Walls(NamedTuple):
     delta: np.ndarray
     d: np.ndarray
 
-    def __getitem__(self, chosen) -> Walls:
-        return Walls(*(column[chosen] for column in tuple(self)))
+    def select(self, chosen) -> Walls:
+        return Walls(*(column[chosen] for column in self))
 
 
 def draw(count: int, random: np.random.Generator) -> Walls:
@@ -221,9 +221,11 @@ def found_in(count: int, seed: int) -> dict[str, list[tuple]]:
         for statement, where in contradictions(facts).items():
             bad = np.flatnonzero(where)
             if bad.size and statement not in ALWAYS:
-                bad = bad[~near_the_edge(facts.walls[bad])]
+                bad = bad[~near_the_edge(facts.walls.select(bad))]
             if bad.size:
-                found.setdefault(statement, []).extend(zip(*(part.tolist() for part in facts.walls[bad]), strict=True))
+                found.setdefault(statement, []).extend(
+                    zip(*(part.tolist() for part in facts.walls.select(bad)), strict=True)
+                )
     return found
 
 
@@ -282,7 +284,7 @@ def test_settling_times_belong_to_stable_walls():
     walls = draw(600, random)
     # Settling is searched backwards period by period: slow loops take too long for a test.
     slow = np.abs(zwidth.decay_rate(*walls)) < 1e-2
-    walls = walls[(walls.d <= 40) & (walls.alpha != 0) & ~slow]
+    walls = walls.select((walls.d <= 40) & (walls.alpha != 0) & ~slow)
     stable = zwidth.is_stable(*walls)
     times = np.array([settling_time(*(float(value) for value in wall)) for wall in zip(*walls, strict=True)])
     assert np.all(np.isnan(times) | (stable & np.isfinite(times) & (times >= 0)))
@@ -292,8 +294,8 @@ def test_settling_times_belong_to_stable_walls():
 def test_an_assessment_says_what_the_functions_say():
     random = np.random.default_rng(23)
     walls = draw(200, random)
-    walls = walls[(walls.delta == 0) | (walls.delta >= 1e-30)]
-    walls = walls[np.all([(x == 0) | ((np.abs(x) > 1e-29) & (np.abs(x) < 1e29)) for x in walls], axis=0)]
+    walls = walls.select((walls.delta == 0) | (walls.delta >= 1e-30))
+    walls = walls.select(np.all([(x == 0) | ((np.abs(x) > 1e-29) & (np.abs(x) < 1e29)) for x in walls], axis=0))
     assert walls.alpha.size > 60
     for wall in zip(*(column.tolist() for column in walls), strict=True):
         alpha, beta, delta, d = wall

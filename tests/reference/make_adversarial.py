@@ -14,6 +14,7 @@ import argparse
 import math
 import time
 from pathlib import Path
+from typing import Any
 
 import flint
 import numpy as np
@@ -269,7 +270,8 @@ def main() -> None:
         print(f"{name}: {mine.sum()} points; unstable, stable, on the boundary: {share}")
     if check(points):
         raise SystemExit("the certified method is wrong or undecided somewhere: nothing written")
-    np.savez_compressed(OUTPUT, **{name: values[: arguments.kept] for name, values in points.items()})
+    kept: dict[str, Any] = {name: values[: arguments.kept] for name, values in points.items()}
+    np.savez_compressed(OUTPUT, **kept)
     print(f"{OUTPUT.name}: {OUTPUT.stat().st_size / 1024:.0f} KiB")
 
 

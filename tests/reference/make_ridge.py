@@ -203,7 +203,7 @@ def corner_row(loop, delta, tau):
 
 def row(model, delta_text, d_text):
     delta, d = mp.mpf(float(delta_text)), mp.mpf(float(d_text))
-    n = int(mp.floor(d)) if model == "held" else 0
+    n = int(mp.floor(d).real) if model == "held" else 0
     tau = d - n
     loop = Loop(model, n)
     # A central difference in delta needs room on both sides; the formulas continue analytically below 0, except

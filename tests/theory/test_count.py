@@ -9,8 +9,9 @@ from __future__ import annotations
 import random
 from itertools import pairwise
 
+import mpmath as mp
 import pytest
-from mpmath import mp, mpc, mpf
+from mpmath import mpc, mpf
 
 import oracles
 from boxes import symbols
@@ -113,10 +114,10 @@ def _random_roots(rng: random.Random, count: int) -> list:
     roots = []
     while len(roots) < count:
         if count - len(roots) >= 2 and rng.random() < 0.5:
-            root = mp.mpc(rng.uniform(-1.2, 1.2), rng.uniform(0.05, 1.2))
+            root = oracles.complex_number(rng.uniform(-1.2, 1.2), rng.uniform(0.05, 1.2))
             roots += [root, mp.conj(root)]
         else:
-            roots.append(mp.mpc(rng.uniform(-1.5, 1.5)))
+            roots.append(oracles.complex_number(rng.uniform(-1.5, 1.5)))
     return roots
 
 

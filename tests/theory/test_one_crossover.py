@@ -11,9 +11,10 @@ import math
 import random
 from functools import lru_cache
 
+import mpmath as mp
 import pytest
 from flint import arb, ctx
-from mpmath import mp, mpc, mpf
+from mpmath import mpf
 
 import oracles
 from boxes import TAU, UNIT, Implication, RefutedError, ball, early_mean, loop, phi, prove, symbols
@@ -214,9 +215,9 @@ class _Wall:
         assert u is not None
         s = mp.sqrt(u * (2 - u))
         a2, a1, a0 = self.m
-        z = mpc(1 - u, s)
-        wall = self.alpha + self.beta * mpc(u, s)
-        return wall, a2 * z + a1 + a0 / z, mpc(s, -mp.expm1(-self.delta) - u), z
+        z = oracles.complex_number(1 - u, s)
+        wall = self.alpha + self.beta * oracles.complex_number(u, s)
+        return wall, a2 * z + a1 + a0 / z, oracles.complex_number(s, -mp.expm1(-self.delta) - u), z
 
     def margin(self):
         """S12: the sum of the three arguments less (n + 1/2) w."""
@@ -235,7 +236,7 @@ class _Wall:
             return False
         wall, numerator, device, z = self.factors()
         product = wall * numerator * device
-        turn = mpc(mp.sqrt(1 - u / 2), mp.sqrt(u / 2)) * z**self.n
+        turn = oracles.complex_number(mp.sqrt(1 - u / 2), mp.sqrt(u / 2)) * z**self.n
         return product.imag > 0 and (product * mp.conj(turn)).imag > 0
 
     def by_curve(self) -> tuple[bool, bool]:

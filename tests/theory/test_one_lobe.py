@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import random
 
+import mpmath as mp
 import pytest
 from flint import arb, fmpq
-from mpmath import mp, mpf
+from mpmath import mpf
 
 import oracles
 from boxes import TAU, UNIT, Implication, RefutedError, UnprovedError, ball, loop, prove, symbols

@@ -72,10 +72,10 @@ def test_types_follow_the_caller():
 
 
 def test_float64_without_touching_the_configuration():
-    before = jax.config.jax_enable_x64
+    before = jax.enable_x64.value
     assert pointwise(fragile, ("x",), (1 + 2.0**-40,)) == np.sqrt(1 + 2.0**-40)
     assert jnp.ones(1).dtype == jnp.float32
-    assert jax.config.jax_enable_x64 == before
+    assert jax.enable_x64.value == before
 
 
 def test_inside_a_transformation_the_ambient_precision_holds():
@@ -167,7 +167,7 @@ def test_plain_numbers_inside_somebody_elses_transformation_are_computed_at_once
     jax.jit(jax.vmap(jax.grad(traced)))(np.ones(2, np.float32))
     assert isinstance(seen[0], np.ndarray | np.float64)
     np.testing.assert_array_equal(seen[0], pointwise(fragile, ("x",), (x,), fused=fused))
-    assert not jax.config.jax_enable_x64
+    assert not jax.enable_x64.value
 
 
 def test_float32_inside_a_transformation_is_said_once(monkeypatch):

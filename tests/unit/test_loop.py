@@ -106,9 +106,9 @@ PHYSICAL = [(0.1, 10.0, 1e-3, 10e3, 40.0), (0.1, 100.0, 1e-3, 60e3, -20.0), (2.0
 @pytest.mark.parametrize("scene", PHYSICAL)
 def test_si_polynomial_is_eq_11_over_its_leading_coefficient(scene, d):
     mass, damping, period, stiffness, virtual_damping = scene
-    got = char_poly_si(*scene, d * period)
+    got = char_poly_si(*scene, delay=d * period)
     with mp.workdps(80):
-        printed = oracles.paper_polynomial_si(*scene, d)
+        printed = oracles.paper_polynomial_si(*scene, d=d)
         exact = [coefficient / (-mpf(period) * mpf(damping) ** 2) for coefficient in printed]
         delta = mpf(damping) * mpf(period) / mpf(mass)
         alpha = mpf(stiffness) * mpf(period) ** 2 / mpf(mass)
@@ -131,8 +131,8 @@ def test_si_polynomial_without_damping_is_the_limit():
 @pytest.mark.parametrize("scene", PHYSICAL)
 def test_closed_loop_is_eq_10(scene, d):
     mass, damping, period, *_ = scene
-    got = closed_loop_transfer(*scene, d)
-    np.testing.assert_array_equal(got.denominator, char_poly_si(*scene, d * period))
+    got = closed_loop_transfer(*scene, d=d)
+    np.testing.assert_array_equal(got.denominator, char_poly_si(*scene, delay=d * period))
     with mp.workdps(80):
         m, b, T = mpf(mass), mpf(damping), mpf(period)
         c = mp.exp(-T * b / m)

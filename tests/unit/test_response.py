@@ -1,5 +1,7 @@
 """Step responses against scipy's discrete simulation, matrix exponentials and a general integrator."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -42,13 +44,14 @@ def test_between_and_at_the_samples_by_matrix_exponentials(wall):
 def test_samples_by_scipy_dlsim(wall):
     alpha, beta, delta, d = wall
     matrices = [np.array(matrix) for matrix in ([[0, 1], [0, -delta]], [[0], [1.0]], [[1.0, 0]], [[0.0]])]
-    numerator, denominator = scipy.signal.ss2tf(*scipy.signal.cont2discrete(matrices, 1.0)[:4])
+    discrete: Any = scipy.signal.cont2discrete(matrices, 1.0)
+    numerator, denominator = scipy.signal.ss2tf(*discrete[:4])
     # G = H/(1 + H (alpha + beta (z - 1)/z) z^-d), over the common denominator
     lag = np.r_[1, np.zeros(int(d) + 1)]
     controller = np.array([alpha + beta, -beta])
     closed = np.polyadd(np.polymul(denominator, lag), np.polymul(numerator[0], controller))
     system = scipy.signal.dlti(np.polymul(numerator[0], lag), closed, dt=1.0)
-    _, expected = scipy.signal.dlsim(system, np.ones(200))
+    expected = scipy.signal.dlsim(system, np.ones(200))[1]
     got = step_response(*wall, periods=200, substeps=1)
     assert_close(got.position, expected[:, 0], tol.RESPONSE)
 

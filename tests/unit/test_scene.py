@@ -133,7 +133,7 @@ def test_a_scene_is_the_same_as_its_numbers():
 
 def test_a_scene_cannot_be_changed():
     with pytest.raises(dataclasses.FrozenInstanceError):
-        zwidth.Device(mass=0.1).mass = 0.2
+        zwidth.Device(mass=0.1).mass = 0.2  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def test_a_scene_without_a_wall_has_none():
@@ -146,10 +146,16 @@ def test_a_scene_without_a_wall_has_none():
     [
         (lambda: zwidth.Device(mass=0.0), "mass: got 0.0; it must be finite and greater than 0"),
         (lambda: zwidth.Device(mass=1.0, damping=-1), "damping: got -1; it must be finite and at least 0"),
-        (lambda: zwidth.Device(mass=np.ones(2)), r"mass: got an array of shape \(2,\); a scene holds single numbers"),
+        (
+            lambda: zwidth.Device(mass=np.ones(2)),  # pyright: ignore[reportArgumentType]
+            r"mass: got an array of shape \(2,\); a scene holds single numbers",
+        ),
         (lambda: zwidth.VirtualWall(stiffness=np.nan), "stiffness: got nan; it must be finite"),
         (lambda: zwidth.Timing(period=1e-3, delay=-1.0), "delay: got -1.0; it must be finite and at least 0"),
-        (lambda: zwidth.Timing(period=1e-3, delay_model="hold"), "delay_model: got 'hold', .* did you mean 'held'"),
+        (
+            lambda: zwidth.Timing(period=1e-3, delay_model="hold"),  # pyright: ignore[reportArgumentType]
+            "delay_model: got 'hold', .* did you mean 'held'",
+        ),
     ],
 )
 def test_what_a_scene_refuses(make, message):

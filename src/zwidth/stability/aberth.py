@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth._types import Array
+from zwidth._types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirst
 from zwidth.domain import poison, valid_wall
 from zwidth.grouping import Degree
 from zwidth.loop import choose_plant
@@ -60,7 +60,7 @@ class ProductForm(NamedTuple):
         return self.power + 2
 
 
-def product_form(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> ProductForm:
+def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> ProductForm:
     """The polynomial of every wall, with a new first axis for its poles; of walls with ``spring`` beta is 0."""
     xp = namespace(alpha, beta, delta, d)
     plant = choose_plant(delta, d, degree)
@@ -147,13 +147,13 @@ def _double_exactly(x: Array) -> Array:
     return optimization_barrier(twice)
 
 
-def _differences(z: Array) -> list[Cartesian]:
+def _differences(z: RootsFirst) -> list[Cartesian]:
     """From each pole the ones that follow it, nearest in number first."""
     twice, count = _double_exactly(z), z.shape[0]
     return [split(z - twice[k : k + count]) for k in range(1, count)]
 
 
-def _step(z: Array, form: ProductForm) -> Array:
+def _step(z: RootsFirst, form: ProductForm) -> RootsFirst:
     q, *others = _differences(z)
     at = split(z)
     q_slope = Cartesian(0.0 * at.re + 1.0, 0.0 * at.im)
@@ -166,7 +166,7 @@ def _step(z: Array, form: ProductForm) -> Array:
     return join(at.re - step.re, at.im - step.im)
 
 
-def _start(form: ProductForm) -> Array:
+def _start(form: ProductForm) -> RootsFirst:
     """Two poles near those of the device, the others around 0, where the two parts of P are about equally large."""
     xp = namespace(form.c)
     around = form.power
@@ -177,7 +177,7 @@ def _start(form: ProductForm) -> Array:
     return xp.concatenate([r * circle, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
 
 
-def discs(z: Array, form: ProductForm) -> tuple[Array, Array, Array]:
+def discs(z: RootsFirst, form: ProductForm) -> tuple[RadiiFirst, Array, Array]:
     """Radii of discs round ``z``, the poles along the first axis: in each lies one pole if the second result says so.
 
     The third says whether P is as small at each of them as rounding lets it be seen.
@@ -201,8 +201,8 @@ def discs(z: Array, form: ProductForm) -> tuple[Array, Array, Array]:
 
 
 def replace_invalid(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree
-) -> tuple[tuple[Array, Array, Array, Array], Array]:
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree
+) -> tuple[tuple[Reals, Reals, Reals, Reals], Reals]:
     """Walls that can be computed, and what to add to the results of those that could not."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d)
@@ -218,8 +218,8 @@ def with_zero(poles: Array, spring: bool) -> Array:
 
 
 def aberth_kernel(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool
-) -> tuple[Array, Array, Array]:
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool
+) -> tuple[Roots, Radii, Array]:
     """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
     walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
     form = product_form(*walls, degree, spring)

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth._types import Array, ArrayLike
+from zwidth._types import Array, ArrayLike, Counts, RootsLike
 from zwidth.batching import to_caller
 from zwidth.errors import InputError
 from zwidth.xp import is_traced, namespace
@@ -21,7 +21,7 @@ _ROUNDINGS = 8.0
 _ON_CIRCLE = 16.0
 
 
-def count_poles(zeros: ArrayLike, poles: ArrayLike, gain: ArrayLike, lag: ArrayLike, radius: ArrayLike = 1.0) -> Array:
+def count_poles(zeros: RootsLike, poles: RootsLike, gain: ArrayLike, lag: ArrayLike, radius: ArrayLike = 1.0) -> Counts:
     """Count the closed loop's poles inside a circle.
 
     Counts, with multiplicity, the zeros of

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth._types import Array, ArrayLike
+from zwidth._types import Array, ArrayLike, Coefficients, Counts, Matrices, Radii, Reals, Roots, RootsFirst
 from zwidth.batching import as_float64, map_blocks
 from zwidth.domain import LONGEST_DELAY, check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
@@ -48,13 +48,13 @@ _WIDE = {"xla_cpu_prefer_vector_width": 512}
 class Poles(NamedTuple):
     """Poles, how far each is off at most, both with a last axis for the poles; and a status and `Method` a wall."""
 
-    z: Array
-    within: Array
+    z: Roots
+    within: Radii
     status: Array
     method: Array
 
 
-def companion(monic: Array) -> Array:
+def companion(monic: Coefficients) -> Matrices:
     """The companion matrices whose eigenvalues are the zeros of monic polynomials, highest power first."""
     xp = namespace(monic)
     size = monic.shape[-1] - 1
@@ -62,7 +62,7 @@ def companion(monic: Array) -> Array:
     return xp.concatenate([-monic[..., None, 1:], below], axis=-2)
 
 
-def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool = False) -> Array:
+def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool = False) -> Roots:
     """All poles along a new last axis of degree.poles; NaN where the input is out of range.
 
     With ``spring``, for walls without virtual damping, one pole is 0 and the matrix a row smaller.
@@ -73,7 +73,7 @@ def pole_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degre
     return _polish_poles(z, alpha, beta, delta, d, degree, spring)
 
 
-def _matrices(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
+def _matrices(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Matrices:
     monic = coefficients(*replace_invalid(alpha, beta, delta, d, degree)[0], degree)
     return companion(monic[..., :-1] if spring else monic)
 
@@ -88,13 +88,13 @@ def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
         return np.concatenate([_eigenvalues(half) for half in np.array_split(matrices, 2)])
 
 
-def _polish_poles(z: Array, alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool) -> Array:
+def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
     """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
     xp = namespace(z, alpha)
     walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
     form = product_form(*walls, degree, spring)
 
-    def step(z: Array) -> Array:
+    def step(z: RootsFirst) -> RootsFirst:
         here = split(z)
         value, slope = evaluate(here, form)
         still = (slope.re == 0) & (slope.im == 0)
@@ -113,8 +113,8 @@ def _square(z: Any) -> Array:
 
 
 def radius_kernel(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool = False, find: Any = pole_kernel
-) -> Array:
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool = False, find: Any = pole_kernel
+) -> Reals:
     """The spectral radius from the companion matrix; at least 1 without stiffness, for a pole is there."""
     xp = namespace(alpha, beta, delta, d)
     radius = xp.max(xp.abs(find(alpha, beta, delta, d, degree, spring)), axis=-1)
@@ -165,7 +165,7 @@ def _inside_jax(kernel: Callable[..., Any]) -> Any:
     return jax.jit(kernel, static_argnums=(4, 5, 6))
 
 
-def _found_poles(*arguments: Any) -> Array:
+def _found_poles(*arguments: Any) -> Roots:
     *wall, find = arguments
     return find(*wall)
 
@@ -215,7 +215,7 @@ def poles(
     *,
     method: PoleMethod = "auto",
     delay: str = "held",
-) -> Array:
+) -> Roots:
     """Return the poles of the closed loop.
 
     ``P(z) = 0``, see `zwidth.char_poly`; the loop is stable when every ``|z| < 1``. In no particular order.
@@ -334,8 +334,8 @@ def _found_on_host(*arguments: Any) -> Poles:
 
 
 def _disc_kernel(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool, find: Any
-) -> tuple[Array, Array, Array]:
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any
+) -> tuple[Roots, Radii, Array]:
     """Poles, their discs, and whether these are disjoint."""
     z = find(alpha, beta, delta, d, degree, spring)
     xp = namespace(z)
@@ -345,17 +345,17 @@ def _disc_kernel(
     return z, with_zero(xp.moveaxis(within, 0, -1), spring) + spoiled[..., None], proved
 
 
-def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Reals:
     """The spectral radius at every point, from the poles."""
     return _of_all_poles(radius_kernel, (alpha, beta, delta, d))
 
 
-def unstable_poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+def unstable_poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Counts:
     """How many poles lie on or outside the unit circle; -1 where the input is out of range."""
     return _of_all_poles(_count_kernel, (alpha, beta, delta, d))
 
 
-def _count_kernel(alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool, find: Any) -> Array:
+def _count_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any) -> Counts:
     xp = namespace(alpha, beta, delta, d)
     z = find(alpha, beta, delta, d, degree, spring)
     count = xp.sum(xp.abs(z) >= 1.0, axis=-1)
@@ -372,8 +372,8 @@ def radius_and_bound(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
 
 
 def _bound_kernel(
-    alpha: Array, beta: Array, delta: Array, d: Array, degree: Degree, spring: bool, find: Any
-) -> tuple[Array, Array, Array]:
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any
+) -> tuple[Reals, Reals, Array]:
     """A pole lies within degree |P/P'| of any z. What rounding may do to P itself comes on top."""
     xp = namespace(alpha, beta, delta, d)
     poles = find(alpha, beta, delta, d, degree, spring)

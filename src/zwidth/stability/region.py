@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth._types import DelayModel
+from zwidth._types import DelayModel, Vertices
 from zwidth.batching import as_float64
 from zwidth.domain import check_scalars
 from zwidth.errors import InputError
@@ -32,9 +32,9 @@ class Piece(IntEnum):
 class StableRegion(NamedTuple):
     """A closed outline: vertex k belongs to ``piece[k]``, and the last vertex joins the first along alpha = 0."""
 
-    alpha: np.ndarray
-    beta: np.ndarray
-    omega: np.ndarray
+    alpha: Vertices
+    beta: Vertices
+    omega: Vertices
     piece: np.ndarray
     verified: bool
 
@@ -45,7 +45,9 @@ class StableRegion(NamedTuple):
         return float(0.5 * abs(np.dot(x, np.roll(y, -1)) - np.dot(y, np.roll(x, -1))))
 
 
-def lobe(delta: float, d: float, *, delay: DelayModel = "held", points: int = 400) -> tuple[np.ndarray, ...]:
+def lobe(
+    delta: float, d: float, *, delay: DelayModel = "held", points: int = 400
+) -> tuple[Vertices, Vertices, Vertices]:
     """Frequencies along the first lobe of the boundary curve, and its alpha and beta there."""
     check_delay_model(delay)
     for name, value in (("delta", delta), ("d", d)):
@@ -109,7 +111,7 @@ def stable_region(delta: float, d: float, *, delay: DelayModel = "held", points:
     return StableRegion(alpha, beta, omega, piece, verified)
 
 
-def _edge_is_right(alpha: np.ndarray, beta: np.ndarray, delta: float, d: float) -> bool:
+def _edge_is_right(alpha: Vertices, beta: Vertices, delta: float, d: float) -> bool:
     """Whether each vertex parts stable from unstable walls: towards the middle, and at alpha = 0 along a column."""
     inner = slice(1, -1)
     middle = np.mean(alpha), np.mean(beta)

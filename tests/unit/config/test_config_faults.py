@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from zwidth.errors import ConfigError
+from zwidth.config.faults import ConfigFileError
 from zwidth.studies.document import load_config
 
 FOLDER = Path(__file__).parents[2] / "data" / "bad_configs"
@@ -162,7 +162,7 @@ FAULTS = {
 
 
 def faults_of(path):
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigFileError) as caught:
         load_config(path)
     return caught.value
 

@@ -12,9 +12,8 @@ import pytest
 import yaml
 
 from sweeping import main_of
-from zwidth.config.faults import dotted
+from zwidth.config.faults import ConfigFileError, dotted
 from zwidth.config.reader import MAX_DEPTH, MAX_NODES
-from zwidth.errors import ConfigError
 from zwidth.studies.document import Config, load_config
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -114,7 +113,7 @@ def outcome(path):
     """The configuration and no faults, or none and its faults; any other exception is the test's failure."""
     try:
         return load_config(path), ()
-    except ConfigError as error:
+    except ConfigFileError as error:
         return None, error.faults
 
 
@@ -164,7 +163,9 @@ def test_any_value_anywhere_ends_in_a_config_or_a_clear_error(value, tmp_path):
 def test_a_fault_without_its_field_would_be_noticed(tmp_path):
     path = tmp_path / "bad.yaml"
     path.write_text("{version: 1, name: a, studies: [{kind: ridge, name: r, delta: -1, d: 0}]}", encoding="utf-8")
-    (fault,) = outcome(path)[1]
+    _, faults = outcome(path)
+    assert len(faults) == 1
+    fault = faults[0]
     fields = fields_of(path.read_bytes())
     check_named(fault, fields)
     for wrong in ("", "delta", "studies[1].delta", "studies[0].delta.linear"):

@@ -5,6 +5,7 @@ import pickle
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +15,8 @@ from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, n
 from zwidth.config.units import Span
 from zwidth.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
+from zwidth.studies.passivity import PassivityStudy
+from zwidth.studies.ridge import RidgeStudy
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))
@@ -39,7 +42,7 @@ def test_shipped_configs_are_valid_and_named_after_their_file(path):
 
 
 def test_the_paper_is_complete():
-    studies = {study.name: study for study in load_config(CONFIGS / "paper.yaml").studies}
+    studies: dict[str, Any] = {study.name: study for study in load_config(CONFIGS / "paper.yaml").studies}
     assert list(studies) == ["fig5", "fig6", "fig7", "fig8", "fig9", "fig10", "fig11", "passivity_cost"]
     assert all(study.figure == name for name, study in studies.items())
     np.testing.assert_array_equal(studies["fig5"].delta.values(), [0, 0.25, 0.5, 0.75, 1])
@@ -152,6 +155,8 @@ def test_aliases_and_a_byte_order_mark(tmp_path):
     text = "version: 1\nname: a\nstudies:\n  - {kind: ridge, name: r, delta: &x [0, 1], d: 0}\n"
     path.write_text(text + "  - {kind: passivity, name: p, delta: *x, d: 0}\n", encoding="utf-8-sig")
     first, second = load_config(path).studies
+    assert isinstance(first, RidgeStudy)
+    assert isinstance(second, PassivityStudy)
     assert first.delta == second.delta
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zwidth.errors import ConfigError
+from zwidth.config.faults import ConfigFileError
 from zwidth.scene import normalize
 from zwidth.studies.document import Config, config_json_schema, load_config
 from zwidth.sweep.grid import Grid
@@ -153,7 +153,7 @@ def test_faults_have_their_place(load, tmp_path, axes, rest, place, words):
     (tmp_path / "short.csv").write_text("mass,damping\n1\n", encoding="utf-8")
     (tmp_path / "typo.csv").write_text("mass,dampng\n1,2\n", encoding="utf-8")
     (tmp_path / "empty.csv").write_text("", encoding="utf-8")
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(ConfigFileError) as caught:
         load(sweep(axes, rest))
     fields = [fault.field.removeprefix("studies[0].") for fault in caught.value.faults]
     assert place in fields, str(caught.value)

@@ -1,15 +1,17 @@
 """Areas against the outlined region, a Monte Carlo count of poles, and Colgate's triangle."""
 
 import jax
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp, mpf
+from mpmath import mpf
 
 import oracles
 import zwidth
 from compiling import SOON
 from zwidth import passive_area, stable_area
 from zwidth.stability.poles import unstable_poles
+from zwidth.stability.region import Piece
 
 # Undamped; cut by the line of z = -1 before and after the corner becomes the ridge; delayed; held.
 POINTS = [(0.0, 0.0), (0.5, 0.0), (3.0, 0.0), (10.0, 0.0), (0.1, 1.0), (1.0, 4.0), (40.0, 0.125), (2.0, 0.6)]
@@ -33,7 +35,7 @@ def test_the_area_by_quadrature_in_mpmath(delta, d):
     with mp.workdps(40 + oracles.digits_for(delta)):
         region = zwidth.stable_region(delta, d, points=8)
         # The last point of the curve, in front of the line to alpha = 0.
-        rises = region.piece[-1] == zwidth.stability.region.Piece.MINUS_ONE
+        rises = region.piece[-1] == Piece.MINUS_ONE
         end, corner, h = mp.pi, mpf(0), mpf(10) ** -20
         if rises:
             corner = oracles.boundary(mp.pi - mpf(10) ** -18, delta, d)[0] ** 2 / 4

@@ -19,8 +19,8 @@ ALPHA = np.asarray(0.5 * zwidth.alpha_max(DELTA, D).alpha)
 @pytest.fixture(scope="module")
 def trials():
     """A fine row of stable dampings for every device."""
-    ends = [zwidth.boundary_point(DELTA, D, alpha=ALPHA, side=side).beta for side in ("lower", "upper")]
-    return np.linspace(*ends, 2001)[1:-1]
+    low, high = (zwidth.boundary_point(DELTA, D, alpha=ALPHA, side=side).beta for side in ("lower", "upper"))
+    return np.linspace(low, high, 2001)[1:-1]
 
 
 def test_no_other_damping_settles_faster(trials):

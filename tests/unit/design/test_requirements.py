@@ -99,10 +99,9 @@ def test_the_longest_delay_is_found_beyond_the_best_one():
 
 
 def test_derivatives_are_those_of_the_inverse_function(x64):
-    device = {"mass": 0.1, "period": 1e-3, "delay": 1e-3}
     damping = np.array([10.0])
-    wanted = max_stiffness(**device, damping=damping)
-    gain = sensitivities(**device, damping=damping)
+    wanted = max_stiffness(damping=damping, mass=0.1, period=1e-3, delay=1e-3)
+    gain = sensitivities(damping=damping, mass=0.1, period=1e-3, delay=1e-3)
 
     def needed(stiffness, mass):
         return required_damping(stiffness, mass=mass, period=1e-3, delay=1e-3).value

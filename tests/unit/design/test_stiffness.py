@@ -89,4 +89,4 @@ def test_wrong_input_is_named(bad, message):
         with pytest.raises(zwidth.InputError, match=message):
             function(**(good | bad))
     with pytest.raises(zwidth.InputError, match="mass: got an array"):
-        sensitivity_lines(**(good | {"mass": np.ones(2)}))
+        sensitivity_lines(mass=np.ones(2), period=1e-3)  # pyright: ignore[reportArgumentType]

@@ -11,7 +11,12 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
+from matplotlib.axis import Tick
+from matplotlib.colors import to_rgb
+from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.text import Annotation, Text
 
 from zwidth import figures
 from zwidth.errors import InputError
@@ -142,7 +147,7 @@ def assert_drawn(ax, label, x, y):
 
 def words(figure):
     """All text of a figure."""
-    return " ".join(text.get_text() for text in figure.findobj(matplotlib.text.Text))
+    return " ".join(text.get_text() for text in figure.findobj(Text))
 
 
 @cache
@@ -182,7 +187,7 @@ def test_a_figure_is_drawn_into_a_given_axes_which_is_returned(name):
 @pytest.mark.parametrize("name", ["draw_boundary", "draw_step", "draw_passivity_cost", "draw_map of many"])
 def test_every_panel_is_drawn_into_axes_of_ones_own(name):
     expected = drawn(name).axes
-    part = Figure(layout="constrained").subfigures(1, 2)[1]
+    part = Figure(layout="constrained").subfigures(1, 2, squeeze=False)[0, 1]
     axes = part.subplots(1, len(expected))
     assert list(draw(name, axes)) == list(axes)
     for ax, alike in zip(axes, expected, strict=True):
@@ -252,8 +257,8 @@ def test_every_text_stays_on_the_page(name):
     figure = drawn(name)
     page = figure.bbox
     # Ticks beyond the range exist, but are not drawn.
-    ticks = {label for tick in figure.findobj(matplotlib.axis.Tick) for label in (tick.label1, tick.label2)}
-    for text in figure.findobj(matplotlib.text.Text):
+    ticks = {label for tick in figure.findobj(Tick) for label in (tick.label1, tick.label2)}
+    for text in figure.findobj(Text):
         if text in ticks or not text.get_visible() or not text.get_text().strip():
             continue
         box = text.get_window_extent()
@@ -285,7 +290,7 @@ def test_boundaries_show_the_given_curves_in_one_panel_for_each_delay():
             given = outline(delta, d)
             assert_drawn(ax, f"boundary, delta = {delta:g}, d = {d:g}", given["alpha"], given["beta"])
         assert_drawn(ax, f"path of alpha_max, d = {d:g}", path(d)["alpha"], path(d)["beta"])
-        shaded = [patch.get_xy() for patch in ax.patches]
+        shaded = [patch.get_xy() for patch in ax.patches if isinstance(patch, Polygon)]
         assert any(np.array_equal(xy[:21], np.c_[outline(1.0, d)["alpha"], outline(1.0, d)["beta"]]) for xy in shaded)
 
 
@@ -318,9 +323,7 @@ def test_passivity_is_dash_dotted_and_si_axes_are_added():
 
 def test_the_larger_delta_is_darker():
     ax = drawn("draw_boundary").axes[0]
-    gray = {
-        line.get_label(): np.dot(matplotlib.colors.to_rgb(line.get_color()), [0.299, 0.587, 0.114]) for line in ax.lines
-    }
+    gray = {line.get_label(): np.dot(to_rgb(line.get_color()), [0.299, 0.587, 0.114]) for line in ax.lines}
     assert gray["boundary, delta = 1, d = 0"] < gray["boundary, delta = 0.5, d = 0"] - 0.1
 
 
@@ -361,7 +364,7 @@ def test_the_slope_is_drawn_beside_its_limit():
         rows = SLOPES["delay_model"] == model
         assert_drawn(limit, f"g, {model}", SLOPES["d"][rows], SLOPES["slope"][rows])
     # The name of a delay stands at the end of its held curve.
-    places = {text.get_text(): text.xy[1] for text in ratio.texts}
+    places = {text.get_text(): text.xy[1] for text in ratio.texts if isinstance(text, Annotation)}
     low, high = np.log(ratio.get_ylim())
     assert places["$d = 0.5$"] == pytest.approx((np.log(2.5) - low) / (high - low), abs=0.03)
 
@@ -393,11 +396,12 @@ def test_step_responses_are_drawn_in_readable_units():
 def test_a_map_shows_the_grid_and_the_edge_of_stability():
     figure = drawn("draw_map of radius")
     mesh = figure.axes[0].collections[0]
-    np.testing.assert_array_equal(mesh.get_array().T, grid_map()["spectral_radius"][:, :, 0, 0])
+    np.testing.assert_array_equal(np.asarray(mesh.get_array()).T, grid_map()["spectral_radius"][:, :, 0, 0])
     contour = figure.axes[0].collections[1]
+    assert isinstance(contour, ContourSet)
     assert list(contour.levels) == [1.0]
     stable = drawn("draw_map of stable").axes[0].collections[0]
-    np.testing.assert_array_equal(stable.get_array().T, grid_map()["stable"][:, :, 0, 0])
+    np.testing.assert_array_equal(np.asarray(stable.get_array()).T, grid_map()["stable"][:, :, 0, 0])
 
 
 def test_a_map_of_many_deltas_shows_the_ends_and_the_middle():

@@ -45,6 +45,7 @@ def holder():
         words = [sys.executable, "-c", HOLD, str(folder), *map(str, shard)]
         process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
         started.append(process)
+        assert process.stdout is not None
         assert process.stdout.readline() == "held\n"
         return process
 

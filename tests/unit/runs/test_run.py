@@ -248,8 +248,8 @@ def test_somebodys_own_config_yaml_is_never_replaced(both, tmp_path):
     out = tmp_path / "out"
     out.mkdir()
     (out / "config.yaml").write_text("mine", encoding="utf-8")
-    for options in ({}, {"resume": True}, {"overwrite": True}):
-        assert run(both, out=out, **options).ok
+    for resume, overwrite in ((False, False), (True, False), (False, True)):
+        assert run(both, out=out, resume=resume, overwrite=overwrite).ok
         assert (out / "config.yaml").read_text(encoding="utf-8") == "mine"
     (out / "config.yaml").unlink()
     assert run(both, out=out, overwrite=True).ok
@@ -263,11 +263,11 @@ def test_a_strangers_store_of_the_same_name_is_never_replaced(both, tmp_path):
 
     store = tmp_path / "out" / "swept.zarr"
     zarr.create_group(store).create_array("mine", data=np.arange(3.0))
-    for options in ({}, {"overwrite": True}):
+    for overwrite in (False, True):
         with pytest.raises(StoreExistsError, match=r"swept\.zarr exists already"):
-            run(both, out=tmp_path / "out", **options)
+            run(both, out=tmp_path / "out", overwrite=overwrite)
     assert [path.name for path in (tmp_path / "out").iterdir() if path.name != ".locks"] == ["swept.zarr"]
-    np.testing.assert_array_equal(zarr.open_group(store)["mine"][:], [0, 1, 2])
+    np.testing.assert_array_equal(zarr.open_array(store, path="mine")[:], [0, 1, 2])
 
 
 def test_a_record_that_names_files_elsewhere_removes_none(finished, both, tmp_path):
@@ -394,9 +394,9 @@ def test_a_run_of_an_earlier_release_is_replaced_but_not_resumed(finished, both)
 @pytest.mark.parametrize("content", ["{", "[]", '{"studies": 1}'])
 def test_a_damaged_record_is_refused(finished, both, content):
     (finished / "run.json").write_text(content, encoding="utf-8")
-    for options in ({"resume": True}, {"overwrite": True}, {}):
+    for resume, overwrite in ((True, False), (False, True), (False, False)):
         with pytest.raises(StoreError, match=r"run\.json: .*choose another folder with --out DIR, or remove it"):
-            run(both, out=finished, **options)
+            run(both, out=finished, resume=resume, overwrite=overwrite)
 
 
 def test_ctrl_c_keeps_every_finished_study(both, tmp_path):

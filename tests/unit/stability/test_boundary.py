@@ -3,12 +3,14 @@
 import itertools
 import math
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp, mpf
+from mpmath import mpf
 
 import oracles
 import tolerances as tol
@@ -37,7 +39,7 @@ def exact_and_condition(omega, delta, d, delay):
     h = mpf(10) ** -30
     # Inwards in omega and delta, to the right in d, where a whole delay belongs.
     shifted = [(omega * (1 - h), delta, d), (omega, delta * (1 - h), d), (omega, delta, d * (1 + h))]
-    moved = [oracles.boundary(*map(mpf, point), delay) for point in shifted]
+    moved = [oracles.boundary(*map(mpf, point), delay=delay) for point in shifted]
     return [(value, abs(value) + sum(abs(m[k] - value) for m in moved) / h) for k, value in enumerate(exact)]
 
 
@@ -169,7 +171,7 @@ def test_derivatives(delay, x64):
 
             def at(steps, point=point, direction=direction):
                 return oracles.boundary(
-                    *(mpf(x) + steps * h * mpf(u) for x, u in zip(point, direction, strict=True)), delay
+                    *(mpf(x) + steps * h * mpf(u) for x, u in zip(point, direction, strict=True)), delay=delay
                 )
 
             for part, (f0, f1, f2, f3) in enumerate(zip(*(at(steps) for steps in range(4)), strict=True)):
@@ -207,7 +209,7 @@ def test_points_out_of_range_are_nan_with_all_derivatives(x64):
 
 def test_an_unknown_delay_model_is_refused():
     with pytest.raises(InputError, match="delay: got 'power', allowed are 'held', 'fractional_power'"):
-        zwidth.boundary(0.1, 0.1, 1, delay="power")
+        zwidth.boundary(0.1, 0.1, 1, delay="power")  # pyright: ignore[reportArgumentType]
 
 
 # --- points on lines ---------------------------------------------------------------------------------------------
@@ -329,7 +331,7 @@ def test_fractional_power_points(ridge):
 
 def test_lines_without_a_stable_part(ridge):
     nan = np.full(DELTA.size, np.nan)
-    for line in (
+    lines: tuple[dict[str, Any], ...] = (
         {"alpha": 1.001 * ridge["held"].alpha},
         {"alpha": 1.001 * ridge["held"].alpha, "side": "upper"},
         {"alpha": np.zeros(DELTA.size)},
@@ -337,7 +339,8 @@ def test_lines_without_a_stable_part(ridge):
         {"beta": -1.001 * DELTA - 0.01},
         {"beta": 10 * (DELTA + 1)},
         {"ray": (-1.0, 0.5, 0.0, 1.0)},
-    ):
+    )
+    for line in lines:
         points = zwidth.boundary_point(DELTA, D, **line)
         np.testing.assert_array_equal(points.status, Status.NO_BOUNDARY)
         for value in (points.alpha, points.beta, points.omega):

@@ -73,7 +73,7 @@ def test_a_map_and_its_points_one_by_one_agree(d):
     stable = is_stable(alpha, beta, 0.2, d)
     # A pair of columns of one length is no map: each point is a row of its own.
     columns = [np.ravel(part) for part in np.broadcast_arrays(alpha, beta)]
-    np.testing.assert_array_equal(stable.ravel(), is_stable(*columns, 0.2, d))
+    np.testing.assert_array_equal(stable.ravel(), is_stable(*columns, delta=0.2, d=d))
     assert 0 < stable.sum() < stable.size
 
 

@@ -3,16 +3,19 @@
 import subprocess
 import sys
 from functools import cache
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp, mpf
+from mpmath import mpf
 
 import oracles
 import tolerances as tol
 import zwidth
+from zwidth._types import DELAY_MODELS, DelayModel
 from zwidth.status import Status
 
 COUNT = 10_000
@@ -110,8 +113,8 @@ def test_rays_end_where_stability_does():
     clear = found & (lengths > 1e-4) & (lengths < 1e4)
     assert clear.mean() > 0.8
     for share, stable in ((1e-3, True), (0.5, True), (0.9, True), (1 - 1e-7, True), (1 + 1e-7, False), (1.01, False)):
-        walls = (part + share * lengths * step for part, step in zip(ray[:2], ray[2:], strict=True))
-        assert not judged(stable, *walls, clear).size, share
+        a, b = (part + share * lengths * step for part, step in zip(ray[:2], ray[2:], strict=True))
+        assert not judged(stable, a, b, clear).size, share
 
 
 @pytest.mark.parametrize(
@@ -168,8 +171,12 @@ def test_points_by_mpmath(fixed):
 
 
 def test_rows_without_a_stable_wall_are_empty_by_every_route():
-    for delay in ("held", "fractional_power"):
-        traced = jax.jit(lambda b, d, delay=delay: zwidth.boundary_point(0.1, d, beta=b, delay=delay).status)
+    for delay in DELAY_MODELS:
+
+        def status(b, d, delay: DelayModel = delay):
+            return zwidth.boundary_point(0.1, d, beta=b, delay=delay).status
+
+        traced = jax.jit(status)
         beta = np.array([5.0, 50.0, -0.1, -0.2, 0.3])
         for d in (0.5, 20.0, 7.4):
             direct = zwidth.boundary_point(0.1, d, beta=beta, delay=delay).status
@@ -223,7 +230,13 @@ def test_optimistix_agrees():
     alpha = top.alpha * random.uniform(1e-3, 0.98, count)
     beta = -delta + (top.beta + delta) * random.uniform(0.05, 1.2, count)
     ray = (0.5 * alpha, top.beta, random.normal(size=count) * top.alpha, random.normal(size=count) * (top.beta + delta))
-    for line in ({"beta": beta}, {"alpha": alpha}, {"alpha": alpha, "side": "upper"}, {"ray": ray}):
+    lines: tuple[dict[str, Any], ...] = (
+        {"beta": beta},
+        {"alpha": alpha},
+        {"alpha": alpha, "side": "upper"},
+        {"ray": ray},
+    )
+    for line in lines:
         mine = zwidth.boundary_point(delta, d, **line)
         other = zwidth.boundary_point(delta, d, **line, method="optimistix")
         np.testing.assert_array_equal(mine.status, other.status)

@@ -4,16 +4,17 @@ import subprocess
 import sys
 from pathlib import Path
 
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp, mpf
-from zwidth.stability.certify_pole import certified_stable
+from mpmath import mpf
 
 import zwidth
 from zwidth.batching import FEW
 from zwidth.domain import wall_status
 from zwidth.errors import InputError
 from zwidth.stability import balls
+from zwidth.stability.certified import certified_stable
 from zwidth.stability.certified_filter import OPEN, SPECIAL, each_code, filter_walls, has_rows
 from zwidth.stability.crossover import Verdict
 from zwidth.stability.layout import lay_out

@@ -3,9 +3,9 @@
 import itertools
 from fractions import Fraction
 
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp
 
 import oracles
 from zwidth.stability import balls

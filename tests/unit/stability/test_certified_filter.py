@@ -71,7 +71,7 @@ def test_every_intermediate_of_the_crossover_is_enclosed(d):
             x, y = flint.arb(alpha[index]), flint.arb(beta[index])
             device = balls.device(delta[index], d[index], BITS)
             truth = gain_cubic(x, y, device)
-            assert escaped(*numbers(here, device), index) == 0
+            assert escaped(*numbers(here, device), index=index) == 0
             assert escaped(cubic, truth, index) == 0
             if not found[index]:
                 continue
@@ -92,7 +92,7 @@ def test_every_number_of_a_short_device_is_enclosed(d):
     with np.errstate(all="ignore"):
         here = enclosed_device(DELTAS, np.full(DELTAS.size, d), classify_delays(d))
     for index, delta in enumerate(DELTAS):
-        assert escaped(*numbers(here, balls.device(float(delta), d, 1600)), index) == 0
+        assert escaped(*numbers(here, balls.device(float(delta), d, 1600)), index=index) == 0
 
 
 def test_bounds_too_small_are_noticed(monkeypatch):
@@ -163,7 +163,7 @@ def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
     rng = np.random.default_rng(17)
     alpha, beta, delta, _ = walls(400, 19, d)
     width = 10.0 ** rng.uniform(-5, -1, 400)
-    boxes = [Ball(x, 1.001 * width * np.abs(x)) for x in (alpha, beta)]
+    a, b = (Ball(x, 1.001 * width * np.abs(x)) for x in (alpha, beta))
     with np.errstate(all="ignore"):
         here = enclosed_device(delta, np.full(400, d), classify_delays(d))
         if d < 1:
@@ -176,7 +176,7 @@ def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
     assert unstable.sum() > 20
     for _ in range(8):
         inside = [x * (1 + width * rng.uniform(-1, 1, 400)) for x in (alpha, beta)]
-        truth = certified_stable(*inside, delta, d)
+        truth = certified_stable(*inside, delta=delta, d=d)
         assert (truth.status == 0).all()
         assert truth.stable[stable].all()
         assert not truth.stable[unstable].any()

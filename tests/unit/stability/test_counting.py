@@ -393,7 +393,8 @@ def test_single_precision_is_traced_with_its_own_rounding():
 def test_jax_arrays_are_computed_in_float64_and_returned_as_such():
     counts = count_poles(jnp.array([0.5, -0.9]), [1.0, 1 - 1e-9], 1e-12, [3, 10**10])
     assert isinstance(counts, jax.Array)
-    assert counts.tolist() == count_poles(np.float32([0.5, -0.9]), [1.0, 1 - 1e-9], 1e-12, [3, 10**10]).tolist()
+    singles = np.array([0.5, -0.9], np.float32)
+    assert counts.tolist() == count_poles(singles, [1.0, 1 - 1e-9], 1e-12, [3, 10**10]).tolist()
 
 
 def test_direct_counts_need_no_jax():

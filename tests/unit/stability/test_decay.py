@@ -4,9 +4,9 @@ from pathlib import Path
 
 import flint
 import jax
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp
 
 import oracles
 import zwidth

@@ -1,6 +1,8 @@
 """Float64 balls: every operation encloses what python-flint's balls compute, and comparisons are certain or false."""
 
 import operator
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ from zwidth.stability import enclosure
 from zwidth.stability.enclosure import Ball, as_ball
 
 flint = pytest.importorskip("flint")
-OPERATIONS = (operator.add, operator.sub, operator.mul, operator.truediv)
+OPERATIONS: tuple[Callable[[Any, Any], Ball], ...] = (operator.add, operator.sub, operator.mul, operator.truediv)
 COUNT = 600
 
 

@@ -34,7 +34,8 @@ def walls(count, seed):
 def verdict(alpha, beta, delta, d):
     """Stable or not by the closed form, whose own judges are certified labels; in NumPy, with nothing to compile."""
     with np.errstate(all="ignore"):
-        return stable_kernel(*np.broadcast_arrays(*map(np.float64, (alpha, beta, delta, d))))
+        alpha, beta, delta, d = np.broadcast_arrays(*map(np.float64, (alpha, beta, delta, d)))
+        return stable_kernel(alpha, beta, delta, d)
 
 
 def open_loop(alpha, beta, delta, d):
@@ -189,7 +190,7 @@ def test_the_distance_is_that_of_the_polynomials():
     for wall in ((0.1, 0.2, 0.1, 0.0), (0.05, -0.1, 0.3, 1.5), (1e-3, 0.05, 0.5, 3.0)):
         z = np.exp(1j * w)
         ratio = np.polyval(zwidth.char_poly(*wall), z) / np.polyval(zwidth.char_poly(0, 0, *wall[2:]), z)
-        square = squared_distance(w, *wall[:2], device(*map(np.float64, wall[2:])))
+        square = squared_distance(w, *wall[:2], device(np.float64(wall[2]), np.float64(wall[3])))
         np.testing.assert_allclose(square, np.abs(ratio) ** 2, rtol=1e-11)
 
 

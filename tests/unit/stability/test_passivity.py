@@ -1,6 +1,7 @@
 """Passivity at any delay: eq. (21), the condition as printed scanned over frequency, and a linear program."""
 
 import math
+from typing import Any
 
 import jax
 import mpmath as mp
@@ -82,10 +83,10 @@ def test_held_delays_join_the_whole_ones(n):
 @pytest.mark.parametrize("d", DELAYS)
 def test_the_passive_set_is_convex_and_a_cone(d):
     one, two = RANDOM.uniform([0, -1, 0], [2, 1, 3], (2, 40, 3))
-    first, second, middle = (zwidth.passivity_margin(*wall.T, d) for wall in (one, two, (one + two) / 2))
+    first, second, middle = (zwidth.passivity_margin(*wall.T, d=d) for wall in (one, two, (one + two) / 2))
     allowed = tol.PASSIVITY.float64 * 10 * (d + 1)
     assert (middle >= (first + second) / 2 - allowed).all()
-    np.testing.assert_allclose(zwidth.passivity_margin(*(3 * one).T, d), 3 * first, rtol=0, atol=3 * allowed)
+    np.testing.assert_allclose(zwidth.passivity_margin(*(3 * one).T, d=d), 3 * first, rtol=0, atol=3 * allowed)
 
 
 @pytest.mark.parametrize("d, alpha, beta", [(12.0, 0.00788585704807089, 0.9951298014123421), (20.0, 0.00217, 0.999)])
@@ -167,13 +168,13 @@ def test_points_out_of_range():
 
 @pytest.mark.parametrize("d", [0, 2.3])
 def test_derivatives(d, x64):
-    gradient = jax.jit(jax.vmap(jax.grad(lambda wall: zwidth.passivity_margin(*wall, d))), compiler_options=SOON)
+    gradient = jax.jit(jax.vmap(jax.grad(lambda wall: zwidth.passivity_margin(*wall, d=d))), compiler_options=SOON)
     walls = np.array([(0.3, 0.2, 2.0), (0.3, -0.2, 2.0), (0.3, 0.2, -1.0)])
     got = np.asarray(gradient(walls))
     assert np.isnan(got[2]).all()
     h = 1e-6
     for k, step in enumerate(h * np.eye(3)):
-        up, down = (zwidth.passivity_margin(*(walls[:2] + s * step).T, d) for s in (1, -1))
+        up, down = (zwidth.passivity_margin(*(walls[:2] + s * step).T, d=d) for s in (1, -1))
         np.testing.assert_allclose(got[:2, k], (up - down) / (2 * h), atol=1e-6)
     if d == 0:
         np.testing.assert_allclose(got[:2], [(-0.5, -1, 1), (-0.5, 1, 1)], atol=1e-9)
@@ -240,7 +241,7 @@ def needed_in_mpmath(alpha, beta, d):
     with mp.workdps(50):
         f, a, b = mp.mpf(d) - n, mp.mpf(alpha), mp.mpf(beta)
         tiny = mp.mpf(10) ** -18
-        brackets = [(tiny, min(mp.pi, 1.1 * mp.pi / (mp.mpf(d) + 1)))]
+        brackets: list[tuple[Any, Any]] = [(tiny, min(mp.pi, 1.1 * mp.pi / (mp.mpf(d) + 1)))]
         brackets.append((max(tiny, mp.mpf(top - step)), min(mp.pi, mp.mpf(top + step))))
         return max(golden_maximum(lambda w: printed(w, a, b, n, f), *bracket) for bracket in brackets)
 
@@ -301,7 +302,7 @@ def test_maps_are_the_scattered_walls(d):
     alpha, beta = np.linspace(-0.1, 2.0, 90)[:, None] / (d + 1), np.linspace(-1.2, 1.2, 100)
     grid = zwidth.passivity_margin(alpha, beta, 1.0, d)
     walls = [value.ravel()[::7] for value in np.broadcast_arrays(alpha, beta)]
-    some = zwidth.passivity_margin(*walls, 1.0, d)
+    some = zwidth.passivity_margin(*walls, delta=1.0, d=d)
     np.testing.assert_allclose(grid.ravel()[::7], some, rtol=0, atol=2 * ON_A_MAP)
     np.testing.assert_array_equal(zwidth.is_passive(alpha, beta, 1.0, d), grid > 0)
 

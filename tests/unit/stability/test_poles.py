@@ -4,9 +4,10 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp
+from mpmath.libmp import NoConvergence
 
 import oracles
 import tolerances as tol
@@ -192,7 +193,7 @@ def test_the_iteration_is_right_to_the_last_digits_wherever_eigenvalues_are():
             polynomial = oracles.polynomial(*(column[k] for column in walls))
             try:
                 exact = mp.polyroots(polynomial[::-1], maxsteps=200, extraprec=400, asc=True)
-            except mp.NoConvergence:
+            except NoConvergence:
                 continue
             checked += 1
             errors = [max(pair_up(z[k][np.isfinite(z[k])], exact)) for z in (found.z, peer.z)]
@@ -253,13 +254,13 @@ def test_a_bad_wall_leaves_its_neighbors_alone():
 def test_a_matrix_without_eigenvalues_leaves_its_neighbors_alone():
     matrices = np.stack([np.eye(3), np.full((3, 3), np.nan), 2 * np.eye(3)])
     got = _eigenvalues(matrices)
-    np.testing.assert_array_equal(got[[0, 2]].real, [[1, 1, 1], [2, 2, 2]])
+    np.testing.assert_array_equal(np.real(got[[0, 2]]), [[1, 1, 1], [2, 2, 2]])
     assert np.isnan(got[1]).all()
 
 
 def test_what_cannot_be_asked_for_is_refused():
     with pytest.raises(InputError, match="method: got 'eig'"):
-        zwidth.poles(0.1, 0.1, 0.1, 1, method="eig")
+        zwidth.poles(0.1, 0.1, 0.1, 1, method="eig")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="aberth"):
         jax.jit(lambda alpha: zwidth.poles(alpha, 0.1, 0.1, 1, method="aberth"))(0.1)
     with pytest.raises(InputError, match="traced"):

@@ -5,9 +5,9 @@ import sys
 from pathlib import Path
 
 import jax
+import mpmath as mp
 import numpy as np
 import pytest
-from mpmath import mp
 
 import oracles
 import tolerances as tol
@@ -67,8 +67,8 @@ def test_maps_keep_their_bounds(d, transposed):
     assert (np.abs(found.radius - peer) <= tol.DOUBLE_POLE.float64 * peer).all()
     for index in np.ndindex(found.radius[::37, ::29].shape):
         place = (37 * index[0], 29 * index[1])
-        wall = (float(axis[place]) for axis in np.broadcast_arrays(*axes))
-        assert abs(found.radius[place] - exact_radius(*wall, 0.1, d)) <= found.error[place]
+        alpha, beta = (float(axis[place]) for axis in np.broadcast_arrays(*axes))
+        assert abs(found.radius[place] - exact_radius(alpha, beta, 0.1, d)) <= found.error[place]
 
 
 def test_several_devices_in_one_call_are_several_maps():

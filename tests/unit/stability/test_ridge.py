@@ -13,13 +13,13 @@ import pytest
 
 import tolerances as tol
 import zwidth
+from zwidth._types import DELAY_MODELS as MODELS
 from zwidth.errors import InputError
 from zwidth.stability.poles import unstable_poles
 from zwidth.stability.ridge import RidgeKind, ridge_kernel
 from zwidth.status import Status
 
 REFERENCE = Path(__file__).resolve().parents[2] / "reference" / "ridge_extended.json"
-MODELS = ["held", "fractional_power"]
 # The corner takes over at d = 0: this float64 is the last smooth one, 4e-18 below.
 TAKE_OVER = 3.659361627421783507
 # One size for all derivatives of a model: one compilation, and a quick one.
@@ -39,10 +39,10 @@ def reference(model):
 @cache
 def compiled_derivatives(model):
     def three(point):
-        return jnp.stack(ridge_kernel(*point, model)[:3])
+        return jnp.stack(ridge_kernel(point[0], point[1], model)[:3])
 
     def alpha(point):
-        return ridge_kernel(*point, model).alpha
+        return ridge_kernel(point[0], point[1], model).alpha
 
     def everything(point):
         # One reverse sweep, and its change in both directions.
@@ -352,7 +352,7 @@ def test_stable_just_inside_and_never_just_outside():
 def test_shapes_types_and_precision():
     point = zwidth.alpha_max(1, 1)
     assert isinstance(point.alpha, np.float64)
-    assert isinstance(point.kind, np.int32)
+    assert type(point.kind) is np.int32
     grid = zwidth.alpha_max(np.array([[0.1], [2.0]]), [0, 1, 2.5])
     assert grid.alpha.shape == grid.status.shape == (2, 3)
     assert grid.alpha.dtype == np.float64
@@ -376,8 +376,8 @@ def test_ambient_precision_inside_jit(model):
 
 def test_arguments_are_checked():
     with pytest.raises(InputError, match=r"method: got 'newtno', .* did you mean 'newton'"):
-        zwidth.alpha_max(1.0, 1, method="newtno")
+        zwidth.alpha_max(1.0, 1, method="newtno")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="delay"):
-        zwidth.alpha_max(1.0, 1, delay="padé")
+        zwidth.alpha_max(1.0, 1, delay="padé")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="delta"):
         zwidth.alpha_max("much", 1)

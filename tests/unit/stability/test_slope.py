@@ -10,10 +10,9 @@ import pytest
 import tolerances as tol
 import zwidth
 from compiling import SOON
+from zwidth._types import DELAY_MODELS as MODELS
 from zwidth.errors import InputError
 from zwidth.stability.slope import slope_kernel, stiffness_slope
-
-MODELS = ["held", "fractional_power"]
 
 
 def limit_polynomial(g, h, d):
@@ -111,4 +110,4 @@ def test_shapes_bad_input_and_precision():
     assert single.dtype == jnp.float32
     assert single == pytest.approx(0.631130, abs=1e-5)
     with pytest.raises(InputError, match="delay"):
-        stiffness_slope(1.0, delay="none")
+        stiffness_slope(1.0, delay="none")  # pyright: ignore[reportArgumentType]

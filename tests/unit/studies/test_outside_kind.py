@@ -84,4 +84,4 @@ def test_a_package_brings_it_by_its_entry_point(config, monkeypatch):
         zwidth.load_config(config)
     found = EntryPoint("ratio", f"{__name__}:RatioStudy", "zwidth.studies")
     monkeypatch.setattr(document, "entry_points", lambda group, name: [found] if name == "ratio" else [])
-    assert zwidth.load_config(config).studies[0].kind == "ratio"
+    assert zwidth.load_config(config).studies[0].kind_name() == "ratio"

@@ -33,7 +33,7 @@ def words_of(task, tmp_path):
 def test_each_task_of_the_array_is_a_shard_also_when_it_is_submitted_alone(tmp_path):
     for task in (1, 7, 16):
         script, words = words_of(task, tmp_path)
-        shards = re.search(r"--array=1-(\d+)$", script, re.MULTILINE)[1]
+        (shards,) = re.findall(r"--array=1-(\d+)$", script, re.MULTILINE)
         assert words == [
             *("run", "configs/dense.yaml", "--out", "/scratch/of somebody/dense"),
             *("--resume", "--shard", f"{task}/{shards}"),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from sweeping import config_of, study
+from sweeping import study, sweep_of
 from zwidth.bench.problems import exact_radius
 from zwidth.status import Status
 from zwidth.sweep.compute import compute
@@ -21,7 +21,7 @@ def grid_of(d, **axes):
         "d": d,
         **axes,
     }
-    return Grid(config_of(study(axes=axes, outputs=OUTPUTS)).studies[0])
+    return Grid(sweep_of(study(axes=axes, outputs=OUTPUTS)))
 
 
 @pytest.fixture(scope="module")

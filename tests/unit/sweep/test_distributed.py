@@ -1,6 +1,7 @@
 """Sweeps on a dask.distributed cluster: one on this machine, with workers in processes of their own."""
 
 import warnings
+from typing import Any
 
 import pytest
 import yaml
@@ -27,13 +28,17 @@ def cluster():
     """The address of a scheduler with two workers, each of which is replaced when it dies."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import dask
+        from dask import config
         from distributed import LocalCluster
 
         # One death more and dask gives a chunk up: each of them costs the start of a worker.
-        few = dask.config.set({"distributed.scheduler.allowed-failures": 1})
-        with few, LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-            yield cluster.scheduler_address
+        few = config.set({"distributed.scheduler.allowed-failures": 1})
+        # None starts no dashboard, though what distributed annotates is a text.
+        options: dict[str, Any] = {"n_workers": 2, "threads_per_worker": 1, "dashboard_address": None}
+        with few:
+            cluster = LocalCluster(processes=True, **options)
+            with cluster:
+                yield cluster.scheduler_address
 
 
 @pytest.fixture(scope="module")

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sweeping import config_of, study
+from sweeping import config_of, study, sweep_of
 from zwidth.errors import ResourceError
 from zwidth.runs import plan_run
-from zwidth.sweep.plan import MEMORY, FamilyPlan, check_resources, chunk_shape, kept_plan, make_plan
+from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, check_resources, chunk_shape, kept_plan, make_plan
 
 HUGE = {
     "alpha": {"linear": {"start": 0, "stop": 1, "num": 100_000}},
@@ -18,6 +18,12 @@ HUGE = {
     "delta": {"linear": {"start": 0, "stop": 1, "num": 10}},
     "d": 1,
 }
+
+
+def plans_of(described) -> list[Plan]:
+    """What a run of one sweep plans to do."""
+    plans = plan_run(config_of(described))
+    return [plan for plan in plans if isinstance(plan, Plan)]
 
 
 @given(st.lists(st.integers(1, 9), max_size=4), st.integers(1, 300))
@@ -37,12 +43,12 @@ def test_chunks_cover_every_point_once(shape, target):
 @pytest.mark.parametrize("outputs", [("stable",), ("spectral_radius", "passive"), ("alpha_max", "stable")])
 @pytest.mark.parametrize("memory", [2**27, MEMORY, 2**30])
 def test_a_chunk_stays_within_its_memory(outputs, memory):
-    plan = make_plan(config_of(study(axes=HUGE, outputs=outputs)).studies[0], memory=memory)
+    plan = make_plan(sweep_of(study(axes=HUGE, outputs=outputs)), memory=memory)
     assert plan.memory <= memory
 
 
 def test_the_plan_that_a_store_keeps_is_the_plan():
-    small = config_of(study(outputs=("stable", "alpha_max"))).studies[0]
+    small = sweep_of(study(outputs=("stable", "alpha_max")))
     plan = make_plan(small, memory=2**27)
     assert kept_plan(small, plan.as_dict()).families == plan.families
     assert kept_plan(small, plan.as_dict()).methods == plan.methods
@@ -50,22 +56,22 @@ def test_the_plan_that_a_store_keeps_is_the_plan():
 
 def test_a_map_of_a_thousand_million_points_takes_megabytes():
     axes = {**HUGE, "alpha": {"linear": {"start": 0, "stop": 1, "num": 10_000}}, "delta": 1}
-    (plan,) = plan_run(config_of(study(axes=axes)))
+    (plan,) = plans_of(study(axes=axes))
     assert plan.family("wall").shape == (10_000, 100_000)
     assert plan.disk < 256 * 2**20
 
 
 def test_what_does_not_fit_is_refused(tmp_path):
-    plans = plan_run(config_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin"))))
+    plans = plans_of(study(axes=HUGE, outputs=("spectral_radius", "margin", "passivity_margin")))
     says = r"free, but the results may take 2\.\d+ TiB, most of them of studies\[map\]\.axes \(.* x beta \d+\)"
     with pytest.raises(ResourceError, match=says):
         check_resources(plans, tmp_path / "not" / "there", workers=1)
     with pytest.raises(ResourceError, match=r"workers: 100000 of them may take .*; choose fewer with --workers"):
-        check_resources(plan_run(config_of()), tmp_path, workers=100_000)
+        check_resources(plans_of(study()), tmp_path, workers=100_000)
 
 
 def test_a_plan_tells_what_it_will_do():
-    text = "\n".join(plan_run(config_of(study(outputs=("stable", "alpha_max"))))[0].lines())
+    text = "\n".join(plans_of(study(outputs=("stable", "alpha_max")))[0].lines())
     for word in (
         "study map",
         "192,000",
@@ -80,11 +86,11 @@ def test_a_plan_tells_what_it_will_do():
 
 def test_the_plan_says_how_radii_are_found_and_what_is_proved_of_them():
     axes = {**HUGE, "d": [1, 70.5]}
-    plan = make_plan(config_of(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)).studies[0])
+    plan = make_plan(sweep_of(study(axes=axes, outputs=("margin", "stable"), accuracy=1e-6)))
     assert plan.methods == {"spectral_radius": "newton", "stable": "crossover"}
     lines = "\n".join(plan.lines())
     assert "spectral_radius by newton: each value proved to 1e-06" in lines
     assert "stable by crossover: no pole is needed" in lines
     assert "polynomials of degree up to 74" in lines
-    usual = make_plan(config_of(study(axes=HUGE, outputs=("margin",))).studies[0])
+    usual = make_plan(sweep_of(study(axes=HUGE, outputs=("margin",))))
     assert "proved to 1e-09" in usual.reasons["spectral_radius"]
