@@ -83,14 +83,7 @@ def _between(samples: _Samples, fractions: np.ndarray, delta: float, f: float, a
 
 
 def step_response(
-    alpha: float,
-    beta: float,
-    delta: float,
-    d: float,
-    *,
-    periods: int = 100,
-    substeps: int = 10,
-    force: float = 1.0,
+    alpha: float, beta: float, delta: float, d: float, *, periods: int = 100, substeps: int = 10, force: float = 1.0
 ) -> StepResponse:
     """Return the response, from force to position, of the device that rests in contact with the wall.
 

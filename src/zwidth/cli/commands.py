@@ -28,13 +28,7 @@ def cli() -> None:
 @physical_options(wall=True, required=True)
 @json_option
 def check(
-    stiffness: float,
-    virtual_damping: float,
-    mass: float,
-    damping: float,
-    period: float,
-    delay: float,
-    as_json: bool,
+    stiffness: float, virtual_damping: float, mass: float, damping: float, period: float, delay: float, as_json: bool
 ) -> None:
     """Judge one wall: stable, passive, how far from the boundary."""
     from zwidth.assessment import assess

@@ -22,16 +22,7 @@ from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
 from zwidth.config.device_table import files_relative_to
-from zwidth.config.faults import (
-    ConfigFileError,
-    Fault,
-    FieldPath,
-    describe,
-    dotted,
-    locate,
-    printable,
-    problems_of,
-)
+from zwidth.config.faults import ConfigFileError, Fault, FieldPath, describe, dotted, locate, printable, problems_of
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

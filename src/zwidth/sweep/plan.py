@@ -313,7 +313,7 @@ def _most_periods(study: SweepStudy, grid: Grid) -> float:
     if "delay" not in given:
         return 0.0
     longest = study.axes.end("delay", largest=True)
-    if grid.delay_in_periods:
+    if study.axes.delay_in_periods:
         return longest
     return longest * (study.axes.end("rate", True) if "rate" in given else 1.0 / study.axes.end("period", False))
 
