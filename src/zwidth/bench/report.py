@@ -140,7 +140,7 @@ def _error(row: Row) -> str:
 
 def write(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write ``bench.json``, ``bench.md``, ``summary.txt`` and ``pareto.png`` into a folder."""
-    from zwidth.figures import pareto
+    from zwidth.figures import pareto, style
 
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
@@ -152,4 +152,4 @@ def write(rows: Sequence[Row], folder: Path) -> list[Path]:
         (folder / name).write_text(text, encoding="utf-8")
     shown = [row for row in rows if row.layout != "one"]
     marks = [pareto.Mark(row.quantity, row.method, row.layout, row.d, row.rate, row.error) for row in shown]
-    return [*(folder / name for name in texts), *pareto.draw(marks, folder / "pareto")]
+    return [*(folder / name for name in texts), *style.save(pareto.draw_pareto(marks), folder / "pareto")]

@@ -223,7 +223,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     """Write a sweep, a store or a folder DIR with one, as netCDF or CSV."""
     if netcdf is None and table is None:
         raise click.UsageError("give --netcdf FILE or --csv FILE")
-    from zwidth.sweep.store import to_csv, to_netcdf
+    from zwidth.sweep.export import to_csv, to_netcdf
 
     for write, file in ((to_netcdf, netcdf), (to_csv, table)):
         if file is not None:

@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import re
-import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -23,7 +22,7 @@ from zwidth.errors import StoreError, StoreExistsError
 from zwidth.files.lock import FOLDER as LOCKS
 from zwidth.files.lock import held_briefly
 from zwidth.files.provenance import versions
-from zwidth.files.whole import check_folder, write_whole
+from zwidth.files.whole import check_folder, hidden_beside, remove_quietly, write_whole
 from zwidth.sweep.resume import refuse_changes, refuse_versions
 from zwidth.sweep.store import SUFFIX
 
@@ -34,7 +33,7 @@ RUN_FORMAT = 2
 # Beside those that can change a result.
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
 
-# As `write_whole`, `Record.staging` and stores call what they have not finished.
+# As `hidden_beside` calls what is not finished.
 _HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
 
 
@@ -165,12 +164,9 @@ class Record:
     @contextmanager
     def staging(self, name: str) -> Iterator[Path]:
         """A hidden folder for the files of a study; it goes when the block ends."""
-        stage = self.folder / f".{name}.{secrets.token_hex(4)}.partial"
-        stage.mkdir(parents=True)
-        try:
+        with hidden_beside(self.folder / name) as stage:
+            stage.mkdir()
             yield stage
-        finally:
-            shutil.rmtree(stage, ignore_errors=True)
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
         """Give the files in ``stage`` their names; when the study is done, take away what else it had before.
@@ -224,12 +220,8 @@ class Record:
     def sweep_up(self) -> None:
         """Remove what runs that were killed have left half made."""
         for left in self.folder.glob(".*.partial"):
-            if not _HALF_MADE.fullmatch(left.name):
-                continue
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                left.unlink(missing_ok=True)
+            if _HALF_MADE.fullmatch(left.name):
+                remove_quietly(left)
 
 
 def _is_of_runs(name: str) -> bool:

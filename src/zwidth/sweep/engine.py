@@ -13,7 +13,7 @@ from typing import Any
 from zwidth.errors import StoreExistsError
 from zwidth.sweep.jobs import Finished, Job, Perform, in_this_process
 from zwidth.sweep.plan import Plan, Task
-from zwidth.sweep.resume import check_same, new_store, repair, store_path, sweep_up
+from zwidth.sweep.resume import check_same, new_store, remove_partials, repair, store_path
 from zwidth.sweep.store import Store
 from zwidth.sweep.study import SweepStudy
 
@@ -146,12 +146,7 @@ def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
 
 
 def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool) -> None:
-    """Refuse stores that exist, unless the run goes on with them, and those of another study or release.
-
-    Raises:
-        StoreExistsError: a store exists and the run does not go on.
-        StoreError: a store is damaged, or was made from another configuration or by other releases.
-    """
+    """Refuse stores that exist, unless the run goes on with them, and those that `check_same` refuses."""
     for study in studies:
         path = store_path(folder, study)
         if not path.exists():
@@ -169,10 +164,11 @@ def _stores(
     """The stores of all sweeps, made or found, and what was repaired in them."""
     stores, repaired = {}, {}
     for study, plan in planned:
-        if shard is None:
-            sweep_up(folder, study)
-        if store_path(folder, study).exists():
-            stores[study.name] = store = Store(store_path(folder, study))
+        path = store_path(folder, study)
+        if path.exists():
+            stores[study.name] = store = Store(path)
+            if shard is None:
+                remove_partials(path)
             repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _share(store.plan, shard))]
         else:
             stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)
