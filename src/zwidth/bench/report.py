@@ -6,6 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ def _processor() -> str:
 
 def document(rows: Sequence[Row]) -> dict[str, Any]:
     """Everything that was measured."""
-    return {"environment": environment(), "rows": [row.as_dict() for row in rows]}
+    return {"environment": environment(), "rows": [asdict(row) for row in rows]}
 
 
 def markdown(rows: Sequence[Row]) -> str:

@@ -32,19 +32,12 @@ _SPACINGS = {"linear": np.linspace, "log": np.geomspace}
 
 @dataclass(frozen=True)
 class Axis:
-    """The values that one quantity takes; none of them twice.
+    """The values that one quantity takes; none of them twice."""
 
-    Attributes:
-        form: how it is written: "number", "list", "linear" (equal steps) or "log" (equal ratios).
-        entries: the number, the numbers of the list in its order, or the two ends, both included.
-        size: how many values there are, known without laying them out.
-        in_periods: whether the values are delays in sampling periods; those in seconds need no unit.
-    """
-
-    form: str
-    entries: tuple[float, ...]
-    size: int
-    in_periods: bool = False
+    form: str  # how it is written: "number", "list", "linear" (equal steps) or "log" (equal ratios)
+    entries: tuple[float, ...]  # the number, the numbers of the list in its order, or the two ends, both included
+    size: int  # how many values there are, known without laying them out
+    in_periods: bool = False  # whether the values are delays in sampling periods
 
     def values(self) -> np.ndarray:
         """The values as a one-dimensional float64 array."""

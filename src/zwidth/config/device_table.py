@@ -55,17 +55,11 @@ def files_relative_to(folder: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class DeviceTable:
-    """Rows of parameters.
+    """Rows of parameters."""
 
-    Args:
-        columns: the parameters, in base units, each with one value a row.
-        labels: a name for each row; empty for none.
-        in_periods: whether the column ``delay`` counts sampling periods; else it is in seconds.
-    """
-
-    columns: dict[str, tuple[float, ...]]
-    labels: tuple[str, ...] = ()
-    in_periods: bool = False
+    columns: dict[str, tuple[float, ...]]  # the parameters in base units
+    labels: tuple[str, ...] = ()  # a name for each row, or none at all
+    in_periods: bool = False  # whether the column ``delay`` counts sampling periods; else it is in seconds
 
     @property
     def size(self) -> int:

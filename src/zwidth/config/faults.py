@@ -26,23 +26,13 @@ _LONGEST_VALUE = 60
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault of a configuration file.
+    """One fault of a configuration file; line and column are None where it has no place, as for a missing file."""
 
-    Args:
-        file: the file as the user named it.
-        line: line in the file, from 1; None where the fault has no place in it, as for a missing file.
-        column: column in characters, from 1; None as for ``line``.
-        field: path of the field, such as ``studies[0].delta``; empty for the file as a whole.
-        problem: what is wrong, with the value received.
-        allowed: what is allowed.
-        remedy: what to do.
-    """
-
-    file: str
-    line: int | None
-    column: int | None
-    field: str
-    problem: str
+    file: str  # as the user named it
+    line: int | None  # from 1
+    column: int | None  # in characters, from 1
+    field: str  # such as ``studies[0].delta``; empty for the file as a whole
+    problem: str  # with the value received
     allowed: str = ""
     remedy: str = ""
 
@@ -55,12 +45,7 @@ class Fault:
 
 
 class ConfigFileError(ConfigError):
-    """A configuration file with faults: one line of the message for each of them.
-
-    Args:
-        message: the whole message.
-        faults: the faults one by one, in the order of their places.
-    """
+    """A configuration file with faults, in the order of their places: one line of the message for each of them."""
 
     def __init__(self, message: str, faults: Sequence[Fault] = ()) -> None:
         # The message alone goes into args, so that a copy sent to another process can be rebuilt.

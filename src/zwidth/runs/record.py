@@ -38,11 +38,7 @@ _HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
 
 
 class Record:
-    """The record in one folder.
-
-    Args:
-        folder: the folder of the run, whether it exists or not.
-    """
+    """The record in the folder of a run, whether it exists or not."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -75,12 +71,7 @@ class Record:
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
     def check_free(self, *, overwrite: bool, going_on: bool) -> None:
-        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with.
-
-        Raises:
-            StoreExistsError: the folder holds a run, or something that no run has written.
-            InputError: the folder cannot be made or written.
-        """
+        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with."""
         if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
             raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
         check_folder(self.folder)
@@ -102,14 +93,7 @@ class Record:
             )
 
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
-        """Refuse to go on with a run that was made from other studies or by other releases.
-
-        Args:
-            inputs: what each study's results follow from, by its name.
-
-        Raises:
-            StoreError: the message names every key that differs.
-        """
+        """Refuse to go on with a run that other releases made, or whose studies, given by name, had other inputs."""
         if not self.exists:
             return
         if self.content.get("format") != RUN_FORMAT:
@@ -171,8 +155,7 @@ class Record:
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
         """Give the files in ``stage`` their names; when the study is done, take away what else it had before.
 
-        Raises:
-            StoreExistsError: a file of one of these names is there that no run has written.
+        A file of somebody's own that has one of these names is a `StoreExistsError`.
         """
         before = self.entry(entry["name"]) or {}
         files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}

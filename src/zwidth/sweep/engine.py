@@ -20,46 +20,28 @@ from zwidth.sweep.study import SweepStudy
 
 @dataclass(frozen=True)
 class Progress:
-    """How far the sweeps of a run are, told after every chunk.
+    """How far the sweeps of a run are, told after every chunk."""
 
-    Attributes:
-        study: name of the study that the chunk belongs to.
-        chunks, total_chunks: how many are done and how many there are to compute in this run.
-        points, total_points: the same in points.
-        rate: points a second since the start.
-        seconds_left: at this rate; NaN before the first chunk.
-        error: what went wrong with the chunk; empty where nothing did.
-    """
-
-    study: str
-    chunks: int
+    study: str  # the one that the chunk belongs to
+    chunks: int  # done, of all that there are to compute in this run
     total_chunks: int
     points: int
     total_points: int
-    rate: float
-    seconds_left: float
-    error: str = ""
+    rate: float  # points a second since the start
+    seconds_left: float  # at this rate; NaN before the first chunk
+    error: str = ""  # what went wrong with the chunk; empty where nothing did
 
 
 @dataclass
 class SweepResult:
-    """What became of one sweep.
+    """What became of one sweep."""
 
-    Attributes:
-        store: the folder of its store.
-        computed: how many chunks this run computed.
-        skipped: how many were done before.
-        total: how many this run was to see done.
-        repaired: the chunks whose files were damaged, and that were computed again.
-        failed: the chunks that could not be computed, with the reason.
-    """
-
-    store: Path
-    computed: int = 0
-    skipped: int = 0
-    total: int = 0
-    repaired: tuple[str, ...] = ()
-    failed: dict[str, str] = field(default_factory=dict)
+    store: Path  # its folder
+    computed: int = 0  # chunks that this run computed
+    skipped: int = 0  # chunks that were done before
+    total: int = 0  # chunks that this run was to see done
+    repaired: tuple[str, ...] = ()  # chunks whose files were damaged, and that were computed again
+    failed: dict[str, str] = field(default_factory=dict)  # chunks that could not be computed, with the reason
 
     @property
     def ok(self) -> bool:
@@ -69,17 +51,11 @@ class SweepResult:
 
 @dataclass
 class Sweeps:
-    """The sweeps of one run.
+    """The sweeps of one run."""
 
-    Attributes:
-        results: one a study, by its name.
-        hopeless: the error that ended the run early, for no other chunk would have escaped it, as a full disk.
-        interrupted: whether somebody stopped the run.
-    """
-
-    results: dict[str, SweepResult]
-    hopeless: str = ""
-    interrupted: bool = False
+    results: dict[str, SweepResult]  # by the name of the study
+    hopeless: str = ""  # the error that ended the run early, for no other chunk would have escaped it, as a full disk
+    interrupted: bool = False  # whether somebody stopped the run
 
 
 def compute_sweeps(

@@ -15,32 +15,19 @@ from zwidth.sweep.study import SweepStudy
 
 
 class Block(NamedTuple):
-    """A block of the grid, normalized: D devices, each with the same number of walls.
+    """A block of the grid, normalized: D devices with A x B walls each, every alpha with every beta."""
 
-    Attributes:
-        delta: of the devices, shape (D,).
-        d: their delays in periods, shape (D,).
-        alpha: of their walls, shape (D, A).
-        beta: of their walls, shape (D, B); every alpha of a device meets every beta.
-        mass, period: of the devices in SI units, shape (D,); empty in a normalized sweep.
-        rows: how many betas the whole grid has, of which the block may hold a part only.
-    """
-
-    delta: np.ndarray
-    d: np.ndarray
-    alpha: np.ndarray
-    beta: np.ndarray
-    mass: np.ndarray
+    delta: np.ndarray  # shape (D,)
+    d: np.ndarray  # shape (D,)
+    alpha: np.ndarray  # shape (D, A)
+    beta: np.ndarray  # shape (D, B)
+    mass: np.ndarray  # in SI units, shape (D,); empty in a normalized sweep, likewise the period
     period: np.ndarray
-    rows: int
+    rows: int  # how many betas the whole grid has, of which the block may hold a part only
 
 
 class Grid:
-    """The dimensions of a sweep, those of walls last, and what lies at each of their points.
-
-    Args:
-        study: the study that spans the grid.
-    """
+    """The dimensions of a sweep, those of walls last, and what lies at each of their points."""
 
     def __init__(self, study: SweepStudy) -> None:
         self.axes = study.axes

@@ -52,11 +52,7 @@ def _quiet() -> Iterator[None]:
 
 
 def check_installed() -> None:
-    """Say what to install where the libraries that stores are made with are missing.
-
-    Raises:
-        InputError: one of them is.
-    """
+    """Raise an `InputError` that says what to install where a library that stores are made with is missing."""
     for name in ("dask", "h5netcdf", "h5py", "xarray", "zarr"):
         if find_spec(name) is None:
             raise InputError(
@@ -70,11 +66,7 @@ def _checksums(family: str) -> str:
 
 
 class Store:
-    """A store on the disk.
-
-    Args:
-        path: its folder, ``<study>.zarr``.
-    """
+    """A store on the disk, in a folder ``<study>.zarr``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -196,13 +188,7 @@ class Store:
 
 
 def create(path: Path, attributes: dict[str, Any], *, may_exist: bool = False) -> Store:
-    """Make an empty store, at once and whole.
-
-    Args:
-        path: its folder.
-        attributes: what it says of itself, with ``study`` and ``plan``.
-        may_exist: take the store that another process has made in the meantime.
-    """
+    """Make an empty store, at once and whole, or take one that another process has made in the meantime."""
     with _built(path, attributes) as fresh:
         try:
             os.rename(fresh, path)
