@@ -15,14 +15,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth._types import Array
 from zwidth.xp import namespace
 
 
 class Jet(NamedTuple):
     """A complex function of w and its derivative."""
 
-    value: np.ndarray
-    slope: np.ndarray
+    value: Array
+    slope: Array
 
     def times(self, other: Jet) -> Jet:
         """The product."""
@@ -37,12 +38,12 @@ class Jet(NamedTuple):
 class Circle(NamedTuple):
     """Points ``z = e^(jw)``, and z - 1 with all its digits."""
 
-    w: np.ndarray
-    z: np.ndarray
-    before: np.ndarray
+    w: Array
+    z: Array
+    before: Array
 
 
-def circle(w: np.ndarray) -> Circle:
+def circle(w: Array) -> Circle:
     """The points of the unit circle at the angles ``w``, exactly -1 at pi."""
     xp = namespace(w)
     half = 0.5 * w
@@ -117,8 +118,8 @@ class LinearLoop:
 
     gain: float
     lag: int
-    zeros: np.ndarray
-    poles: np.ndarray
+    zeros: Array
+    poles: Array
     estimate: Estimate
 
     def needed(self, at: Circle) -> Jet:
@@ -137,6 +138,6 @@ class LinearLoop:
         before = circle(w).before[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         far = np.abs(before + roots) - reach[..., None]
-        floor = np.maximum(1e-3 * np.abs(roots.real), 1e-9)
+        floor = np.maximum(1e-3 * np.abs(np.real(roots)), 1e-9)
         near = (1.0 / np.maximum(far, floor)).sum(-1)
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0

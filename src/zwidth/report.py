@@ -6,8 +6,7 @@ Hulin, Preusche, Hirzinger: Stability Boundary for Haptic Rendering: Influence o
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from decimal import Decimal
 from typing import Any
 
@@ -29,6 +28,7 @@ STIFFNESS_FRACTION = 0.75
 MASSIE_SALISBURY = 3.5e3
 # The delays of Fig. 5, and of Fig. 10 as far as they are whole.
 SLOPE_DELAYS = (0.0, 1.0, 2.0, 4.0)
+_LINE = "delta above which the line appears for d = 0"
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,12 @@ class Sharpened:
 
 def published_numbers() -> list[Comparison]:
     """Compare every number that the paper prints with the computed one."""
-    return [*_compare_undamped(), *_example(), *_factors(), _line()]
+    return [
+        *_compare_undamped(),
+        *_example(),
+        *_factors(),
+        Comparison(_LINE, "section V, remark 3", "2.3", line_appears()),
+    ]
 
 
 def _ridge(delta: float, d: float) -> tuple[float, float]:
@@ -101,18 +106,15 @@ def _factors() -> list[Comparison]:
     ]
 
 
-def _line() -> Comparison:
-    quantity = "delta above which the line appears for d = 0"
-    return Comparison(quantity, "section V, remark 3", "2.3", line_appears())
-
-
 def line_appears() -> float:
     """The delta from which, for d = 0, the line of a real pole at z = -1 bounds the stable set.
 
     The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
     bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
     """
-    return _root(lambda delta: float(boundary(np.pi, delta, 0).alpha), 1.0, 6.0)
+    # To the last digits of float64.
+    exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
+    return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
 
 
 def corner_takes_over() -> float:
@@ -141,12 +143,6 @@ def _slope_at_corner(delta: np.longdouble) -> np.longdouble:
     numerator = (1 - c) + beta * (p2 + c * psi) - beta**2 * psi * p1
     denominator = psi * (1 + p2 * beta)
     return ((p2 + c * psi) - 2 * beta * psi * p1) * denominator - numerator * psi * p2
-
-
-def _root(function: Callable[[float], float], low: float, high: float) -> float:
-    """The root in a bracket, to the last digits of float64."""
-    solution = root_scalar(function, bracket=(low, high), method="brentq", xtol=1e-15, rtol=1e-15)
-    return float(solution.root)
 
 
 def sharpened_numbers() -> list[Sharpened]:
@@ -188,20 +184,8 @@ def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         "source": SOURCE,
         "all_agree": all(row.agrees for row in printed),
         "given": {"where": "section VIII", **example},
-        "published": [
-            {
-                "quantity": row.quantity,
-                "where": row.where,
-                "printed": row.printed,
-                "computed": row.computed,
-                "agrees": row.agrees,
-            }
-            for row in printed
-        ],
-        "sharpened": [
-            {"quantity": row.quantity, "where": row.where, "computed": row.computed, "how": row.how}
-            for row in sharpened
-        ],
+        "published": [{**asdict(row), "agrees": row.agrees} for row in printed],
+        "sharpened": [asdict(row) for row in sharpened],
     }
     return json.dumps(content, indent=2) + "\n"
 
@@ -220,7 +204,8 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         "| quantity | where | printed | computed | agrees |",
         "|---|---|---|---|---|",
         *(
-            f"| {row.quantity} | {row.where} | {row.printed} | {_digits(row.computed)} | {_word(row.agrees)} |"
+            f"| {row.quantity} | {row.where} | {row.printed} | {_digits(row.computed)} "
+            f"| {'yes' if row.agrees else '**NO**'} |"
             for row in printed
         ),
         "",
@@ -240,7 +225,3 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
 def _digits(value: float) -> str:
     """Ten significant digits; zero as it is."""
     return f"{value:.10g}" if value == 0 else f"{value:#.10g}"
-
-
-def _word(agrees: bool) -> str:
-    return "yes" if agrees else "**NO**"

@@ -19,7 +19,6 @@ from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.grouping import find_degree
 from zwidth.numerics import phi
-from zwidth.scene import Scene
 from zwidth.settling import advance, settling_time
 
 
@@ -83,14 +82,7 @@ def _interpolate(samples: _Samples, fractions: np.ndarray, delta: float, f: floa
 
 
 def step_response(
-    alpha: float,
-    beta: float,
-    delta: float,
-    d: float,
-    *,
-    periods: int = 100,
-    substeps: int = 10,
-    force: float = 1.0,
+    alpha: float, beta: float, delta: float, d: float, *, periods: int = 100, substeps: int = 10, force: float = 1.0
 ) -> StepResponse:
     """Return the response, from force to position, of the device that rests in contact with the wall.
 
@@ -145,19 +137,3 @@ def step_response(
     final = force / alpha if alpha != 0 else math.nan
     settled = settling_time(alpha, beta, delta, d) if force != 0 else 0.0
     return StepResponse(time, position, velocity, wall_force, final, settled)
-
-
-def scene_step_response(scene: Scene, *, duration: float, substeps: int = 10, force: float = 1.0) -> StepResponse:
-    """`step_response` of a scene in SI units: seconds, meters, meters a second, newtons."""
-    period, mass = scene.timing.period, scene.device.mass
-    alpha, beta, delta, d = scene.normalized
-    length = period * period / mass
-    raw = step_response(alpha, beta, delta, d, periods=max(1, round(duration / period)), substeps=substeps, force=force)
-    return StepResponse(
-        raw.time * period,
-        raw.position * length,
-        raw.velocity * length / period,
-        raw.wall_force,
-        raw.final_position * length,
-        raw.settling_time * period,
-    )

@@ -11,7 +11,6 @@ import scipy.signal
 
 import zwidth
 from peers.scenes import Loop, closed_loop_matrix, continuous, held, random_loops
-from zwidth.response import scene_step_response
 from zwidth.scene import Normalized
 
 LOOPS = random_loops()
@@ -112,8 +111,8 @@ def our_step(loop: Loop, periods: int) -> np.ndarray:
         zwidth.Timing(loop.period, loop.delay),
         zwidth.VirtualWall(loop.stiffness, loop.virtual_damping),
     )
-    response = scene_step_response(scene, duration=periods * loop.period, substeps=1)
-    return response.position
+    response = zwidth.step_response(*map(float, scene.normalized), periods=periods, substeps=1)
+    return response.position * loop.period**2 / loop.mass
 
 
 def test_step_responses_agree_with_python_control_and_scipy():

@@ -11,7 +11,7 @@ import tolerances as tol
 import zwidth
 from peers import models
 from zwidth.errors import InputError
-from zwidth.response import scene_step_response, step_response
+from zwidth.response import step_response
 
 STABLE = [
     (0.108, 0.425, 0.0, 1.0),
@@ -136,12 +136,14 @@ def test_without_a_spring_there_is_no_final_position():
 def test_a_scene_responds_in_si_units():
     device = zwidth.Device(mass=0.1, damping=10.0)
     scene = zwidth.Scene(device, zwidth.Timing(period=1e-3, delay=1.5e-3), zwidth.VirtualWall(8e3, 30.0))
-    got = scene_step_response(scene, duration=0.1, substeps=2, force=3.0)
+    raw = step_response(*map(float, scene.normalized), periods=100, substeps=2, force=3.0)
     expected = models.simulate(0.1, 10.0, 1e-3, 8e3, 30.0, 1.5, 3.0, [0.0, 0.5], 100)
-    for value, true in zip((got.position, got.velocity, got.wall_force), expected, strict=True):
+    # A unit of length is T^2/m for 1 N, and a unit of time is T.
+    got = (raw.position * 1e-3**2 / 0.1, raw.velocity * 1e-3 / 0.1, raw.wall_force)
+    for value, true in zip(got, expected, strict=True):
         assert_close(value, true, tol.RESPONSE)
-    assert got.final_position == pytest.approx(3.0 / 8e3, rel=1e-14)
-    assert got.time[-1] == pytest.approx(0.0995, rel=1e-12)
+    assert raw.final_position * 1e-3**2 / 0.1 == pytest.approx(3.0 / 8e3, rel=1e-14)
+    assert raw.time[-1] == 99.5
 
 
 @pytest.mark.parametrize(

@@ -14,11 +14,11 @@ from jaxtyping import AbstractArray, jaxtyped
 import zwidth
 from zwidth import _types
 from zwidth._types import Reals, Roots
-from zwidth.grouping import degree_of
+from zwidth.grouping import find_degree
 from zwidth.loop import affine, closed_loop_transfer, coefficients, frequency_boundary, frequency_loop
 from zwidth.response import step_response
 from zwidth.stability.aberth import aberth_kernel, discs, product_form
-from zwidth.stability.poles import companion, pole_kernel, poles_of, radius_kernel, unstable_poles
+from zwidth.stability.poles import companion, enclose_poles, pole_kernel, radius_kernel, unstable_poles
 from zwidth.stability.region import lobe
 
 with patch.object(typing, "TYPE_CHECKING", True):
@@ -28,15 +28,15 @@ with patch.object(typing, "TYPE_CHECKING", True):
 WALL = {"alpha": np.array([0.1, 0.2, 0.4]), "beta": np.array([[0.1], [0.3]]), "delta": np.float64(0.2)}
 GRID = dict(zip(WALL, np.broadcast_arrays(*WALL.values()), strict=True))
 DEVICE = {"delta": GRID["delta"], "d": np.full((2, 3), 1.5)}
-HALF = degree_of(1.5)
+HALF = find_degree(1.5)
 KERNEL = {**GRID, **DEVICE, "degree": HALF}
-LOOP = frequency_loop(**DEVICE, delay="held")
+LOOP = frequency_loop(**DEVICE, delay_model="held")
 ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
 
 CALLS = [
     (zwidth.char_poly, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
     (zwidth.poles, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
-    (poles_of, {**WALL, "d": np.float64(1.5)}),
+    (enclose_poles, {**WALL, "d": np.float64(1.5)}),
     (unstable_poles, {**WALL, "d": np.float64(1.5)}),
     (
         zwidth.count_poles,
@@ -56,7 +56,7 @@ CALLS = [
     (radius_kernel, KERNEL),
     (aberth_kernel, {**KERNEL, "spring": False}),
     (discs, {"z": ROOTS_FIRST, "form": product_form(**KERNEL, spring=False)}),
-    (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP, "delay": "held"}),
+    (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP, "delay_model": "held"}),
 ]
 
 

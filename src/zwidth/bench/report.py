@@ -6,6 +6,7 @@ import json
 import os
 import platform
 from collections.abc import Sequence
+from dataclasses import asdict
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ def _processor() -> str:
 
 def document(rows: Sequence[Row]) -> dict[str, Any]:
     """Everything that was measured."""
-    return {"environment": environment(), "rows": [row.as_dict() for row in rows]}
+    return {"environment": environment(), "rows": [asdict(row) for row in rows]}
 
 
 def markdown(rows: Sequence[Row]) -> str:
@@ -140,7 +141,7 @@ def _error(row: Row) -> str:
 
 def write(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write ``bench.json``, ``bench.md``, ``summary.txt`` and ``pareto.png`` into a folder."""
-    from zwidth.figures import pareto
+    from zwidth.figures import pareto, style
 
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
@@ -152,4 +153,4 @@ def write(rows: Sequence[Row], folder: Path) -> list[Path]:
         (folder / name).write_text(text, encoding="utf-8")
     shown = [row for row in rows if row.layout != "one"]
     marks = [pareto.Mark(row.quantity, row.method, row.layout, row.d, row.rate, row.error) for row in shown]
-    return [*(folder / name for name in texts), *pareto.draw(marks, folder / "pareto")]
+    return [*(folder / name for name in texts), *style.save(pareto.draw_pareto(marks), folder / "pareto")]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -33,37 +33,22 @@ _LONGEST_BASELINE = 50
 class Row:
     """What was measured of one method on one problem.
 
-    Attributes:
-        quantity: "stable", "spectral_radius", "passive" or "alpha_max".
-        method: the method's name; a baseline's is that of the tool.
-        layout: "map" (axes of one device), "scattered" (every point a device of its own) or "one" (a single number).
-        d: delay in periods.
-        points: how many were computed at once.
-        first_seconds: what the first call takes longer than a later one: compilation, on a cold cache.
-        rate: points a second of later calls, by their median.
-        error: of "stable", the largest relative distance in alpha from the boundary at which a label was wrong; of
-            "spectral_radius", "alpha_max" and the damping that "passive" asks for, the largest relative error; 0 where
-            none was seen.
-        wrong: how many of ``checked`` labels were wrong; of other quantities, 0.
-        checked: how many points the error was measured on, against more digits.
-        baseline: whether it is a tool for comparison.
+    The error is 0 where none was seen; else, of "stable", the largest relative distance in alpha from the boundary at
+    which a label was wrong, and of every other quantity (of "passive", the damping that is needed) the largest relative
+    error.
     """
 
-    quantity: str
-    method: str
-    layout: str
+    quantity: str  # "stable", "spectral_radius", "passive" or "alpha_max"
+    method: str  # of a baseline the tool's name
+    layout: str  # "map" (axes of one device), "scattered" (a device for every point) or "one" (a single number)
     d: float
-    points: int
-    first_seconds: float
-    rate: float
+    points: int  # computed at once
+    first_seconds: float  # what the first call takes longer than a later one: compilation, on a cold cache
+    rate: float  # points a second of later calls, by their median
     error: float
-    wrong: int
-    checked: int
-    baseline: bool = False
-
-    def as_dict(self) -> dict[str, Any]:
-        """The fields as plain JSON values."""
-        return asdict(self)
+    wrong: int  # labels among those checked; 0 of other quantities
+    checked: int  # points that the error was measured on, against more digits
+    baseline: bool = False  # whether it is a tool for comparison
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ def main(arguments: list[str] | None = None) -> None:
     except OSError as error:
         if os.environ.get("ZWIDTH_TRACEBACK"):
             raise
-        click.echo(f"zwidth: {_told(error)}", err=True)
+        click.echo(f"zwidth: {_describe_refusal(error)}", err=True)
         sys.exit(_EXIT_FAILED)
     except Exception as error:
         if os.environ.get("ZWIDTH_TRACEBACK"):
@@ -57,7 +57,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(_EXIT_FAILED)
 
 
-def _told(error: OSError) -> str:
+def _describe_refusal(error: OSError) -> str:
     """What the system refused: the file, why, and what helps."""
     from zwidth.files.whole import REMEDIES
 

@@ -11,7 +11,7 @@ from zwidth import __version__
 from zwidth.cli import runs
 from zwidth.cli.bench import bench
 from zwidth.cli.options import json_option, physical_options
-from zwidth.cli.words import SlopesInWords, row, verdict_lines
+from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.formatting import plain, with_unit
 
 
@@ -28,13 +28,7 @@ def cli() -> None:
 @physical_options(wall=True, required=True)
 @json_option
 def check(
-    stiffness: float,
-    virtual_damping: float,
-    mass: float,
-    damping: float,
-    period: float,
-    delay: float,
-    as_json: bool,
+    stiffness: float, virtual_damping: float, mass: float, damping: float, period: float, delay: float, as_json: bool
 ) -> None:
     """Judge one wall: stable, passive, how far from the boundary."""
     from zwidth.assessment import assess
@@ -90,6 +84,7 @@ def ridge(
     point = alpha_max(at_delta, at_d, delay=delay_model)  # pyright: ignore[reportArgumentType]  (click checked it)
     if int(point.status) != Status.OK:
         raise click.UsageError(f"--delta {at_delta}, --d {at_d}: {Status(int(point.status)).message}")
+    slopes: list[Slope] = []
     result: dict[str, Any] = {
         "delta": float(np.asarray(at_delta)),
         "d": float(np.asarray(at_d)),
@@ -101,10 +96,8 @@ def ridge(
     if scene is not None:
         wall = scene.to_si(alpha=point.alpha, beta=point.beta)
         result |= {"stiffness_max": float(wall.stiffness), "virtual_damping": float(wall.virtual_damping)}
-        slopes = SlopesInWords.of(scene, delay_model)
-        result["sensitivities"] = slopes.as_dict()
-    else:
-        slopes = None
+        slopes = find_slopes(scene, delay_model)
+        result["sensitivities"] = {slope.name: slope.as_dict() for slope in slopes}
     if as_json:
         click.echo(json.dumps(result, indent=2, allow_nan=False))
         return
@@ -114,8 +107,8 @@ def ridge(
     if scene is not None:
         click.echo(row("K_max", with_unit(result["stiffness_max"], "N/m")))
         click.echo(row("B", with_unit(result["virtual_damping"], "N s/m")))
-    for line in slopes.lines() if slopes is not None else ():
-        click.echo(line)
+    for slope in slopes:
+        click.echo(slope.line())
 
 
 @cli.command()

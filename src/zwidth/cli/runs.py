@@ -67,17 +67,7 @@ class Size(click.ParamType):
 @click.option("--shard", type=Shard(), help="Compute every n-th chunk of sweeps only, as one of n jobs.")
 @click.option("--memory", type=Size(), default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
-def run(
-    path: Path,
-    out: Path | None,
-    overwrite: bool,
-    resume: bool,
-    workers: int | None,
-    scheduler: str | None,
-    shard: tuple[int, int] | None,
-    memory: int,
-    dry_run: bool,
-) -> None:
+def run(path: Path, dry_run: bool, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
     Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
@@ -87,37 +77,28 @@ def run(
     from zwidth.runs.run import run as run_studies
 
     if dry_run:
-        _print_plan(path, out, memory, workers)
+        _print_plan(path, **options)
         return
-    again = _again(path, out, workers, scheduler, shard)
-    with _ending_on_sigterm() as stopped_by:
+    command = _spell_resume_command(path, **options)
+    with _interrupt_on_sigterm() as stopped_by:
         try:
             with reporter() as progress:
-                result = run_studies(
-                    path,
-                    out=out,
-                    overwrite=overwrite,
-                    resume=resume,
-                    workers=workers,
-                    scheduler=scheduler,
-                    shard=shard,
-                    memory=memory,
-                    progress=progress,
-                )
+                # The options are those of `zwidth.run`, by their names.
+                result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:
             # Before the first study began.
             result = None
     if result is not None:
-        _tell(result, again)
+        _report_end(result, command)
     if result is None or result.interrupted:
-        click.echo(f"zwidth: stopped; what is done is kept, go on with: {again}", err=True)
+        click.echo(f"zwidth: stopped; what is done is kept, go on with: {command}", err=True)
         raise SystemExit(128 + (stopped_by[0] if stopped_by else signal.SIGINT))
     if not result.ok:
         raise SystemExit(_EXIT_FAILED)
 
 
 @contextmanager
-def _ending_on_sigterm() -> Iterator[list[int]]:
+def _interrupt_on_sigterm() -> Iterator[list[int]]:
     """End like with Ctrl-C when told to end; yields the signals that came."""
     came: list[int] = []
 
@@ -132,7 +113,7 @@ def _ending_on_sigterm() -> Iterator[list[int]]:
         signal.signal(signal.SIGTERM, before)
 
 
-def _print_plan(path: Path, out: Path | None, memory: int, workers: int | None) -> None:
+def _print_plan(path: Path, *, out: Path | None, memory: int, workers: int | None, **_: Any) -> None:
     """The plan, or why it does not fit."""
     from zwidth.runs.run import plan_run
     from zwidth.studies.document import load_config
@@ -153,8 +134,8 @@ def _print_plan(path: Path, out: Path | None, memory: int, workers: int | None) 
     check_resources([step for step in steps if isinstance(step, Plan)], folder, workers or 1)
 
 
-def _again(
-    path: Path, out: Path | None, workers: int | None, scheduler: str | None, shard: tuple[int, int] | None
+def _spell_resume_command(
+    path: Path, *, out: Path | None, workers: int | None, scheduler: str | None, shard: tuple[int, int] | None, **_: Any
 ) -> str:
     """The command that goes on with a run, as a shell takes it."""
     words = ["zwidth", "run", str(path)]
@@ -166,7 +147,7 @@ def _again(
     return shlex.join(words)
 
 
-def _tell(result: RunResult, again: str) -> None:
+def _report_end(result: RunResult, command: str) -> None:
     """The end of a run: what was repaired, what is done, what went wrong and what to do."""
     for found in result.repaired:
         click.echo(f"repaired {found}", err=True)
@@ -179,7 +160,7 @@ def _tell(result: RunResult, again: str) -> None:
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
     if result.hopeless:
         click.echo(f"zwidth: out: {result.folder}: {result.hopeless}", err=True)
-        click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {again}", err=True)
+        click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {command}", err=True)
         return
     for study in result.failed:
         for chunk, error in study.sweep.failed.items() if study.sweep else ():
@@ -187,7 +168,7 @@ def _tell(result: RunResult, again: str) -> None:
         if not study.sweep:
             click.echo(f"zwidth: study {study.name!r} failed: {study.error}", err=True)
     if result.failed and not result.interrupted:
-        click.echo(f"zwidth: try again what failed with: {again}", err=True)
+        click.echo(f"zwidth: try again what failed with: {command}", err=True)
 
 
 @click.command()
@@ -223,7 +204,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     """Write a sweep, a store or a folder DIR with one, as netCDF or CSV."""
     if netcdf is None and table is None:
         raise click.UsageError("give --netcdf FILE or --csv FILE")
-    from zwidth.sweep.store import to_csv, to_netcdf
+    from zwidth.sweep.export import to_csv, to_netcdf
 
     for write, file in ((to_netcdf, netcdf), (to_csv, table)):
         if file is not None:

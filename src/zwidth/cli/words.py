@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from math import isfinite
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -19,42 +18,35 @@ def row(label: str, text: str) -> str:
     return f"{label:<22}{text}"
 
 
-@dataclass(frozen=True)
-class SlopesInWords:
-    """The derivatives of K_max of one device: name, value, unit and what a small step comes to."""
+class Slope(NamedTuple):
+    """The derivative of K_max by one property of a device, and what a small step of it comes to in words."""
 
-    rows: tuple[tuple[str, float, str, str], ...]
+    name: str
+    symbol: str
+    value: float
+    unit: str
+    words: str
 
-    @classmethod
-    def of(cls, scene: Scene, delay_model: str) -> SlopesInWords:
-        from zwidth.design.stiffness import sensitivities, sensitivity_lines
-
-        device = {
-            "mass": scene.device.mass,
-            "damping": scene.device.damping,
-            "period": scene.timing.period,
-            "delay": scene.timing.delay,
-        }
-        gain = sensitivities(**device, delay_model=delay_model)  # pyright: ignore[reportArgumentType]  (click checked it)
-        words = sensitivity_lines(**device, delay_model=delay_model)  # pyright: ignore[reportArgumentType]
-        values = (gain.per_damping, gain.per_mass, gain.per_period, gain.per_delay)
-        names, units = ("damping", "mass", "period", "delay"), ("N s/m", "kg", "s", "s")
-        return cls(tuple(zip(names, map(float, values), units, words, strict=True)))
-
-    def lines(self) -> list[str]:
+    def line(self) -> str:
         """For people."""
-        symbols = {"damping": "b", "mass": "m", "period": "T", "delay": "t_d"}
-        return [
-            row(f"dK_max/d{symbols[name]}", f"{with_unit(value, f'N/m per {unit}')}: {words}")
-            for name, value, unit, words in self.rows
-        ]
+        return row(f"dK_max/d{self.symbol}", f"{with_unit(self.value, self.unit)}: {self.words}")
 
-    def as_dict(self) -> dict[str, dict[str, Any]]:
+    def as_dict(self) -> dict[str, Any]:
         """For machines; null stands for an infinite slope, which JSON cannot write."""
-        return {
-            name: {"value": value if isfinite(value) else None, "unit": f"N/m per {unit}"}
-            for name, value, unit, _ in self.rows
-        }
+        return {"value": self.value if isfinite(self.value) else None, "unit": self.unit}
+
+
+def find_slopes(scene: Scene, delay_model: Any) -> list[Slope]:
+    """What damping, mass, period and delay change of the stiffest wall of a device."""
+    from zwidth.design.stiffness import sensitivities, sensitivity_lines
+
+    numbers = (scene.device.damping, scene.device.mass, scene.timing.period, scene.timing.delay)
+    device: dict[str, Any] = dict(zip(("damping", "mass", "period", "delay"), numbers, strict=True))
+    gain = sensitivities(**device, delay_model=delay_model)
+    words = sensitivity_lines(**device, delay_model=delay_model)
+    units = (f"N/m per {unit}" for unit in ("N s/m", "kg", "s", "s"))
+    values = (float(getattr(gain, f"per_{name}")) for name in device)
+    return [Slope(*parts) for parts in zip(device, ("b", "m", "T", "t_d"), values, units, words, strict=True)]
 
 
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:

@@ -7,7 +7,6 @@ A new spelling is one more class here and one more entry in `_spellings`.
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
@@ -24,130 +23,39 @@ from zwidth.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
 LONGEST_AXIS = 10_000_000
 """More values than any result could use, few enough to be laid out in memory."""
 
-"""A loop has as many poles as its delay has periods, and a few more."""
-
 Entry: TypeAlias = Callable[[Any], float]
 """Reads one value of an axis, or raises a problem."""
 
 _FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
+_SPACINGS = {"linear": np.linspace, "log": np.geomspace}
 
 
-class Axis(ABC):
+@dataclass(frozen=True)
+class Axis:
     """The values that one quantity takes; none of them twice."""
 
-    @abstractmethod
+    form: str  # how it is written: "number", "list", "linear" (equal steps) or "log" (equal ratios)
+    entries: tuple[float, ...]  # the number, the numbers of the list in its order, or the two ends, both included
+    size: int  # how many values there are, known without laying them out
+    in_periods: bool = False  # whether the values are delays in sampling periods
+
     def values(self) -> np.ndarray:
         """The values as a one-dimensional float64 array."""
-
-    @property
-    @abstractmethod
-    def size(self) -> int:
-        """How many values there are, known without laying them out."""
-
-    @property
-    @abstractmethod
-    def largest(self) -> float:
-        """The largest of the values."""
-
-    @abstractmethod
-    def spelling(self) -> Any:
-        """The axis as a configuration file writes it."""
-
-
-@dataclass(frozen=True)
-class PointAxis(Axis):
-    """A single number."""
-
-    value: float
-
-    def values(self) -> np.ndarray:
-        """The one value."""
-        return np.array([self.value], dtype=np.float64)
-
-    @property
-    def size(self) -> int:
-        """One."""
-        return 1
-
-    @property
-    def largest(self) -> float:
-        """The value itself."""
-        return self.value
-
-    def spelling(self) -> float:
-        """The number."""
-        return self.value
-
-
-@dataclass(frozen=True)
-class ListAxis(Axis):
-    """Numbers in the order in which they are listed."""
-
-    entries: tuple[float, ...]
-
-    def values(self) -> np.ndarray:
-        """The listed values."""
+        if self.form in _SPACINGS:
+            return _SPACINGS[self.form](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
     @property
-    def size(self) -> int:
-        """How many numbers are listed."""
-        return len(self.entries)
-
-    @property
     def largest(self) -> float:
-        """The largest entry."""
+        """The largest of the values."""
         return max(self.entries)
 
-    def spelling(self) -> list[float]:
-        """The list."""
-        return list(self.entries)
-
-
-@dataclass(frozen=True)
-class _SpacedAxis(Axis):
-    """``num`` values from ``start`` to ``stop``, both included."""
-
-    start: float
-    stop: float
-    num: int
-
-    @property
-    def size(self) -> int:
-        """``num``."""
-        return self.num
-
-    @property
-    def largest(self) -> float:
-        """The larger end."""
-        return max(self.start, self.stop)
-
-    def _ends(self) -> dict[str, float | int]:
-        return {"start": self.start, "stop": self.stop, "num": self.num}
-
-
-class LinearAxis(_SpacedAxis):
-    """Equal steps from ``start`` to ``stop``, both included."""
-
-    def values(self) -> np.ndarray:
-        """``num`` equally spaced values."""
-        return np.linspace(self.start, self.stop, self.num)
-
-    def spelling(self) -> dict[str, Any]:
-        """``{linear: {start, stop, num}}``."""
-        return {"linear": self._ends()}
-
-
-class LogAxis(_SpacedAxis):
-    """Equal ratios from ``start`` to ``stop``, both included."""
-
-    def values(self) -> np.ndarray:
-        """``num`` values in geometric progression."""
-        return np.geomspace(self.start, self.stop, self.num)
-
-    def spelling(self) -> dict[str, Any]:
-        """``{log: {start, stop, num}}``."""
-        return {"log": self._ends()}
+    def spelling(self) -> Any:
+        """The axis as a configuration file writes it."""
+        written = [f"{value!r} periods" if self.in_periods else value for value in self.entries]
+        if self.form in _SPACINGS:
+            return {self.form: {"start": written[0], "stop": written[1], "num": self.size}}
+        return written if self.form == "list" else written[0]
 
 
 class _Spacing(Strict):
@@ -207,36 +115,27 @@ def axis(allowed: Range = ANY) -> Callable[[Any], Axis]:
 
 def axis_of(entry: Entry, positive: Entry) -> Callable[[Any], Axis]:
     """A validator for an axis of what ``entry`` reads; ``positive`` reads the ends of equal ratios."""
-    spellings: dict[str, tuple[type[_Spacing], type[_SpacedAxis]]] = {
-        "linear": (_spacing_model("linear", entry), LinearAxis),
-        "log": (_spacing_model("log", positive), LogAxis),
-    }
+    models = {"linear": _spacing_model("linear", entry), "log": _spacing_model("log", positive)}
 
     def validate(raw: Any) -> Axis:
         if isinstance(raw, Axis):
             return raw
         if isinstance(raw, list | tuple):
-            return ListAxis(entries_of(raw, entry))
+            return Axis("list", entries_of(raw, entry), len(raw))
         if not isinstance(raw, dict):
-            return PointAxis(entry(raw))
+            return Axis("number", (entry(raw),), 1)
         if len(raw) != 1:
             raise problem(f"got {describe(raw)}", f"an axis is {_FORMS}", "keep one of these forms")
-        ((key, ends),) = raw.items()
-        if key not in spellings:
-            unknown = problem(
-                "unknown key",
-                f"an axis is {_FORMS}",
-                suggestion(key, spellings, "write one of these forms"),
-                on_key=True,
-            )
-            raise validation_error("axis", [((key,), unknown)])
-        model, kind = spellings[key]
+        ((form, ends),) = raw.items()
+        if form not in models:
+            remedy = suggestion(form, models, "write one of these forms")
+            unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
+            raise validation_error("axis", [((form,), unknown)])
         try:
-            spaced = model.model_validate(ends)
+            spaced: Any = models[form].model_validate(ends)
         except ValidationError as error:
-            found = [((key, *path), what) for path, what in problems_of(error)]
-            raise validation_error("axis", found) from None
-        return kind(**spaced.model_dump())
+            raise validation_error("axis", problems_of(error, form)) from None
+        return Axis(form, (spaced.start, spaced.stop), spaced.num)
 
     return validate
 
@@ -254,26 +153,22 @@ def _schema(allowed: Range) -> WithJsonSchema:
 def axis_schema(entry: dict[str, Any], positive: dict[str, Any]) -> WithJsonSchema:
     """The JSON Schema of an axis, from those of an entry and of the end of a log axis."""
 
-    def spaced(end: dict[str, Any]) -> dict[str, Any]:
-        count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
-        return {
-            "type": "object",
-            "properties": {"start": end, "stop": end, "num": count},
-            "required": ["start", "stop", "num"],
-            "additionalProperties": False,
-        }
+    def mapping(**properties: dict[str, Any]) -> dict[str, Any]:
+        required = list(properties)
+        return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
 
+    count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
     keyed = [
-        {"type": "object", "properties": {key: spec}, "required": [key], "additionalProperties": False}
-        for key, spec in (("linear", spaced(entry)), ("log", spaced(positive)))
+        mapping(**{form: mapping(start=end, stop=end, num=count)})
+        for form, end in (("linear", entry), ("log", positive))
     ]
     listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
     return WithJsonSchema({"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
 
 
-_SPELLED = PlainSerializer(lambda value: value.spelling(), return_type=Any)
+SPELLED = PlainSerializer(lambda value: value.spelling(), return_type=Any)
 _DELAYS = Range(0.0, MAX_DELAY_PERIODS)
 
-AnyAxis = Annotated[Axis, PlainValidator(axis()), _SPELLED, _schema(ANY)]
-DeltaAxis = Annotated[Axis, PlainValidator(axis(NOT_NEGATIVE)), _SPELLED, _schema(NOT_NEGATIVE)]
-DelayAxis = Annotated[Axis, PlainValidator(axis(_DELAYS)), _SPELLED, _schema(_DELAYS)]
+AnyAxis = Annotated[Axis, PlainValidator(axis()), SPELLED, _schema(ANY)]
+DeltaAxis = Annotated[Axis, PlainValidator(axis(NOT_NEGATIVE)), SPELLED, _schema(NOT_NEGATIVE)]
+DelayAxis = Annotated[Axis, PlainValidator(axis(_DELAYS)), SPELLED, _schema(_DELAYS)]

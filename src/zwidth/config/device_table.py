@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -12,16 +12,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
+from pydantic import PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import Entry, entries_of
+from zwidth.config.axes import SPELLED, Entry, entries_of
 from zwidth.config.faults import (
     LocatedProblem,
     describe,
     listing,
     printable,
     problem,
+    problems_of,
     resembling,
     suggestion,
     validation_error,
@@ -54,17 +55,11 @@ def files_relative_to(folder: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class DeviceTable:
-    """Rows of parameters.
+    """Rows of parameters."""
 
-    Args:
-        columns: the parameters, in base units, each with one value a row.
-        labels: a name for each row; empty for none.
-        delay_unit: the unit of the column ``delay``, "s" or "periods".
-    """
-
-    columns: dict[str, tuple[float, ...]]
-    labels: tuple[str, ...] = ()
-    delay_unit: str = "s"
+    columns: dict[str, tuple[float, ...]]  # the parameters in base units
+    labels: tuple[str, ...] = ()  # a name for each row, or none at all
+    in_periods: bool = False  # whether the column ``delay`` counts sampling periods; else it is in seconds
 
     @property
     def size(self) -> int:
@@ -78,9 +73,9 @@ class DeviceTable:
     def spelling(self) -> dict[str, Any]:
         """The table as a configuration file writes it, whether it came from a CSV file or not."""
         lists: dict[str, Any] = {LABEL: list(self.labels)} if self.labels else {}
-        for name, values in self.columns.items():
-            in_periods = name == "delay" and self.delay_unit == "periods"
-            lists[name] = [f"{value!r} periods" for value in values] if in_periods else list(values)
+        lists |= {name: list(values) for name, values in self.columns.items()}
+        if self.in_periods:
+            lists["delay"] = [f"{value!r} periods" for value in lists["delay"]]
         return lists
 
 
@@ -96,9 +91,8 @@ def read_table(raw: Any) -> DeviceTable:
 def _from_lists(raw: dict[str, Any]) -> DeviceTable:
     known = (LABEL, *PARAMETERS)
     found: list[LocatedProblem] = []
-    columns: dict[str, tuple[float, ...]] = {}
-    labels: tuple[str, ...] = ()
-    delay_unit = "s"
+    columns: dict[str, tuple[Any, ...]] = {}
+    in_periods = False
     for key, cells in raw.items():
         if key not in known:
             what = problem("unknown key", f"devices are {_FORMS}", suggestion(key, known, "remove it"), on_key=True)
@@ -106,65 +100,45 @@ def _from_lists(raw: dict[str, Any]) -> DeviceTable:
         elif not isinstance(cells, list | tuple):
             what = problem(f"got {describe(cells)}", "a column of devices is a list", "write [value, value, ...]")
             found.append(((key,), what))
-        elif key == LABEL:
-            labels, faults = _labels(cells)
-            found += faults
         else:
+            entry, counts_periods = _cell_reader(key)
             try:
-                columns[key], delay_unit = _column(key, cells, delay_unit)
-            except (PydanticCustomError, ValueError) as error:
-                found += _below(key, error)
+                columns[key] = entries_of(cells, entry, distinct=False) if cells or key != LABEL else ()
+            except (PydanticCustomError, ValidationError) as error:
+                found += problems_of(error, key)
+            in_periods |= counts_periods()
     if found:
         raise validation_error("devices", found)
-    return _checked(columns, labels, delay_unit)
+    return _checked(columns, in_periods)
 
 
-def _below(key: str, error: Exception) -> Iterator[LocatedProblem]:
-    """The problems of one column with their paths."""
-    from pydantic import ValidationError
-
-    from zwidth.config.faults import problems_of
-
-    if isinstance(error, ValidationError):
-        yield from (((key, *path), what) for path, what in problems_of(error))
-    elif isinstance(error, PydanticCustomError):
-        yield (key,), error
-    else:
-        raise error
+def _cell_reader(key: str) -> tuple[Entry, Callable[[], bool]]:
+    """What reads the cells of a column, and whether those read so far are delays in sampling periods."""
+    if key == "delay":
+        entry, _, in_periods = delay_entries()
+        return entry, in_periods
+    return _label if key == LABEL else entry_of(key), lambda: False
 
 
-def _column(key: str, cells: list[Any] | tuple[Any, ...], delay_unit: str) -> tuple[tuple[float, ...], str]:
-    """One column in base units, and the unit of the delays."""
-    if key != "delay":
-        return entries_of(cells, entry_of(key), distinct=False), delay_unit
-    entry, _, unit = delay_entries()
-    values = entries_of(cells, entry, distinct=False)
-    return values, unit()
+def _label(cell: Any) -> Any:
+    if not isinstance(cell, str) or not cell.strip():
+        raise problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
+    return cell
 
 
-def _labels(cells: Any) -> tuple[tuple[str, ...], list[LocatedProblem]]:
-    found: list[LocatedProblem] = []
-    for index, cell in enumerate(cells):
-        if not isinstance(cell, str) or not cell.strip():
-            what = problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
-            found.append(((LABEL, index), what))
-    return tuple(str(cell) for cell in cells), found
-
-
-def _checked(columns: dict[str, tuple[float, ...]], labels: tuple[str, ...], delay_unit: str) -> DeviceTable:
+def _checked(columns: dict[str, tuple[Any, ...]], in_periods: bool) -> DeviceTable:
     """The table, where its columns are of one length."""
+    labels = columns.pop(LABEL, ())
     if not columns:
         raise problem("got no parameter", f"devices are {_FORMS}", f"add a column such as {'mass'!r}")
-    lengths = {name: len(values) for name, values in columns.items()}
-    if labels:
-        lengths[LABEL] = len(labels)
+    lengths = {name: len(values) for name, values in columns.items()} | ({LABEL: len(labels)} if labels else {})
     if len(set(lengths.values())) > 1:
         sizes = ", ".join(f"{name} {length}" for name, length in lengths.items())
         raise problem(f"got columns of different length: {sizes}", "all columns have one entry a row", "complete them")
     rows = next(iter(lengths.values()))
     if rows > MAX_ROWS:
         raise problem(f"got {rows} rows", f"at most {MAX_ROWS} devices a study", "split the table")
-    return DeviceTable(columns, labels, delay_unit)
+    return DeviceTable(columns, labels, in_periods)
 
 
 def _from_csv(raw: dict[str, Any]) -> DeviceTable:
@@ -246,23 +220,22 @@ def _mapped(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, 
 
 def _parsed(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
     """The chosen columns of a file's rows."""
-    columns: dict[str, tuple[float, ...]] = {}
-    labels: tuple[str, ...] = ()
-    delay_unit = "s"
+    columns: dict[str, tuple[Any, ...]] = {}
+    in_periods = False
     for key, (index, unit) in chosen.items():
         cells = []
         for line, row in rows[1:]:
             if index >= len(row) or not row[index].strip():
                 allowed = "every device has a value for every parameter"
                 raise problem(f"{printable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
-            cells.append((line, row[index].strip()))
+            cells.append((f"{printable(name)}, line {line}: {key}", row[index].strip()))
         if key == LABEL:
-            labels = tuple(cell for _, cell in cells)
+            columns[key] = tuple(cell for _, cell in cells)
             continue
-        entry, _, delays_in = delay_entries() if key == "delay" else (entry_of(key), None, lambda: "s")
-        columns[key] = tuple(_cell(entry, cell, unit, f"{printable(name)}, line {line}: {key}") for line, cell in cells)
-        delay_unit = delays_in() if key == "delay" else delay_unit
-    return _checked(columns, labels, delay_unit)
+        entry, counts_periods = _cell_reader(key)
+        columns[key] = tuple(_cell(entry, cell, unit, place) for place, cell in cells)
+        in_periods |= counts_periods()
+    return _checked(columns, in_periods)
 
 
 def _cell(entry: Entry, cell: str, unit: str, place: str) -> float:
@@ -282,24 +255,11 @@ def _schema() -> dict[str, Any]:
     column = {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}}
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     names = {"type": "object", "additionalProperties": {"type": "string"}}
-    lists = {
-        "type": "object",
-        "properties": {LABEL: labels, **dict.fromkeys(PARAMETERS, column)},
-        "minProperties": 1,
-        "additionalProperties": False,
-    }
-    file = {
-        "type": "object",
-        "properties": {"csv": {"type": "string"}, "columns": names},
-        "required": ["csv"],
-        "additionalProperties": False,
-    }
-    return {"description": f"Devices: {_FORMS}.", "anyOf": [lists, file]}
+    lists = {LABEL: labels, **dict.fromkeys(PARAMETERS, column)}
+    keys = {"csv": {"type": "string"}, "columns": names}
+    closed = {"type": "object", "additionalProperties": False}
+    forms = [{"properties": lists, "minProperties": 1, **closed}, {"properties": keys, "required": ["csv"], **closed}]
+    return {"description": f"Devices: {_FORMS}.", "anyOf": forms}
 
 
-TableField = Annotated[
-    DeviceTable,
-    PlainValidator(read_table),
-    PlainSerializer(lambda table: table.spelling(), return_type=Any),
-    WithJsonSchema(_schema()),
-]
+TableField = Annotated[DeviceTable, PlainValidator(read_table), SPELLED, WithJsonSchema(_schema())]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -25,23 +26,13 @@ _LONGEST_VALUE = 60
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault of a configuration file.
+    """One fault of a configuration file; line and column are None where it has no place, as for a missing file."""
 
-    Args:
-        file: the file as the user named it.
-        line: line in the file, from 1; None where the fault has no place in it, as for a missing file.
-        column: column in characters, from 1; None as for ``line``.
-        field: path of the field, such as ``studies[0].delta``; empty for the file as a whole.
-        problem: what is wrong, with the value received.
-        allowed: what is allowed.
-        remedy: what to do.
-    """
-
-    file: str
-    line: int | None
-    column: int | None
-    field: str
-    problem: str
+    file: str  # as the user named it
+    line: int | None  # from 1
+    column: int | None  # in characters, from 1
+    field: str  # such as ``studies[0].delta``; empty for the file as a whole
+    problem: str  # with the value received
     allowed: str = ""
     remedy: str = ""
 
@@ -54,12 +45,7 @@ class Fault:
 
 
 class ConfigFileError(ConfigError):
-    """A configuration file with faults: one line of the message for each of them.
-
-    Args:
-        message: the whole message.
-        faults: the faults one by one, in the order of their places.
-    """
+    """A configuration file with faults, in the order of their places: one line of the message for each of them."""
 
     def __init__(self, message: str, faults: Sequence[Fault] = ()) -> None:
         # The message alone goes into args, so that a copy sent to another process can be rebuilt.
@@ -82,15 +68,36 @@ def problem(what: str, allowed: str = "", remedy: str = "", *, on_key: bool = Fa
     return PydanticCustomError("zwidth", "{what}; {allowed}; {remedy}", context)
 
 
-def problems_of(error: ValidationError) -> list[LocatedProblem]:
-    """Every problem of a pydantic error with the path to its field."""
+# What pydantic itself finds: what is allowed, and the remedy.
+_PLAIN = {
+    "bool_type": ("it must be true or false", "write true or false, without quotes"),
+    "string_type": ("it must be text", "put the text in quotes"),
+}
+
+
+def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> list[LocatedProblem]:
+    """Every problem of an error with the path to its field, below the keys ``above`` of what was read."""
+    from pydantic import ValidationError
+
+    if not isinstance(error, ValidationError):
+        return [(above, error)]
     found = []
     for detail in error.errors(include_url=False):
-        if detail["type"] == "zwidth":
-            found.append((detail["loc"], problem(**detail.get("ctx", {}))))
+        kind, got = detail["type"], f"got {describe(detail['input'])}"
+        if kind == "zwidth":
+            what = problem(**detail.get("ctx", {}))
+        elif kind == "literal_error":
+            what = unlisted(detail["input"], re.findall("'(.*?)'", detail.get("ctx", {})["expected"]))
         else:
-            found.append((detail["loc"], problem(f"got {describe(detail['input'])}", detail["msg"])))
+            what = problem(got, *_PLAIN.get(kind, (detail["msg"],)))
+        found.append(((*above, *detail["loc"]), what))
     return found
+
+
+def unlisted(value: Any, names: Sequence[str]) -> PydanticCustomError:
+    """The problem of a value that is none of a few names."""
+    allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
+    return problem(f"got {describe(value)}", allowed, suggestion(value, names, "write one of these"))
 
 
 def validation_error(title: str, problems: Iterable[LocatedProblem]) -> ValidationError:

@@ -42,11 +42,6 @@ class Strict(BaseModel):
     """What the mapping describes, for messages."""
 
     @classmethod
-    def known_keys(cls) -> tuple[str, ...]:
-        """Every key that may be written."""
-        return tuple(cls.model_fields)
-
-    @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         """Hook: fill in what another part of the file supplies."""
         return raw
@@ -66,8 +61,8 @@ class Strict(BaseModel):
         """Hook: what is wrong with a key that does not belong here, what is allowed and the remedy."""
         if name == "<<":
             return "unknown key", "YAML 1.2 has no merge keys", "write the keys out"
-        known = cls.known_keys()
-        return "unknown key", f"{cls.what} has the keys {listing(known)}", suggestion(name, known, "remove it")
+        allowed = f"{cls.what} has the keys {listing(cls.model_fields)}"
+        return "unknown key", allowed, suggestion(name, cls.model_fields, "remove it")
 
     def limits(self) -> Iterable[LocatedProblem]:
         """Hook: faults that only valid values show."""
@@ -79,8 +74,7 @@ class Strict(BaseModel):
         if isinstance(raw, cls):
             return raw
         if not isinstance(raw, dict):
-            known = listing(cls.known_keys())
-            allowed = f"{cls.what} is a mapping with the keys {known}"
+            allowed = f"{cls.what} is a mapping with the keys {listing(cls.model_fields)}"
             raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines, or {key: value}")
         raw = cls.prepare(raw)
         found = list(cls._unusable(raw))
@@ -100,7 +94,7 @@ class Strict(BaseModel):
     def _unusable(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         """Keys that do not exist, and keys without a value."""
         for key, value in raw.items():
-            if key not in cls.known_keys():
+            if key not in cls.model_fields:
                 yield (key,), problem(*cls.unknown(key), on_key=True)
             elif value is None:
                 yield (key,), problem("got nothing", "a key that is written has a value", "add one or remove the key")
@@ -108,39 +102,14 @@ class Strict(BaseModel):
     @classmethod
     def _with_remedies(cls, error: ValidationError, skipped: set[Any]) -> Iterable[LocatedProblem]:
         """The problems of an error; a key that is absent is reported with what this class knows of it."""
-        known = cls.known_keys()
         # Faults of their own: a key without a value, and one that is misspelled.
-        explained = skipped | {resembling(key, known) for key in skipped}
+        explained = skipped | {resembling(key, cls.model_fields) for key in skipped}
         details = error.errors(include_url=False, include_input=False, include_context=False)
         for detail, (path, what) in zip(details, problems_of(error), strict=True):
             absent = detail["type"] == "missing" or (len(path) == 1 and (what.context or {})["what"] == "missing")
             if absent and path[0] in explained:
                 continue
             yield path, problem("missing", *cls.missing(str(path[0]))) if detail["type"] == "missing" else what
-
-
-def one_of(*names: str) -> Callable[[Any], str]:
-    """A validator for one of a few names."""
-
-    def validate(value: Any) -> str:
-        if isinstance(value, str) and value in names:
-            return value
-        allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
-        raise problem(f"got {describe(value)}", allowed, suggestion(value, names, "write one of these"))
-
-    return validate
-
-
-def _boolean(value: Any) -> bool:
-    if isinstance(value, bool):
-        return value
-    raise problem(f"got {describe(value)}", "it must be true or false", "write true or false, without quotes")
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, str):
-        return value
-    raise problem(f"got {describe(value)}", "it must be text", "put the text in quotes")
 
 
 def _name(value: Any) -> str:
@@ -189,8 +158,6 @@ def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
             seen[value] = index
 
 
-Boolean = Annotated[bool, BeforeValidator(_boolean)]
-Text = Annotated[str, BeforeValidator(_text)]
 Name = Annotated[str, BeforeValidator(_name), WithJsonSchema({"type": "string", "pattern": "^[a-z0-9_-]{1,64}$"})]
 Number = Annotated[float, BeforeValidator(number())]
 NonNegative = Annotated[float, BeforeValidator(number(NOT_NEGATIVE)), WithJsonSchema({"type": "number", "minimum": 0})]
@@ -219,10 +186,7 @@ Damping = Annotated[float, BeforeValidator(quantity(DAMPING, NOT_NEGATIVE)), uni
 VirtualDamping = Annotated[float, BeforeValidator(quantity(DAMPING)), unit_schema(DAMPING)]
 Stiffness = Annotated[float, BeforeValidator(quantity(STIFFNESS)), unit_schema(STIFFNESS)]
 Delay = Annotated[
-    Span,
-    PlainValidator(span(NOT_NEGATIVE)),
-    PlainSerializer(str, return_type=str),
-    unit_schema(TIME, *PERIOD_WORDS),
+    Span, PlainValidator(span(NOT_NEGATIVE)), PlainSerializer(str, return_type=str), unit_schema(TIME, *PERIOD_WORDS)
 ]
 Duration = Annotated[
     Span, PlainValidator(span(POSITIVE)), PlainSerializer(str, return_type=str), unit_schema(TIME, *PERIOD_WORDS)

@@ -3,58 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Annotated, Any
 
-import numpy as np
-from pydantic import PlainSerializer, PlainValidator, WithJsonSchema
+from pydantic import PlainValidator, WithJsonSchema
 
-from zwidth.config.axes import Axis, Entry, axis_of, axis_schema
+from zwidth.config.axes import SPELLED, Axis, Entry, axis_of, axis_schema
 from zwidth.config.faults import describe, problem
 from zwidth.config.fields import unit_schema
 from zwidth.config.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, dimension_of, entry_of, quantity, span
 from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
 
 
-@dataclass(frozen=True)
-class DelayValues(Axis):
-    """An axis of delays, all in seconds or all in sampling periods."""
-
-    axis: Axis
-    unit: str
-
-    def values(self) -> np.ndarray:
-        """The delays in ``unit``."""
-        return self.axis.values()
-
-    @property
-    def size(self) -> int:
-        """How many delays there are."""
-        return self.axis.size
-
-    @property
-    def largest(self) -> float:
-        """The longest delay."""
-        return self.axis.largest
-
-    def spelling(self) -> Any:
-        """The axis as a configuration file writes it."""
-        return _with_unit(self.axis.spelling(), self.unit)
-
-
-def _with_unit(spelling: Any, unit: str) -> Any:
-    """The numbers of a spelling followed by a unit; seconds are meant where none is written."""
-    if unit == "s" or isinstance(spelling, int):
-        return spelling
-    if isinstance(spelling, dict):
-        return {key: _with_unit(value, unit) for key, value in spelling.items()}
-    if isinstance(spelling, list):
-        return [_with_unit(value, unit) for value in spelling]
-    return f"{spelling!r} {unit}"
-
-
-def delay_entries() -> tuple[Entry, Entry, Callable[[], str]]:
-    """Validators for delays, for delays > 0, and what tells the unit that all of them were written in."""
+def delay_entries() -> tuple[Entry, Entry, Callable[[], bool]]:
+    """Validators for delays, for delays > 0, and what tells whether all of them were written in sampling periods."""
     units: dict[str, None] = {}
 
     def reader(allowed: Range) -> Entry:
@@ -64,23 +26,18 @@ def delay_entries() -> tuple[Entry, Entry, Callable[[], str]]:
             value, unit = read(raw)
             units.setdefault(unit)
             if len(units) > 1:
-                remedy = f"write all of them in {next(iter(units))}"
-                raise problem(
-                    f"got {describe(raw)}", "the delays of an axis are all in seconds or all in periods", remedy
-                )
+                allowed = "the delays of an axis are all in seconds or all in periods"
+                raise problem(f"got {describe(raw)}", allowed, f"write all of them in {next(iter(units))}")
             return value
 
         return entry
 
-    return reader(NOT_NEGATIVE), reader(POSITIVE), lambda: next(iter(units), "s")
+    return reader(NOT_NEGATIVE), reader(POSITIVE), lambda: "periods" in units
 
 
-def _delays(raw: Any) -> DelayValues:
-    if isinstance(raw, DelayValues):
-        return raw
-    entry, positive, unit = delay_entries()
-    axis = axis_of(entry, positive)(raw)
-    return DelayValues(axis, unit())
+def _delays(raw: Any) -> Axis:
+    entry, positive, in_periods = delay_entries()
+    return raw if isinstance(raw, Axis) else replace(axis_of(entry, positive)(raw), in_periods=in_periods())
 
 
 def _reader(name: str) -> Callable[[Any], Axis]:
@@ -97,12 +54,10 @@ def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
     return axis_schema(entry, entry)
 
 
-SPELLED = PlainSerializer(lambda value: value.spelling(), return_type=Any)
-
 PeriodAxis = Annotated[Axis, PlainValidator(_reader("period")), SPELLED, _schema(TIME)]
 RateAxis = Annotated[Axis, PlainValidator(_reader("rate")), SPELLED, _schema(RATE)]
 MassAxis = Annotated[Axis, PlainValidator(_reader("mass")), SPELLED, _schema(MASS)]
 DampingAxis = Annotated[Axis, PlainValidator(_reader("damping")), SPELLED, _schema(DAMPING)]
 StiffnessAxis = Annotated[Axis, PlainValidator(_reader("stiffness")), SPELLED, _schema(STIFFNESS)]
 VirtualDampingAxis = Annotated[Axis, PlainValidator(_reader("virtual_damping")), SPELLED, _schema(DAMPING)]
-TimeAxis = Annotated[DelayValues, PlainValidator(_delays), SPELLED, _schema(TIME, "periods", "period")]
+TimeAxis = Annotated[Axis, PlainValidator(_delays), SPELLED, _schema(TIME, "periods", "period")]

@@ -22,16 +22,7 @@ from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
 from zwidth.config.device_table import files_relative_to
-from zwidth.config.faults import (
-    ConfigFileError,
-    Fault,
-    FieldPath,
-    describe,
-    dotted,
-    locate,
-    printable,
-    problems_of,
-)
+from zwidth.config.faults import ConfigFileError, Fault, FieldPath, describe, dotted, locate, printable, problems_of
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
@@ -189,12 +180,7 @@ def _is_key(parent: yaml.Node | None, index: Any, event: yaml.Event) -> bool:
 
 
 class _Tree:
-    """A file as plain Python values, with the places of all of them.
-
-    Args:
-        file: its name, for messages.
-        text: its content.
-    """
+    """A file of a name and a text as plain Python values, with the places of all of them."""
 
     def __init__(self, file: str, text: str) -> None:
         self.file = file

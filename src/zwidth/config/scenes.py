@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
-from zwidth._types import DELAY_MODELS, DelayModel
+from zwidth._types import DelayModel
 from zwidth.config.faults import LocatedProblem, describe, listing, problem, short
 from zwidth.config.fields import (
     PERIOD_SCHEMA,
@@ -20,9 +20,7 @@ from zwidth.config.fields import (
     Number,
     Stiffness,
     Strict,
-    Text,
     VirtualDamping,
-    one_of,
 )
 from zwidth.config.numbers import number
 from zwidth.config.units import RATE, TIME, Span, quantity
@@ -33,9 +31,6 @@ from zwidth.scene import Device, Scene, Timing, VirtualWall, normalize
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping"})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
-
-
-AnyDelayModel = Annotated[DelayModel, BeforeValidator(one_of(*DELAY_MODELS))]
 
 
 class _OneKind(Strict):
@@ -152,7 +147,7 @@ class PhysicalDevice(_PhysicalPlant):
 
     what: ClassVar[str] = "a device"
 
-    label: Text | None = None
+    label: str | None = None
     """Name of the device in legends."""
 
 
@@ -161,7 +156,7 @@ class NormalizedDevice(_NormalizedPlant):
 
     what: ClassVar[str] = "a device"
 
-    label: Text | None = None
+    label: str | None = None
     """Name of the device in legends."""
 
 
@@ -176,7 +171,7 @@ class PhysicalScene(_PhysicalPlant):
     virtual_damping: VirtualDamping | None = None
     """Damping B of the wall in N s/m."""
 
-    delay_model: AnyDelayModel = "held"
+    delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
     def to_scene(self) -> Scene:
@@ -210,7 +205,7 @@ class NormalizedScene(_NormalizedPlant):
     beta: Number | None = None
     """Normalized damping B T/m of the wall."""
 
-    delay_model: AnyDelayModel = "held"
+    delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
     @property

@@ -7,10 +7,10 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
 
-from zwidth._types import DELAY_MODELS
-from zwidth.config.faults import LocatedProblem, describe, problem
-from zwidth.config.fields import Name, Strict, members, one_of
-from zwidth.config.scenes import AnyDelayModel, AnyScene
+from zwidth._types import DELAY_MODELS, DelayModel
+from zwidth.config.faults import LocatedProblem, describe, problem, unlisted
+from zwidth.config.fields import Name, Strict, members
+from zwidth.config.scenes import AnyScene
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
@@ -18,7 +18,9 @@ MAX_BYTES = 2**30
 
 def _only_held(value: Any) -> str:
     """A validator for a study that needs poles."""
-    if one_of(*DELAY_MODELS)(value) == "fractional_power":
+    if value not in DELAY_MODELS:
+        raise unlisted(value, DELAY_MODELS)
+    if value == "fractional_power":
         raise problem(
             f"got {describe(value)}, the study's own or that of scene.delay_model",
             "poles do not exist in this delay model, only the boundary and the ridge do; allowed is 'held'",
@@ -28,12 +30,7 @@ def _only_held(value: Any) -> str:
 
 
 HeldOnly = Annotated[Literal["held"], BeforeValidator(_only_held)]
-DelayModels = Annotated[tuple[AnyDelayModel, ...], WrapValidator(members("delay models"))]
-
-
-def figure_layout(*names: str) -> BeforeValidator:
-    """A validator for the layout of a figure."""
-    return BeforeValidator(one_of(*names))
+DelayModels = Annotated[tuple[DelayModel, ...], WrapValidator(members("delay models"))]
 
 
 def _drop_supplied(schema: dict[str, Any], model: type[Study]) -> None:

@@ -104,27 +104,27 @@ def quantity(dimension: Dimension, allowed: Range = ANY) -> Callable[[Any], floa
     """A validator for a quantity; its value is in the SI base unit."""
 
     def validate(value: Any) -> float:
-        amount, unit = _parse(value, dimension, periods=False)
-        return _check_magnitude(check_range(amount, allowed, unit), unit)
+        return _read(value, dimension, allowed)[0]
 
     return validate
 
 
-def _check_magnitude(value: float, unit: str) -> float:
-    """Return a quantity that the model is computed for, or raise a problem."""
+def _read(value: Any, dimension: Dimension, allowed: Range, *, periods: bool = False) -> tuple[float, str]:
+    """A quantity that the model is computed for, and its unit as `_parse` gives it."""
+    amount, unit = _parse(value, dimension, periods=periods)
+    check_range(amount, allowed, unit)
     least, most = SI_RANGE
-    if value and not least <= abs(value) <= most:
-        allowed = f"it must be 0 or {least:g} to {most:g} {unit} in magnitude"
-        raise problem(f"got {short(value)} {unit}", allowed, "check the units")
-    return value
+    if amount and not least <= abs(amount) <= most:
+        within = f"it must be 0 or {least:g} to {most:g} {unit} in magnitude"
+        raise problem(f"got {short(amount)} {unit}", within, "check the units")
+    return amount, unit
 
 
 def span(allowed: Range) -> Callable[[Any], Span]:
     def validate(value: Any) -> Span:
         if isinstance(value, Span):
             return value
-        amount, unit = _parse(value, TIME, periods=True)
-        amount = _check_magnitude(check_range(amount, allowed, unit), unit)
+        amount, unit = _read(value, TIME, allowed, periods=True)
         return Span(amount, "periods" if unit == "periods" else "s")
 
     return validate

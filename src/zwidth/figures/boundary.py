@@ -30,9 +30,6 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
             stiffness_N_per_m and virtual_damping_N_s_per_m the axes are in SI units as well.
         axes: an Axes of yours for all delays together, or one for each delay.
 
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
-
     Raises:
         InputError: several Axes, but not one for each delay.
     """

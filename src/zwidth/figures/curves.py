@@ -29,9 +29,6 @@ def draw_curves(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = No
         data: results of a sweep, as `zwidth.open_dataset` gives them, or a part of them.
         name: the output, a number.
         axes: Axes of yours, one for each panel or fewer.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     output, data = OUTPUTS[name], grid.shown(data, [name])
     dims = sorted(grid.axes_of(data, name), key=lambda dim: -data.sizes[dim])
@@ -87,9 +84,6 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np
     Args:
         data: results of a sweep over walls and devices, as `zwidth.open_dataset` gives them, or a part of them.
         axes: Axes of yours, one for each panel or fewer.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     found = outlined(data)
     if found is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -46,9 +45,6 @@ def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.
     Args:
         marks: the measurements; of several with one name the first is drawn.
         axes: Axes of yours, one for each delay or fewer.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     delays = sorted({mark.d for mark in marks})
     columns = min(4, len(delays))
@@ -64,11 +60,6 @@ def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.
         ax.set_ylabel("points per second")
     style.legend(panels, _legend(marks), outside=axes is None, place="lower", ncols=4)
     return panels
-
-
-def draw(marks: Sequence[Mark], stem: Path) -> tuple[Path, Path]:
-    """Draw and write PNG and SVG."""
-    return style.save(draw_pareto(marks), stem)
 
 
 def _draw_panel(ax: Axes, marks: Sequence[Mark]) -> None:

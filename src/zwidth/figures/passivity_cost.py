@@ -18,9 +18,6 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     Args:
         table: columns of a passivity study: d, delta, alpha_max, alpha_max_passive.
         axes: an Axes of yours for the two maxima alone, or two.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2)
     costs = curves(table, "d")

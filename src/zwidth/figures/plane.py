@@ -47,9 +47,6 @@ def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = Non
         name: the output.
         axes: Axes of yours, one for each panel or fewer.
 
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
-
     Raises:
         InputError: the output varies over less than two parameters.
     """

@@ -27,9 +27,6 @@ def draw_recommendation(
         region: columns of a boundary study of the device, in SI units.
         response: columns of a step study of the device with this wall.
         axes: an Axes of yours for the region alone, or two.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.5, 2)
     _draw_region(panels[0], found, region)

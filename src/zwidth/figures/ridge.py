@@ -20,9 +20,6 @@ def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings:
         table: columns of a ridge study: d, delay_model, delta, alpha_max.
         axes: an Axes of yours; two of them, in this order, for the two scalings.
         two_scalings: show the small deltas in a panel of their own, as the paper does.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     width, height = (style.WIDTH, 3.6) if two_scalings else (5.4, 4.1)
     panels = style.panels(axes, 1 + two_scalings, width, height, columns=1 + two_scalings)

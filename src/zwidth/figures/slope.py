@@ -23,9 +23,6 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
         table: columns of a ridge study: d, delay_model, delta, alpha_max.
         slopes: delay_model, d and slope, which is g(d): over a range of delays, those of ``table`` among them.
         axes: an Axes of yours for the first panel alone, or two.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
     paths, models = curves(table, "d", "delay_model"), curves(slopes, "delay_model")

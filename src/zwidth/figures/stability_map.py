@@ -30,9 +30,6 @@ def draw_map(arrays: Mapping[str, np.ndarray], output: str, axes: style.AnyAxes 
             stiffness_N_per_m and virtual_damping_N_s_per_m a single panel is in SI units as well.
         output: "stable", "spectral_radius" or "passive".
         axes: an Axes of yours for the first delta and d alone, or one for each panel.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     delta, d = arrays["delta"], arrays["d"]
     rows, columns = style.evenly(d.size, _PANELS), style.evenly(delta.size, _PANELS)

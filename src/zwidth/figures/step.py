@@ -26,9 +26,6 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         table: columns of a step study: label, alpha, beta, time, position, wall_force, final_position, settling_time;
             those of a device in SI units have their units behind their names, as in time_s and position_m.
         axes: an Axes of yours for the positions alone, or two.
-
-    Returns:
-        The Axes; without ``axes`` those of a new figure, unknown to pyplot.
     """
     panels = style.panels(axes, 2, 5.6, 5.0, height_ratios=(1.8, 1.2), sharex=True)
     clock, unit = draw_positions(panels[0], table)

@@ -21,10 +21,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     Args:
         table: columns of a boundary study in the plane delta_beta: curve, d, delay_model, delta, beta_lower,
             beta_upper.
-        ax: an Axes of yours.
-
-    Returns:
-        The Axes; without ``ax`` that of a new figure, unknown to pyplot.
+        ax: an Axes of yours; the function returns one, not an array of them.
     """
     ax = ax or style.panels(None, 1, 5.4, 4.1)[0]
     assert ax is not None

@@ -5,7 +5,10 @@ from __future__ import annotations
 import errno
 import os
 import secrets
+import shutil
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from zwidth.errors import InputError
@@ -55,17 +58,30 @@ def existing(folder: Path) -> Path:
     return next(path for path in (folder, *folder.parents) if path.exists())
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file under another name and rename it when all of it is on its way to the disk."""
+@contextmanager
+def hidden_beside(path: Path) -> Iterator[Path]:
+    """A name beside ``path`` for a file or folder in the making; what is left of it goes when the block ends."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
     try:
-        with open(partial, "wb") as stream:
-            stream.write(data)
+        yield partial
+    finally:
+        remove_quietly(partial)
+
+
+def remove_quietly(path: Path) -> None:
+    """Remove a file or a folder, as far as the system lets it."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, data: bytes) -> None:
+    """Write a file under another name and rename it when all of it is on its way to the disk."""
+    with hidden_beside(path) as partial:
+        partial.write_bytes(data)
         os.replace(partial, path)
-    except BaseException:
-        partial.unlink(missing_ok=True)
-        raise
 
 
 def checksum(path: Path) -> int:

@@ -1,1 +1,1 @@
-"""Any linear loop of a virtual wall: the poles that its walls put on the unit circle, and all that follows from them."""
+"""Any linear loop of a virtual wall: which walls put poles on the unit circle, and all that follows from it."""

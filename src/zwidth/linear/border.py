@@ -111,7 +111,9 @@ class Border:
     def _line_corners(self) -> np.ndarray:
         """The dampings at which two of the lines meet."""
         lines = self.boundary.lines
-        pairs = [(a, b) for k, a in enumerate(lines) for b in lines[:k] if abs(a.f - b.f) > 1e-12 * (abs(a.f) + abs(b.f))]
+        pairs = [
+            (a, b) for k, a in enumerate(lines) for b in lines[:k] if abs(a.f - b.f) > 1e-12 * (abs(a.f) + abs(b.f))
+        ]
         return np.array([(a.q - b.q) / (a.f - b.f) for a, b in pairs])
 
     def _line_end(self, place: int, beta: np.ndarray, k: int, side: int) -> float:

@@ -14,12 +14,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from zwidth.errors import ZwidthError
-from zwidth.linear_loop import Circle, LinearLoop, circle
+from zwidth.linear_loop import LinearLoop, circle
 from zwidth.stability.counting import count_poles
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
@@ -183,7 +184,9 @@ class Boundary:
             outside = outside_by_count(self.loop, alpha, beta)
             told.append(outside - int(self._passed(np.array([alpha]), np.array([beta]))[0]))
         if len(set(told)) != 1:
-            raise ZwidthError(f"scene: the boundary does not agree with counted poles ({told}); please report this loop")
+            raise ZwidthError(
+                f"scene: the boundary does not agree with counted poles ({told}); please report this loop"
+            )
         return told[0]
 
     def _witnesses(self) -> list[tuple[float, float]]:
@@ -204,7 +207,7 @@ class Boundary:
 
 def outside_by_count(loop: LinearLoop, alpha: float, beta: float) -> int:
     """Poles of one wall outside the unit circle, counted without the boundary."""
-    from zwidth.linear.polynomial import closed_loop_roots, closed_loop_poles
+    from zwidth.linear.polynomial import closed_loop_poles, closed_loop_roots
 
     zeros, poles, gain, lag = closed_loop_roots(loop, alpha, beta)
     inside = int(count_poles(zeros, poles, gain=gain, lag=max(lag, 0)))
@@ -246,7 +249,7 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
 
 
 def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``Im(q - beta F)/sin w`` with its limits at 0 and pi, its derivative, ``Re(q - beta F)`` and ``Im(q' - beta F')``."""
+    """``Im(q - beta F)/sin w`` with its limits, its derivative; and ``Re(q - beta F)`` and ``Im(q' - beta F')``."""
     at = circle(w)
     with np.errstate(all="ignore"):
         q, f = loop.needed(at), loop.estimate.jet(at)
@@ -309,7 +312,8 @@ def _end_lines(loop: LinearLoop) -> list[Line]:
             q, f = loop.needed(at), loop.estimate.jet(at)
         numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
         if np.all(np.isfinite(numbers)) and abs(numbers[0]) < 1e14:
-            lines.append(Line(w, *(float(n) for n in numbers), 1))
+            q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
+            lines.append(Line(w, q_value, f_value, q_turn, f_turn, 1))
     return lines
 
 
@@ -320,7 +324,7 @@ def _arcs(loop: LinearLoop, w: np.ndarray, here: Curve, poles: np.ndarray, turns
     at_pole = {float(p) for p in poles}
     limits = _end_limits(loop)
     arcs = []
-    for a, b in zip(ends[:-1], ends[1:], strict=True):
+    for a, b in pairwise(ends.tolist()):
         inner = (w > a) & (w < b)
         nodes, beta, slope = w[inner], here.beta[inner], here.turn[inner]
         if not nodes.size:

@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.errors import InputError
-from zwidth.linear_loop import Circle, Estimate, Jet, LinearLoop, circle, lag_jet
+from zwidth.linear_loop import Circle, Estimate, LinearLoop, circle, lag_jet
 from zwidth.plant import held_plant, undelayed_plant
 from zwidth.xp import namespace
 
@@ -214,7 +214,9 @@ def linear_loop(chain: Chain) -> LinearLoop:
     """The loop of a chain by its roots."""
     if chain.rigid:
         return _rigid_loop(chain)
-    stiffest = max(float(link.stiffness) / min(float(b.mass) for b in chain.bodies) for link in (*chain.links, Link(0.0, 0.0)))
+    stiffest = max(
+        float(link.stiffness) / min(float(b.mass) for b in chain.bodies) for link in (*chain.links, Link(0.0, 0.0))
+    )
     if stiffest > _STIFFEST:
         raise InputError(
             f"coupling.stiffness: a link that rings {np.sqrt(stiffest) / (2 * np.pi):.3g} times a period cannot be "

@@ -18,7 +18,9 @@ def check_number(
     """Return one real number in range, a float unless JAX traces or holds it; else raise `InputError`."""
     if is_jax(value):
         return value
-    ends = f"{'greater than' if low_open else 'at least'} {low:g}" + (f" and at most {high:g}" if high < math.inf else "")
+    ends = f"{'greater than' if low_open else 'at least'} {low:g}" + (
+        f" and at most {high:g}" if high < math.inf else ""
+    )
     allowed = f"it must be one finite number, {ends}{f' (in {unit})' if unit else ''}"
     if isinstance(value, bool | str) or np.ndim(value) != 0:
         raise InputError(f"{field}: got {value!r}; {allowed}")

@@ -85,7 +85,8 @@ class LowPass:
         coded_period: the period that p and the difference were written for, in s; the loop's where left out.
 
     References:
-        HannesRovina/HapticHumanRobotInterfaces-Lab ``Firmware/src/haptic_controller.c``; bgromov/Hapkit3.0 ``hapkit3.h``.
+        HannesRovina/HapticHumanRobotInterfaces-Lab ``Firmware/src/haptic_controller.c``;
+        bgromov/Hapkit3.0 ``hapkit3.h``.
     """
 
     cutoff: Any = None
@@ -95,7 +96,9 @@ class LowPass:
 
     def __post_init__(self) -> None:
         if (self.cutoff is None) == (self.time_constant is None):
-            raise InputError("velocity: give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them")
+            raise InputError(
+                "velocity: give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
+            )
         name, unit = ("cutoff", "Hz") if self.time_constant is None else ("time_constant", "s")
         value = check_number(f"velocity.{name}", getattr(self, name), unit, low_open=True)
         object.__setattr__(self, name, value)
@@ -235,7 +238,9 @@ def _offsets(polynomial: np.ndarray) -> np.ndarray:
     """Roots by their offsets from 1, found in powers of z - 1: next to 1 they keep their digits."""
     if polynomial.size < 2:
         return np.zeros(0, complex)
-    shifted = np.polynomial.polynomial.Polynomial(polynomial[::-1])(np.polynomial.polynomial.Polynomial([1.0, 1.0])).coef
+    shifted = np.polynomial.polynomial.Polynomial(polynomial[::-1])(
+        np.polynomial.polynomial.Polynomial([1.0, 1.0])
+    ).coef
     scale = np.abs(polynomial).sum()
     shifted = np.where(np.abs(shifted) <= 4 * polynomial.size * np.finfo(float).eps * scale, 0.0, shifted)
     return -np.polynomial.polynomial.polyroots(shifted) + 0j

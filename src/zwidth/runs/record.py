@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import re
-import secrets
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -23,7 +22,7 @@ from zwidth.errors import StoreError, StoreExistsError
 from zwidth.files.lock import FOLDER as LOCKS
 from zwidth.files.lock import held_briefly
 from zwidth.files.provenance import versions
-from zwidth.files.whole import check_folder, write_whole
+from zwidth.files.whole import check_folder, hidden_beside, remove_quietly, write_whole
 from zwidth.sweep.resume import refuse_changes, refuse_versions
 from zwidth.sweep.store import SUFFIX
 
@@ -34,16 +33,12 @@ RUN_FORMAT = 2
 # Beside those that can change a result.
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
 
-# As `write_whole`, `Record.staging` and stores call what they have not finished.
+# As `hidden_beside` calls what is not finished.
 _HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
 
 
 class Record:
-    """The record in one folder.
-
-    Args:
-        folder: the folder of the run, whether it exists or not.
-    """
+    """The record in the folder of a run, whether it exists or not."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -76,12 +71,7 @@ class Record:
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
     def check_free(self, *, overwrite: bool, going_on: bool) -> None:
-        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with.
-
-        Raises:
-            StoreExistsError: the folder holds a run, or something that no run has written.
-            InputError: the folder cannot be made or written.
-        """
+        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with."""
         if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
             raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
         check_folder(self.folder)
@@ -103,14 +93,7 @@ class Record:
             )
 
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
-        """Refuse to go on with a run that was made from other studies or by other releases.
-
-        Args:
-            inputs: what each study's results follow from, by its name.
-
-        Raises:
-            StoreError: the message names every key that differs.
-        """
+        """Refuse to go on with a run that other releases made, or whose studies, given by name, had other inputs."""
         if not self.exists:
             return
         if self.content.get("format") != RUN_FORMAT:
@@ -165,18 +148,14 @@ class Record:
     @contextmanager
     def staging(self, name: str) -> Iterator[Path]:
         """A hidden folder for the files of a study; it goes when the block ends."""
-        stage = self.folder / f".{name}.{secrets.token_hex(4)}.partial"
-        stage.mkdir(parents=True)
-        try:
+        with hidden_beside(self.folder / name) as stage:
+            stage.mkdir()
             yield stage
-        finally:
-            shutil.rmtree(stage, ignore_errors=True)
 
     def keep(self, stage: Path, entry: dict[str, Any]) -> None:
         """Give the files in ``stage`` their names; when the study is done, take away what else it had before.
 
-        Raises:
-            StoreExistsError: a file of one of these names is there that no run has written.
+        A file of somebody's own that has one of these names is a `StoreExistsError`.
         """
         before = self.entry(entry["name"]) or {}
         files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}
@@ -224,12 +203,8 @@ class Record:
     def sweep_up(self) -> None:
         """Remove what runs that were killed have left half made."""
         for left in self.folder.glob(".*.partial"):
-            if not _HALF_MADE.fullmatch(left.name):
-                continue
-            if left.is_dir():
-                shutil.rmtree(left, ignore_errors=True)
-            else:
-                left.unlink(missing_ok=True)
+            if _HALF_MADE.fullmatch(left.name):
+                remove_quietly(left)
 
 
 def _is_of_runs(name: str) -> bool:

@@ -14,49 +14,31 @@ from zwidth.sweep.engine import Progress, SweepResult
 class StudyResult:
     """How one study went.
 
-    Attributes:
-        name: the study's name in the configuration; "published" for the comparison with the paper's numbers.
-        kind: the study's kind; "report" for that comparison.
-        state: "done"; "kept", where an earlier run had done it; "failed"; or "open", a sweep of which chunks are left
-            to do, by another shard or because the run was stopped.
-        seconds: time it took; the sweeps of a run are computed together.
-        files: names of the files written, in the run's folder; a sweep's is its store.
-        notes: what a reader of the results must know, such as points without an answer.
-        error: type and message of what went wrong, "" for a study that did not fail.
-        exception: the error itself, of a study that is no sweep.
-        sweep: the chunks of a sweep.
+    Its state is "done"; "kept", where an earlier run had done it; "failed"; or "open", a sweep of which chunks are left
+    to do, by another shard or because the run was stopped.
     """
 
-    name: str
-    kind: str
+    name: str  # "published" for the comparison with the paper's numbers
+    kind: str  # "report" for that comparison
     state: Literal["done", "kept", "failed", "open"]
-    seconds: float = 0.0
-    files: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-    error: str = ""
-    exception: Exception | None = field(default=None, repr=False, compare=False)
+    seconds: float = 0.0  # the sweeps of a run are computed together
+    files: tuple[str, ...] = ()  # written in the run's folder; a sweep's is its store
+    notes: tuple[str, ...] = ()  # what a reader of the results must know, such as points without an answer
+    error: str = ""  # type and message of what went wrong
+    exception: Exception | None = field(default=None, repr=False, compare=False)  # of a study that is no sweep
     sweep: SweepResult | None = None
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run.
-
-    Attributes:
-        folder: where the results are.
-        studies: how each study went, those that are sweeps last.
-        seconds: time it took.
-        repaired: files and chunks that were damaged or missing, and that were made again.
-        hopeless: the error that ended the run early, for nothing else would have escaped it, as a full disk.
-        interrupted: whether somebody stopped the run, with Ctrl-C; what was done by then is kept.
-    """
+    """A finished run."""
 
     folder: Path
-    studies: tuple[StudyResult, ...]
+    studies: tuple[StudyResult, ...]  # how each of them went, those that are sweeps last
     seconds: float
-    repaired: tuple[str, ...] = ()
-    hopeless: str = ""
-    interrupted: bool = False
+    repaired: tuple[str, ...] = ()  # files and chunks that were damaged or missing, and that were made again
+    hopeless: str = ""  # the error that ended the run early, for nothing else would have escaped it, as a full disk
+    interrupted: bool = False  # whether somebody stopped the run, with Ctrl-C; what was done by then is kept
 
     @property
     def failed(self) -> tuple[StudyResult, ...]:
@@ -76,23 +58,14 @@ class RunResult:
 
 @dataclass(frozen=True)
 class StudyEvent:
-    """The start or the end of a study, or a chunk of a sweep.
+    """The start or the end of a study, or a chunk of a sweep."""
 
-    Attributes:
-        index: number of the study, from 1.
-        total: how many there are.
-        name: name of the study.
-        kind: kind of the study.
-        result: how it went, when it ends.
-        progress: how far the sweeps are, after a chunk.
-    """
-
-    index: int
-    total: int
+    index: int  # number of the study, from 1
+    total: int  # how many there are
     name: str
     kind: str
-    result: StudyResult | None = None
-    progress: Progress | None = None
+    result: StudyResult | None = None  # how it went, when it ends
+    progress: Progress | None = None  # how far the sweeps are, after a chunk
 
 
 ProgressCallback: TypeAlias = Callable[[StudyEvent], None]

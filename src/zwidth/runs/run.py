@@ -33,15 +33,11 @@ AnyConfig = Config | str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class Computation:
-    """What a run computes as a whole: a study that is no sweep, or the comparison with the paper's numbers.
-
-    Attributes:
-        inputs: what the results follow from, besides the releases.
-    """
+    """What a run computes as a whole: a study that is no sweep, or the comparison with the paper's numbers."""
 
     name: str
     kind: str
-    inputs: dict[str, Any]
+    inputs: dict[str, Any]  # what the results follow from, besides the releases
     compute: Callable[[], Outcome]
 
 
@@ -156,13 +152,7 @@ def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
 
 
 class _Run:
-    """A run on its way.
-
-    Args:
-        record: of the run, whose folder is held.
-        tell: called with every event.
-        total: how many studies there are.
-    """
+    """A run of so many studies on its way; its folder is held, and ``tell`` is called with every event."""
 
     def __init__(self, record: Record, tell: ProgressCallback, total: int) -> None:
         self.record = record

@@ -5,18 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from itertools import product
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator
 
 from zwidth import figures
 from zwidth._types import DelayModel
 from zwidth.batching import map_flat
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Boolean, one_of
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import DelayModels, figure_layout
+from zwidth.config.study import DelayModels
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.stability.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
@@ -42,21 +40,19 @@ class BoundaryStudy(CurvesStudy):
 
     kind: Literal["boundary"]
 
-    plane: Annotated[Plane, BeforeValidator(one_of("alpha_beta", "delta_beta"))] = "alpha_beta"
+    plane: Plane = "alpha_beta"
     """Boundary over alpha and beta, or over delta and beta at alpha -> 0."""
 
     delay_models: DelayModels = ("held",)
     """Models of a delay that is not whole."""
 
-    ridge_path: Boolean = False
+    ridge_path: bool = False
     """Draw the path of maximum stiffness over delta as well; in the plane alpha_beta."""
 
-    passivity: Boolean = False
+    passivity: bool = False
     """Draw the passivity condition as well."""
 
-    figure: Annotated[
-        Literal["fig5", "fig6", "fig7", "fig8", "fig9"] | None, figure_layout("fig5", "fig6", "fig7", "fig8", "fig9")
-    ] = None
+    figure: Literal["fig5", "fig6", "fig7", "fig8", "fig9"] | None = None
     """Layout of the figure; a generic one where left out."""
 
     @classmethod

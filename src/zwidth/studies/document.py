@@ -19,15 +19,8 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from zwidth.config.faults import (
-    LocatedProblem,
-    describe,
-    listing,
-    problem,
-    suggestion,
-    validation_error,
-)
-from zwidth.config.fields import Name, Strict, Text, members
+from zwidth.config.faults import LocatedProblem, describe, listing, problem, suggestion, validation_error
+from zwidth.config.fields import Name, Strict, members
 from zwidth.config.numbers import looks_like_number
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
@@ -84,9 +77,7 @@ def _study(raw: Any) -> Any:
     model = _model_of(kind)
     if model is None:
         what = problem(
-            f"got {describe(kind)}",
-            f"the kinds are {listing(KINDS)}",
-            suggestion(kind, KINDS, "write one of these"),
+            f"got {describe(kind)}", f"the kinds are {listing(KINDS)}", suggestion(kind, KINDS, "write one of these")
         )
         raise validation_error("study", [(("kind",), what)])
     return model.model_validate(raw)
@@ -131,7 +122,7 @@ class Config(Strict):
     name: Name
     """Name of the configuration; results go to a folder of this name unless told otherwise."""
 
-    description: Text = ""
+    description: str = ""
     """Free text."""
 
     scene: SceneField | None = None

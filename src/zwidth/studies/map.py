@@ -6,11 +6,11 @@ from functools import partial
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, WrapValidator
+from pydantic import WrapValidator
 
 from zwidth import figures
 from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
-from zwidth.config.fields import members, one_of
+from zwidth.config.fields import members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly
 from zwidth.stability.labels import is_stable
@@ -46,13 +46,7 @@ class MapStudy(ComputedStudy):
     d: DelayAxis
     """Delay in periods, a number or an axis; the scene's where left out."""
 
-    outputs: Annotated[
-        tuple[
-            Annotated[MapOutput, BeforeValidator(one_of("stable", "spectral_radius", "passive"))],
-            ...,
-        ],
-        WrapValidator(members("outputs")),
-    ] = ("stable",)
+    outputs: Annotated[tuple[MapOutput, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed at every point."""
 
     delay_model: HeldOnly = "held"

@@ -25,10 +25,9 @@ class Outcome:
     """The result of one study.
 
     Attributes:
-        table: columns of the study's CSV file, all of one length; empty for none.
-        arrays: arrays of the study's npz file; empty for none.
-        figures: what draws each figure and returns its Axes, by what its file name adds to the study's name ("" for
-            nothing).
+        table: columns of the study's CSV file, all of one length.
+        arrays: arrays of the study's npz file.
+        figures: what draws each figure and returns its Axes, by what its file name adds to the study's name.
         documents: texts by file name.
         notes: what a reader of the results must know, such as points without an answer.
     """

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import HeldOnly, figure_layout
+from zwidth.config.study import HeldOnly
 from zwidth.stability.passivity import passive_stiffness_slope, passivity_margin
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome
@@ -34,7 +34,7 @@ class PassivityStudy(CurvesStudy):
     delay_model: HeldOnly = "held"
     """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
 
-    figure: Annotated[Literal["passivity_cost"] | None, figure_layout("passivity_cost")] = None
+    figure: Literal["passivity_cost"] | None = None
     """Layout of the figure; a generic one where left out."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:

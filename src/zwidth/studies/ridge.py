@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth._types import DelayModel
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import DelayModels, figure_layout
+from zwidth.config.study import DelayModels
 from zwidth.stability.ridge import RidgeKind, RidgePoint, alpha_max
 from zwidth.stability.slope import stiffness_slope
 from zwidth.status import Status
@@ -37,7 +37,7 @@ class RidgeStudy(CurvesStudy):
     delay_models: DelayModels = ("held",)
     """Models of a delay that is not whole."""
 
-    figure: Annotated[Literal["fig10"] | None, figure_layout("fig10")] = None
+    figure: Literal["fig10"] | None = None
     """Layout of the figure; a generic one where left out."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:

@@ -26,7 +26,7 @@ from zwidth.config.scenes import (
     WallField,
     normalized_wall,
 )
-from zwidth.config.study import HeldOnly, figure_layout
+from zwidth.config.study import HeldOnly
 from zwidth.config.units import Span
 from zwidth.formatting import plain, with_unit
 from zwidth.quantities import Range
@@ -128,7 +128,7 @@ class StepStudy(ResponseStudy):
     walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
     """Walls, one for all devices or one for each; a single device takes any number of them."""
 
-    figure: Annotated[Literal["fig11"] | None, figure_layout("fig11")] = None
+    figure: Literal["fig11"] | None = None
     """Layout of the figure; a generic one where left out."""
 
     @classmethod

@@ -17,13 +17,7 @@ def _opened(path: str, made: int) -> Store:
 
 
 def perform(path: str, family: str, index: int) -> None:
-    """Compute and write one chunk, unless it is done already.
-
-    Args:
-        path: the store.
-        family: the family of outputs, "wall" or "device".
-        index: number of the chunk in that family.
-    """
+    """Compute and write one chunk of a store, by its number in a family of outputs, unless it is done already."""
     store = _opened(path, os.stat(os.path.join(path, "zarr.json")).st_ino)
     task = Task("device" if family == "device" else "wall", index)
     if store.is_done(task):

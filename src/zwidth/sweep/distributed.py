@@ -20,11 +20,7 @@ _AHEAD = 4
 
 @contextmanager
 def connected(address: str) -> Iterator[Client]:
-    """A connection to a scheduler while the block runs.
-
-    Raises:
-        InputError: nobody answers at the address.
-    """
+    """A connection to a scheduler while the block runs; an `InputError` where nobody answers."""
     from distributed import Client
 
     try:

@@ -13,53 +13,35 @@ from typing import Any
 from zwidth.errors import StoreExistsError
 from zwidth.sweep.jobs import Finished, Job, Perform, in_this_process
 from zwidth.sweep.plan import Plan, Task
-from zwidth.sweep.resume import check_same, new_store, repair, store_path, sweep_up
+from zwidth.sweep.resume import check_same, new_store, remove_partials, repair, store_path
 from zwidth.sweep.store import Store
 from zwidth.sweep.study import SweepStudy
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far the sweeps of a run are, told after every chunk.
+    """How far the sweeps of a run are, told after every chunk."""
 
-    Attributes:
-        study: name of the study that the chunk belongs to.
-        chunks, total_chunks: how many are done and how many there are to compute in this run.
-        points, total_points: the same in points.
-        rate: points a second since the start.
-        seconds_left: at this rate; NaN before the first chunk.
-        error: what went wrong with the chunk; empty where nothing did.
-    """
-
-    study: str
-    chunks: int
+    study: str  # the one that the chunk belongs to
+    chunks: int  # done, of all that there are to compute in this run
     total_chunks: int
     points: int
     total_points: int
-    rate: float
-    seconds_left: float
-    error: str = ""
+    rate: float  # points a second since the start
+    seconds_left: float  # at this rate; NaN before the first chunk
+    error: str = ""  # what went wrong with the chunk; empty where nothing did
 
 
 @dataclass
 class SweepResult:
-    """What became of one sweep.
+    """What became of one sweep."""
 
-    Attributes:
-        store: the folder of its store.
-        computed: how many chunks this run computed.
-        skipped: how many were done before.
-        total: how many this run was to see done.
-        repaired: the chunks whose files were damaged, and that were computed again.
-        failed: the chunks that could not be computed, with the reason.
-    """
-
-    store: Path
-    computed: int = 0
-    skipped: int = 0
-    total: int = 0
-    repaired: tuple[str, ...] = ()
-    failed: dict[str, str] = field(default_factory=dict)
+    store: Path  # its folder
+    computed: int = 0  # chunks that this run computed
+    skipped: int = 0  # chunks that were done before
+    total: int = 0  # chunks that this run was to see done
+    repaired: tuple[str, ...] = ()  # chunks whose files were damaged, and that were computed again
+    failed: dict[str, str] = field(default_factory=dict)  # chunks that could not be computed, with the reason
 
     @property
     def ok(self) -> bool:
@@ -69,17 +51,11 @@ class SweepResult:
 
 @dataclass
 class Sweeps:
-    """The sweeps of one run.
+    """The sweeps of one run."""
 
-    Attributes:
-        results: one a study, by its name.
-        hopeless: the error that ended the run early, for no other chunk would have escaped it, as a full disk.
-        interrupted: whether somebody stopped the run.
-    """
-
-    results: dict[str, SweepResult]
-    hopeless: str = ""
-    interrupted: bool = False
+    results: dict[str, SweepResult]  # by the name of the study
+    hopeless: str = ""  # the error that ended the run early, for no other chunk would have escaped it, as a full disk
+    interrupted: bool = False  # whether somebody stopped the run
 
 
 def compute_sweeps(
@@ -146,12 +122,7 @@ def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
 
 
 def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool) -> None:
-    """Refuse stores that exist, unless the run goes on with them, and those of another study or release.
-
-    Raises:
-        StoreExistsError: a store exists and the run does not go on.
-        StoreError: a store is damaged, or was made from another configuration or by other releases.
-    """
+    """Refuse stores that exist, unless the run goes on with them, and those that `check_same` refuses."""
     for study in studies:
         path = store_path(folder, study)
         if not path.exists():
@@ -169,10 +140,11 @@ def _stores(
     """The stores of all sweeps, made or found, and what was repaired in them."""
     stores, repaired = {}, {}
     for study, plan in planned:
-        if shard is None:
-            sweep_up(folder, study)
-        if store_path(folder, study).exists():
-            stores[study.name] = store = Store(store_path(folder, study))
+        path = store_path(folder, study)
+        if path.exists():
+            stores[study.name] = store = Store(path)
+            if shard is None:
+                remove_partials(path)
             repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _share(store.plan, shard))]
         else:
             stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)

@@ -15,32 +15,19 @@ from zwidth.sweep.study import SweepStudy
 
 
 class Block(NamedTuple):
-    """A block of the grid, normalized: D devices, each with the same number of walls.
+    """A block of the grid, normalized: D devices with A x B walls each, every alpha with every beta."""
 
-    Attributes:
-        delta: of the devices, shape (D,).
-        d: their delays in periods, shape (D,).
-        alpha: of their walls, shape (D, A).
-        beta: of their walls, shape (D, B); every alpha of a device meets every beta.
-        mass, period: of the devices in SI units, shape (D,); empty in a normalized sweep.
-        rows: how many betas the whole grid has, of which the block may hold a part only.
-    """
-
-    delta: np.ndarray
-    d: np.ndarray
-    alpha: np.ndarray
-    beta: np.ndarray
-    mass: np.ndarray
+    delta: np.ndarray  # shape (D,)
+    d: np.ndarray  # shape (D,)
+    alpha: np.ndarray  # shape (D, A)
+    beta: np.ndarray  # shape (D, B)
+    mass: np.ndarray  # in SI units, shape (D,); empty in a normalized sweep, likewise the period
     period: np.ndarray
-    rows: int
+    rows: int  # how many betas the whole grid has, of which the block may hold a part only
 
 
 class Grid:
-    """The dimensions of a sweep, those of walls last, and what lies at each of their points.
-
-    Args:
-        study: the study that spans the grid.
-    """
+    """The dimensions of a sweep, those of walls last, and what lies at each of their points."""
 
     def __init__(self, study: SweepStudy) -> None:
         self.axes = study.axes
@@ -67,14 +54,6 @@ class Grid:
         own = {name: getattr(self.axes, name) for name in PARAMETERS}
         return columns | {name: axis.values() for name, axis in own.items() if axis is not None}
 
-    @property
-    def delay_in_periods(self) -> bool:
-        """Whether the parameter ``delay`` counts sampling periods."""
-        table = self.axes.devices
-        if self.axes.delay is not None:
-            return self.axes.delay.unit == "periods"
-        return table is not None and table.delay_unit == "periods"
-
     def coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]]:
         """Dimensions, values and attributes of every parameter, and the labels of the devices."""
         table = self.axes.devices
@@ -83,7 +62,7 @@ class Grid:
             labels = table.labels or tuple(str(row) for row in range(1, table.size + 1))
             found["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
         for name, values in self._values.items():
-            units = "sampling periods" if name == "delay" and self.delay_in_periods else PARAMETERS[name].unit
+            units = "sampling periods" if name == "delay" and self.axes.delay_in_periods else PARAMETERS[name].unit
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
             if table is not None and name in table.columns:
                 found[name] = (("device",), values, attributes)
@@ -116,7 +95,7 @@ class Grid:
             if "rate" in self._values
             else self._device("period", slices, shape)
         )
-        in_periods = self.delay_in_periods
+        in_periods = self.axes.delay_in_periods
         # Beyond float64 is a status of the point, not a warning.
         with np.errstate(all="ignore"):
             device = normalize(mass=mass, damping=damping, period=period, delay=np.zeros(1) if in_periods else delay)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -32,8 +32,15 @@ _FEWEST_CHUNKS = 16
 _SMALLEST_CHUNK = 2**15
 _LAID_OUT_BYTES = 96 * 2**20
 
+# Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it.
+_RATES = {
+    **{"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 1e6},
+    **{"gain_margin": 2e5, "delay_margin": 2e4, "modulus_margin": 2e4},
+}
+_FOLLOWS_FROM = dict.fromkeys(RADIUS_OUTPUTS, "spectral_radius")
+_FOLLOWS_FROM |= {"passivity_margin": "passive", "phase_margin": "gain_margin"}
+
 Methods: TypeAlias = dict[str, str]
-Rate: TypeAlias = Callable[[str], float]
 
 
 @dataclass(frozen=True)
@@ -99,27 +106,16 @@ class FamilyPlan:
 
 @dataclass(frozen=True)
 class Plan:
-    """What a sweep will do.
-
-    Attributes:
-        study: name of the study.
-        families: how its outputs are cut into chunks.
-        methods: the method of every output that has a choice.
-        reasons: why it is that one.
-        model: what is modelled, in words.
-        memory: bytes that a chunk takes while it is computed, at most.
-        disk: bytes that the store takes, estimated from above.
-        seconds: time on one core, a rough guess.
-    """
+    """What a sweep will do."""
 
     study: str
     families: tuple[FamilyPlan, ...]
-    methods: Methods
-    reasons: Methods
-    model: str
-    memory: int
-    disk: int
-    seconds: float
+    methods: Methods  # of every output that is found by a method of its own
+    reasons: Methods  # why it is that one
+    model: str  # what is modelled, in words
+    memory: int  # bytes that a chunk takes while it is computed, at most
+    disk: int  # bytes that the store takes, estimated from above
+    seconds: float  # on one core, a rough guess
 
     def family(self, name: str) -> FamilyPlan:
         """The plan of one family."""
@@ -141,8 +137,7 @@ class Plan:
     @property
     def extent(self) -> str:
         """The axes of the largest family and how many values each has, for messages."""
-        family = max(self.families, key=lambda family: math.prod(family.shape))
-        return family.extent
+        return max(self.families, key=lambda family: math.prod(family.shape)).extent
 
     def as_dict(self) -> dict[str, Any]:
         """What a store keeps of the plan: later work on it must follow the same."""
@@ -168,20 +163,14 @@ class Plan:
         yield f"  time       about {_time(self.seconds)} on one core"
 
 
-def make_plan(study: SweepStudy, *, memory: int = MEMORY, rate: Rate | None = None) -> Plan:
-    """Cut a study into chunks and choose its methods.
-
-    Args:
-        study: the study.
-        memory: bytes that a chunk may take while it is computed.
-        rate: points a second of an output; a rough table where left out.
-    """
+def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
+    """Cut a study into chunks of so many bytes, from the points a second that each output takes at a ``rate``."""
     grid = Grid(study)
     chosen = choose_methods(study)
     methods = {name: method for name, (method, _) in chosen.items()}
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
-        slowness = sum(1.0 / (rate or _rate)(name) for name in _computed(outputs))
+        slowness = sum(1.0 / _RATES[name] for name in _costly(outputs))
         per_point = _bytes_per_point(outputs)
         size = grid.size_of(family)
         target = min((memory - _LAID_OUT_BYTES) // per_point, _LARGEST_CHUNK, int(_CHUNK_SECONDS / slowness))
@@ -240,13 +229,7 @@ def _model(longest: float) -> str:
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
-    """Refuse, before any work, what cannot fit on the disk or in memory.
-
-    Args:
-        plans: what is to be computed.
-        folder: where.
-        workers: how many processes compute at one time.
-        begun: studies that have a store, and part of their disk space, already.
+    """Refuse, before any work, what cannot fit on the disk or in memory; ``begun`` studies have their disk space.
 
     Raises:
         InputError: the folder cannot be made or written.
@@ -283,12 +266,9 @@ def _machine_memory() -> int:
         return total
 
 
-def _computed(outputs: tuple[str, ...]) -> set[str]:
+def _costly(outputs: tuple[str, ...]) -> set[str]:
     """The outputs that cost something; the others follow from them."""
-    costly = {"spectral_radius" if name in RADIUS_OUTPUTS else name for name in outputs}
-    costly = {"passive" if name == "passivity_margin" else name for name in costly}
-    costly = {"gain_margin" if name == "phase_margin" else name for name in costly}
-    return {"alpha_max" if OUTPUTS[name].family == "device" else name for name in costly}
+    return {"alpha_max" if OUTPUTS[name].family == "device" else _FOLLOWS_FROM.get(name, name) for name in outputs}
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:
@@ -313,18 +293,9 @@ def _most_periods(study: SweepStudy, grid: Grid) -> float:
     if "delay" not in given:
         return 0.0
     longest = study.axes.end("delay", largest=True)
-    if grid.delay_in_periods:
+    if study.axes.delay_in_periods:
         return longest
     return longest * (study.axes.end("rate", True) if "rate" in given else 1.0 / study.axes.end("period", False))
-
-
-def _rate(output: str) -> float:
-    """Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it."""
-    return {
-        **{"alpha_max": 1e6, "stable": 3e8, "passive": 4e6},
-        "spectral_radius": 1e6,
-        **{"gain_margin": 2e5, "phase_margin": 2e5, "delay_margin": 2e4, "modulus_margin": 2e4},
-    }[output]
 
 
 def _size(count: float) -> str:

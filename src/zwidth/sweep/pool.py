@@ -53,13 +53,7 @@ def in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[F
 
 
 class _Worker:
-    """One process and what it is doing.
-
-    Args:
-        number: of the worker.
-        count: how many there are.
-        perform: what does a job.
-    """
+    """One process of ``count``, and what it is doing."""
 
     def __init__(self, number: int, count: int, perform: Perform) -> None:
         self.number = number

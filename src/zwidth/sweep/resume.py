@@ -44,22 +44,14 @@ def new_store(folder: Path, study: SweepStudy, plan: Plan, about: Mapping[str, A
 
 
 def check_same(store: Store, study: SweepStudy) -> None:
-    """Refuse a store that was made from another study or by other releases.
-
-    Raises:
-        StoreError: the message names every key that differs.
-    """
+    """Refuse a store that was made from another study or by other releases."""
     now = study.model_dump(mode="json", exclude_none=True)
     refuse_changes(store.path, study.name, "store", store.attributes["study"], now)
     refuse_versions(store.path, store.attributes["versions"])
 
 
 def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> None:
-    """Refuse to go on with results that were made from another study.
-
-    Raises:
-        StoreError: the message names every key that differs.
-    """
+    """Raise a `StoreError` that names every key in which results were made from another study."""
     changed = list(differences(old, new))
     if changed:
         lines = [
@@ -74,11 +66,7 @@ def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> Non
 
 
 def refuse_versions(where: Path, old: dict[str, str]) -> None:
-    """Refuse to go on with results of other releases: together they are not what either of them would compute.
-
-    Raises:
-        StoreError: the message names the first that differs.
-    """
+    """Refuse to go on with results of other releases: together they are not what either of them would compute."""
     now = versions()
     for key in (key for key in now if key != "python" and old.get(key) != now[key]):
         raise StoreError(
@@ -106,11 +94,8 @@ def repair(store: Store, tasks: Iterable[Task]) -> list[str]:
     return found
 
 
-def sweep_up(folder: Path, study: SweepStudy) -> None:
-    """Remove the unfinished files of a run that was killed."""
-    path = store_path(folder, study)
-    for left in folder.glob(f".{path.name}.*.partial"):
-        shutil.rmtree(left, ignore_errors=True)
+def remove_partials(path: Path) -> None:
+    """Remove the unfinished files of a run that was killed from a store."""
     for left in path.rglob("*.partial"):
         left.unlink(missing_ok=True)
 

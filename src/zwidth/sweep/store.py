@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-import secrets
-import shutil
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -26,7 +24,7 @@ import numpy as np
 
 from zwidth.errors import InputError, StoreError, StoreExistsError
 from zwidth.files.provenance import digest
-from zwidth.files.whole import checksum, write_whole
+from zwidth.files.whole import checksum, hidden_beside, write_whole
 from zwidth.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
@@ -38,7 +36,6 @@ if TYPE_CHECKING:
 
 SUFFIX = ".zarr"
 FORMAT = 1
-MAX_CSV_POINTS = 1_000_000
 _SEAL = "attributes_sha256"
 _FILES = "file_checksums"
 # Zarr reads the first; the second is a copy of it, for the whole store would be lost with one flipped bit.
@@ -55,11 +52,7 @@ def _quiet() -> Iterator[None]:
 
 
 def check_installed() -> None:
-    """Say what to install where the libraries that stores are made with are missing.
-
-    Raises:
-        InputError: one of them is.
-    """
+    """Raise an `InputError` that says what to install where a library that stores are made with is missing."""
     for name in ("dask", "h5netcdf", "h5py", "xarray", "zarr"):
         if find_spec(name) is None:
             raise InputError(
@@ -73,11 +66,7 @@ def _checksums(family: str) -> str:
 
 
 class Store:
-    """A store on the disk.
-
-    Args:
-        path: its folder, ``<study>.zarr``.
-    """
+    """A store on the disk, in a folder ``<study>.zarr``."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -199,13 +188,7 @@ class Store:
 
 
 def create(path: Path, attributes: dict[str, Any], *, may_exist: bool = False) -> Store:
-    """Make an empty store, at once and whole.
-
-    Args:
-        path: its folder.
-        attributes: what it says of itself, with ``study`` and ``plan``.
-        may_exist: take the store that another process has made in the meantime.
-    """
+    """Make an empty store, at once and whole, or take one that another process has made in the meantime."""
     with _built(path, attributes) as fresh:
         try:
             os.rename(fresh, path)
@@ -222,29 +205,22 @@ def create(path: Path, attributes: dict[str, Any], *, may_exist: bool = False) -
 @contextmanager
 def _built(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
     """A complete store without chunks, beside ``path``; what is left of it goes when the block ends."""
-    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}.partial")
-    fresh.parent.mkdir(parents=True, exist_ok=True)
     study = SweepStudy.model_validate(attributes["study"])
     plan, grid = kept_plan(study, attributes["plan"]), Grid(study)
-    try:
+    with hidden_beside(path) as fresh:
         with _quiet():
             _build(fresh, plan, grid)
         files = sorted(file for file in fresh.rglob("*") if file.is_file() and file != fresh / "zarr.json")
         sums = {file.relative_to(fresh).as_posix(): checksum(file) for file in files}
-        described = {"Conventions": "CF-1.11", "zwidth_format": FORMAT, "coordinates": _auxiliary(grid), **attributes}
+        # The coordinates that are no dimension, as CF lists them.
+        auxiliary = " ".join(name for name in grid.coordinates() if name not in grid.dims)
+        described = {"Conventions": "CF-1.11", "zwidth_format": FORMAT, "coordinates": auxiliary, **attributes}
         described = {key: value for key, value in described.items() if key not in (_FILES, _SEAL)} | {_FILES: sums}
         document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8"))
         document["attributes"] = {**described, _SEAL: digest(described)}
         for name in _DESCRIPTIONS:
             write_whole(fresh / name, json.dumps(document, indent=2).encode())
         yield fresh
-    finally:
-        shutil.rmtree(fresh, ignore_errors=True)
-
-
-def _auxiliary(grid: Grid) -> str:
-    """The coordinates that are no dimension, as CF lists them."""
-    return " ".join(name for name in grid.coordinates() if name not in grid.dims)
 
 
 def _build(path: Path, plan: Plan, grid: Grid) -> None:
@@ -354,79 +330,3 @@ def one_store(path: str | os.PathLike[str]) -> Store:
             f"{folder}: holds several stores; name one of {names}" if found else f"{folder}: holds no store of a sweep"
         )
     return Store(found[0])
-
-
-def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
-    """Write the results of a sweep into one netCDF-4 file, chunk by chunk.
-
-    Args:
-        path: as for `open_dataset`.
-        file: the file to make; truth values become bytes, and what is nested in the attributes JSON.
-
-    Raises:
-        StoreError: as `open_dataset`.
-        StoreExistsError: the file exists.
-    """
-    target = _free(file)
-    dataset = open_dataset(path)
-    packed = {name: {"zlib": True, "complevel": 1} for name, variable in dataset.data_vars.items() if variable.ndim}
-    for variable in (dataset, *dataset.variables.values()):
-        variable.attrs = {key: _flat(value) for key, value in variable.attrs.items()}
-    with _replacing(target) as partial:
-        # One thread: the HDF5 library is not made for several, and lets only one of them in at a time.
-        import dask
-
-        with dask.config.set(scheduler="synchronous"):  # pyright: ignore[reportPrivateImportUsage]
-            dataset.to_netcdf(partial, engine="h5netcdf", encoding=packed)
-
-
-def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
-    """Write the results of a small sweep as a table, one row a point, all parameters and outputs in columns.
-
-    Args:
-        path: as for `open_dataset`.
-        file: the file to make.
-
-    Raises:
-        StoreError: as `open_dataset`, or more than a million points.
-        StoreExistsError: the file exists.
-    """
-    target = _free(file)
-    dataset = open_dataset(path)
-    points = int(np.prod(list(dataset.sizes.values()), dtype=float))
-    if points > MAX_CSV_POINTS:
-        raise StoreError(
-            f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; export to netCDF, or select "
-            "a part with zwidth.open_dataset"
-        )
-    with _replacing(target) as partial:
-        if dataset.sizes:
-            dataset.to_dataframe().to_csv(partial)
-        else:
-            dataset.expand_dims("point").to_dataframe().to_csv(partial, index=False)
-
-
-def _flat(value: Any) -> Any:
-    """An attribute as netCDF knows them."""
-    if isinstance(value, list) and all(isinstance(item, int) for item in value):
-        return np.array(value, dtype=np.int64 if max(value, default=0) > NOT_COMPUTED else np.uint8)
-    return json.dumps(value) if value is None or isinstance(value, dict | list) else value
-
-
-def _free(file: str | os.PathLike[str]) -> Path:
-    target = Path(os.fsdecode(file))
-    if target.exists():
-        raise StoreExistsError(f"{target} exists already; choose another name or remove it")
-    return target
-
-
-@contextmanager
-def _replacing(target: Path) -> Iterator[Path]:
-    """A file that takes its name when it is whole."""
-    target.parent.mkdir(parents=True, exist_ok=True)
-    partial = target.with_name(f".{target.name}.{secrets.token_hex(4)}.partial")
-    try:
-        yield partial
-        os.replace(partial, target)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -9,14 +9,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import AnyAxis, Axis, DelayAxis, DeltaAxis, PointAxis
+from zwidth.config.axes import AnyAxis, Axis, DelayAxis, DeltaAxis
 from zwidth.config.device_table import DeviceTable, TableField, read_table
-from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Strict, members, one_of
+from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
+from zwidth.config.fields import Strict, members
 from zwidth.config.numbers import number
 from zwidth.config.parameters import (
     DampingAxis,
-    DelayValues,
     MassAxis,
     PeriodAxis,
     RateAxis,
@@ -40,9 +39,14 @@ from zwidth.quantities import (
 
 MAX_SWEEP_POINTS = 10**12
 
-OutputName = Annotated[
-    str, BeforeValidator(one_of(*OUTPUTS)), WithJsonSchema({"type": "string", "enum": list(OUTPUTS)})
-]
+
+def _check_output(name: Any) -> str:
+    if not isinstance(name, str) or name not in OUTPUTS:
+        raise unlisted(name, tuple(OUTPUTS))
+    return name
+
+
+OutputName = Annotated[str, BeforeValidator(_check_output), WithJsonSchema({"type": "string", "enum": list(OUTPUTS)})]
 # Closer in, the rounding of the two counts that prove a radius would meet.
 _ACCURACY = Range(1e-12, 0.1)
 
@@ -119,12 +123,18 @@ class Axes(Strict):
         return any(name in PHYSICAL for name in self.given)
 
     @property
+    def delay_in_periods(self) -> bool:
+        """Whether the delays count sampling periods."""
+        source = self.devices if self.delay is None else self.delay
+        return source is not None and source.in_periods
+
+    @property
     def sizes(self) -> dict[str, int]:
         """The dimensions, slow ones first; a single number is none."""
         sizes = {"device": self.devices.size} if self.devices else {}
         for name in PARAMETERS:
             axis = getattr(self, name)
-            if axis is not None and not is_point(axis):
+            if axis is not None and axis.form != "number":
                 sizes[name] = axis.size
         return sizes
 
@@ -135,11 +145,6 @@ class Axes(Strict):
             return max(column) if largest else min(column)
         axis: Axis = getattr(self, name)
         return axis.largest if largest else float(axis.values().min())
-
-
-def is_point(axis: Axis) -> bool:
-    """Whether an axis is written as a single number, and thus no dimension of the store."""
-    return isinstance(axis.axis if isinstance(axis, DelayValues) else axis, PointAxis)
 
 
 def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
@@ -240,9 +245,8 @@ class SweepStudy(Study):
         if "delay" not in given or not {"period", "rate"} & set(given):
             return
         axis = self.axes.delay
-        unit = axis.unit if axis is not None else self.axes.devices.delay_unit if self.axes.devices else "s"
         longest = self.axes.end("delay", largest=True)
-        if unit == "s":
+        if not self.axes.delay_in_periods:
             longest *= self.axes.end("rate", True) if "rate" in given else 1.0 / self.axes.end("period", False)
         if not longest <= MAX_DELAY_PERIODS:
             place = ("axes", "devices") if axis is None else ("axes", "delay")

@@ -13,21 +13,13 @@ from zwidth.sweep.store import Store, find_stores
 
 @dataclass(frozen=True)
 class Verification:
-    """What a store holds, and in which state.
-
-    Attributes:
-        path: the store.
-        chunks: how many chunks it is to have.
-        done: how many of them are marked as done.
-        damaged: chunks and files that are not what was written, each with what is wrong.
-        error: why the store cannot be read at all; empty where it can.
-    """
+    """What a store holds, and in which state."""
 
     path: Path
-    chunks: int = 0
-    done: int = 0
-    damaged: tuple[str, ...] = ()
-    error: str = ""
+    chunks: int = 0  # how many it is to have
+    done: int = 0  # how many of them are marked as done
+    damaged: tuple[str, ...] = ()  # chunks and files that are not what was written, each with what is wrong
+    error: str = ""  # why the store cannot be read at all; empty where it can
 
     @property
     def ok(self) -> bool:

@@ -19,10 +19,7 @@ PLANE = {
     "delta": [0.05, 0.1, 0.5, 1.0],
     "d": [0, 1],
 }
-SURFACE = {
-    "delta": {"log": {"start": 0.01, "stop": 4, "num": 9}},
-    "d": {"linear": {"start": 0, "stop": 4, "num": 8}},
-}
+SURFACE = {"delta": {"log": {"start": 0.01, "stop": 4, "num": 9}}, "d": {"linear": {"start": 0, "stop": 4, "num": 8}}}
 DEVICES = {
     "devices": {"label": ["light", "heavy"], "mass": [0.1, 1], "damping": [1, 2]},
     "rate": [1000, 2000, 4000],

@@ -70,9 +70,9 @@ def test_every_adversarial_label_is_found():
 def test_compiled_and_plain_filters_agree_with_the_labels():
     # More points than NumPy is given, by repetition; the compiled filter's labels must be right as well.
     points = adversarial()
-    columns = [np.tile(points[name], 2) for name in NAMES]
-    assert columns[0].size > FEW
-    code, label = filter_walls(lay_out(tuple(columns)).points), np.tile(points["label"], 2)
+    alpha, beta, delta, d = (np.tile(points[name], 2) for name in NAMES)
+    assert alpha.size > FEW
+    code, label = filter_walls(lay_out((alpha, beta, delta, d)).points), np.tile(points["label"], 2)
     decided = code < OPEN
     assert decided.mean() > 0.7
     np.testing.assert_array_equal(code[decided] == 1, label[decided] == STABLE)
@@ -285,7 +285,7 @@ def test_strong_damping_and_fractions_next_to_nothing(d):
 def test_the_extra_is_loaded_only_when_needed():
     code = """
 import sys
-import zwidth.stability.certify_pole as certified
+import zwidth.stability.certified as certified
 result = certified.certified_stable(0.3, 0.5, 0.0, 0)
 assert bool(result.stable), result
 assert "flint" not in sys.modules

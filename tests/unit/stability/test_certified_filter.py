@@ -100,7 +100,7 @@ def test_bounds_too_small_are_noticed(monkeypatch):
     monkeypatch.setattr(enclosure, "UNIT", 2.0**-58)
     monkeypatch.setattr(certified_filter, "UNIT", 2.0**-58)
     here = enclosed_device(delta, d, classify_delays(d))
-    assert sum(escaped(*numbers(here, balls.device(delta[i], d[i], BITS)), i) for i in range(60)) > 10
+    assert sum(escaped(*numbers(here, balls.device(delta[i], d[i], BITS)), index=i) for i in range(60)) > 10
 
 
 def test_phi_errors_are_as_stated():
@@ -163,7 +163,7 @@ def test_a_verdict_on_a_box_holds_for_every_wall_in_it(d):
     rng = np.random.default_rng(17)
     alpha, beta, delta, _ = walls(400, 19, d)
     width = 10.0 ** rng.uniform(-5, -1, 400)
-    a, b = (Ball(x, 1.001 * width * np.abs(x)) for x in (alpha, beta))
+    boxes = Ball(alpha, 1.001 * width * np.abs(alpha)), Ball(beta, 1.001 * width * np.abs(beta))
     with np.errstate(all="ignore"):
         here = enclosed_device(delta, np.full(400, d), classify_delays(d))
         if d < 1:
@@ -192,4 +192,4 @@ def test_where_the_computed_end_of_a_row_is_wrong_nothing_wrong_is_proved(error,
     assert {certified_filter.STABLE, certified_filter.UNSTABLE} <= set(expected.ravel().tolist())
     computed = certified_filter.row_limits
     monkeypatch.setattr(certified_filter, "row_limits", lambda *row: computed(*row) * error)
-    np.testing.assert_array_equal(certified_filter.filtered(points), expected)
+    np.testing.assert_array_equal(certified_filter.filter_walls(points), expected)

@@ -319,7 +319,7 @@ def test_without_the_libraries_of_stores_a_run_says_what_to_install(tmp_path, mo
 
 def test_what_a_killed_run_leaves_behind_is_removed(finished, tmp_path):
     config, path = copy_of(finished, tmp_path)
-    left = [path / "stable" / "c" / "0" / "0" / "0" / "0.123.partial", tmp_path / ".map.zarr.1234.partial"]
+    left = [path / "stable" / "c" / "0" / "0" / "0" / "0.123.partial", tmp_path / ".map.zarr.12345678.partial"]
     left[0].write_bytes(b"half")
     left[1].mkdir()
     run_sweeps(config, tmp_path, resume=True)

@@ -1,0 +1,15 @@
+"""Every name of `zwidth.figures`, once."""
+
+from .boundary import draw_boundary as draw_boundary
+from .curves import draw_curves as draw_curves
+from .curves import draw_outlines as draw_outlines
+from .passivity_cost import draw_passivity_cost as draw_passivity_cost
+from .plane import draw_plane as draw_plane
+from .recommendation import draw_recommendation as draw_recommendation
+from .ridge import draw_ridge as draw_ridge
+from .slope import draw_slope as draw_slope
+from .stability_map import draw_map as draw_map
+from .step import draw_step as draw_step
+from .style import house_style as house_style
+from .style import save as save
+from .zero_stiffness import draw_zero_stiffness as draw_zero_stiffness
