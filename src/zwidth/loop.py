@@ -20,8 +20,8 @@ from zwidth.batching import concrete_delay
 from zwidth.domain import check_scalars, poison, valid_wall
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import Degree, few_poles, map_by_degree
+from zwidth.normalization import normalize
 from zwidth.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
-from zwidth.scene import normalize
 from zwidth.xp import horner, namespace
 
 

@@ -21,8 +21,8 @@ from typing import Any, NamedTuple
 
 from zwidth._types import Array, ArrayLike, Coefficients
 from zwidth.batching import pointwise
+from zwidth.normalization import normalize
 from zwidth.numerics import phi
-from zwidth.scene import normalize
 from zwidth.xp import namespace
 
 # x -> `zwidth.numerics.phi.PhiFunctions`, in any arithmetic

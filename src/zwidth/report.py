@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import root_scalar
 
-from zwidth.scene import normalize
+from zwidth.normalization import normalize
 from zwidth.stability.boundary import boundary
 from zwidth.stability.ridge import alpha_max
 from zwidth.stability.slope import stiffness_slope

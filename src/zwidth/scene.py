@@ -1,326 +1,114 @@
-"""What the user describes: a device, a virtual wall and their timing, in SI units and normalized.
-
-The normalization is the paper's eqs. (14) and (16): ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``,
-``d = t_d/T``.
-"""
+"""A whole loop as people have it: device, timing, velocity estimate, hand; and every question about its walls."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth._types import DELAY_MODELS, Array, ArrayLike, DelayModel
-from zwidth.batching import refuse_masked
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, void, within
-from zwidth.errors import InputError, check_choice
-from zwidth.status import Status
-from zwidth.xp import frozen, is_jax, is_traced, namespace
+from zwidth._types import Array, ArrayLike
+from zwidth.batching import as_float64
+from zwidth.errors import InputError
+from zwidth.linear.border import Border, Outline, outlines
+from zwidth.linear.boundary import Boundary, curve_at
+from zwidth.linear.chain import Chain, chain_of, linear_loop
+from zwidth.linear.rows import label_walls, stable_intervals
+from zwidth.linear_loop import LinearLoop
+from zwidth.normalization import Normalized, Physical, denormalize, in_periods, normalize
+from zwidth.parts.device import Device
+from zwidth.parts.operator import Operator
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import BackwardDifference, Velocity
+from zwidth.parts.wall import VirtualWall
+from zwidth.stability.labels import is_stable
 
 
-class Normalized(NamedTuple):
-    """The four dimensionless numbers that the stability of the wall depends on."""
+_EXAMPLES = {
+    "device": "zwidth.Device(mass=0.1, damping=10)",
+    "timing": "zwidth.Timing(period=1e-3, delay=1e-3)",
+    "wall": "zwidth.VirtualWall(stiffness=10e3)",
+    "velocity": "zwidth.LowPass(cutoff=100)",
+    "operator": "zwidth.Operator(mass=0.5)",
+}
 
-    alpha: Array
-    beta: Array
-    delta: Array
-    d: Array
 
+class WallSI(NamedTuple):
+    """Walls by stiffness in N/m and damping in N s/m."""
 
-class Physical(NamedTuple):
-    """The same wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
-
-    mass: Array
-    damping: Array
-    period: Array
-    delay: Array
     stiffness: Array
     virtual_damping: Array
 
 
-# field -> (unit, lowest value, whether the lowest value itself is excluded, magnitudes allowed beside 0)
-_RANGES: dict[str, tuple[str, float, bool, tuple[float, float]]] = {
-    "mass": ("kg", 0.0, True, SI_RANGE),
-    "damping": ("N s/m", 0.0, False, SI_RANGE),
-    "period": ("s", 0.0, True, SI_RANGE),
-    "delay": ("s", 0.0, False, SI_RANGE),
-    "stiffness": ("N/m", -math.inf, False, SI_RANGE),
-    "virtual_damping": ("N s/m", -math.inf, False, SI_RANGE),
-    "wanted_stiffness": ("N/m", 0.0, True, SI_RANGE),
-    "delta": ("", 0.0, False, (0.0, LARGEST_DAMPING)),
-    "d": ("", 0.0, False, (0.0, LONGEST_DELAY)),
-    "alpha": ("", -math.inf, False, WALL_RANGE),
-    "beta": ("", -math.inf, False, WALL_RANGE),
-}
-
-
-def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
-    """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
-    if is_traced(value):
-        return value
-    refuse_masked(name, value)
-    try:
-        number = np.asarray(value)
-    except ValueError as error:
-        raise InputError(f"{name}: got {value!r}, a rectangular array of real numbers is needed") from error
-    if number.dtype.kind not in "biuf":
-        raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed")
-    number = number.astype(np.float64, copy=False)
-    if number.ndim == 0:
-        unit, lowest, excluded, (least, most) = _RANGES[name]
-        if not _valid(name, number):
-            bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
-            raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
-        if not within(number, (least, most)):
-            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"at most {most:g}"
-            raise InputError(f"{name}: got {value!r}; it must be {allowed}{f' (in {unit})' if unit else ''}")
-    return number
-
-
-def _valid(name: str, value: Array) -> Array:
-    _, lowest, excluded, _ = _RANGES[name]
-    return namespace(value).isfinite(value) & ((value > lowest) if excluded else (value >= lowest))
-
-
-def _in_range(name: str, value: Array) -> Array:
-    return _valid(name, value) & within(value, _RANGES[name][3])
-
-
-def quantity_status(**values: Array) -> Array:
-    """The `Status` of quantities named as in `normalize`: INVALID_INPUT before OUT_OF_RANGE, elementwise."""
-    xp = namespace(*values.values())
-    valid = inside = True
-    for name, value in values.items():
-        valid, inside = valid & _valid(name, value), inside & within(value, _RANGES[name][3])
-    return xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
-
-
-def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
-    """Check the arguments, put NaN where an array's entry is out of range, and apply ``formula``."""
-    checked = {name: _check_quantity(name, value) for name, value in values.items()}
-    try:
-        np.broadcast_shapes(*(np.shape(value) for value in checked.values()))
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in checked.items())
-        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
-    if any(map(is_jax, values.values())):
-        from zwidth.batching import elementwise
-
-        return elementwise(_formula_at, tuple(values), tuple(values.values()), (formula, tuple(values)))
-    with np.errstate(all="ignore"):
-        result = _formula_at(*checked.values(), formula, tuple(values))
-    return tuple(part[()] for part in result)
-
-
-def _formula_at(*arguments: Any) -> tuple[Array, ...]:
-    """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
-    *values, formula, names = arguments
-    return formula(*(void(_in_range(name, value), value)[0] for name, value in zip(names, values, strict=True)))
-
-
-def in_periods(delay: Array, period: Array) -> Array:
-    """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number.
-
-    1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
-    """
-    xp = namespace(delay, period)
-    quotient = delay / period
-    whole = xp.round(quotient)
-    near = xp.abs(quotient - whole) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(whole, 1.0)
-    # Rounding is flat; the quotient it corrects is not.
-    return quotient - frozen(xp.where(near & (whole > 0), quotient - whole, 0.0), xp)
-
-
-def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
-    """Eqs. (14), (16)."""
-    return (
-        stiffness * period * period / mass,
-        virtual_damping * period / mass,
-        damping * period / mass,
-        in_periods(delay, period),
-    )
-
-
-def _denormalize(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
-    """Eqs. (14), (16) solved for the SI quantities, in the order of `Physical`."""
-    rate = mass / period
-    return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
-
-
-def normalize(
-    *,
-    mass: ArrayLike,
-    damping: ArrayLike = 0.0,
-    period: ArrayLike,
-    delay: ArrayLike = 0.0,
-    stiffness: ArrayLike = 0.0,
-    virtual_damping: ArrayLike = 0.0,
-) -> Normalized:
-    """Turn SI quantities into the normalized ones.
-
-    ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``, ``d = t_d/T``.
-
-    Args:
-        mass: m in kg, > 0.
-        damping: b, the physical damping of the device, in N s/m, >= 0.
-        period: T, the sampling period, in s, > 0.
-        delay: t_d, from the sample to the moment its force acts, in s, >= 0.
-        stiffness: K of the virtual wall in N/m.
-        virtual_damping: B of the virtual wall in N s/m.
-            All broadcast against each other; each is 0 or 1e-30 to 1e30 in magnitude.
-
-    Returns:
-        ``alpha``, ``beta``, ``delta``, ``d``. ``d`` is taken as whole where the quotient is whole but for rounding.
-        An entry of an array that is out of range gives NaN.
-
-    Raises:
-        InputError: a scalar is out of range, or an argument is no number.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
-
-    Example:
-        >>> import zwidth
-        >>> wall = zwidth.normalize(mass=0.1, damping=10, period=1e-3, delay=1e-3, stiffness=14.9e3)
-        >>> print(f"{wall.alpha:.3f} {wall.delta:.1f} {wall.d:.0f}")
-        0.149 0.1 1
-    """
-    numbers = _convert_quantities(
-        _normalize,
-        mass=mass,
-        damping=damping,
-        period=period,
-        delay=delay,
-        stiffness=stiffness,
-        virtual_damping=virtual_damping,
-    )
-    return Normalized(*numbers)
-
-
-def denormalize(
-    *,
-    mass: ArrayLike,
-    period: ArrayLike,
-    alpha: ArrayLike = 0.0,
-    beta: ArrayLike = 0.0,
-    delta: ArrayLike = 0.0,
-    d: ArrayLike = 0.0,
-) -> Physical:
-    """Turn normalized quantities back into SI ones, for a device of this mass and sampling period.
-
-    ``K = alpha m/T^2``, ``B = beta m/T``, ``b = delta m/T``, ``t_d = d T``.
-
-    Args:
-        mass: m in kg, > 0.
-        period: T in s, > 0.
-        alpha: normalized stiffness, 0 or 1e-60 to 1e60 in magnitude.
-        beta: normalized virtual damping, 0 or 1e-60 to 1e60 in magnitude.
-        delta: normalized physical damping, 0 to 1e12.
-        d: delay in periods, 0 to 1e5.
-
-    Returns:
-        ``mass``, ``damping``, ``period``, ``delay``, ``stiffness``, ``virtual_damping`` in SI units.
-
-    Raises:
-        InputError: a scalar is out of range, or an argument is no number.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
-
-    Example:
-        >>> import zwidth
-        >>> print(f"{zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.149).stiffness:.0f} N/m")
-        14900 N/m
-    """
-    numbers = _convert_quantities(_denormalize, mass=mass, period=period, alpha=alpha, beta=beta, delta=delta, d=d)
-    return Physical(*numbers)
-
-
-def _require_scalar(name: str, value: float) -> None:
-    if np.ndim(value) != 0:
-        raise InputError(f"{name}: got an array of shape {np.shape(value)}; a scene holds single numbers")
-    _check_quantity(name, value)
-
-
-@dataclass(frozen=True)
-class Device:
-    """The haptic device: a mass with viscous damping.
-
-    Args:
-        mass: m in kg, > 0.
-        damping: b in N s/m, >= 0.
-    """
-
-    mass: float
-    damping: float = 0.0
-
-    def __post_init__(self) -> None:
-        _require_scalar("mass", self.mass)
-        _require_scalar("damping", self.damping)
-
-
-@dataclass(frozen=True)
-class VirtualWall:
-    """The wall that is rendered: a spring and a damper, the damper acting on the backward difference.
-
-    Args:
-        stiffness: K in N/m.
-        virtual_damping: B in N s/m.
-    """
-
-    stiffness: float
-    virtual_damping: float = 0.0
-
-    def __post_init__(self) -> None:
-        _require_scalar("stiffness", self.stiffness)
-        _require_scalar("virtual_damping", self.virtual_damping)
-
-
-@dataclass(frozen=True)
-class Timing:
-    """When the wall's force is computed and when it acts.
-
-    Args:
-        period: T in s, > 0.
-        delay: t_d in s, >= 0, whole periods or not.
-        delay_model: "held" (exact for every delay) or "fractional_power" (the paper's z^(1+d), boundary and
-            ridge only).
-    """
-
-    period: float
-    delay: float = 0.0
-    delay_model: DelayModel = "held"
-
-    def __post_init__(self) -> None:
-        _require_scalar("period", self.period)
-        _require_scalar("delay", self.delay)
-        check_choice("delay_model", self.delay_model, DELAY_MODELS)
-
-
 @dataclass(frozen=True)
 class Scene:
-    """A device, its timing and, where one is chosen, the wall it renders.
+    """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
+
+    Args:
+        device: mass and damping, rigid or with a coupling.
+        timing: period and delay.
+        wall: the wall that `zwidth.assess` judges; the questions below are asked of any wall. It may be left out.
+        velocity: how the velocity is estimated; the backward difference by default.
+        operator: the hand, None where nobody holds the device.
 
     Example:
         >>> import zwidth
-        >>> scene = zwidth.Scene(zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3))
-        >>> print(f"{scene.delta:.1f} {scene.d:.0f}")
-        0.1 1
+        >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
+        >>> scene = zwidth.Scene(device, timing, velocity=zwidth.LowPass(cutoff=100))
+        >>> scene.is_stable(10e3, [5, 40])
+        array([ True, False])
     """
 
     device: Device
     timing: Timing
     wall: VirtualWall = field(default_factory=lambda: VirtualWall(stiffness=0.0))
+    velocity: Velocity = field(default_factory=BackwardDifference)
+    operator: Operator | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.wall, Velocity):
+            # Without a wall the velocity estimate is the third part.
+            object.__setattr__(self, "velocity", self.wall)
+            object.__setattr__(self, "wall", VirtualWall(stiffness=0.0))
+        kinds = {
+            "device": Device,
+            "timing": Timing,
+            "wall": VirtualWall,
+            "velocity": Velocity,
+            "operator": Operator | None,
+        }
+        for name, kind in kinds.items():
+            part = getattr(self, name)
+            if not isinstance(part, kind):
+                raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {_EXAMPLES[name]}")
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether it is a rigid mass with the backward difference, for which the closed forms hold."""
+        hand = self.operator
+        bare = isinstance(self.velocity, BackwardDifference) and self.velocity.coded_period is None
+        free = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
+        return bare and free and self.device.coupling is None
+
+    @property
+    def mass(self) -> Any:
+        """The mass that the wall's force acts on, in kg: the unit of the normalized stiffness."""
+        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
+        return self.device.mass + (self.operator.mass if held and self.operator is not None else 0.0)
+
+    @property
+    def damping(self) -> Any:
+        """The damping to ground of that mass, in N s/m."""
+        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
+        return self.device.damping + (self.operator.damping if held and self.operator is not None else 0.0)
 
     @property
     def normalized(self) -> Normalized:
-        """``alpha``, ``beta``, ``delta``, ``d`` of this scene."""
+        """``alpha``, ``beta``, ``delta``, ``d`` of this scene and its wall."""
         return normalize(
-            mass=self.device.mass,
-            damping=self.device.damping,
+            mass=self.mass,
+            damping=self.damping,
             period=self.timing.period,
             delay=self.timing.delay,
             stiffness=self.wall.stiffness,
@@ -345,10 +133,118 @@ class Scene:
     @property
     def d(self) -> float:
         """Delay in periods."""
-        return self.normalized.d
+        return in_periods(*(np.float64(value) for value in (self.timing.delay, self.timing.period)))
+
+    @property
+    def whole_delay(self) -> int:
+        """Whole periods of it."""
+        return int(np.floor(self.d))
 
     def to_si(self, *, alpha: ArrayLike = 0.0, beta: ArrayLike = 0.0) -> Physical:
         """Stiffness in N/m and damping in N s/m of a normalized wall on this device."""
         return denormalize(
-            mass=self.device.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
+            mass=self.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
         )
+
+    @property
+    def units(self) -> WallSI:
+        """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
+        rate = self.mass / self.timing.period
+        return WallSI(rate / self.timing.period, rate)
+
+    @cached_property
+    def chain(self) -> Chain:
+        """Its masses, springs and dampers, normalized."""
+        return chain_of(self)
+
+    @cached_property
+    def loop(self) -> LinearLoop:
+        """Its loop without the wall, by roots, normalized."""
+        return linear_loop(self.chain)
+
+    @cached_property
+    def traced_boundary(self) -> Boundary:
+        """The boundary of its walls, normalized, laid out once."""
+        return Boundary.trace(self.loop)
+
+    @cached_property
+    def border(self) -> Border:
+        """The edge of its stable set, normalized."""
+        return Border(self.traced_boundary)
+
+    def normalize_walls(self, stiffness: ArrayLike, virtual_damping: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Walls in SI units as arrays of alpha and beta of one shape."""
+        units = self.units
+        both = as_float64("stiffness", stiffness), as_float64("virtual_damping", virtual_damping)
+        try:
+            alpha, beta = np.broadcast_arrays(*both)
+        except ValueError as error:
+            raise InputError(
+                f"shapes do not broadcast: stiffness {both[0].shape}, virtual_damping {both[1].shape}; make each "
+                "axis equal or 1"
+            ) from error
+        with np.errstate(all="ignore"):
+            return alpha / units.stiffness, beta / units.virtual_damping
+
+    def is_stable(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """Whether walls are stable: every pole strictly inside the unit circle.
+
+        Args:
+            stiffness: K in N/m.
+            virtual_damping: B in N s/m. Both broadcast.
+
+        Returns:
+            Boolean array of the broadcast shape, False for what is NaN.
+
+        Numerics:
+            Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
+            row (`zwidth.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
+            costs some microseconds and a stiffness next to nothing.
+        """
+        alpha, beta = self.normalize_walls(stiffness, virtual_damping)
+        if self.is_rigid:
+            return is_stable(alpha, beta, self.delta, self.d)
+        return label_walls(self.traced_boundary, alpha, beta)[()]
+
+    def stable_stiffness(self, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
+        """The stable intervals of the stiffness at a damping, several where there are several.
+
+        Args:
+            virtual_damping: B in N s/m, a number or an array.
+
+        Returns:
+            Array (n, 2) in N/m, or with the shape of the damping in front and NaN where a row has fewer intervals. The
+            ends are not stable themselves.
+        """
+        beta = as_float64("virtual_damping", virtual_damping) / self.units.virtual_damping
+        found = stable_intervals(self.traced_boundary, beta.reshape(-1))
+        both = np.stack(found, -1) * self.units.stiffness
+        return both.reshape(*beta.shape, *both.shape[1:])
+
+    def boundary(self, omega: ArrayLike) -> WallSI:
+        """The walls that put a pole pair on the unit circle at a frequency.
+
+        Args:
+            omega: in rad/s, between 0 and half the sampling rate, ``pi/T``.
+
+        Returns:
+            ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
+        """
+        w = as_float64("omega", omega) * self.timing.period
+        inside = (w > 0) & (w < np.pi)
+        curve = curve_at(self.loop, np.where(inside, w, 1.0))
+        units = self.units
+        numbers = (curve.alpha * units.stiffness, curve.beta * units.virtual_damping)
+        return WallSI(*(np.where(inside, part, np.nan)[()] for part in numbers))
+
+    def stable_region(self) -> list[Outline]:
+        """Closed outlines of the stable set, the largest first, islands and holes told apart.
+
+        Returns:
+            A list of outlines with ``stiffness`` in N/m, ``virtual_damping`` in N s/m and ``hole``.
+        """
+        units = self.units
+        return [
+            Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, piece.hole)
+            for piece in outlines(self.border)
+        ]

@@ -32,7 +32,10 @@ def check(
 ) -> None:
     """Judge one wall: stable, passive, how far from the boundary."""
     from zwidth.assessment import assess
-    from zwidth.scene import Device, Scene, Timing, VirtualWall
+    from zwidth.parts.device import Device
+    from zwidth.parts.timing import Timing
+    from zwidth.parts.wall import VirtualWall
+    from zwidth.scene import Scene
 
     scene = Scene(Device(mass, damping), Timing(period, delay), VirtualWall(stiffness, virtual_damping))
     verdict = assess(scene)
@@ -72,7 +75,9 @@ def ridge(
     """
     import numpy as np
 
-    from zwidth.scene import Device, Scene, Timing
+    from zwidth.parts.device import Device
+    from zwidth.parts.timing import Timing
+    from zwidth.scene import Scene
     from zwidth.stability.ridge import RidgeKind, alpha_max
     from zwidth.status import Status
 

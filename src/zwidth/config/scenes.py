@@ -26,8 +26,12 @@ from zwidth.config.numbers import number
 from zwidth.config.units import RATE, TIME, Span, quantity
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.errors import InputError
+from zwidth.normalization import normalize
+from zwidth.parts.device import Device
+from zwidth.parts.timing import Timing
+from zwidth.parts.wall import VirtualWall
 from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
-from zwidth.scene import Device, Scene, Timing, VirtualWall, normalize
+from zwidth.scene import Scene
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping"})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})

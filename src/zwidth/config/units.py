@@ -10,8 +10,8 @@ from typing import Any, Literal, NamedTuple
 from zwidth.config.faults import describe, problem, short, suggestion
 from zwidth.config.numbers import check_range, looks_like_number, number, to_float
 from zwidth.domain import SI_RANGE
+from zwidth.normalization import normalize
 from zwidth.quantities import ANY, PARAMETERS, Range
-from zwidth.scene import normalize
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
 _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,20})", re.DOTALL)

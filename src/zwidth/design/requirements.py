@@ -22,8 +22,8 @@ from zwidth.batching import elementwise
 from zwidth.design.stiffness import check_stiffness, checked_device
 from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, poison, within
 from zwidth.errors import InputError
+from zwidth.normalization import denormalize, in_periods, normalize, quantity_status
 from zwidth.numerics.roots import last_cell, newton
-from zwidth.scene import denormalize, in_periods, normalize, quantity_status
 from zwidth.stability.devices import ANY, Kind, classify_delays
 from zwidth.stability.ridge import ridge_kernel, slopes_kernel
 from zwidth.status import Status

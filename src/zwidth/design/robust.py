@@ -17,8 +17,8 @@ from zwidth.batching import as_float64
 from zwidth.design.stiffness import max_stiffness
 from zwidth.domain import SI_RANGE, within
 from zwidth.errors import InputError
+from zwidth.normalization import normalize
 from zwidth.numerics.roots import bisect
-from zwidth.scene import normalize
 from zwidth.stability.affine import quantities, stable_everywhere
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.labels import is_stable

@@ -13,7 +13,7 @@ from zwidth.domain import check_scalars
 from zwidth.errors import InputError
 from zwidth.formatting import with_unit
 from zwidth.loop import check_delay_model
-from zwidth.scene import Normalized, normalize, quantity_status
+from zwidth.normalization import Normalized, normalize, quantity_status
 from zwidth.stability.devices import Kind, classify_delays
 from zwidth.stability.ridge import ridge_kernel, slopes_kernel
 from zwidth.status import Status

@@ -168,14 +168,15 @@ def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:
 class Outline(NamedTuple):
     """One closed outline of the stable set; a hole where unstable walls lie inside."""
 
-    alpha: np.ndarray
-    beta: np.ndarray
+    stiffness: np.ndarray
+    virtual_damping: np.ndarray
     hole: bool
 
     @property
     def area(self) -> float:
         """Inside, of the polygon."""
-        return 0.5 * abs(float(np.dot(self.alpha, np.roll(self.beta, -1)) - np.dot(np.roll(self.alpha, -1), self.beta)))
+        x, y = self.stiffness, self.virtual_damping
+        return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y)))
 
 
 def outlines(border: Border) -> list[Outline]:
@@ -212,5 +213,5 @@ def _inside(found: list[Outline], k: int) -> int:
     """How many of the larger outlines an outline lies in."""
     from matplotlib.path import Path
 
-    point = found[k].alpha[0], found[k].beta[0]
-    return sum(bool(Path(np.stack([o.alpha, o.beta], -1)).contains_point(point)) for o in found[:k])
+    point = found[k].stiffness[0], found[k].virtual_damping[0]
+    return sum(bool(Path(np.stack([o.stiffness, o.virtual_damping], -1)).contains_point(point)) for o in found[:k])

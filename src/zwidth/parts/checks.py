@@ -18,10 +18,7 @@ def check_number(
     """Return one real number in range, a float unless JAX traces or holds it; else raise `InputError`."""
     if is_jax(value):
         return value
-    ends = f"{'greater than' if low_open else 'at least'} {low:g}" + (
-        f" and at most {high:g}" if high < math.inf else ""
-    )
-    allowed = f"it must be one finite number, {ends}{f' (in {unit})' if unit else ''}"
+    allowed = f"it must be one finite number{_bounds(low, low_open, high)}{f' (in {unit})' if unit else ''}"
     if isinstance(value, bool | str) or np.ndim(value) != 0:
         raise InputError(f"{field}: got {value!r}; {allowed}")
     try:
@@ -36,6 +33,11 @@ def check_number(
             f"{field}: got {value!r}; it must be 0 or {SI_RANGE[0]:g} to {SI_RANGE[1]:g} in magnitude; check the units"
         )
     return number
+
+
+def _bounds(low: float, low_open: bool, high: float) -> str:
+    above = "" if low == -math.inf else f", {'greater than' if low_open else 'at least'} {low:g}"
+    return above + ("" if high == math.inf else f" and at most {high:g}")
 
 
 def check_whole(field: str, value: Any, low: int, high: int) -> int:

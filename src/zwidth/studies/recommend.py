@@ -14,7 +14,8 @@ from zwidth.assessment import Assessment, assess
 from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.formatting import plain, with_unit
-from zwidth.scene import Scene, VirtualWall
+from zwidth.parts.wall import VirtualWall
+from zwidth.scene import Scene
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, in_si, si_scales, stack

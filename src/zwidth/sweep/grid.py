@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.config.device_table import LABEL
+from zwidth.normalization import normalize
 from zwidth.quantities import PARAMETERS, WALL, Family
-from zwidth.scene import normalize
 from zwidth.sweep.study import SweepStudy
 
 

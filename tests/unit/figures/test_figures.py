@@ -213,7 +213,7 @@ def test_responses_that_are_alike_are_two_all_the_same():
 
 
 def test_every_function_takes_axes_last_and_returns_them():
-    for name in (name for name in figures.__all__ if name.startswith("draw_")):
+    for name in (name for name in dir(figures) if name.startswith("draw_")):
         signature = inspect.signature(getattr(figures, name))
         (where,) = [each for each in signature.parameters.values() if each.default is None]
         assert where.name == ("ax" if name == "draw_zero_stiffness" else "axes"), name
