@@ -35,7 +35,7 @@ class Jet(NamedTuple):
         return Jet(value, (self.slope - value * other.slope) / other.value)
 
 
-class Circle(NamedTuple):
+class CirclePoints(NamedTuple):
     """Points ``z = e^(jw)``, and z - 1 with all its digits."""
 
     w: Array
@@ -43,16 +43,16 @@ class Circle(NamedTuple):
     before: Array
 
 
-def circle(w: Array) -> Circle:
+def circle(w: Array) -> CirclePoints:
     """The points of the unit circle at the angles ``w``, exactly -1 at pi."""
     xp = namespace(w)
     half = 0.5 * w
     s, c = xp.sin(half), xp.where(w >= np.pi, 0.0, xp.cos(half))
     before = -2.0 * s * s + 2j * s * c
-    return Circle(w, 1.0 + before, before)
+    return CirclePoints(w, 1.0 + before, before)
 
 
-def lag_jet(at: Circle, turns: float) -> Jet:
+def lag_jet(at: CirclePoints, turns: float) -> Jet:
     """``z^turns``."""
     # At pi a whole number of half turns is a sign.
     even = 1.0 - 2.0 * (turns % 2)
@@ -61,7 +61,7 @@ def lag_jet(at: Circle, turns: float) -> Jet:
     return Jet(value, 1j * turns * value)
 
 
-def product_jet(at: Circle, offsets: Any, factor: Any) -> Jet:
+def product_jet(at: CirclePoints, offsets: Any, factor: Any) -> Jet:
     """``factor prod(z - root)`` of roots given by their offsets from 1."""
     value = 0.0 * at.z + factor
     slope = 0.0 * at.z
@@ -90,7 +90,7 @@ class Estimate:
     zeros: Any = field(default_factory=_no_roots)
     poles: Any = field(default_factory=_no_roots)
 
-    def jet(self, at: Circle) -> Jet:
+    def jet(self, at: CirclePoints) -> Jet:
         """F and its derivative in w."""
         xp = namespace(at.w)
         parts = product_jet(at, self.zeros, self.gain)
@@ -122,7 +122,7 @@ class LinearLoop:
     poles: Array
     estimate: Estimate
 
-    def needed(self, at: Circle) -> Jet:
+    def needed(self, at: CirclePoints) -> Jet:
         """``q = -1/G``: what the wall must answer to put a pole at z."""
         over = product_jet(at, self.poles, -1.0).over(product_jet(at, self.zeros, self.gain))
         return over.times(lag_jet(at, self.lag))

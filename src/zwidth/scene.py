@@ -24,7 +24,6 @@ from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
 from zwidth.stability.labels import is_stable
 
-
 _EXAMPLES = {
     "device": "zwidth.Device(mass=0.1, damping=10)",
     "timing": "zwidth.Timing(period=1e-3, delay=1e-3)",

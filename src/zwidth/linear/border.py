@@ -31,7 +31,7 @@ class Edge(NamedTuple):
     line: int  # which of the boundary's lines, or -1 for the curve
 
 
-class Peak(NamedTuple):
+class StiffestWall(NamedTuple):
     """The stiffest stable wall: the end of all stable alpha."""
 
     alpha: float
@@ -122,7 +122,7 @@ class Border:
             return float(beta[k])
         return _last_held(lambda at: self.boundary.line_borders(place, at), float(beta[k]), float(beta[after]))
 
-    def peak(self) -> Peak | None:
+    def peak(self) -> StiffestWall | None:
         """The stiffest stable wall, None where no wall is stable."""
         best = None
         for edge in self.curved:
@@ -131,11 +131,11 @@ class Border:
             inner = 0 < k < edge.w.size - 1
             kind = RidgeKind.SMOOTH if inner else RidgeKind.CORNER
             if best is None or edge.alpha[k] > best.alpha:
-                best = Peak(float(edge.alpha[k]), float(edge.beta[k]), w, kind)
+                best = StiffestWall(float(edge.alpha[k]), float(edge.beta[k]), w, kind)
         for edge in self.straight:
             k = int(np.argmax(edge.alpha))
             if best is None or edge.alpha[k] > best.alpha * (1 + 1e-9) + 1e-300:
-                best = Peak(float(edge.alpha[k]), float(edge.beta[k]), float(edge.w[k]), RidgeKind.CORNER)
+                best = StiffestWall(float(edge.alpha[k]), float(edge.beta[k]), float(edge.w[k]), RidgeKind.CORNER)
         return best
 
 

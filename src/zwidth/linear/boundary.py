@@ -34,7 +34,7 @@ _MOST_STEPS, _ARRIVED = 120, 1e-10
 _NONE = 1e-11
 
 
-class Curve(NamedTuple):
+class CurvePoints(NamedTuple):
     """Points of the boundary curve, and what decides their order."""
 
     alpha: np.ndarray
@@ -56,7 +56,7 @@ class Arc(NamedTuple):
         return float(min(self.w[0], self.w[-1]))
 
 
-class Line(NamedTuple):
+class CrossingLine(NamedTuple):
     """A frequency at which a whole line ``alpha + beta real(F) = q`` puts poles on the circle."""
 
     w: float
@@ -75,7 +75,7 @@ class Crossings(NamedTuple):
     leaving: np.ndarray  # poles that leave the circle as alpha rises past the crossing; negative for entering ones
 
 
-def curve_at(loop: LinearLoop, w: np.ndarray) -> Curve:
+def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
     """The boundary curve at angles in (0, pi)."""
     at = circle(w)
     with np.errstate(all="ignore"):
@@ -85,7 +85,7 @@ def curve_at(loop: LinearLoop, w: np.ndarray) -> Curve:
         turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
         beta_slope = turn / f.value.imag**2
         alpha_slope = q.slope.real - beta_slope * f.value.real - beta * f.slope.real
-        return Curve(alpha, beta, alpha_slope, turn, f.value.imag)
+        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag)
 
 
 def nodes_of(loop: LinearLoop) -> np.ndarray:
@@ -111,7 +111,7 @@ class Boundary:
     loop: LinearLoop
     w: np.ndarray
     arcs: tuple[Arc, ...]
-    lines: tuple[Line, ...]
+    lines: tuple[CrossingLine, ...]
     infinite: np.ndarray  # angles at which the curve runs to infinity
 
     @classmethod
@@ -274,7 +274,7 @@ def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) ->
     return 0.5 * (low + high)
 
 
-def _dips(loop: LinearLoop, w: np.ndarray, here: Curve) -> np.ndarray:
+def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
     """Nodes to add where d beta/dw keeps its sign from one node to the next but may not do so between them.
 
     The curve changes so little over a step that the slope is nearly a parabola there; where an end's tangent leads
@@ -293,17 +293,17 @@ def _dips(loop: LinearLoop, w: np.ndarray, here: Curve) -> np.ndarray:
     return (w[k, None] + step[k, None] * _INSIDE).ravel()
 
 
-def _interior_line(loop: LinearLoop, w: float) -> Line | None:
+def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
     """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
     at = circle(np.array([w]))
     q, f = loop.needed(at), loop.estimate.jet(at)
     if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
         return None
     value, turn = float(q.value[0].real), float(q.slope[0].imag)
-    return Line(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
+    return CrossingLine(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
 
 
-def _end_lines(loop: LinearLoop) -> list[Line]:
+def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
     """The lines of real poles at z = 1 and z = -1; where the device does not move there is none."""
     lines = []
     for w in (0.0, np.pi):
@@ -313,11 +313,11 @@ def _end_lines(loop: LinearLoop) -> list[Line]:
         numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
         if np.all(np.isfinite(numbers)) and abs(numbers[0]) < 1e14:
             q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
-            lines.append(Line(w, q_value, f_value, q_turn, f_turn, 1))
+            lines.append(CrossingLine(w, q_value, f_value, q_turn, f_turn, 1))
     return lines
 
 
-def _arcs(loop: LinearLoop, w: np.ndarray, here: Curve, poles: np.ndarray, turns: np.ndarray) -> list[Arc]:
+def _arcs(loop: LinearLoop, w: np.ndarray, here: CurvePoints, poles: np.ndarray, turns: np.ndarray) -> list[Arc]:
     """Cut the curve where beta turns or runs to infinity."""
     cuts = np.sort(np.concatenate([poles, turns]))
     ends = np.concatenate([[0.0], cuts, [np.pi]])

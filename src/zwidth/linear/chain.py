@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.errors import InputError
-from zwidth.linear_loop import Circle, Estimate, LinearLoop, circle, lag_jet
+from zwidth.linear_loop import CirclePoints, Estimate, LinearLoop, circle, lag_jet
 from zwidth.plant import held_plant, undelayed_plant
 from zwidth.xp import namespace
 
@@ -160,7 +160,7 @@ def sampled(chain: Chain) -> Sampled:
 
 def needed(chain: Chain, w: Any, parts: Sampled | None = None) -> Any:
     """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
-    at: Circle = circle(w)
+    at: CirclePoints = circle(w)
     if chain.rigid:
         return _rigid_needed(chain, at)
     parts = parts or sampled(chain)
@@ -171,7 +171,7 @@ def needed(chain: Chain, w: Any, parts: Sampled | None = None) -> Any:
     return -lag_jet(at, turns).value / (parts.sensor @ moved)
 
 
-def _rigid_needed(chain: Chain, at: Circle) -> Any:
+def _rigid_needed(chain: Chain, at: CirclePoints) -> Any:
     fraction = chain.d - chain.whole
     whole = isinstance(fraction, float | np.floating) and fraction == 0.0
     delta = chain.bodies[0].damping
