@@ -16,7 +16,7 @@ from zwidth.config.study import HeldOnly
 from zwidth.stability.labels import is_stable
 from zwidth.stability.passivity import is_passive
 from zwidth.stability.radii import spectral_radius
-from zwidth.studies.outcome import ComputedStudy, Outcome, of_scene
+from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 
@@ -84,6 +84,6 @@ class MapStudy(ComputedStudy):
             for name in outputs:
                 outputs[name][place] = np.asarray(_FUNCTIONS[name](*wall))
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
-        arrays = of_scene(arrays, self.delta, self.d, scene)
+        arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
         return Outcome(arrays=arrays, figures={f"_{name}": partial(figures.draw_map, arrays, name) for name in names})

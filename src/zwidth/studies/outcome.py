@@ -79,20 +79,20 @@ def si_scales(device: PhysicalDevice) -> tuple[float, float]:
     return device.mass / device.period**2, device.mass / device.period
 
 
-def in_si(table: Table, device: PhysicalDevice) -> Table:
+def add_si_columns(table: Table, device: PhysicalDevice) -> Table:
     """A table with its walls in N/m and N s/m as well."""
     stiffness, damping = si_scales(device)
     return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 
-def of_scene(table: Table, delta: Axis, d: Axis, scene: AnyScene | None) -> Table:
+def add_si_of_scene(table: Table, delta: Axis, d: Axis, scene: AnyScene | None) -> Table:
     """A table of walls, in SI units as well where delta and d are those of the file's scene alone."""
-    if isinstance(scene, PhysicalScene) and _is(delta, scene.delta) and _is(d, scene.d):
-        return in_si(table, scene.device)
+    if isinstance(scene, PhysicalScene) and _is_single(delta, scene.delta) and _is_single(d, scene.d):
+        return add_si_columns(table, scene.device)
     return table
 
 
-def _is(axis: Axis, value: float) -> bool:
+def _is_single(axis: Axis, value: float) -> bool:
     return axis.size == 1 and float(axis.values()[0]) == value
 
 
