@@ -187,8 +187,7 @@ def _choose_columns(header: list[str], mapping: Any, name: str) -> dict[str, tup
     chosen: dict[str, tuple[int, str]] = {}
     known = (LABEL, *PARAMETERS)
     for index, title in enumerate(header):
-        match = _HEADER.fullmatch(title)
-        key, unit = (match.group(1), match.group(2) or "") if match else (title, "")
+        key, unit = _split_header(title)
         if key in chosen:
             raise problem(f"{printable(name)}: the column {describe(key)} comes twice", "each once", "remove one")
         if key in known:
@@ -213,9 +212,14 @@ def _map_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[
         if not isinstance(title, str) or title.strip() not in titles:
             allowed = f"the headers of {printable(name)} are {listing(titles[:20])}"
             raise problem(f"columns: got {describe(title)}", allowed, suggestion(title, titles, "write one of these"))
-        match = _HEADER.fullmatch(title.strip())
-        chosen[key] = titles.index(title.strip()), (match.group(2) or "") if match else ""
+        chosen[key] = titles.index(title.strip()), _split_header(title)[1]
     return chosen
+
+
+def _split_header(title: str) -> tuple[str, str]:
+    """The name of a column and its unit, which stands in brackets."""
+    match = _HEADER.fullmatch(title)
+    return (match.group(1), match.group(2) or "") if match else (title, "")
 
 
 def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:

@@ -196,8 +196,7 @@ class _Run:
             try:
                 outcome = piece.compute()
                 notes = outcome.notes
-                for _ in outcome.write(stage, piece.name):
-                    pass
+                outcome.write(stage, piece.name)
             except Exception as caught:
                 error = caught
             entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes)}

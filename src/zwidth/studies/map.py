@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
@@ -59,18 +60,15 @@ class MapStudy(ComputedStudy):
 
     @property
     def extent(self) -> str:
-        """alpha x beta x delta x d."""
         return f"alpha x beta x delta x d = {' x '.join(str(size) for size in self.shape)}"
 
     @property
     def points(self) -> int:
-        """The product of the four sizes."""
-        a, b, delta, d = self.shape
-        return a * b * delta * d
+        return math.prod(self.shape)
 
     @property
     def nbytes(self) -> int:
-        """All outputs and a status code a point."""
+        # And a status code a point.
         return self.points * (1 + sum(_OUTPUT_BYTES[name] for name in self.outputs))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -38,20 +38,16 @@ class Outcome:
     documents: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
-    def write(self, folder: Path, name: str) -> Iterator[str]:
-        """Write everything, data before figures, and yield the name of each file when it is there."""
+    def write(self, folder: Path, name: str) -> None:
+        """Write everything, data before figures."""
         for file, text in self.documents.items():
             (folder / file).write_text(text, encoding="utf-8")
-            yield file
         if self.table:
             (folder / f"{name}.csv").write_text(csv_text(self.table), encoding="utf-8")
-            yield f"{name}.csv"
         if self.arrays:
             np.savez_compressed(folder / f"{name}.npz", **self.arrays)  # pyright: ignore[reportArgumentType]
-            yield f"{name}.npz"
         for addition, draw in self.figures.items():
-            for file in figures.save(draw(), folder / f"{name}{addition}"):
-                yield file.name
+            figures.save(draw(), folder / f"{name}{addition}")
 
 
 class ComputedStudy(Study):

@@ -50,7 +50,6 @@ class RecommendStudy(ResponseStudy):
         return super().missing(name)
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
-        """The one device; its wall is a share of the maximum."""
         return ((self.device, None),)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
