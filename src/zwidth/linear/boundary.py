@@ -236,8 +236,8 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
             new = x - value / slope
-        good = (new > below[here]) & (new < above[here]) & (step % 6 != 5)
-        new = np.where(good | (value == 0), new, 0.5 * (below[here] + above[here]))
+        good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
+        new = np.where(good, new, 0.5 * (below[here] + above[here]))
         found[here] = new
         # A step so short leaves rounding: each next one would be its square.
         on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
