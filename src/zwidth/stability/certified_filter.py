@@ -30,7 +30,7 @@ from zwidth.stability.devices import DeviceTerms, Kind, classify_delays, device
 from zwidth.stability.enclosure import TINY, UNIT, Ball
 from zwidth.stability.layout import Points, pick_points
 from zwidth.status import Status
-from zwidth.xla import COSINE, SINE, store_once
+from zwidth.xla import COSINE, SINE, fit_arcsine, store_once
 from zwidth.xp import horner, namespace
 
 UNSTABLE, STABLE, OPEN = 0, 1, 2
