@@ -21,6 +21,7 @@ import numpy as np
 
 from zwidth.errors import ZwidthError
 from zwidth.linear_loop import LinearLoop, circle
+from zwidth.numerics.roots import false_position
 from zwidth.stability.counting import count_poles
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
@@ -262,16 +263,17 @@ def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.nda
 
 
 def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
-    """Zeros of a field of the curve between nodes where its sign changes, by bisection."""
+    """Zeros of a field of the curve between nodes where its sign changes."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    low, high, sign = w[k], w[k + 1], values[k] > 0
+    low, high, sign = w[k], w[k + 1], np.sign(values[k])
     if not k.size:
         return low
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        same = (getattr(curve_at(loop, middle), field) > 0) == sign
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return 0.5 * (low + high)
+    with np.errstate(all="ignore"):
+        scale = sign / (np.abs(values[k]) + np.abs(values[k + 1]))
+        ends = values[k] * scale, values[k + 1] * scale
+        return false_position(
+            lambda at: getattr(curve_at(loop, at), field) * scale, low, high, *ends, _MOST_STEPS, 2e-16 * high
+        )
 
 
 def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
