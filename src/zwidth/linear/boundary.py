@@ -49,6 +49,7 @@ class Arc(NamedTuple):
 
     w: np.ndarray
     beta: np.ndarray
+    leaving: float  # 1 where a pair leaves the circle as alpha rises past the arc, -1 where one enters
 
     @property
     def first(self) -> float:
@@ -131,16 +132,18 @@ class Boundary:
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
-        rows, places, low, high = [], [], [], []
+        rows, places, low, high, signs = [], [], [], [], []
         for place, arc in enumerate(self.arcs):
             row = np.flatnonzero((beta >= arc.beta[0]) & (beta <= arc.beta[-1]))
             k = np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
             rows.append(row)
             places.append(np.full(row.size, place))
+            signs.append(np.full(row.size, arc.leaving))
             low.append(arc.w[k - 1])
             high.append(arc.w[k])
         row, place = np.concatenate(rows), np.concatenate(places)
-        w, alpha, sign = _solve_rows(self.loop, beta[row], np.concatenate(low), np.concatenate(high))
+        sign = np.concatenate(signs)
+        w, alpha = _solve_rows(self.loop, beta[row], np.concatenate(low), np.concatenate(high), sign > 0)
         shape = beta.size, len(self.arcs) + len(self.lines)
         out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
         out.alpha[row, place], out.w[row, place], out.leaving[row, place] = alpha, w, 2.0 * sign
@@ -217,10 +220,12 @@ def outside_by_count(loop: LinearLoop, alpha: float, beta: float) -> int:
     return int(np.sum(np.abs(closed_loop_poles(loop, alpha, beta)) >= 1.0))
 
 
-def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The angle between two nodes at which each row crosses, its alpha, and whether a pole leaves there (1, else -1).
+def _solve_rows(
+    loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray, rising: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The angle between two nodes at which each row crosses, and its alpha.
 
-    ``Im q - beta Im F`` over sin w, by Newton's method kept inside its bracket; who has arrived takes no part any more.
+    ``Im q - beta Im F`` over sin w, which rises with w where a pair leaves, by Newton's method kept inside its bracket; who has arrived takes no part any more.
     """
     below, above = np.minimum(low, high), np.maximum(low, high)
     first, last = _residual(loop, beta, below)[0], _residual(loop, beta, above)[0]
@@ -228,12 +233,10 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
     found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
-    # By both ends: on a row through a node one of them is rounding.
-    rising = first < last
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
-        value, slope, _, _ = _residual(loop, beta[here], x)
+        value, slope, _ = _residual(loop, beta[here], x)
         ahead = (value < 0) == rising[here]
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
@@ -246,12 +249,11 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         if not on.any():
             break
         here, x = here[on], new[on]
-    _, _, alpha, leave = _residual(loop, beta, found)
-    return found, alpha, np.where(leave > 0, 1.0, -1.0)
+    return found, _residual(loop, beta, found)[2]
 
 
 def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``Im(q - beta F)/sin w`` with its limits, its derivative; and ``Re(q - beta F)`` and ``Im(q' - beta F')``."""
+    """``Im(q - beta F)/sin w`` with its limits, its derivative; and ``Re(q - beta F)``."""
     at = circle(w)
     with np.errstate(all="ignore"):
         q, f = loop.needed(at), loop.estimate.jet(at)
@@ -260,7 +262,7 @@ def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.nda
         end = sine == 0
         safe = np.where(end, 1.0, sine)
         ratio = np.where(end, slope.imag / cosine, value.imag / safe)
-        return ratio, (slope.imag - ratio * cosine) / safe, value.real, slope.imag
+        return ratio, (slope.imag - ratio * cosine) / safe, value.real
 
 
 def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
@@ -334,12 +336,14 @@ def _arcs(loop: LinearLoop, w: np.ndarray, here: CurvePoints, poles: np.ndarray,
     arcs = []
     for a, b in pairwise(ends.tolist()):
         inner = (w > a) & (w < b)
-        nodes, beta, slope = w[inner], here.beta[inner], here.turn[inner]
+        nodes, beta, slope, fall = w[inner], here.beta[inner], here.turn[inner], here.fall[inner]
         if not nodes.size:
             nodes = np.array([0.5 * (a + b)])
             middle = curve_at(loop, nodes)
-            beta, slope = middle.beta, middle.turn
+            beta, slope, fall = middle.beta, middle.turn, middle.fall
         rising = np.sum(np.sign(slope)) > 0
+        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w. By its nodes this is told once.
+        leaving = 1.0 if rising == (np.sum(np.sign(fall)) > 0) else -1.0
         first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
         last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
         nodes, beta = np.concatenate([[a], nodes, [b]]), np.concatenate([[first], beta, [last]])
@@ -350,7 +354,7 @@ def _arcs(loop: LinearLoop, w: np.ndarray, here: CurvePoints, poles: np.ndarray,
         good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
         good[[0, -1]] = True
         if beta[0] <= beta[-1]:
-            arcs.append(Arc(nodes[good], beta[good]))
+            arcs.append(Arc(nodes[good], beta[good], leaving))
     return arcs
 
 
