@@ -20,6 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths, lag_jet, product_jet
+from zwidth.numerics.roots import false_position
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08
@@ -222,8 +223,8 @@ def _solve_rows(
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
             new = x - value / slope
-        good = (new > below[here]) & (new < above[here]) & (step % 6 != 5)
-        new = np.where(good | (value == 0), new, 0.5 * (below[here] + above[here]))
+        good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
+        new = np.where(good, new, 0.5 * (below[here] + above[here]))
         found[here] = new
         # A step so short leaves rounding: each next one would be its square.
         on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
@@ -247,16 +248,17 @@ def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.nda
 
 
 def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
-    """Zeros of a field of the curve between nodes where its sign changes, by bisection."""
+    """Zeros of a field of the curve between nodes where its sign changes."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    low, high, sign = w[k], w[k + 1], values[k] > 0
+    low, high, sign = w[k], w[k + 1], np.sign(values[k])
     if not k.size:
         return low
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        same = (getattr(curve_at(loop, middle), field) > 0) == sign
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return 0.5 * (low + high)
+    with np.errstate(all="ignore"):
+        scale = sign / (np.abs(values[k]) + np.abs(values[k + 1]))
+        ends = values[k] * scale, values[k + 1] * scale
+        return false_position(
+            lambda at: getattr(curve_at(loop, at), field) * scale, low, high, *ends, _MOST_STEPS, 2e-16 * high
+        )
 
 
 def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
