@@ -7,7 +7,7 @@ monotone, so that each row meets an arc once at most. Along a row a pole leaves 
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
 
-with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide. It is counted once.
+with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide.
 """
 
 from __future__ import annotations
@@ -19,10 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.errors import ZwidthError
-from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths
+from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths, lag_jet, product_jet
 from zwidth.numerics.roots import false_position
-from zwidth.stability.counting import count_poles
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08
@@ -146,11 +144,12 @@ class Boundary:
         place = np.repeat(np.arange(len(cells)), [rows.size for rows, _ in cells])
         low = np.concatenate([arc.w[k - 1] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
         high = np.concatenate([arc.w[k] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
-        w, alpha = _solve_rows(self.loop, beta[row], low, high)
+        leaving = np.array([arc.leaving for arc in self.arcs])[place]
+        w, alpha = _solve_rows(self.loop, beta[row], low, high, leaving > 0)
         shape = beta.size, len(self.arcs) + len(self.lines)
         out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
         out.alpha[row, place], out.w[row, place] = alpha, w
-        out.leaving[row, place] = np.array([arc.leaving for arc in self.arcs])[place]
+        out.leaving[row, place] = leaving
         for place, line in enumerate(self.lines, len(self.arcs)):
             out.alpha[:, place] = line.q - beta * line.f
             out.w[:, place] = line.w
@@ -181,7 +180,7 @@ class Boundary:
             near.append((row[left], np.full(left.sum(), arc.leaving), arc.w[k[left] - 1], arc.w[k[left]]))
         row, leaving, low, high = (np.concatenate(column) for column in zip(*near, strict=True))
         if row.size:
-            passed = _solve_rows(self.loop, beta[row], low, high)[1] < alpha[row]
+            passed = _solve_rows(self.loop, beta[row], low, high, leaving > 0)[1] < alpha[row]
             np.add.at(total, row[passed], leaving[passed])
         for place, line in enumerate(self.lines, len(self.arcs)):
             passed = (line.q - beta * line.f < alpha) & (but != place)
@@ -207,31 +206,25 @@ class Boundary:
 
     @cached_property
     def base(self) -> int:
-        """Poles outside far below every crossing; three walls that are counted one by one must agree on it."""
-        told = []
-        for alpha, beta in self._witnesses():
-            outside = outside_by_count(self.loop, alpha, beta)
-            told.append(outside - int(self._passed(np.array([alpha]), np.array([beta]))[0]))
-        if len(set(told)) != 1:
-            raise ZwidthError(
-                f"scene: the boundary does not agree with counted poles ({told}); please report this loop"
-            )
-        return told[0]
+        """Poles outside far below every crossing (docs/theory/scenes.md, S14)."""
+        return self._far_outside(-1.0)
 
-    def _witnesses(self) -> list[tuple[float, float]]:
-        """Walls far from every crossing of their rows."""
-        spread = np.concatenate([arc.beta[np.isfinite(arc.beta)] for arc in self.arcs])
-        size = np.quantile(np.abs(spread), 0.25) + 1e-12
-        found = []
-        for beta in (0.31 * size, -0.17 * size, 1.37 * size):
-            alpha = np.sort(self.crossings(np.array([beta])).alpha[0])
-            alpha = alpha[np.isfinite(alpha)]
-            ends = np.concatenate([[alpha[0] - 1.0 - abs(alpha[0])], alpha, [alpha[-1] + 1.0 + abs(alpha[-1])]])
-            # Of the gaps between crossings the one that is widest for its height.
-            gap = np.diff(ends) / (np.abs(ends[1:]) + np.abs(ends[:-1]) + 1e-300)
-            best = int(np.argmax(gap))
-            found.append((0.5 * float(ends[best] + ends[best + 1]), float(beta)))
-        return found
+    @cached_property
+    def top(self) -> int:
+        """Poles outside far above every crossing: every row's crossings must lead from ``base`` to it."""
+        return self._far_outside(1.0)
+
+    def _far_outside(self, side: float) -> int:
+        """Where the wall's spring is all there is, the poles are at the device's zeros, the others at infinity."""
+        loop = self.loop
+        depth = depths(loop.zeros)
+        on = np.abs(depth) <= ON_CIRCLE
+        at = circle(np.abs(np.angle(1.0 - loop.zeros[on])))
+        answer = product_jet(at, loop.zeros, loop.gain).over(product_jet(at, loop.poles, 1.0))
+        answer = answer.times(lag_jet(at, -loop.lag))
+        # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
+        leaving = int(np.sum(side * answer.slope.imag < 0))
+        return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
 
 
 def _cells(arc: Arc, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -240,21 +233,13 @@ def _cells(arc: Arc, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return row, np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
 
 
-def outside_by_count(loop: LinearLoop, alpha: float, beta: float) -> int:
-    """Poles of one wall outside the unit circle, counted without the boundary."""
-    from zwidth.linear.polynomial import closed_loop_poles, closed_loop_roots
-
-    zeros, poles, gain, lag = closed_loop_roots(loop, alpha, beta)
-    inside = int(count_poles(zeros, poles, gain=gain, lag=max(lag, 0)))
-    if inside >= 0:
-        return max(poles.size + lag, zeros.size) - inside
-    return int(np.sum(np.abs(closed_loop_poles(loop, alpha, beta)) >= 1.0))
-
-
-def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _solve_rows(
+    loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray, rising: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """The angle between two nodes at which each row crosses, and its alpha.
 
-    ``Im q - beta Im F`` over sin w, by Newton's method kept inside its bracket; who has arrived takes no part any more.
+    ``Im q - beta Im F`` over sin w, which is ``rising`` with w where a pair leaves, by Newton's method kept inside its
+    bracket; who has arrived takes no part any more.
     """
     below, above = np.minimum(low, high), np.maximum(low, high)
     first, last = _residual(loop, beta, below)[0], _residual(loop, beta, above)[0]
@@ -262,8 +247,6 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
     found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
-    # By both ends: on a row through a node one of them is rounding.
-    rising = first < last
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
@@ -353,7 +336,8 @@ def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
         with np.errstate(all="ignore"):
             q, f = loop.needed(at), loop.estimate.jet(at)
         numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
-        if np.all(np.isfinite(numbers)) and abs(numbers[0]) < 1e14:
+        infinite = np.any(np.abs(loop.zeros - (2.0 if w else 0.0)) <= ON_CIRCLE)
+        if np.all(np.isfinite(numbers)) and not infinite:
             q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
             lines.append(CrossingLine(w, q_value, f_value, q_turn, f_turn, 1))
     return lines
@@ -378,6 +362,7 @@ def _arcs(
             nodes = np.array([0.5 * (a + b)])
             curve = curve_at(loop, nodes)
         rising = np.sum(np.sign(curve.turn)) > 0
+        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
         leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
         first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
         last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
