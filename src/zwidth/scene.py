@@ -172,18 +172,18 @@ class Scene:
         return Border(self.traced_boundary)
 
     def normalize_walls(self, stiffness: ArrayLike, virtual_damping: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Walls in SI units as arrays of alpha and beta of one shape."""
+        """Walls in SI units as arrays of alpha and beta that broadcast."""
         units = self.units
         both = as_float64("stiffness", stiffness), as_float64("virtual_damping", virtual_damping)
         try:
-            alpha, beta = np.broadcast_arrays(*both)
+            np.broadcast_shapes(both[0].shape, both[1].shape)
         except ValueError as error:
             raise InputError(
                 f"shapes do not broadcast: stiffness {both[0].shape}, virtual_damping {both[1].shape}; make each "
                 "axis equal or 1"
             ) from error
         with np.errstate(all="ignore"):
-            return alpha / units.stiffness, beta / units.virtual_damping
+            return both[0] / units.stiffness, both[1] / units.virtual_damping
 
     def is_stable(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.

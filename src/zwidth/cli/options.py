@@ -20,14 +20,14 @@ class QuantityType(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Parse one option."""
 
-        from zwidth.config.units import entry_of
+        from zwidth.config.units import make_entry_reader
 
         try:
             number: float | str = float(value)
         except ValueError:
             number = value
         try:
-            return entry_of(self.parameter.name)(number)
+            return make_entry_reader(self.parameter.name)(number)
         except ValueError as error:
             # A problem of a configuration's; the parts that it leaves out stand as empty text between separators.
             self.fail("; ".join(part for part in str(error).split("; ") if part), param, ctx)

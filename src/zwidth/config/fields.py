@@ -29,7 +29,7 @@ from zwidth.config.faults import (
     validation_error,
 )
 from zwidth.config.numbers import number
-from zwidth.config.units import DAMPING, MASS, PERIOD_WORDS, RATE, STIFFNESS, TIME, Dimension, Span, quantity, span
+from zwidth.config.units import DAMPING, MASS, PERIOD_WORDS, STIFFNESS, TIME, Dimension, Span, quantity, span
 from zwidth.quantities import FRACTION, NOT_NEGATIVE, POSITIVE
 
 
@@ -191,5 +191,3 @@ Delay = Annotated[
 Duration = Annotated[
     Span, PlainValidator(span(POSITIVE)), PlainSerializer(str, return_type=str), unit_schema(TIME, *PERIOD_WORDS)
 ]
-PERIOD_SCHEMA = unit_schema(TIME)
-RATE_SCHEMA = unit_schema(RATE)

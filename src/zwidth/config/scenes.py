@@ -11,8 +11,6 @@ from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 from zwidth._types import DelayModel
 from zwidth.config.faults import LocatedProblem, describe, listing, problem, short
 from zwidth.config.fields import (
-    PERIOD_SCHEMA,
-    RATE_SCHEMA,
     Damping,
     Delay,
     Mass,
@@ -21,6 +19,7 @@ from zwidth.config.fields import (
     Stiffness,
     Strict,
     VirtualDamping,
+    unit_schema,
 )
 from zwidth.config.numbers import number
 from zwidth.config.units import RATE, TIME, Span, quantity
@@ -82,12 +81,12 @@ class _PhysicalPlant(_OneKind):
     damping: Damping = 0.0
     """Physical damping b of the device in N s/m, >= 0."""
 
-    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), RATE_SCHEMA] | None = Field(
+    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), unit_schema(RATE)] | None = Field(
         default=None, exclude=True
     )
     """Sampling rate 1/T in Hz; give it or the period."""
 
-    period: Annotated[float, BeforeValidator(_period), PERIOD_SCHEMA] = Field(default=None, validate_default=True)
+    period: Annotated[float, BeforeValidator(_period), unit_schema(TIME)] = Field(default=None, validate_default=True)
     """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
 
     delay: Delay = Span(0.0, "s")

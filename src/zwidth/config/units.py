@@ -41,7 +41,7 @@ _OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPIN
 PERIOD_WORDS = ("periods", "period")
 
 
-def dimension_of(unit: str) -> Dimension:
+def find_dimension(unit: str) -> Dimension:
     """The units beside an SI base unit."""
     return _OF_UNIT[unit]
 
@@ -130,9 +130,9 @@ def span(allowed: Range) -> Callable[[Any], Span]:
     return validate
 
 
-def entry_of(name: str) -> Callable[[Any], float]:
+def make_entry_reader(name: str) -> Callable[[Any], float]:
     """A validator for one value of a parameter."""
     parameter = PARAMETERS[name]
     if parameter.unit == "1":
         return number(parameter.allowed)
-    return quantity(dimension_of(parameter.unit), parameter.allowed)
+    return quantity(find_dimension(parameter.unit), parameter.allowed)

@@ -21,15 +21,16 @@ from typing import Any
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import BLOCK, FEW, compile_strips, map_blocks, store_once
+from zwidth.batching import BLOCK, FEW, compile_strips, map_blocks
 from zwidth.domain import WALL_RANGE, wall_status
 from zwidth.numerics.phi import phi_functions
 from zwidth.stability.boundary_map import row_limits
-from zwidth.stability.crossover import COSINE, SINE, Lag, first_zero, long_verdict, short_verdict
+from zwidth.stability.crossover import Lag, first_zero, long_verdict, short_verdict
 from zwidth.stability.devices import DeviceTerms, Kind, classify_delays, device
 from zwidth.stability.enclosure import TINY, UNIT, Ball
 from zwidth.stability.layout import Points, pick_points
 from zwidth.status import Status
+from zwidth.xla import COSINE, SINE, store_once
 from zwidth.xp import horner, namespace
 
 UNSTABLE, STABLE, OPEN = 0, 1, 2

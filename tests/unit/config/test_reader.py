@@ -24,16 +24,6 @@ PHYSICAL = "scene: {mass: 100 g, damping: 10 N s/m, rate: 1 kHz, delay: 1.5 peri
 RIDGE = "studies: [{kind: ridge, name: r}]\n"
 
 
-@pytest.fixture
-def load(tmp_path):
-    def from_text(text):
-        path = tmp_path / "config.yaml"
-        path.write_text(f"version: 1\nname: test\n{text}", encoding="utf-8")
-        return load_config(path)
-
-    return from_text
-
-
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
 def test_shipped_configs_are_valid_and_named_after_their_file(path):
     config = load_config(str(path))
