@@ -16,7 +16,7 @@ from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
 from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear_loop import LinearLoop
-from zwidth.normalization import Normalized, Physical, denormalize, in_periods, normalize
+from zwidth.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
 from zwidth.parts.timing import Timing
@@ -56,7 +56,7 @@ class Scene:
         >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(device, timing, velocity=zwidth.LowPass(cutoff=100))
         >>> scene.is_stable(10e3, [5, 40])
-        array([ True, False])
+        array([False,  True])
     """
 
     device: Device
@@ -112,7 +112,7 @@ class Scene:
             delay=self.timing.delay,
             stiffness=self.wall.stiffness,
             virtual_damping=self.wall.virtual_damping,
-        )
+        )._replace(d=self.d)
 
     @property
     def alpha(self) -> float:
@@ -132,7 +132,7 @@ class Scene:
     @property
     def d(self) -> float:
         """Delay in periods."""
-        return in_periods(*(np.float64(value) for value in (self.timing.delay, self.timing.period)))
+        return self.timing.d
 
     @property
     def whole_delay(self) -> int:
