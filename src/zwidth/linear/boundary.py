@@ -20,7 +20,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.errors import ZwidthError
-from zwidth.linear_loop import LinearLoop, circle
+from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths
+from zwidth.numerics.roots import false_position
 from zwidth.stability.counting import count_poles
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
@@ -124,6 +125,7 @@ class Boundary:
         poles = zeros_of(loop, w, here.fall, "fall")
         lines = tuple(line for p in poles if (line := _interior_line(loop, p)) is not None)
         poles = np.array([p for p in poles if all(abs(p - line.w) > 1e-9 for line in lines)])
+        poles = np.union1d(poles, _circle_zeros(loop))
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
         return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns)), (*lines, *_end_lines(loop)), poles)
@@ -227,7 +229,8 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
     found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
-    rising = first < 0
+    # By both ends: on a row through a node one of them is rounding.
+    rising = first < last
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
@@ -236,8 +239,8 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
             new = x - value / slope
-        good = (new > below[here]) & (new < above[here]) & (step % 6 != 5)
-        new = np.where(good | (value == 0), new, 0.5 * (below[here] + above[here]))
+        good = (new >= below[here]) & (new <= above[here]) & (step % 6 != 5)
+        new = np.where(good, new, 0.5 * (below[here] + above[here]))
         found[here] = new
         # A step so short leaves rounding: each next one would be its square.
         on = (np.abs(new - x) > _ARRIVED * new) & (above[here] - below[here] > _ARRIVED * new)
@@ -262,16 +265,17 @@ def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.nda
 
 
 def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
-    """Zeros of a field of the curve between nodes where its sign changes, by bisection."""
+    """Zeros of a field of the curve between nodes where its sign changes."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    low, high, sign = w[k], w[k + 1], values[k] > 0
+    low, high, sign = w[k], w[k + 1], np.sign(values[k])
     if not k.size:
         return low
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        same = (getattr(curve_at(loop, middle), field) > 0) == sign
-        low, high = np.where(same, middle, low), np.where(same, high, middle)
-    return 0.5 * (low + high)
+    with np.errstate(all="ignore"):
+        scale = sign / (np.abs(values[k]) + np.abs(values[k + 1]))
+        ends = values[k] * scale, values[k + 1] * scale
+        return false_position(
+            lambda at: getattr(curve_at(loop, at), field) * scale, low, high, *ends, _MOST_STEPS, 2e-16 * high
+        )
 
 
 def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
@@ -301,6 +305,12 @@ def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
         return None
     value, turn = float(q.value[0].real), float(q.slope[0].imag)
     return CrossingLine(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
+
+
+def _circle_zeros(loop: LinearLoop) -> np.ndarray:
+    """Angles of the device's zeros on the circle, where q is infinite: nothing damps the masses beyond the sensor."""
+    angles = np.angle(1.0 - loop.zeros[np.abs(depths(loop.zeros)) <= ON_CIRCLE])
+    return angles[(angles > 0) & (angles < np.pi - 1e-6)]
 
 
 def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
