@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -37,7 +37,7 @@ class Timing:
     delay_model: DelayModel = "held"
     rate: Any = None
     # A delay that was given in periods: dividing its seconds by the period might miss it by a rounding error.
-    _periods: float | None = field(default=None, init=False, repr=False, compare=False)
+    _periods: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
         if (self.period is None) == (self.rate is None):
