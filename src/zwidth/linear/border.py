@@ -1,4 +1,4 @@
-"""The edge of the stable set of any linear loop: which parts of the boundary it is, its corners, its highest point."""
+"""The edge of the stable set of any linear loop: which parts of the boundary it is, and its corners."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import numpy as np
 
 from zwidth.linear.boundary import Boundary, curve_at, zeros_of
 from zwidth.linear_loop import circle
-from zwidth.stability.ridge import RidgeKind
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
 _ROUNDS = 11
@@ -29,15 +28,6 @@ class Edge(NamedTuple):
     alpha: np.ndarray
     beta: np.ndarray
     line: int  # which of the boundary's lines, or -1 for the curve
-
-
-class StiffestWall(NamedTuple):
-    """The stiffest stable wall: the end of all stable alpha."""
-
-    alpha: float
-    beta: float
-    omega: float
-    kind: RidgeKind
 
 
 @dataclass(frozen=True)
@@ -64,11 +54,11 @@ class Border:
             alpha, beta = curve.alpha.copy(), curve.beta.copy()
             for k, end in ((0, 0.0), (-1, np.pi)):
                 if at[k] == end:
-                    alpha[k], beta[k] = self._at_end(end)
+                    alpha[k], beta[k] = self.at_end(end)
             edges.append(Edge(at, alpha, beta, -1))
         return edges
 
-    def _at_end(self, w: float) -> tuple[float, float]:
+    def at_end(self, w: float) -> tuple[float, float]:
         """The curve's limit at z = 1 or z = -1."""
         at = circle(np.array([w]))
         with np.errstate(all="ignore"):
@@ -81,7 +71,7 @@ class Border:
         after = k + side
         if not 0 <= after < w.size:
             end = 0.0 if side < 0 else np.pi
-            return end if np.all(np.isfinite(self._at_end(end))) else float(w[k])
+            return end if np.all(np.isfinite(self.at_end(end))) else float(w[k])
         if piece[after] != piece[k]:
             return float(w[k])
         return _last_held(self.boundary.borders, float(w[k]), float(w[after]))
@@ -121,22 +111,6 @@ class Border:
         if not 0 <= after < beta.size:
             return float(beta[k])
         return _last_held(lambda at: self.boundary.line_borders(place, at), float(beta[k]), float(beta[after]))
-
-    def peak(self) -> StiffestWall | None:
-        """The stiffest stable wall, None where no wall is stable."""
-        best = None
-        for edge in self.curved:
-            k = int(np.argmax(edge.alpha))
-            w = float(edge.w[k])
-            inner = 0 < k < edge.w.size - 1
-            kind = RidgeKind.SMOOTH if inner else RidgeKind.CORNER
-            if best is None or edge.alpha[k] > best.alpha:
-                best = StiffestWall(float(edge.alpha[k]), float(edge.beta[k]), w, kind)
-        for edge in self.straight:
-            k = int(np.argmax(edge.alpha))
-            if best is None or edge.alpha[k] > best.alpha * (1 + 1e-9) + 1e-300:
-                best = StiffestWall(float(edge.alpha[k]), float(edge.beta[k]), float(edge.w[k]), RidgeKind.CORNER)
-        return best
 
 
 def _last_held(holds: Callable[[np.ndarray], np.ndarray], inside: float, outside: float) -> float:
