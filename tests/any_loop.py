@@ -70,8 +70,8 @@ def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
         for _ in range(velocity.order):
             top, bottom = np.convolve(top, [-np.expm1(-period / tau), 0.0]), np.convolve(bottom, [1.0, -p])
     elif isinstance(velocity, zwidth.Butterworth):
-        b, a = scipy.signal.butter(velocity.order, 2.0 * velocity.cutoff * period)
-        top, bottom = np.convolve(b, top), np.convolve(a, bottom)
+        designed: Any = scipy.signal.butter(velocity.order, 2.0 * velocity.cutoff * period)
+        top, bottom = np.convolve(designed[0], top), np.convolve(designed[1], bottom)
     return np.concatenate([np.zeros(bottom.size - top.size), top]), bottom
 
 
