@@ -31,6 +31,8 @@ _INSIDE = np.arange(1, 8) / 8.0
 _MOST_STEPS, _ARRIVED = 120, 1e-10
 # Of |q|: less of an imaginary part than that where Im F vanishes is none.
 _NONE = 1e-11
+# A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
+_FLAT = 1e-12
 
 
 class CurvePoints(NamedTuple):
@@ -65,6 +67,17 @@ class CrossingLine(NamedTuple):
     q_turn: float  # Im dq/dw
     f_turn: float
     poles: int  # 1 at z = 1 and z = -1, else 2
+
+    @property
+    def meeting(self) -> float:
+        """The damping at which the curve meets the line, NaN where it does not."""
+        return self.q_turn / self.f_turn if abs(self.f_turn) > _FLAT else np.nan
+
+    def leaving(self, beta: np.ndarray) -> np.ndarray:
+        """Poles that leave the circle there as alpha rises; on the row through the meeting, as just above it."""
+        if np.isnan(self.meeting):
+            return np.full(beta.shape, self.poles * np.sign(self.q_turn))
+        return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
 
 
 class Crossings(NamedTuple):
@@ -127,13 +140,15 @@ class Boundary:
         poles = np.union1d(poles, _circle_zeros(loop))
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
-        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns)), (*lines, *_end_lines(loop)), poles)
+        lines = (*lines, *_end_lines(loop))
+        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns, lines)), lines, poles)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
         rows, places, low, high, signs = [], [], [], [], []
         for place, arc in enumerate(self.arcs):
-            row = np.flatnonzero((beta >= arc.beta[0]) & (beta <= arc.beta[-1]))
+            # A row through an end of arcs and lines is counted as the row just above it.
+            row = np.flatnonzero((beta >= arc.beta[0]) & (beta < arc.beta[-1]))
             k = np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
             rows.append(row)
             places.append(np.full(row.size, place))
@@ -142,14 +157,15 @@ class Boundary:
             high.append(arc.w[k])
         row, place = np.concatenate(rows), np.concatenate(places)
         sign = np.concatenate(signs)
-        w, alpha = _solve_rows(self.loop, beta[row], np.concatenate(low), np.concatenate(high), sign > 0)
+        at_lines = [line.w for line in self.lines if 0 < line.w < np.pi]
+        w, alpha = _solve_rows(self.loop, at_lines, beta[row], np.concatenate(low), np.concatenate(high), sign)
         shape = beta.size, len(self.arcs) + len(self.lines)
         out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
         out.alpha[row, place], out.w[row, place], out.leaving[row, place] = alpha, w, 2.0 * sign
         for place, line in enumerate(self.lines, len(self.arcs)):
             out.alpha[:, place] = line.q - beta * line.f
             out.w[:, place] = line.w
-            out.leaving[:, place] = line.poles * np.sign(line.q_turn - beta * line.f_turn)
+            out.leaving[:, place] = line.leaving(beta)
         return out
 
     def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
@@ -175,9 +191,8 @@ class Boundary:
     def line_borders(self, line: int, beta: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of a line at each damping."""
         at = self.lines[line]
-        turn = at.q_turn - beta * at.f_turn
         others = self.base + self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
-        return others == np.where(turn > 0, 0, at.poles)
+        return others == np.where(at.leaving(beta) > 0, 0, at.poles)
 
     @cached_property
     def base(self) -> int:
@@ -203,14 +218,17 @@ class Boundary:
 
 
 def _solve_rows(
-    loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray, rising: np.ndarray
+    loop: LinearLoop, lines: list[float], beta: np.ndarray, low: np.ndarray, high: np.ndarray, leaving: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The angle between two nodes at which each row crosses, and its alpha.
 
-    ``Im q - beta Im F`` over sin w, which rises with w where a pair leaves, by Newton's method kept inside its bracket; who has arrived takes no part any more.
+    ``Im(q - beta F)``, which rises with w where a pair leaves, over what it is 0 with on every row; by Newton's method
+    kept inside its bracket; who has arrived takes no part any more.
     """
+    cosine = np.cos(0.5 * (low + high))
+    rising = leaving * np.prod([np.sign(cosine - np.cos(line)) for line in lines], axis=0) > 0
     below, above = np.minimum(low, high), np.maximum(low, high)
-    first, last = _residual(loop, beta, below)[0], _residual(loop, beta, above)[0]
+    first, last = _residual(loop, lines, beta, below)[0], _residual(loop, lines, beta, above)[0]
     with np.errstate(all="ignore"):
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
@@ -218,7 +236,7 @@ def _solve_rows(
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
-        value, slope, _ = _residual(loop, beta[here], x)
+        value, slope, _ = _residual(loop, lines, beta[here], x)
         ahead = (value < 0) == rising[here]
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
@@ -231,20 +249,24 @@ def _solve_rows(
         if not on.any():
             break
         here, x = here[on], new[on]
-    return found, _residual(loop, beta, found)[2]
+    return found, _residual(loop, lines, beta, found)[2]
 
 
-def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``Im(q - beta F)/sin w`` with its limits, its derivative; and ``Re(q - beta F)``."""
+def _residual(loop: LinearLoop, lines: list[float], beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``Im(q - beta F)`` over sin w and the lines' ``cos w - cos line``, its derivative; and ``Re(q - beta F)``."""
     at = circle(w)
     with np.errstate(all="ignore"):
         q, f = loop.needed(at), loop.estimate.jet(at)
         value, slope = q.value - beta * f.value, q.slope - beta * f.slope
         sine, cosine = np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
-        end = sine == 0
-        safe = np.where(end, 1.0, sine)
-        ratio = np.where(end, slope.imag / cosine, value.imag / safe)
-        return ratio, (slope.imag - ratio * cosine) / safe, value.real
+        whole, turn = sine, cosine
+        for line in lines:
+            factor = np.where(w == line, 0.0, -2.0 * np.sin(0.5 * (w + line)) * np.sin(0.5 * (w - line)))
+            whole, turn = whole * factor, turn * factor - whole * sine
+        end = whole == 0
+        safe = np.where(end, 1.0, whole)
+        ratio = np.where(end, slope.imag / turn, value.imag / safe)
+        return ratio, (slope.imag - ratio * turn) / safe, value.real
 
 
 def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
@@ -311,12 +333,19 @@ def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
     return lines
 
 
-def _arcs(loop: LinearLoop, w: np.ndarray, here: CurvePoints, poles: np.ndarray, turns: np.ndarray) -> list[Arc]:
-    """Cut the curve where beta turns or runs to infinity."""
-    cuts = np.sort(np.concatenate([poles, turns]))
+def _arcs(
+    loop: LinearLoop,
+    w: np.ndarray,
+    here: CurvePoints,
+    poles: np.ndarray,
+    turns: np.ndarray,
+    lines: tuple[CrossingLine, ...],
+) -> list[Arc]:
+    """Cut the curve where beta turns or runs to infinity, and where it meets a line: Im F changes its sign there."""
+    limits = {line.w: line.meeting for line in lines}
+    cuts = np.unique(np.concatenate([poles, turns, [w for w in limits if 0 < w < np.pi]]))
     ends = np.concatenate([[0.0], cuts, [np.pi]])
     at_pole = {float(p) for p in poles}
-    limits = _end_limits(loop)
     arcs = []
     for a, b in pairwise(ends.tolist()):
         inner = (w > a) & (w < b)
@@ -342,19 +371,8 @@ def _arcs(loop: LinearLoop, w: np.ndarray, here: CurvePoints, poles: np.ndarray,
     return arcs
 
 
-def _end_limits(loop: LinearLoop) -> dict[float, float]:
-    """``Im q'/Im F'``, the limit of beta, at 0 and at pi; infinite or NaN where there is none."""
-    at = circle(np.array([0.0, np.pi]))
-    with np.errstate(all="ignore"):
-        q, f = loop.needed(at), loop.estimate.jet(at)
-        steep = np.abs(f.slope.imag) > 1e-12 * (1.0 + np.abs(f.slope))
-        limit = np.where(steep & np.isfinite(q.slope.imag), q.slope.imag / f.slope.imag, np.nan)
-    return {0.0: float(limit[0]), float(np.pi): float(limit[1])}
-
-
 def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
-    if w in at_pole:
-        return side * np.inf
-    if w in limits:
-        return limits[w] if np.isfinite(limits[w]) else side * np.inf
+    if w in (0.0, np.pi) or w in limits or w in at_pole:
+        limit = limits.get(w, np.nan)
+        return limit if np.isfinite(limit) else side * np.inf
     return float(curve_at(loop, np.array([w])).beta[0])
