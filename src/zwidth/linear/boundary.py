@@ -33,6 +33,8 @@ _MOST_STEPS, _ARRIVED = 120, 1e-10
 _NONE = 1e-11
 # A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
 _FLAT = 1e-12
+# By how much a row is moved, at most, that rounding keeps from being counted.
+_SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13)
 
 
 class CurvePoints(NamedTuple):
@@ -86,6 +88,7 @@ class Crossings(NamedTuple):
     alpha: np.ndarray
     w: np.ndarray
     leaving: np.ndarray  # poles that leave the circle as alpha rises past the crossing; negative for entering ones
+    sound: np.ndarray  # of each row: whether its crossings lead from the count far below to that far above
 
 
 def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
@@ -144,7 +147,20 @@ class Boundary:
         return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns, lines)), lines, poles)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
-        """Where the rows of these dampings, shape (rows,), cross the boundary."""
+        """Where the rows of these dampings, shape (rows,), cross the boundary.
+
+        A row within rounding of a turn of the curve may miss one of its two arcs; a neighbor that does not stands for it.
+        """
+        found = self._cross(beta)
+        for shift in _SHIFTS:
+            row = np.flatnonzero(~found.sound & np.isfinite(beta))
+            if not row.size:
+                break
+            for part, new in zip(found, self._cross(beta[row] * (1.0 + shift)), strict=True):
+                part[row] = new
+        return found
+
+    def _cross(self, beta: np.ndarray) -> Crossings:
         rows, places, low, high, signs = [], [], [], [], []
         for place, arc in enumerate(self.arcs):
             # A row through an end of arcs and lines is counted as the row just above it.
@@ -160,23 +176,25 @@ class Boundary:
         at_lines = [line.w for line in self.lines if 0 < line.w < np.pi]
         w, alpha = _solve_rows(self.loop, at_lines, beta[row], np.concatenate(low), np.concatenate(high), sign)
         shape = beta.size, len(self.arcs) + len(self.lines)
-        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
+        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), np.zeros(beta.size, bool))
         out.alpha[row, place], out.w[row, place], out.leaving[row, place] = alpha, w, 2.0 * sign
         for place, line in enumerate(self.lines, len(self.arcs)):
             out.alpha[:, place] = line.q - beta * line.f
             out.w[:, place] = line.w
             out.leaving[:, place] = line.leaving(beta)
+        out.sound[:] = self.base + out.leaving.sum(-1) == self.top
         return out
 
     def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,)."""
-        return self.base + self._passed(alpha, beta)
+        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,); -1 if not told."""
+        passed, sound = self._passed(alpha, beta)
+        return np.where(sound, self.base + passed, -1)
 
-    def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> np.ndarray:
-        """Poles that have left below each wall, without those of one column of the crossings."""
+    def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> tuple[np.ndarray, np.ndarray]:
+        """Poles that have left below each wall, without those of one column of the crossings; whether that is told."""
         found = self.crossings(beta)
         counts = (found.alpha < alpha[:, None]) & (np.arange(found.alpha.shape[1]) != np.reshape(but, (-1, 1)))
-        return np.where(counts, found.leaving, 0.0).sum(-1).astype(int)
+        return np.where(counts, found.leaving, 0.0).sum(-1).astype(int), found.sound
 
     def borders(self, w: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of the curve at each angle."""
@@ -186,13 +204,14 @@ class Boundary:
         own = np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
         finite = np.isfinite(here.alpha) & np.isfinite(here.beta)
         at = np.where(finite, here.alpha, 0.0), np.where(finite, here.beta, 0.0)
-        return finite & (self.base + self._passed(*at, own) == np.where(leaves, 0, 2))
+        passed, sound = self._passed(*at, own)
+        return finite & sound & (self.base + passed == np.where(leaves, 0, 2))
 
     def line_borders(self, line: int, beta: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of a line at each damping."""
         at = self.lines[line]
-        others = self.base + self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
-        return others == np.where(at.leaving(beta) > 0, 0, at.poles)
+        passed, sound = self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
+        return sound & (self.base + passed == np.where(at.leaving(beta) > 0, 0, at.poles))
 
     @cached_property
     def base(self) -> int:
