@@ -29,12 +29,14 @@ _ROUNDS = 60
 _INSIDE = np.arange(1, 8) / 8.0
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
 _MOST_STEPS, _ARRIVED = 120, 1e-10
+# How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
+_ROOM = 0.02
 # Of |q|: less of an imaginary part than that where Im F vanishes is none.
 _NONE = 1e-11
 # A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
 _FLAT = 1e-12
-# By how much a row is moved, at most, that rounding keeps from being counted.
-_SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13)
+# By what share a row is moved, at most, that rounding keeps from being counted.
+_SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 
 
 class CurvePoints(NamedTuple):
@@ -45,6 +47,7 @@ class CurvePoints(NamedTuple):
     alpha_slope: np.ndarray  # d alpha/dw
     turn: np.ndarray  # Im q' Im F - Im q Im F', of the sign of d beta/dw
     fall: np.ndarray  # Im F
+    size: np.ndarray  # |q| + |beta F|, of which alpha is a difference
 
 
 class Arc(NamedTuple):
@@ -52,7 +55,9 @@ class Arc(NamedTuple):
 
     w: np.ndarray
     beta: np.ndarray
-    leaving: float  # 1 where a pair leaves the circle as alpha rises past the arc, -1 where one enters
+    alpha: np.ndarray
+    size: np.ndarray
+    leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
 
     @property
     def first(self) -> float:
@@ -72,7 +77,7 @@ class CrossingLine(NamedTuple):
 
     @property
     def meeting(self) -> float:
-        """The damping at which the curve meets the line, NaN where it does not."""
+        """The damping at which the curve meets the line, ``Im q'/Im F'``; NaN where it does not."""
         return self.q_turn / self.f_turn if abs(self.f_turn) > _FLAT else np.nan
 
     def leaving(self, beta: np.ndarray) -> np.ndarray:
@@ -101,7 +106,8 @@ def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
         turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
         beta_slope = turn / f.value.imag**2
         alpha_slope = q.slope.real - beta_slope * f.value.real - beta * f.slope.real
-        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag)
+        size = np.abs(q.value) + np.abs(beta * f.value)
+        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag, size)
 
 
 def nodes_of(loop: LinearLoop) -> np.ndarray:
@@ -144,57 +150,93 @@ class Boundary:
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
         lines = (*lines, *_end_lines(loop))
-        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns, lines)), lines, poles)
+        limits = {0.0: np.nan, np.pi: np.nan} | {line.w: line.meeting for line in lines}
+        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns, limits)), lines, poles)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
-        """Where the rows of these dampings, shape (rows,), cross the boundary.
-
-        A row within rounding of a turn of the curve may miss one of its two arcs; a neighbor that does not stands for it.
-        """
-        found = self._cross(beta)
-        for shift in _SHIFTS:
-            row = np.flatnonzero(~found.sound & np.isfinite(beta))
-            if not row.size:
-                break
-            for part, new in zip(found, self._cross(beta[row] * (1.0 + shift)), strict=True):
-                part[row] = new
-        return found
-
-    def _cross(self, beta: np.ndarray) -> Crossings:
-        rows, places, low, high, signs = [], [], [], [], []
-        for place, arc in enumerate(self.arcs):
-            # A row through an end of arcs and lines is counted as the row just above it.
-            row = np.flatnonzero((beta >= arc.beta[0]) & (beta < arc.beta[-1]))
-            k = np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
-            rows.append(row)
-            places.append(np.full(row.size, place))
-            signs.append(np.full(row.size, arc.leaving))
-            low.append(arc.w[k - 1])
-            high.append(arc.w[k])
-        row, place = np.concatenate(rows), np.concatenate(places)
-        sign = np.concatenate(signs)
-        at_lines = [line.w for line in self.lines if 0 < line.w < np.pi]
-        w, alpha = _solve_rows(self.loop, at_lines, beta[row], np.concatenate(low), np.concatenate(high), sign)
+        """Where the rows of these dampings, shape (rows,), cross the boundary."""
+        beta, sound = self._settle(beta)
+        cells = [_cells(arc, beta) for arc in self.arcs]
+        row = np.concatenate([rows for rows, _ in cells])
+        place = np.repeat(np.arange(len(cells)), [rows.size for rows, _ in cells])
+        low = np.concatenate([arc.w[k - 1] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
+        high = np.concatenate([arc.w[k] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
+        leaving = np.array([arc.leaving for arc in self.arcs])[place]
+        w, alpha = _solve_rows(self.loop, self._fixed, beta[row], low, high, leaving)
         shape = beta.size, len(self.arcs) + len(self.lines)
-        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), np.zeros(beta.size, bool))
-        out.alpha[row, place], out.w[row, place], out.leaving[row, place] = alpha, w, 2.0 * sign
+        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), sound)
+        out.alpha[row, place], out.w[row, place] = alpha, w
+        out.leaving[row, place] = leaving
         for place, line in enumerate(self.lines, len(self.arcs)):
             out.alpha[:, place] = line.q - beta * line.f
             out.w[:, place] = line.w
             out.leaving[:, place] = line.leaving(beta)
-        out.sound[:] = self.base + out.leaving.sum(-1) == self.top
         return out
 
+    @property
+    def _fixed(self) -> list[float]:
+        """The angles besides 0 and pi at which ``Im(q - beta F)`` vanishes on every row."""
+        return [line.w for line in self.lines if line.poles == 2]
+
+    def _settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows whose crossings lead from the count far below to that far above, and which ones do.
+
+        A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
+        """
+        missed = self._missed(beta)
+        for shift in _SHIFTS:
+            row = np.flatnonzero(missed)
+            if not row.size:
+                break
+            beta = beta.copy()
+            beta[row] = beta[row] * (1.0 + shift)
+            missed[row] = self._missed(beta[row])
+        return beta, missed == 0
+
+    def _missed(self, beta: np.ndarray) -> np.ndarray:
+        """By how many poles the crossings of each row fail to lead to the count far above."""
+        total = np.full(beta.shape, float(self.base - self.top))
+        for arc in self.arcs:
+            total += np.where((beta >= arc.beta[0]) & (beta < arc.beta[-1]), arc.leaving, 0.0)
+        for line in self.lines:
+            total += line.leaving(beta)
+        return total
+
     def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,); -1 if not told."""
+        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,).
+
+        -1 where the row's crossings contradict each other.
+        """
         passed, sound = self._passed(alpha, beta)
         return np.where(sound, self.base + passed, -1)
 
     def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> tuple[np.ndarray, np.ndarray]:
-        """Poles that have left below each wall, without those of one column of the crossings; whether that is told."""
-        found = self.crossings(beta)
-        counts = (found.alpha < alpha[:, None]) & (np.arange(found.alpha.shape[1]) != np.reshape(but, (-1, 1)))
-        return np.where(counts, found.leaving, 0.0).sum(-1).astype(int), found.sound
+        """Poles that have left below each wall, without those of one column of the crossings; and if that is sound.
+
+        Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
+        """
+        but = np.broadcast_to(but, beta.shape)
+        beta, sound = self._settle(beta)
+        total = np.zeros(beta.shape)
+        near: list[tuple[np.ndarray, ...]] = []
+        for place, arc in enumerate(self.arcs):
+            row, k = _cells(arc, beta)
+            with np.errstate(all="ignore"):
+                ends = np.stack([arc.alpha[k - 1], arc.alpha[k]])
+                room = np.abs(ends[1] - ends[0]) + _ROOM * np.maximum(arc.size[k - 1], arc.size[k])
+                above, below = alpha[row] > ends.max(0) + room, alpha[row] < ends.min(0) - room
+            counted = but[row] != place
+            total[row[above & counted]] += arc.leaving
+            left = ~(above | below) & counted
+            near.append((row[left], np.full(left.sum(), arc.leaving), arc.w[k[left] - 1], arc.w[k[left]]))
+        row, leaving, low, high = (np.concatenate(column) for column in zip(*near, strict=True))
+        if row.size:
+            passed = _solve_rows(self.loop, self._fixed, beta[row], low, high, leaving)[1] < alpha[row]
+            np.add.at(total, row[passed], leaving[passed])
+        for place, line in enumerate(self.lines, len(self.arcs)):
+            passed = (line.q - beta * line.f < alpha) & (but != place)
+            total += np.where(passed, line.leaving(beta), 0.0)
+        return total.astype(int), sound
 
     def borders(self, w: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of the curve at each angle."""
@@ -236,18 +278,25 @@ class Boundary:
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
 
 
+def _cells(arc: Arc, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that meet an arc, and before which of its nodes."""
+    # A row through an end of arcs is counted as the row just above it.
+    row = np.flatnonzero((beta >= arc.beta[0]) & (beta < arc.beta[-1]))
+    return row, np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
+
+
 def _solve_rows(
-    loop: LinearLoop, lines: list[float], beta: np.ndarray, low: np.ndarray, high: np.ndarray, leaving: np.ndarray
+    loop: LinearLoop, fixed: list[float], beta: np.ndarray, low: np.ndarray, high: np.ndarray, leaving: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The angle between two nodes at which each row crosses, and its alpha.
 
-    ``Im(q - beta F)``, which rises with w where a pair leaves, over what it is 0 with on every row; by Newton's method
-    kept inside its bracket; who has arrived takes no part any more.
+    ``Im(q - beta F)``, which rises with w where a pair leaves, over what vanishes on every row, by Newton's method kept
+    inside its bracket; who has arrived takes no part any more.
     """
     cosine = np.cos(0.5 * (low + high))
-    rising = leaving * np.prod([np.sign(cosine - np.cos(line)) for line in lines], axis=0) > 0
+    rising = leaving * np.prod([np.sign(cosine - np.cos(w)) for w in fixed], axis=0) > 0
     below, above = np.minimum(low, high), np.maximum(low, high)
-    first, last = _residual(loop, lines, beta, below)[0], _residual(loop, lines, beta, above)[0]
+    first, last = _residual(loop, fixed, beta, below)[0], _residual(loop, fixed, beta, above)[0]
     with np.errstate(all="ignore"):
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
@@ -255,7 +304,7 @@ def _solve_rows(
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
-        value, slope, _ = _residual(loop, lines, beta[here], x)
+        value, slope, _ = _residual(loop, fixed, beta[here], x)
         ahead = (value < 0) == rising[here]
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
@@ -268,20 +317,20 @@ def _solve_rows(
         if not on.any():
             break
         here, x = here[on], new[on]
-    return found, _residual(loop, lines, beta, found)[2]
+    return found, _residual(loop, fixed, beta, found)[2]
 
 
-def _residual(loop: LinearLoop, lines: list[float], beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``Im(q - beta F)`` over sin w and the lines' ``cos w - cos line``, its derivative; and ``Re(q - beta F)``."""
+def _residual(loop: LinearLoop, fixed: list[float], beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``Im(q - beta F)`` over ``sin w prod(cos w - cos fixed)``, its derivative; and ``Re(q - beta F)``."""
     at = circle(w)
     with np.errstate(all="ignore"):
         q, f = loop.needed(at), loop.estimate.jet(at)
         value, slope = q.value - beta * f.value, q.slope - beta * f.slope
-        sine, cosine = np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
-        whole, turn = sine, cosine
-        for line in lines:
-            factor = np.where(w == line, 0.0, -2.0 * np.sin(0.5 * (w + line)) * np.sin(0.5 * (w - line)))
-            whole, turn = whole * factor, turn * factor - whole * sine
+        whole = np.where(w >= np.pi, 0.0, np.sin(w))
+        turn = np.cos(w)
+        for angle in fixed:
+            factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
+            whole, turn = whole * factor, turn * factor - whole * np.sin(w)
         end = whole == 0
         safe = np.where(end, 1.0, whole)
         ratio = np.where(end, slope.imag / turn, value.imag / safe)
@@ -358,40 +407,40 @@ def _arcs(
     here: CurvePoints,
     poles: np.ndarray,
     turns: np.ndarray,
-    lines: tuple[CrossingLine, ...],
+    limits: dict[float, float],
 ) -> list[Arc]:
-    """Cut the curve where beta turns or runs to infinity, and where it meets a line: Im F changes its sign there."""
-    limits = {line.w: line.meeting for line in lines}
-    cuts = np.unique(np.concatenate([poles, turns, [w for w in limits if 0 < w < np.pi]]))
-    ends = np.concatenate([[0.0], cuts, [np.pi]])
+    """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
+    ends = np.unique(np.concatenate([list(limits), poles, turns]))
     at_pole = {float(p) for p in poles}
     arcs = []
     for a, b in pairwise(ends.tolist()):
         inner = (w > a) & (w < b)
-        nodes, beta, slope, fall = w[inner], here.beta[inner], here.turn[inner], here.fall[inner]
+        nodes, curve = w[inner], CurvePoints(*(values[inner] for values in here))
         if not nodes.size:
             nodes = np.array([0.5 * (a + b)])
-            middle = curve_at(loop, nodes)
-            beta, slope, fall = middle.beta, middle.turn, middle.fall
-        rising = np.sum(np.sign(slope)) > 0
-        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w. By its nodes this is told once.
-        leaving = 1.0 if rising == (np.sum(np.sign(fall)) > 0) else -1.0
+            curve = curve_at(loop, nodes)
+        rising = np.sum(np.sign(curve.turn)) > 0
+        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
+        leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
         first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
         last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
-        nodes, beta = np.concatenate([[a], nodes, [b]]), np.concatenate([[first], beta, [last]])
+        # What the ends' alpha is no one asks: next to them every wall is compared with the crossing itself.
+        nodes, beta = np.concatenate([[a], nodes, [b]]), np.concatenate([[first], curve.beta, [last]])
+        alpha, size = (np.concatenate([[np.nan], part, [np.nan]]) for part in (curve.alpha, curve.size))
         if not rising:
-            nodes, beta = nodes[::-1], beta[::-1]
+            nodes, beta, alpha, size = nodes[::-1], beta[::-1], alpha[::-1], size[::-1]
         # Next to a limit or an extreme rounding may leave a node out of order; without it nothing is lost.
         good = np.maximum.accumulate(beta) == beta
         good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
         good[[0, -1]] = True
         if beta[0] <= beta[-1]:
-            arcs.append(Arc(nodes[good], beta[good], leaving))
+            arcs.append(Arc(nodes[good], beta[good], alpha[good], size[good], leaving))
     return arcs
 
 
 def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
-    if w in (0.0, np.pi) or w in limits or w in at_pole:
-        limit = limits.get(w, np.nan)
-        return limit if np.isfinite(limit) else side * np.inf
+    if w in at_pole:
+        return side * np.inf
+    if w in limits:
+        return limits[w] if np.isfinite(limits[w]) else side * np.inf
     return float(curve_at(loop, np.array([w])).beta[0])
