@@ -241,9 +241,9 @@ class Boundary:
     def borders(self, w: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of the curve at each angle."""
         here = curve_at(self.loop, w)
-        with np.errstate(all="ignore"):
-            leaves = here.turn * here.fall > 0
         own = np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
+        # By the arc: next to z = -1 the slope at one angle may be rounding.
+        leaves = np.array([arc.leaving for arc in self.arcs])[own] > 0
         finite = np.isfinite(here.alpha) & np.isfinite(here.beta)
         at = np.where(finite, here.alpha, 0.0), np.where(finite, here.beta, 0.0)
         passed, sound = self._passed(*at, own)
