@@ -116,7 +116,9 @@ def main() -> None:
         exact = []
         for low, high in ends:
             middle, far = flint.arb(0.5 * (low + high)), flint.arb(1e-4 * (high - low))
-            exact.append([bisect(scene, damping, middle, flint.arb(end) + side * far) for end, side in ((low, -1), (high, 1))])
+            exact.append(
+                [bisect(scene, damping, middle, flint.arb(end) + side * far) for end, side in ((low, -1), (high, 1))]
+            )
         numbers = np.array([[float(end) for end in pair] for pair in exact])
         if not labels_agree(scene, damping, numbers):
             raise SystemExit(f"the row {damping} of {parts} has other intervals than {ends.tolist()}")

@@ -25,6 +25,8 @@ from zwidth.numerics.roots import false_position
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08
 _ROUNDS = 60
+# How near to z = -1 the last node is, for a loop without roots there.
+_LAST = 1e-4
 # Shares of a step at which a dip of the slope between two nodes is looked for.
 _INSIDE = np.arange(1, 8) / 8.0
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
@@ -112,10 +114,14 @@ def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
 
 def nodes_of(loop: LinearLoop) -> np.ndarray:
     """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
-    sizes = np.abs(np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros]))
-    slowest = min([1.0 / (abs(loop.lag) + loop.estimate.window + 1.0), *sizes[sizes > 1e-13]])
-    first = 1e-3 * min(slowest, 1.0)
-    w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - 1e-6, 32)[1:]])
+    roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
+    sizes, far = np.abs(roots), np.abs(roots - 2.0)
+    turn = 1.0 / (abs(loop.lag) + loop.estimate.window + 1.0)
+    first = 1e-3 * min([turn, *sizes[sizes > 1e-13]])
+    # Next to z = -1 imaginary parts x = pi - w have lost eps/x of themselves, and beta varies by (x/far)^2: closer than
+    # this its slope is rounding.
+    last = _LAST * min([turn, *far[far > 1e-13]]) ** (2.0 / 3.0)
+    w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
     for _ in range(_ROUNDS):
         half = 0.5 * np.diff(w)
         wide = 2.0 * half * loop.turning(w[:-1] + half, half) > _STEP * 16.0
@@ -143,10 +149,11 @@ class Boundary:
         here = curve_at(loop, w)
         w = np.unique(np.concatenate([w, _dips(loop, w, here)]))
         here = curve_at(loop, w)
-        poles = zeros_of(loop, w, here.fall, "fall")
-        lines = tuple(line for p in poles if (line := _interior_line(loop, p)) is not None)
-        poles = np.array([p for p in poles if all(abs(p - line.w) > 1e-9 for line in lines)])
-        poles = np.union1d(poles, _circle_zeros(loop))
+        vertical = zeros_of(loop, w, here.fall, "fall")
+        touched = [p for p in _circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
+        vertical = np.union1d(vertical, touched)
+        lines = tuple(line for p in vertical if (line := _interior_line(loop, p)) is not None)
+        poles = np.array([p for p in vertical if all(p != line.w for line in lines)])
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
         lines = (*lines, *_end_lines(loop))
@@ -381,9 +388,10 @@ def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
 
 
 def _circle_zeros(loop: LinearLoop) -> np.ndarray:
-    """Angles of the device's zeros on the circle, where q is infinite: nothing damps the masses beyond the sensor."""
-    angles = np.angle(1.0 - loop.zeros[np.abs(depths(loop.zeros)) <= ON_CIRCLE])
-    return angles[(angles > 0) & (angles < np.pi - 1e-6)]
+    """Angles of zeros on the circle: of an undamped device, where q is infinite, and of F, where Im F may only touch 0."""
+    zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
+    angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
+    return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 
 def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
