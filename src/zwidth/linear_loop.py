@@ -155,6 +155,6 @@ class LinearLoop:
         far = np.abs(before + roots) - reach[..., None]
         # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
         depth = np.abs(depths(roots))
-        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, 1e-9)
+        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, np.where(roots == 0, 1e-9, 1e-5))
         near = (1.0 / np.maximum(far, floor)).sum(-1)
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0
