@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from zwidth._types import Array, ArrayLike
+from zwidth._types import ArrayLike
 from zwidth.errors import InputError, PrecisionWarning, TracedDelayError
+from zwidth.xla import STRIP, UNFUSED, WIDE
 from zwidth.xp import is_jax, is_traced
 
 # Large batches run in pieces of one size: one compilation, bounded memory, and a point's value does not depend
@@ -31,8 +32,6 @@ CHUNK = 1 << 15
 FEW = 1 << 12
 # What an elementwise kernel holds at one time then stays in the cache; smaller blocks cost as much in calls.
 BLOCK = 1 << 16
-# Within a block in pieces whose intermediates stay next to the processor.
-_STRIP = 1 << 12
 # The compiler treats shorter arrays differently, to the last place.
 _LEAST = 1 << 4
 
@@ -185,7 +184,8 @@ def _compile_elementwise(kernel: Callable[..., Any], static: tuple[Any, ...]) ->
     """A kernel compiled, with its derivatives as one product for each argument.
 
     A point depends on itself alone, so that all there is to differentiate is a few numbers a point. Left to itself,
-    `jax.grad` outside `jit` would compile a program that hands out every intermediate result: 3 to 4 times as long.
+    `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge
+    1.2 to 1.5 times as long (benchmarks/bench_xla.py).
     """
     import jax
 
@@ -246,9 +246,9 @@ def compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...] = ()) -> 
 
     def strips(*columns: Any) -> Any:
         size = max(column.size for column in columns)
-        if size <= _STRIP:
+        if size <= STRIP:
             return kernel(*(column if column.size > 1 else column[0] for column in columns), *static)
-        long = tuple(column.reshape(-1, _STRIP) for column in columns if column.size > 1)
+        long = tuple(column.reshape(-1, STRIP) for column in columns if column.size > 1)
 
         def strip(parts: tuple[Any, ...]) -> Any:
             rest = iter(parts)
@@ -256,29 +256,24 @@ def compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...] = ()) -> 
 
         return tree_map(lambda leaf: leaf.reshape(-1), jax.lax.map(strip, long))
 
-    # Twice as wide as what XLA takes by itself where the processor has it; without effect elsewhere.
-    return jax.jit(strips, compiler_options={"xla_cpu_prefer_vector_width": 512})
+    return jax.jit(strips, compiler_options=WIDE)
 
 
 def map_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int, threads: int | None = None) -> Any:
     """Apply a compiled elementwise function to equally long columns, block by block on every processor.
 
-    One array of a million points would be up to five times slower: what the function holds meanwhile leaves the cache.
+    One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py):
+    what the function holds meanwhile leaves the cache.
     Columns of one value are handed over as they are.
     """
     return _map_pieces(function, columns, _padded_size(_length(columns), block, _LEAST), threads)
-
-
-# Kernels that iterate over long formulas compile 2 to 5 times faster without XLA's fusion, and run no slower:
-# fused, XLA computes shared parts of the formula again for each of their uses.
-_UNFUSED = {"xla_disable_hlo_passes": "fusion"}
 
 
 @cache
 def _compile_pointwise(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
     import jax
 
-    options = None if fused else _UNFUSED
+    options = None if fused else UNFUSED
     return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)), compiler_options=options)
 
 
@@ -377,22 +372,6 @@ def _map_traced(kernel: Callable[..., Any], values: tuple[ArrayLike, ...], stati
         return kernel(*arrays, *static)
     flat = jax.vmap(lambda *point: kernel(*point, *static))(*(array.reshape(-1) for array in arrays))
     return jax.tree.map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat)
-
-
-def store_once(values: Any, witness: Array) -> Any:
-    """``values``, computed once: for a kernel in which many later steps use them.
-
-    XLA:CPU repeats a chain of cheap operations in every loop it makes out of the operations behind it, but never a
-    division. The divisor here is 1, or NaN where ``witness`` (anything known at run time) is, so that the compiler
-    cannot see it. Halves the time to compile and to run of a Newton iteration on a discretized plant.
-    """
-    if not is_jax(witness):
-        return values
-    import jax.numpy as jnp
-    from jax.lax import stop_gradient
-
-    one = stop_gradient(jnp.where(jnp.isnan(witness), jnp.nan, 1.0))
-    return tree_map(lambda value: value / one, values)
 
 
 def concrete_delay(d: ArrayLike) -> np.ndarray:

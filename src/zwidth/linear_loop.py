@@ -18,6 +18,9 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.xp import frozen, namespace
 
+# Nearer to the circle than this a root of the loop is on it: an undamped mode, or a zero of an undamped device.
+ON_CIRCLE = 1e-12
+
 
 class Jet(NamedTuple):
     """A complex function of w and its derivative."""
@@ -57,6 +60,11 @@ def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:
     if xp is np:
         return np.where(w >= np.pi, exact, value)
     return value - frozen(xp.where(w >= np.pi, value - exact, 0.0), xp)
+
+
+def depths(offsets: np.ndarray) -> np.ndarray:
+    """``1 - |root|`` of roots given by their offsets from 1, with the digits that they have next to 1."""
+    return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
 
 
 def lag_jet(at: CirclePoints, turns: float) -> Jet:
@@ -145,6 +153,8 @@ class LinearLoop:
         before = circle(w).before[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         far = np.abs(before + roots) - reach[..., None]
-        floor = np.maximum(1e-3 * np.abs(np.real(roots)), 1e-9)
+        # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
+        depth = np.abs(depths(roots))
+        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, 1e-9)
         near = (1.0 / np.maximum(far, floor)).sum(-1)
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0

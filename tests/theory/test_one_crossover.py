@@ -82,14 +82,8 @@ def test_s3_mean_of_the_density_is_below_half() -> None:
 
 def test_s3_a0_is_at_most_a1() -> None:
     """S3: a1 - a0 = phi1 ((1 - 2 E s) + (1 - f)(2 - 3 E max(1 - s/(1 - f), 0))) >= 0; 0 at delta = 0, f = 1."""
-
-    def claim(tau, f):
-        # The first summand is not negative (the test before this one).
-        if 2 - 3 * early_mean(tau, f) > 0:
-            return True
-        return (m := loop(tau, f)).a1 - m.a0
-
-    prove(claim, [TAU, UNIT])
+    # The first summand is not negative (the test before this one).
+    prove(lambda tau, f: 2 - 3 * early_mean(tau, f) > 0 or (m := loop(tau, f)).a1 - m.a0, [TAU, UNIT])
 
 
 def test_s3_is_refuted_with_a_smaller_factor() -> None:
@@ -110,13 +104,8 @@ def test_s4_a2_exceeds_a0_for_f_up_to_half() -> None:
 
 def test_s4_m_is_not_negative_at_minus_one_for_f_from_half() -> None:
     """S4: a1 >= a2 + a0; it vanishes at delta = 0, f = 1, where the form of S3 with 4 for 3 shows the sign."""
-
-    def claim(tau, f):
-        if 2 - 4 * early_mean(tau, f) > 0:
-            return True
-        return 1 - 2 * ((m := loop(tau, f)).a2 + m.a0)
-
-    prove(claim, [TAU, (0.5, 1.0)])
+    from_half = [TAU, (0.5, 1.0)]
+    prove(lambda tau, f: 2 - 4 * early_mean(tau, f) > 0 or 1 - 2 * ((m := loop(tau, f)).a2 + m.a0), from_half)
 
 
 def test_s4_is_refuted_for_smaller_f() -> None:

@@ -138,7 +138,7 @@ def passive_error(d: float, points: int) -> Error:
     return float(np.max(np.abs(needed - exact) / exact)), 0, exact.size
 
 
-def _time_call(
+def _time_layouts(
     quantity: str, method: str, d: float, error: Error, call: Callable[[Walls], Any], points: dict[str, int]
 ) -> Iterator[Row]:
     """One row for each layout and its number of points."""
@@ -165,7 +165,7 @@ def _labels(d: float, sizes: Sizes) -> Iterator[Row]:
             points = {"map": _fewer(20_000, d), "scattered": _fewer(20_000, d)}
         elif method == "certified":
             points = {"map": sizes.map_points // 4, "scattered": sizes.map_points // 16}
-        yield from _time_call("stable", method, d, error, classify, points)
+        yield from _time_layouts("stable", method, d, error, classify, points)
 
 
 def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
@@ -180,7 +180,7 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
     for method, radius, points in cases:
         if not _possible(method, d):
             continue
-        yield from _time_call("spectral_radius", method, d, radius_error(radius, d, sizes.roots), radius, points)
+        yield from _time_layouts("spectral_radius", method, d, radius_error(radius, d, sizes.roots), radius, points)
     for name, tool in available().items():
         if d > _LONGEST_BASELINE or (tool.only_whole and d != int(d)):
             continue
@@ -195,7 +195,7 @@ def _passive(d: float, sizes: Sizes) -> Iterator[Row]:
     points = {"map": sizes.map_points // 4, "scattered": sizes.map_points // 16, "one": 1}
     # The reference looks at every maximum of a bound that oscillates d times.
     error = passive_error(d, min(sizes.roots, 20))
-    yield from _time_call("passive", "worst frequency", d, error, lambda walls: is_passive(*walls), points)
+    yield from _time_layouts("passive", "worst frequency", d, error, lambda walls: is_passive(*walls), points)
 
 
 def ridge_error(d: float, method: RidgeMethod = "newton") -> Error:
@@ -234,7 +234,7 @@ def _growing_maps(sizes: Sizes) -> Iterator[Row]:
     error = label_error(lambda walls: is_stable(*walls), 4.0, sizes.checked)
     points = 10_000
     while points <= sizes.largest_map:
-        yield from _time_call("stable", "crossover", 4.0, error, lambda walls: is_stable(*walls), {"map": points})
+        yield from _time_layouts("stable", "crossover", 4.0, error, lambda walls: is_stable(*walls), {"map": points})
         points *= 10
 
 

@@ -10,6 +10,7 @@ import click
 from zwidth import __version__
 from zwidth.cli import runs
 from zwidth.cli.bench import bench
+from zwidth.cli.devices import devices
 from zwidth.cli.options import json_option, physical_options
 from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.formatting import plain, with_unit
@@ -27,9 +28,7 @@ def cli() -> None:
 @cli.command()
 @physical_options(wall=True, required=True)
 @json_option
-def check(
-    stiffness: float, virtual_damping: float, mass: float, damping: float, period: float, delay: float, as_json: bool
-) -> None:
+def check(as_json: bool, **given: float) -> None:
     """Judge one wall: stable, passive, how far from the boundary."""
     from zwidth.assessment import assess
     from zwidth.parts.device import Device
@@ -37,7 +36,8 @@ def check(
     from zwidth.parts.wall import VirtualWall
     from zwidth.scene import Scene
 
-    scene = Scene(Device(mass, damping), Timing(period, delay), VirtualWall(stiffness, virtual_damping))
+    wall = VirtualWall(given["stiffness"], given["virtual_damping"])
+    scene = Scene(Device(given["mass"], given["damping"]), Timing(given["period"], given["delay"]), wall)
     verdict = assess(scene)
     if as_json:
         click.echo(json.dumps(verdict.as_dict(), indent=2, allow_nan=False))
@@ -124,5 +124,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (*runs.COMMANDS, bench):
+for command in (*runs.COMMANDS, devices, bench):
     cli.add_command(command)

@@ -15,9 +15,10 @@ import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, ValidationError, WithJsonSchema, create_model
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.faults import LocatedProblem, describe, problem, problems_of, short, suggestion, validation_error
+from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
 from zwidth.config.fields import Strict, repeated
 from zwidth.config.numbers import number, whole_number
+from zwidth.formatting import describe, short, suggestion
 from zwidth.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
 
 LONGEST_AXIS = 10_000_000
@@ -88,7 +89,7 @@ def _spacing_model(name: str, entry: Entry) -> type[_Spacing]:
     return model
 
 
-def entries_of(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
+def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
     """The entries of a list, each read by ``entry``; all faults are reported with their positions."""
     if not raw:
         raise problem("got an empty list", "an axis has at least one value", "fill the list")
@@ -110,10 +111,10 @@ def entries_of(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool
 def axis(allowed: Range = ANY) -> Callable[[Any], Axis]:
     """A validator for an axis whose values lie in a given range."""
     # Equal ratios need values of one sign; a log axis of negative numbers has no use here.
-    return axis_of(number(allowed), number(Range(0.0, allowed.high, low_open=True)))
+    return make_axis_reader(number(allowed), number(Range(0.0, allowed.high, low_open=True)))
 
 
-def axis_of(entry: Entry, positive: Entry) -> Callable[[Any], Axis]:
+def make_axis_reader(entry: Entry, positive: Entry) -> Callable[[Any], Axis]:
     """A validator for an axis of what ``entry`` reads; ``positive`` reads the ends of equal ratios."""
     models = {"linear": _spacing_model("linear", entry), "log": _spacing_model("log", positive)}
 
@@ -121,7 +122,7 @@ def axis_of(entry: Entry, positive: Entry) -> Callable[[Any], Axis]:
         if isinstance(raw, Axis):
             return raw
         if isinstance(raw, list | tuple):
-            return Axis("list", entries_of(raw, entry), len(raw))
+            return Axis("list", read_entries(raw, entry), len(raw))
         if not isinstance(raw, dict):
             return Axis("number", (entry(raw),), 1)
         if len(raw) != 1:

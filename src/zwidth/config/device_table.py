@@ -15,22 +15,13 @@ import numpy as np
 from pydantic import PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import SPELLED, Entry, entries_of
-from zwidth.config.faults import (
-    LocatedProblem,
-    describe,
-    listing,
-    printable,
-    problem,
-    problems_of,
-    resembling,
-    suggestion,
-    validation_error,
-)
-from zwidth.config.numbers import looks_like_number
-from zwidth.config.parameters import delay_entries
-from zwidth.config.units import entry_of
+from zwidth.config.axes import SPELLED, Entry, read_entries
+from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
+from zwidth.config.parameters import make_delay_readers
+from zwidth.config.units import make_entry_reader
+from zwidth.formatting import describe, resembling, suggestion
 from zwidth.quantities import PARAMETERS
+from zwidth.units import looks_like_number
 
 LABEL = "label"
 MAX_ROWS = 100_000
@@ -85,10 +76,10 @@ def read_table(raw: Any) -> DeviceTable:
         return raw
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", f"devices are {_FORMS}", "write {csv: devices.csv}")
-    return _from_csv(raw) if "csv" in raw else _from_lists(raw)
+    return _read_csv(raw) if "csv" in raw else _read_lists(raw)
 
 
-def _from_lists(raw: dict[str, Any]) -> DeviceTable:
+def _read_lists(raw: dict[str, Any]) -> DeviceTable:
     known = (LABEL, *PARAMETERS)
     found: list[LocatedProblem] = []
     columns: dict[str, tuple[Any, ...]] = {}
@@ -103,30 +94,30 @@ def _from_lists(raw: dict[str, Any]) -> DeviceTable:
         else:
             entry, counts_periods = _cell_reader(key)
             try:
-                columns[key] = entries_of(cells, entry, distinct=False) if cells or key != LABEL else ()
+                columns[key] = read_entries(cells, entry, distinct=False) if cells or key != LABEL else ()
             except (PydanticCustomError, ValidationError) as error:
                 found += problems_of(error, key)
             in_periods |= counts_periods()
     if found:
         raise validation_error("devices", found)
-    return _checked(columns, in_periods)
+    return _check_lengths(columns, in_periods)
 
 
 def _cell_reader(key: str) -> tuple[Entry, Callable[[], bool]]:
     """What reads the cells of a column, and whether those read so far are delays in sampling periods."""
     if key == "delay":
-        entry, _, in_periods = delay_entries()
+        entry, _, in_periods = make_delay_readers()
         return entry, in_periods
-    return _label if key == LABEL else entry_of(key), lambda: False
+    return _check_label if key == LABEL else make_entry_reader(key), lambda: False
 
 
-def _label(cell: Any) -> Any:
+def _check_label(cell: Any) -> Any:
     if not isinstance(cell, str) or not cell.strip():
         raise problem(f"got {describe(cell)}", "a label is text", "put it in quotes")
     return cell
 
 
-def _checked(columns: dict[str, tuple[Any, ...]], in_periods: bool) -> DeviceTable:
+def _check_lengths(columns: dict[str, tuple[Any, ...]], in_periods: bool) -> DeviceTable:
     """The table, where its columns are of one length."""
     labels = columns.pop(LABEL, ())
     if not columns:
@@ -141,7 +132,7 @@ def _checked(columns: dict[str, tuple[Any, ...]], in_periods: bool) -> DeviceTab
     return DeviceTable(columns, labels, in_periods)
 
 
-def _from_csv(raw: dict[str, Any]) -> DeviceTable:
+def _read_csv(raw: dict[str, Any]) -> DeviceTable:
     """A table from a file, whose header names parameters and, in brackets, their units."""
     for key in raw:
         if key not in ("csv", "columns"):
@@ -153,14 +144,14 @@ def _from_csv(raw: dict[str, Any]) -> DeviceTable:
         what = problem(f"got {describe(name)}", "csv is the name of a file", "write 'csv: devices.csv'")
         raise validation_error("devices", [(("csv",), what)])
     try:
-        rows = _rows(name)
-        chosen = _chosen(rows[0][1], raw.get("columns"), name)
-        return _parsed(rows, chosen, name)
+        rows = _read_rows(name)
+        chosen = _choose_columns(rows[0][1], raw.get("columns"), name)
+        return _parse_rows(rows, chosen, name)
     except PydanticCustomError as error:
         raise validation_error("devices", [(("csv",), error)]) from None
 
 
-def _rows(name: str) -> list[tuple[int, list[str]]]:
+def _read_rows(name: str) -> list[tuple[int, list[str]]]:
     """The lines of a CSV file that hold something, with their numbers; the first one is the header."""
     path = _folder.get() / name
     try:
@@ -180,15 +171,14 @@ def _rows(name: str) -> list[tuple[int, list[str]]]:
     return rows
 
 
-def _chosen(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
+def _choose_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
     """For every parameter that the file holds its column and unit."""
     if mapping is not None:
-        return _mapped(header, mapping, name)
+        return _map_columns(header, mapping, name)
     chosen: dict[str, tuple[int, str]] = {}
     known = (LABEL, *PARAMETERS)
     for index, title in enumerate(header):
-        match = _HEADER.fullmatch(title)
-        key, unit = (match.group(1), match.group(2) or "") if match else (title, "")
+        key, unit = _split_header(title)
         if key in chosen:
             raise problem(f"{printable(name)}: the column {describe(key)} comes twice", "each once", "remove one")
         if key in known:
@@ -200,7 +190,7 @@ def _chosen(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, 
     return chosen
 
 
-def _mapped(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
+def _map_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, str]]:
     """The same where the configuration says which column is what, as ``mass: "moving mass [g]"``."""
     known = (LABEL, *PARAMETERS)
     if not isinstance(mapping, dict) or not mapping:
@@ -213,12 +203,17 @@ def _mapped(header: list[str], mapping: Any, name: str) -> dict[str, tuple[int, 
         if not isinstance(title, str) or title.strip() not in titles:
             allowed = f"the headers of {printable(name)} are {listing(titles[:20])}"
             raise problem(f"columns: got {describe(title)}", allowed, suggestion(title, titles, "write one of these"))
-        match = _HEADER.fullmatch(title.strip())
-        chosen[key] = titles.index(title.strip()), (match.group(2) or "") if match else ""
+        chosen[key] = titles.index(title.strip()), _split_header(title)[1]
     return chosen
 
 
-def _parsed(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
+def _split_header(title: str) -> tuple[str, str]:
+    """The name of a column and its unit, which stands in brackets."""
+    match = _HEADER.fullmatch(title)
+    return (match.group(1), match.group(2) or "") if match else (title, "")
+
+
+def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
     """The chosen columns of a file's rows."""
     columns: dict[str, tuple[Any, ...]] = {}
     in_periods = False
@@ -233,12 +228,12 @@ def _parsed(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]
             columns[key] = tuple(cell for _, cell in cells)
             continue
         entry, counts_periods = _cell_reader(key)
-        columns[key] = tuple(_cell(entry, cell, unit, place) for place, cell in cells)
+        columns[key] = tuple(_read_cell(entry, cell, unit, place) for place, cell in cells)
         in_periods |= counts_periods()
-    return _checked(columns, in_periods)
+    return _check_lengths(columns, in_periods)
 
 
-def _cell(entry: Entry, cell: str, unit: str, place: str) -> float:
+def _read_cell(entry: Entry, cell: str, unit: str, place: str) -> float:
     """One value of a CSV file: a number in the header's unit, or a number with a unit of its own."""
     raw: float | str = cell
     if looks_like_number(cell):
@@ -250,7 +245,7 @@ def _cell(entry: Entry, cell: str, unit: str, place: str) -> float:
         raise problem(f"{place}: {context['what']}", context["allowed"], context["remedy"]) from None
 
 
-def _schema() -> dict[str, Any]:
+def _make_schema() -> dict[str, Any]:
     """The JSON Schema of a table."""
     column = {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}}
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
@@ -262,4 +257,4 @@ def _schema() -> dict[str, Any]:
     return {"description": f"Devices: {_FORMS}.", "anyOf": forms}
 
 
-TableField = Annotated[DeviceTable, PlainValidator(read_table), SPELLED, WithJsonSchema(_schema())]
+TableField = Annotated[DeviceTable, PlainValidator(read_table), SPELLED, WithJsonSchema(_make_schema())]

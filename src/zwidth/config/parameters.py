@@ -8,14 +8,16 @@ from typing import Annotated, Any
 
 from pydantic import PlainValidator, WithJsonSchema
 
-from zwidth.config.axes import SPELLED, Axis, Entry, axis_of, axis_schema
-from zwidth.config.faults import describe, problem
+from zwidth.config.axes import SPELLED, Axis, Entry, axis_schema, make_axis_reader
+from zwidth.config.faults import problem
 from zwidth.config.fields import unit_schema
-from zwidth.config.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, dimension_of, entry_of, quantity, span
+from zwidth.config.units import make_entry_reader, quantity, span
+from zwidth.formatting import describe
 from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, find_dimension
 
 
-def delay_entries() -> tuple[Entry, Entry, Callable[[], bool]]:
+def make_delay_readers() -> tuple[Entry, Entry, Callable[[], bool]]:
     """Validators for delays, for delays > 0, and what tells whether all of them were written in sampling periods."""
     units: dict[str, None] = {}
 
@@ -36,8 +38,8 @@ def delay_entries() -> tuple[Entry, Entry, Callable[[], bool]]:
 
 
 def _delays(raw: Any) -> Axis:
-    entry, positive, in_periods = delay_entries()
-    return raw if isinstance(raw, Axis) else replace(axis_of(entry, positive)(raw), in_periods=in_periods())
+    entry, positive, in_periods = make_delay_readers()
+    return raw if isinstance(raw, Axis) else replace(make_axis_reader(entry, positive)(raw), in_periods=in_periods())
 
 
 def _reader(name: str) -> Callable[[Any], Axis]:
@@ -45,7 +47,7 @@ def _reader(name: str) -> Callable[[Any], Axis]:
     allowed = PARAMETERS[name].allowed
     low = max(allowed.low, 0.0)
     positive = Range(low, allowed.high, low_open=low == 0.0)
-    return axis_of(entry_of(name), quantity(dimension_of(PARAMETERS[name].unit), positive))
+    return make_axis_reader(make_entry_reader(name), quantity(find_dimension(PARAMETERS[name].unit), positive))
 
 
 def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:

@@ -9,10 +9,8 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DelayModel
-from zwidth.config.faults import LocatedProblem, describe, listing, problem, short
+from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import (
-    PERIOD_SCHEMA,
-    RATE_SCHEMA,
     Damping,
     Delay,
     Mass,
@@ -21,17 +19,20 @@ from zwidth.config.fields import (
     Stiffness,
     Strict,
     VirtualDamping,
+    unit_schema,
 )
 from zwidth.config.numbers import number
-from zwidth.config.units import RATE, TIME, Span, quantity
+from zwidth.config.units import quantity
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.errors import InputError
+from zwidth.formatting import describe, short
 from zwidth.normalization import normalize
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.parts.wall import VirtualWall
 from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
 from zwidth.scene import Scene
+from zwidth.units import RATE, TIME, Span
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping"})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
@@ -82,12 +83,12 @@ class _PhysicalPlant(_OneKind):
     damping: Damping = 0.0
     """Physical damping b of the device in N s/m, >= 0."""
 
-    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), RATE_SCHEMA] | None = Field(
+    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), unit_schema(RATE)] | None = Field(
         default=None, exclude=True
     )
     """Sampling rate 1/T in Hz; give it or the period."""
 
-    period: Annotated[float, BeforeValidator(_period), PERIOD_SCHEMA] = Field(default=None, validate_default=True)
+    period: Annotated[float, BeforeValidator(_period), unit_schema(TIME)] = Field(default=None, validate_default=True)
     """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
 
     delay: Delay = Span(0.0, "s")

@@ -30,14 +30,14 @@ def draw_curves(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = No
         name: the output, a number.
         axes: Axes of yours, one for each panel or fewer.
     """
-    output, data = OUTPUTS[name], grid.shown(data, [name])
-    dims = sorted(grid.axes_of(data, name), key=lambda dim: -data.sizes[dim])
+    output, data = OUTPUTS[name], grid.prepare(data, [name])
+    dims = sorted(grid.choose_axes(data, name), key=lambda dim: -data.sizes[dim])
     if not dims:
         raise InputError(f"name: {name!r} varies over no parameter that it could be drawn over")
-    x, several = dims[0], [*dims[1:], *[dim for dim in reversed(grid.varied(data, name)) if dim not in dims]][:1]
+    x, several = dims[0], [*dims[1:], *[dim for dim in reversed(grid.list_varied(data, name)) if dim not in dims]][:1]
     parts, columns = grid.panels(data, [x, *several])
     panels = panel_grid(axes, len(parts), columns)
-    picked = style.evenly(data.sizes[several[0]], _CURVES) if several else [0]
+    picked = style.pick_evenly(data.sizes[several[0]], _CURVES) if several else [0]
     labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]
     colors = style.ordered_colors(len(picked))
     few = data.sizes[x] <= 12
@@ -60,20 +60,20 @@ def draw_curves(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = No
     if few and not grid.logarithmic(values):
         panels[0].set_xlim(*style.span(float(values.min()), float(values.max())))
     style.label_axes(panels, grid.axis_label(data, x), grid.output_label(data, name), once=axes is None)
-    _name(panels, labels, colors, outside=axes is None)
+    _name_colors(panels, labels, colors, outside=axes is None)
     return panels
 
 
-def outlined(data: xarray.Dataset) -> tuple[str, str] | None:
+def find_outlines(data: xarray.Dataset) -> tuple[str, str] | None:
     """The output whose contours are the boundaries of walls, and the parameter each of whose values has one."""
     name = next((name for name in (*SMOOTH, "stable") if name in data and _has_walls(data, name)), None)
-    dims = [dim for dim in grid.varied(data, name) if dim not in WALL] if name else []
+    dims = [dim for dim in grid.list_varied(data, name) if dim not in WALL] if name else []
     first = next((dim for dim in ("delta", "damping", *reversed(dims)) if dim in dims), None)
     return (name, first) if name and first else None
 
 
 def _has_walls(data: xarray.Dataset, name: str) -> bool:
-    dims = grid.axes_of(data, name)
+    dims = grid.choose_axes(data, name)
     return len(dims) == 2 and dims[1] in WALL
 
 
@@ -85,15 +85,15 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np
         data: results of a sweep over walls and devices, as `zwidth.open_dataset` gives them, or a part of them.
         axes: Axes of yours, one for each panel or fewer.
     """
-    found = outlined(data)
+    found = find_outlines(data)
     if found is None:
         raise InputError("data: holds no boundaries of several devices; a sweep over walls and devices does")
     name, family = found
-    data = grid.shown(data, [name])
-    x, y = dims = grid.axes_of(data, name)
+    data = grid.prepare(data, [name])
+    x, y = dims = grid.choose_axes(data, name)
     parts, columns = grid.panels(data, [family, *dims], plane=dims)
     panels = panel_grid(axes, len(parts), columns)
-    picked = style.evenly(data.sizes[family], _CURVES)
+    picked = style.pick_evenly(data.sizes[family], _CURVES)
     colors = style.ordered_colors(len(picked))
     labels = [grid.spell(data[family][k]) for k in picked]
     for part, ax in zip(parts, panels, strict=False):
@@ -107,7 +107,7 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np
         grid.scale_axis(ax, "y", part[y])
         ax.set_title(grid.title(part))
     style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)
-    _name(panels, labels, colors, outside=axes is None, title="boundaries of the stable walls")
+    _name_colors(panels, labels, colors, outside=axes is None, title="boundaries of the stable walls")
     return panels
 
 
@@ -117,7 +117,9 @@ def _decade(values: np.ndarray) -> tuple[float, ...]:
     return (1.0, 2.0, 5.0) if positive.size and positive.max() < 100 * positive.min() else (1.0,)
 
 
-def _name(axes: np.ndarray, names: list[str], colors: list[Any], *, outside: bool, title: str | None = None) -> None:
+def _name_colors(
+    axes: np.ndarray, names: list[str], colors: list[Any], *, outside: bool, title: str | None = None
+) -> None:
     """Which color is which."""
     longest = max(10 if "$" in name else len(name) for name in names)
     columns = max(1, min(len(names), 6, _LINE // max(longest, 1)))

@@ -24,18 +24,18 @@ _MANY_PANELS = 9
 _ORDER = ("alpha", "stiffness", "beta", "virtual_damping", "delta", "damping", "d", "delay", "rate", "period", "mass")
 
 
-def varied(data: xarray.Dataset, name: str) -> list[str]:
+def list_varied(data: xarray.Dataset, name: str) -> list[str]:
     """The parameters that a variable varies over."""
     return [str(dim) for dim in data[name].dims if data.sizes[dim] > 1]
 
 
-def axes_of(data: xarray.Dataset, name: str) -> list[str]:
+def choose_axes(data: xarray.Dataset, name: str) -> list[str]:
     """One or two parameters that a variable is drawn over."""
-    dims = varied(data, name)
+    dims = list_varied(data, name)
     return [dim for dim in _ORDER if dim in dims][:2]
 
 
-def shown(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
+def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
     """Some variables of one family as they are drawn.
 
     Only dimensions with two values or more remain, single values of the others beside them. All is in units with few
@@ -80,14 +80,14 @@ def panels(data: xarray.Dataset, over: list[str], plane: Sequence[str] = ()) -> 
     """A part of a dataset for each panel, and how many panels are beside each other.
 
     Args:
-        data: as `shown` gives it.
+        data: as `prepare` gives it.
         over: the dimensions that a panel has; the last two others vary from panel to panel.
         plane: those of them that are drawn as a plane, which resolves so many values and no more.
     """
     free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
     data = data.isel(dict.fromkeys(free[:-2], 0))
     free = free[-2:]
-    picked = [style.evenly(data.sizes[dim], _MANY_PANELS if len(free) == 1 else _ACROSS) for dim in free]
+    picked = [style.pick_evenly(data.sizes[dim], _MANY_PANELS if len(free) == 1 else _ACROSS) for dim in free]
     places = [dict(zip(free, place, strict=True)) for place in product(*picked)]
     most = _RESOLVED if len(places) == 1 else _RESOLVED_BY_MANY
     thin = {dim: slice(None, None, -(-data.sizes[dim] // most)) for dim in plane}

@@ -50,11 +50,11 @@ def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = Non
     Raises:
         InputError: the output varies over less than two parameters.
     """
-    dims = grid.axes_of(data, name)
+    dims = grid.choose_axes(data, name)
     if len(dims) < 2:
         raise InputError(f"name: {name!r} varies over less than two parameters, a plane needs them")
     x, y = dims
-    parts, columns = grid.panels(_with_peak(data, _drawn(data, name), x, y), dims, plane=dims)
+    parts, columns = grid.panels(_add_peak(data, _select_drawn(data, name), x, y), dims, plane=dims)
     panels = panel_grid(axes, len(parts), columns)
     parts = [part.compute() for part in parts[: len(panels)]]
     norm, image = _norm(parts, name), None
@@ -65,17 +65,17 @@ def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = Non
     return panels
 
 
-def _drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
+def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
     """The output, and what is drawn along with it."""
     beside = ["passive", *[edge for edge in SMOOTH if edge in data][:1]] if name == "stable" else []
     beside += ["kind"] if OUTPUTS[name].family == "device" else []
-    data = grid.shown(data, [name, *[each for each in beside if each in data and each != name]])
+    data = grid.prepare(data, [name, *[each for each in beside if each in data and each != name]])
     if name in ("settling_time", "gain_margin", "delay_margin"):
         data[name] = data[name].where(np.isfinite(data[name]) & (data[name] > 0))
     return data
 
 
-def _with_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xarray.Dataset:
+def _add_peak(data: xarray.Dataset, drawn: xarray.Dataset, x: str, y: str) -> xarray.Dataset:
     """The stiffest stable wall of every panel, where the plane is one of walls."""
     names = dict(zip((x, y), _PEAKS.get(x, ()), strict=False))
     if y not in ("beta", "virtual_damping") or not names or not all(name in data for name in names.values()):
@@ -109,7 +109,7 @@ def _draw_panel(ax: Axes, part: xarray.Dataset, name: str, norm: Any) -> Any:
         image = ax.pcolormesh(x, y, shown, cmap=_colors(output), norm=norm, **mesh)
         _draw_contours(ax, x, y, shown, output, norm)
         _draw_corners(ax, x, y, part)
-    peak = _peak(part)
+    peak = _find_peak(part)
     if peak is not None:
         ax.plot(*peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
     for which, values in (("x", x), ("y", y)):
@@ -118,7 +118,7 @@ def _draw_panel(ax: Axes, part: xarray.Dataset, name: str, norm: Any) -> Any:
     return image
 
 
-def _peak(part: xarray.Dataset) -> list[float] | None:
+def _find_peak(part: xarray.Dataset) -> list[float] | None:
     """The stiffest stable wall, where it lies within the panel."""
     peaks = {str(name)[: -len("_peak")]: float(value) for name, value in part.items() if str(name).endswith("_peak")}
     inside = (part[dim].min() <= value <= part[dim].max() for dim, value in peaks.items())
@@ -246,6 +246,6 @@ def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: An
         handles.append(Patch(facecolor=_MISSING, label="not computed"))
     if any("kind" in part and (part["kind"] == 1).mean() > _SEEN for part in parts):
         handles.append(Patch(facecolor="white", hatch="////", edgecolor="#606060", linewidth=0, label="corner optimum"))
-    if any(_peak(part) is not None for part in parts):
+    if any(_find_peak(part) is not None for part in parts):
         handles.append(Line2D([], [], linestyle="", label="stiffest stable wall", **_PEAK))
     style.legend(axes, handles, outside=outside, ncols=len(handles))

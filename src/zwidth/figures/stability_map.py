@@ -32,7 +32,7 @@ def draw_map(arrays: Mapping[str, np.ndarray], output: str, axes: style.AnyAxes 
         axes: an Axes of yours for the first delta and d alone, or one for each panel.
     """
     delta, d = arrays["delta"], arrays["d"]
-    rows, columns = style.evenly(d.size, _PANELS), style.evenly(delta.size, _PANELS)
+    rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
     places = list(product(rows, columns))
     single = len(places) == 1
     width, height = (5.9, 4.3) if single else (0.6 + 2.3 * len(columns), 1.0 + 2.1 * len(rows))

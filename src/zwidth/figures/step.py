@@ -29,7 +29,7 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """
     panels = style.panels(axes, 2, 5.6, 5.0, height_ratios=(1.8, 1.2), sharex=True)
     clock, unit = draw_positions(panels[0], table)
-    responses = _responses(table)
+    responses = _read_responses(table)
     for ax in panels[1:]:
         _draw_forces(ax, responses, clock)
         ax.set_ylabel("wall force in N" if unit else "wall force  in $F$")
@@ -47,14 +47,14 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
 def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
     """Draw the position of every response over time; returns the scale and the unit of time, "" where normalized."""
-    responses, physical = _responses(table), "time_s" in table
+    responses, physical = _read_responses(table), "time_s" in table
     clock, unit, factor, length = 1.0, "", 1.0, ""
     if physical:
         clock, unit = style.si_unit(max(float(each.time[-1]) for each in responses), "s")
         # The final position: an unstable response has no largest one worth a unit.
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
         factor, length = style.si_unit(max(finals, default=0.0), "m")
-    for each, color, dash in _colored(responses):
+    for each, color, dash in _assign_colors(responses):
         text = rf"{each.label}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
         text += "" if each.settled else ", not settled"
         ax.plot(each.time * clock, each.position * factor, color=color, linestyle=dash, label=text, zorder=3)
@@ -68,7 +68,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
     return clock, unit
 
 
-def _responses(table: Table) -> list[Any]:
+def _read_responses(table: Table) -> list[Any]:
     """The responses in a table; ``settled`` tells that one has settled, for good, at the end of the time shown."""
     columns = {name: np.asarray(table[name + unit if name + unit in table else name]) for name, unit in _UNITS.items()}
     columns |= {name: np.asarray(table[name]) for name in ("label", "alpha", "beta")}
@@ -82,14 +82,14 @@ def _responses(table: Table) -> list[Any]:
     return responses
 
 
-def _colored(responses: list[Any]) -> list[tuple[Any, Any, Any]]:
+def _assign_colors(responses: list[Any]) -> list[tuple[Any, Any, Any]]:
     """Each with a color and a line style."""
     return [(each, _COLORS[k % len(_COLORS)], _STYLES[k % len(_STYLES)]) for k, each in enumerate(responses)]
 
 
 def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
     """The force of the wall over time."""
-    for each, color, _ in _colored(responses):
+    for each, color, _ in _assign_colors(responses):
         label = f"wall_force, {each.label}"
         # Steps are too short for dashes: lightness has to do.
         ax.plot(each.time * clock, each.wall_force, color=color, linewidth=1.1, label=label, zorder=3)

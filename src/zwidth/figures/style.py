@@ -190,7 +190,7 @@ def color_by_value(values: Sequence[float]) -> dict[float, Any]:
     return dict(zip(distinct, ordered_colors(len(distinct)), strict=True))
 
 
-def evenly(count: int, most: int) -> list[int]:
+def pick_evenly(count: int, most: int) -> list[int]:
     """Indices of all values, or of so many that are spaced evenly."""
     return list(range(count)) if count <= most else sorted({round(place) for place in np.linspace(0, count - 1, most)})
 

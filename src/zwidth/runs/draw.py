@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.errors import InputError, StoreError
-from zwidth.figures.curves import draw_curves, draw_outlines, outlined
-from zwidth.figures.grid import axes_of
+from zwidth.figures.curves import draw_curves, draw_outlines, find_outlines
+from zwidth.figures.grid import choose_axes
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.style import save
 from zwidth.quantities import OUTPUTS
@@ -81,13 +81,13 @@ def figures_of(data: xarray.Dataset) -> Iterator[tuple[str, Callable[[], Any]]]:
     for name in map(str, data.data_vars):
         if name not in OUTPUTS or name == "kind" or (name == "passive" and "stable" in data):
             continue
-        axes = axes_of(data, name)
+        axes = choose_axes(data, name)
         few = OUTPUTS[name].family == "device" and min((data.sizes[axis] for axis in axes), default=0) < _SURFACE
         if len(axes) == 2 and not few:
             yield name, partial(draw_plane, data, name)
         elif axes and OUTPUTS[name].dtype == "float64":
             yield name, partial(draw_curves, data, name)
-    if outlined(data):
+    if find_outlines(data):
         yield "boundaries", partial(draw_outlines, data)
 
 

@@ -85,7 +85,7 @@ class Record:
                 )
             return
         # Stores are refused or replaced one by one: they say themselves what they are.
-        strange = [path.name for path in self.folder.iterdir() if not _is_of_runs(path.name)]
+        strange = [path.name for path in self.folder.iterdir() if not _belongs_to_runs(path.name)]
         if strange:
             raise StoreExistsError(
                 f"out: {self.folder} is not empty and holds no run (no {RUN_FILE}); choose another folder with "
@@ -207,7 +207,7 @@ class Record:
                 remove_quietly(left)
 
 
-def _is_of_runs(name: str) -> bool:
+def _belongs_to_runs(name: str) -> bool:
     """Whether a run without a record, or one that was killed, leaves something of this name."""
     return name.endswith((SUFFIX, ".partial")) or name in (LOCKS, CONFIG_FILE, "figures")
 

@@ -105,11 +105,11 @@ def run(
     """
     going_on = resume or shard is not None
     _check_options(workers, scheduler, shard, going_on=going_on, overwrite=overwrite)
-    config, text = _read(config)
+    config, text = _read_config(config)
     shown = Path("runs", config.name) if out is None else Path(os.fsdecode(out))
     folder, clock = Path(os.path.abspath(shown)), time.perf_counter()
-    pieces = _pieces(config) if shard is None or shard[0] == 1 else []
-    planned = [(study, make_plan(study, memory=memory)) for study in _sweeps(config)]
+    pieces = _list_computations(config) if shard is None or shard[0] == 1 else []
+    planned = [(study, make_plan(study, memory=memory)) for study in _list_sweeps(config)]
     if planned:
         check_installed()
     # What does not fit, or not belong there, is refused before anything is made.
@@ -119,7 +119,7 @@ def run(
     with holding(folder, shard):
         record = Record(folder)
         record.check_free(overwrite=overwrite, going_on=going_on)
-        inputs = {piece.name: piece.inputs for piece in pieces} | {one.name: _spelled(one) for one, _ in planned}
+        inputs = {piece.name: piece.inputs for piece in pieces} | {one.name: _spell(one) for one, _ in planned}
         if overwrite:
             record.clear()
             for study, _ in planned:
@@ -133,7 +133,7 @@ def run(
         record.start(name=config.name, description=config.description, config_sha256=digest)
         record.keep_config(text)
         job.do(pieces)
-        about = {"name": config.name, "description": config.description, "config": _spelled(config)}
+        about = {"name": config.name, "description": config.description, "config": _spell(config)}
         if planned and not job.over:
             options = {"shard": shard, "workers": workers, "scheduler": scheduler}
             job.sweep(planned, about, perform=perform, **options)
@@ -147,7 +147,7 @@ def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
     Raises:
         ConfigError: the configuration has faults.
     """
-    config, _ = _read(config)
+    config, _ = _read_config(config)
     return [make_plan(study, memory=memory) if isinstance(study, SweepStudy) else study for study in config.studies]
 
 
@@ -196,22 +196,21 @@ class _Run:
             try:
                 outcome = piece.compute()
                 notes = outcome.notes
-                for _ in outcome.write(stage, piece.name):
-                    pass
+                outcome.write(stage, piece.name)
             except Exception as caught:
                 error = caught
             entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes)}
-            entry |= {"error": _in_words(error), "state": "failed" if error else "done"}
+            entry |= {"error": _describe_error(error), "state": "failed" if error else "done"}
             try:
                 self.record.keep(stage, entry)
             except Exception as caught:
                 error = error or caught
                 before = self.record.entry(piece.name) or {}
-                entry |= {"error": _in_words(error), "state": "failed", "files": before.get("files", {})}
+                entry |= {"error": _describe_error(error), "state": "failed", "files": before.get("files", {})}
                 with suppress(OSError):
                     self.record.note(entry)
         if error is not None and hopeless(error):
-            self.hopeless = _in_words(error)
+            self.hopeless = _describe_error(error)
         kept = self.record.entry(piece.name)
         return StudyResult(
             piece.name,
@@ -220,7 +219,7 @@ class _Run:
             time.perf_counter() - clock,
             tuple(kept["files"]) if kept else (),
             notes,
-            _in_words(error),
+            _describe_error(error),
             error,
         )
 
@@ -265,18 +264,18 @@ class _Run:
 def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
     """What the record says of a sweep; its store knows by itself which of its files are whole."""
     files = {store_path(Path(), study).name: None}
-    return {"name": study.name, "kind": "sweep", "state": state, "inputs": _spelled(study), "files": files}
+    return {"name": study.name, "kind": "sweep", "state": state, "inputs": _spell(study), "files": files}
 
 
-def _pieces(config: Config) -> list[Computation]:
+def _list_computations(config: Config) -> list[Computation]:
     """The studies that are computed as a whole; where figures of the paper are repeated, its numbers as well."""
     pieces = []
     for study in config.studies:
         if isinstance(study, ComputedStudy):
             alone = sum(type(other) is type(study) for other in config.studies) == 1
-            inputs = _spelled(study)
+            inputs = _spell(study)
             if study.reads_scene and config.scene is not None:
-                inputs["scene"] = _spelled(config.scene)
+                inputs["scene"] = _spell(config.scene)
             pieces.append(
                 Computation(study.name, study.kind_name(), inputs, partial(study.compute, config.scene, alone))
             )
@@ -287,24 +286,24 @@ def _pieces(config: Config) -> list[Computation]:
     return pieces
 
 
-def _sweeps(config: Config) -> list[SweepStudy]:
+def _list_sweeps(config: Config) -> list[SweepStudy]:
     return [study for study in config.studies if isinstance(study, SweepStudy)]
 
 
-def _spelled(model: Any) -> dict[str, Any]:
+def _spell(model: Any) -> dict[str, Any]:
     """A configuration, or a part of it, as JSON has it."""
     return model.model_dump(mode="json", exclude_none=True)
 
 
-def _read(config: AnyConfig) -> tuple[Config, str]:
+def _read_config(config: AnyConfig) -> tuple[Config, str]:
     """A configuration and its text."""
     if isinstance(config, Config):
-        return config, json.dumps(_spelled(config), indent=2) + "\n"
+        return config, json.dumps(_spell(config), indent=2) + "\n"
     path = Path(os.fsdecode(config))
     return load_config(path), path.read_text(encoding="utf-8-sig")
 
 
-def _in_words(error: Exception | None) -> str:
+def _describe_error(error: Exception | None) -> str:
     return f"{type(error).__name__}: {error}" if error else ""
 
 

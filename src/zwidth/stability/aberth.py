@@ -136,20 +136,9 @@ def split(z: Array) -> Cartesian:
     return Cartesian(z.real, z.imag)
 
 
-def _double_exactly(x: Array) -> Array:
-    """The poles twice in a row, so that every other pole of each is found by a shift."""
-    twice = namespace(x).concatenate([x, x])
-    if isinstance(x, np.ndarray):
-        return twice
-    from jax.lax import optimization_barrier
-
-    # Joined inside the loop over the walls the copies would cost a branch for every number.
-    return optimization_barrier(twice)
-
-
 def _differences(z: RootsFirst) -> list[Cartesian]:
     """From each pole the ones that follow it, nearest in number first."""
-    twice, count = _double_exactly(z), z.shape[0]
+    twice, count = namespace(z).concatenate([z, z]), z.shape[0]
     return [split(z - twice[k : k + count]) for k in range(1, count)]
 
 
@@ -192,7 +181,7 @@ def discs(z: RootsFirst, form: ProductForm) -> tuple[RadiiFirst, Array, Array]:
     size = xp.abs(value.re) + xp.abs(value.im)
     # A thousandth more than N, for the rounding of q.
     within = 1.001 * form.poles * (size + bound) / q
-    twice = _double_exactly(within)
+    twice = xp.concatenate([within, within])
     disjoint = xp.isfinite(within)
     for k, distance in enumerate(apart[: form.poles // 2], start=1):
         disjoint = disjoint & (distance > within + twice[k : k + form.poles])

@@ -23,8 +23,8 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.domain import valid_wall, void
 from zwidth.plant import held_plant, split_delay, undelayed_plant
-from zwidth.stability.crossover import ARCSINE
-from zwidth.xp import epsilon, horner, namespace
+from zwidth.xla import angle, find_turn
+from zwidth.xp import epsilon, namespace
 
 # Steps of the bracketed Newton iteration for the zeros of the cubic.
 _CUBIC_STEPS = 6
@@ -60,28 +60,6 @@ def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: b
         h, q = plant.a1, 0.0 * plant.a1
     alpha, beta, s = void(ok, alpha, beta, alpha + beta)
     return Loop(alpha, beta, s, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
-
-
-def angle(re: Array, im: Array) -> Array:
-    """The argument in (-pi, pi], by a polynomial: four times faster than the compiler's."""
-    xp = namespace(re, im)
-    if xp is np:
-        return np.arctan2(im, re)
-    size = xp.abs(re)
-    length = xp.sqrt(re * re + im * im)
-    half = 0.5 * im * im / (length * (length + size))
-    value = 2.0 * xp.sqrt(half) * horner(4.0 * half - 1.0, ARCSINE)
-    value = xp.where(re < 0, np.pi - value, value)
-    return xp.where(im < 0, -value, value)
-
-
-def find_turn(x: Array, y: Array, xp: Any) -> Array:
-    """The w of ``x = sin^2(w/2)`` and y = 1 - x."""
-    if xp is np:
-        return 2.0 * np.arctan2(np.sqrt(x), np.sqrt(y))
-    low = xp.minimum(x, y)
-    value = 2.0 * xp.sqrt(low) * horner(4.0 * low - 1.0, ARCSINE)
-    return xp.where(x > y, np.pi - value, value)
 
 
 class _Circle(NamedTuple):

@@ -18,31 +18,16 @@ balls. Where a number stands for all in a set, a comparison is true if it is so 
 from __future__ import annotations
 
 from collections.abc import Callable
-from math import factorial
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import store_once
 from zwidth.domain import WALL_RANGE, within
 from zwidth.stability.devices import ANY, DeviceTerms, Kind, device
 from zwidth.stability.row_limit import long_curve, short_curve
+from zwidth.xla import ARCSINE, COSINE, SINE
 from zwidth.xp import horner, namespace, root
-
-
-def _arcsine_fit(terms: int) -> list[float]:
-    """``asin(sqrt y)/sqrt y`` on [0, 1/2] as powers of 4 y - 1, by interpolation: 2e-16 relative with 19 terms."""
-    node = np.cos(np.pi * (np.arange(terms) + 0.5) / terms)
-    y = 0.25 * (node + 1.0)
-    fit = np.polynomial.chebyshev.chebfit(node, np.arcsin(np.sqrt(y)) / np.sqrt(y), terms - 1)
-    return np.polynomial.chebyshev.cheb2poly(fit).tolist()
-
-
-ARCSINE = _arcsine_fit(19)
-# Taylor series; on [0, pi/2] the first term left out is below 1e-17.
-SINE = [(-1.0) ** k / factorial(2 * k + 1) for k in range(11)]
-COSINE = [(-1.0) ** k / factorial(2 * k) for k in range(12)]
 
 # From its start the zero of the cubic is within 11 %; each step squares that.
 _NEWTON_STEPS = 4
@@ -209,8 +194,7 @@ def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> Crossover:
 def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind = ANY) -> Array:
     """Whether each wall is stable, elementwise; False for what is NaN."""
     here = device(delta, d, kind)
-    # With a fraction several loops of the compiler use it.
-    return stable_at(alpha, beta, store_once(here, delta) if kind.fractional and kind.long else here, kind)
+    return stable_at(alpha, beta, here, kind)
 
 
 def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: Kind) -> Array:

@@ -25,7 +25,6 @@ N is homogeneous in (alpha, beta), a polynomial in u under the root, and station
 
 from __future__ import annotations
 
-from math import factorial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,15 +32,12 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.numerics.roots import newton
 from zwidth.plant import split_delay
-from zwidth.stability.crossover import ARCSINE
 from zwidth.stability.devices import ANY, Kind
+from zwidth.xla import ARCSINE, COSINE, SINE
 from zwidth.xp import epsilon, frozen, horner, namespace
 
 # Of the peak, from its fit; of the direction from which it exists, from twice its beta at most.
 _STEPS, _DIRECTION_STEPS = 3, 12
-# Taylor series; on [0, pi/2] the first term left out is below 1e-17.
-SINE = [(-1.0) ** i / factorial(2 * i + 1) for i in range(11)]
-COSINE = [(-1.0) ** i / factorial(2 * i) for i in range(12)]
 
 
 class Delay(NamedTuple):
@@ -155,7 +151,7 @@ def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -
 
 
 def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
-    """Cosine and sine of ``k w`` in [0, pi], u in (0, 1]; compiled, polynomials are several times faster than calls."""
+    """Cosine and sine of ``k w`` in [0, pi], u in (0, 1]."""
     if xp is np:
         x = 2.0 * k * np.arcsin(np.sqrt(0.5 * u))
         return np.cos(x), np.sin(x)

@@ -71,7 +71,7 @@ class Value(NamedTuple):
 
 
 def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
-    """Sine and cosine for |x| <= pi/2; several times faster than the compiler's, which serve every argument."""
+    """Sine and cosine for |x| <= pi/2."""
     if xp is np:
         # Python's numbers stay Python's.
         return (float(np.sin(x)), float(np.cos(x))) if type(x) is float else (np.sin(x), np.cos(x))

@@ -41,8 +41,6 @@ MOST_POLES = 4000
 _MOST_AT_ONE_TIME = 24
 # Numbers of one kind that a block of walls holds, which then stay in the cache, and those of a block of matrices.
 _NUMBERS, _MATRICES = 1 << 15, 1 << 15
-# Wider than the compiler chooses where the processor has it: up to twice as fast.
-_WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 class Poles(NamedTuple):
@@ -194,7 +192,7 @@ def _compiled_around_lapack(*arguments: Any) -> np.ndarray:
 def _compile_by_degree(kernel: Callable[..., Any], degree: Degree, spring: bool) -> Any:
     import jax
 
-    return jax.jit(lambda *arrays: kernel(*arrays, degree, spring), compiler_options=_WIDE)
+    return jax.jit(lambda *arrays: kernel(*arrays, degree, spring))
 
 
 def _block(most: int) -> int:

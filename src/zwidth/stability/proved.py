@@ -16,9 +16,10 @@ from zwidth.stability.circle import factor_loop
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.devices import classify_delays
 from zwidth.stability.layout import Points, fold
-from zwidth.stability.radius import WIDE, Found, certify_pole, has_bound, quick_kernel, search
+from zwidth.stability.radius import Found, certify_pole, has_bound, quick_kernel, search
 from zwidth.stability.radius_map import SMALLEST_MAP, Map, as_map, followed_poles, lay_nodes
 from zwidth.status import Status
+from zwidth.xla import WIDE
 
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(12)

@@ -13,8 +13,9 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.domain import poison, valid_wall, void
-from zwidth.stability.circle import Loop, angle, count, factor_loop
+from zwidth.stability.circle import Loop, count, factor_loop
 from zwidth.stability.pole_step import halley_step, move_pole, newton_step
+from zwidth.xla import angle
 from zwidth.xp import epsilon, frozen, namespace, repeat
 
 # Steps on both starts, then on the larger of the two.
@@ -27,9 +28,6 @@ _COUNTED, _RELATIVE = 4096.0, 2e-11
 # From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
 # crossovers depend on it.
 _SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
-
-# Long formulas of few numbers gain a third from the widest registers; without such registers nothing changes.
-WIDE = {"xla_cpu_prefer_vector_width": 512}
 
 
 class Found(NamedTuple):

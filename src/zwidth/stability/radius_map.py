@@ -20,7 +20,8 @@ from zwidth.domain import wall_status
 from zwidth.stability.circle import Loop, factor_loop
 from zwidth.stability.layout import Points
 from zwidth.stability.pole_step import halley_step, move_pole, value_at
-from zwidth.stability.radius import WIDE, certify_pole
+from zwidth.stability.radius import certify_pole
+from zwidth.xla import WIDE
 
 # Points along each side of a cell.
 _CELL = 16

@@ -18,13 +18,13 @@ import jax.numpy as jnp
 import optimistix
 
 from zwidth._types import Array
-from zwidth.batching import store_once
 from zwidth.domain import device_status, poison
 from zwidth.loop import FrequencyLoop, frequency_boundary, frequency_loop
 from zwidth.stability.bracketing import bisect, lobe_end
 from zwidth.stability.ridge import RidgeKind, RidgePoint
 from zwidth.stability.ridge_newton import corner, expand_curve
 from zwidth.status import Status
+from zwidth.xla import store_once
 
 _MAX_STEPS = 16
 

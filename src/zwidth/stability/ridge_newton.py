@@ -22,21 +22,15 @@ no point waits for another.
 
 from __future__ import annotations
 
-from math import factorial
 from typing import NamedTuple
 
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.batching import store_once
 from zwidth.plant import Plant
-from zwidth.stability.crossover import ARCSINE
 from zwidth.stability.devices import ANY, Kind
+from zwidth.xla import ARCSINE, COSINE, SINE, store_once
 from zwidth.xp import epsilon, frozen, horner, namespace, repeat
-
-# Taylor series; on [0, pi/2] the first term left out is below 1e-17.
-_SIN = [(-1.0) ** k / factorial(2 * k + 1) for k in range(11)]
-_COS = [(-1.0) ** k / factorial(2 * k) for k in range(12)]
 
 
 class Curve(NamedTuple):
@@ -90,7 +84,7 @@ def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
     # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
     D, x = lag + 1.0, lag * half
     square = x * x
-    sine, cosine = x * horner(square, _SIN), horner(square, _COS)
+    sine, cosine = x * horner(square, SINE), horner(square, COSINE)
     ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
     sin2 = 4.0 * y * q
     tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio

@@ -18,7 +18,7 @@ from zwidth.config.study import DelayModels
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.stability.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, of_scene, stack
+from zwidth.studies.outcome import Outcome, add_si_of_scene, stack
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
 
@@ -105,7 +105,7 @@ class BoundaryStudy(CurvesStudy):
             parts.append({"curve": "ridge_path", **path})
             notes += remarks
         parts += passive_outlines(deltas, delays) if self.passivity else ()
-        table = of_scene(stack(parts), self.delta, self.d, scene)
+        table = add_si_of_scene(stack(parts), self.delta, self.d, scene)
         return Outcome(table=table, figures={"": partial(figures.draw_boundary, table)}, notes=tuple(notes))
 
 

@@ -22,12 +22,10 @@ class CurvesStudy(ComputedStudy):
 
     @property
     def extent(self) -> str:
-        """delta x d x delay models."""
         return f"delta x d x delay models = {self.delta.size} x {self.d.size} x {self.models}"
 
     @property
     def points(self) -> int:
-        """One a pair of delta and d and delay model."""
         return self.delta.size * self.d.size * self.models
 
     @property

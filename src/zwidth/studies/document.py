@@ -19,12 +19,12 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, core_schema
 
-from zwidth.config.faults import LocatedProblem, describe, listing, problem, suggestion, validation_error
+from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Name, Strict, members
-from zwidth.config.numbers import looks_like_number
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import Study
+from zwidth.formatting import describe, suggestion
 from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
@@ -32,6 +32,7 @@ from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy
 from zwidth.studies.step import StepStudy
 from zwidth.sweep.study import SweepStudy
+from zwidth.units import looks_like_number
 
 FORMAT_VERSION = 1
 
@@ -56,7 +57,7 @@ for _model in (BoundaryStudy, MapStudy, RidgeStudy, PassivityStudy, StepStudy, R
     register(_model)
 
 
-def _model_of(kind: Any) -> type[Study] | None:
+def _find_model(kind: Any) -> type[Study] | None:
     """The model of a kind, which an installed package may bring: an entry point in the group ``zwidth.studies``."""
     if isinstance(kind, str) and kind not in KINDS:
         for found in entry_points(group="zwidth.studies", name=kind):
@@ -64,7 +65,7 @@ def _model_of(kind: Any) -> type[Study] | None:
     return KINDS.get(kind) if isinstance(kind, str) else None
 
 
-def _study(raw: Any) -> Any:
+def _read_study(raw: Any) -> Any:
     """A validator that reads a mapping as the study that its kind names."""
     if isinstance(raw, Study):
         return raw
@@ -74,7 +75,7 @@ def _study(raw: Any) -> Any:
     kind = raw.get("kind")
     if "kind" not in raw:
         raise validation_error("study", [(("kind",), problem("missing", kinds, "add 'kind: boundary'"))])
-    model = _model_of(kind)
+    model = _find_model(kind)
     if model is None:
         what = problem(
             f"got {describe(kind)}", f"the kinds are {listing(KINDS)}", suggestion(kind, KINDS, "write one of these")
@@ -92,7 +93,7 @@ class _OfAnyKind:
             return study.model_dump(mode=info.mode, exclude_none=info.exclude_none)
 
         serialization = core_schema.plain_serializer_function_ser_schema(spelled, info_arg=True)
-        return core_schema.no_info_plain_validator_function(_study, serialization=serialization)
+        return core_schema.no_info_plain_validator_function(_read_study, serialization=serialization)
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
@@ -100,7 +101,7 @@ class _OfAnyKind:
         return handler(TypeAdapter[Any](every).core_schema)  # pyright: ignore[reportArgumentType]
 
 
-def _version(value: Any) -> int:
+def _check_version(value: Any) -> int:
     if value == FORMAT_VERSION and isinstance(value, int) and not isinstance(value, bool):
         return value
     remedy = f"write 'version: {FORMAT_VERSION}'"
@@ -116,7 +117,7 @@ class Config(Strict):
 
     what: ClassVar[str] = "a configuration"
 
-    version: Annotated[int, BeforeValidator(_version), WithJsonSchema({"const": FORMAT_VERSION})]
+    version: Annotated[int, BeforeValidator(_check_version), WithJsonSchema({"const": FORMAT_VERSION})]
     """Version of the format, 1."""
 
     name: Name
@@ -147,7 +148,7 @@ class Config(Strict):
         if "scene" not in raw or not isinstance(studies, list | tuple):
             return raw
         scene = _scene_or_stand_in(raw["scene"])
-        return {**raw, "studies": [_filled(study, scene) for study in studies]}
+        return {**raw, "studies": [_fill_study(study, scene) for study in studies]}
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
@@ -180,9 +181,9 @@ def _scene_or_stand_in(raw: Any) -> AnyScene:
     return PhysicalScene(mass=1.0, period=1.0, stiffness=0.0)
 
 
-def _filled(study: Any, scene: AnyScene) -> Any:
+def _fill_study(study: Any, scene: AnyScene) -> Any:
     """A study's mapping with what the scene supplies; anything else as it is."""
-    model = _model_of(study.get("kind")) if isinstance(study, dict) else None
+    model = _find_model(study.get("kind")) if isinstance(study, dict) else None
     return study if model is None else model.fill(study, scene)
 
 
@@ -200,17 +201,17 @@ def config_json_schema() -> dict[str, Any]:
         >>> sorted(config_json_schema()["required"])
         ['name', 'studies', 'version']
     """
-    schema = _without_null(Config.model_json_schema())
+    schema = _drop_null(Config.model_json_schema())
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
 
 
-def _without_null(schema: Any) -> Any:
+def _drop_null(schema: Any) -> Any:
     """The schema without null, which stands for "not given" in the models and is never written in a file."""
     if isinstance(schema, list):
-        return [_without_null(item) for item in schema if item != {"type": "null"}]
+        return [_drop_null(item) for item in schema if item != {"type": "null"}]
     if not isinstance(schema, dict):
         return schema
-    return {key: _without_null(value) for key, value in schema.items() if key != "default" or value is not None}
+    return {key: _drop_null(value) for key, value in schema.items() if key != "default" or value is not None}
 
 
 def load_config(path: str | bytes | os.PathLike[str]) -> Config:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
 from typing import Annotated, ClassVar, Literal, TypeAlias
 
@@ -16,7 +17,7 @@ from zwidth.config.study import HeldOnly
 from zwidth.stability.labels import is_stable
 from zwidth.stability.passivity import is_passive
 from zwidth.stability.radii import spectral_radius
-from zwidth.studies.outcome import ComputedStudy, Outcome, of_scene
+from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 
@@ -59,18 +60,15 @@ class MapStudy(ComputedStudy):
 
     @property
     def extent(self) -> str:
-        """alpha x beta x delta x d."""
         return f"alpha x beta x delta x d = {' x '.join(str(size) for size in self.shape)}"
 
     @property
     def points(self) -> int:
-        """The product of the four sizes."""
-        a, b, delta, d = self.shape
-        return a * b * delta * d
+        return math.prod(self.shape)
 
     @property
     def nbytes(self) -> int:
-        """All outputs and a status code a point."""
+        # And a status code a point.
         return self.points * (1 + sum(_OUTPUT_BYTES[name] for name in self.outputs))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -84,6 +82,6 @@ class MapStudy(ComputedStudy):
             for name in outputs:
                 outputs[name][place] = np.asarray(_FUNCTIONS[name](*wall))
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
-        arrays = of_scene(arrays, self.delta, self.d, scene)
+        arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
         return Outcome(arrays=arrays, figures={f"_{name}": partial(figures.draw_map, arrays, name) for name in names})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -38,20 +38,16 @@ class Outcome:
     documents: dict[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
 
-    def write(self, folder: Path, name: str) -> Iterator[str]:
-        """Write everything, data before figures, and yield the name of each file when it is there."""
+    def write(self, folder: Path, name: str) -> None:
+        """Write everything, data before figures."""
         for file, text in self.documents.items():
             (folder / file).write_text(text, encoding="utf-8")
-            yield file
         if self.table:
             (folder / f"{name}.csv").write_text(csv_text(self.table), encoding="utf-8")
-            yield f"{name}.csv"
         if self.arrays:
             np.savez_compressed(folder / f"{name}.npz", **self.arrays)  # pyright: ignore[reportArgumentType]
-            yield f"{name}.npz"
         for addition, draw in self.figures.items():
-            for file in figures.save(draw(), folder / f"{name}{addition}"):
-                yield file.name
+            figures.save(draw(), folder / f"{name}{addition}")
 
 
 class ComputedStudy(Study):
@@ -79,20 +75,20 @@ def si_scales(device: PhysicalDevice) -> tuple[float, float]:
     return device.mass / device.period**2, device.mass / device.period
 
 
-def in_si(table: Table, device: PhysicalDevice) -> Table:
+def add_si_columns(table: Table, device: PhysicalDevice) -> Table:
     """A table with its walls in N/m and N s/m as well."""
     stiffness, damping = si_scales(device)
     return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 
-def of_scene(table: Table, delta: Axis, d: Axis, scene: AnyScene | None) -> Table:
+def add_si_of_scene(table: Table, delta: Axis, d: Axis, scene: AnyScene | None) -> Table:
     """A table of walls, in SI units as well where delta and d are those of the file's scene alone."""
-    if isinstance(scene, PhysicalScene) and _is(delta, scene.delta) and _is(d, scene.d):
-        return in_si(table, scene.device)
+    if isinstance(scene, PhysicalScene) and _is_single(delta, scene.delta) and _is_single(d, scene.d):
+        return add_si_columns(table, scene.device)
     return table
 
 
-def _is(axis: Axis, value: float) -> bool:
+def _is_single(axis: Axis, value: float) -> bool:
     return axis.size == 1 and float(axis.values()[0]) == value
 
 

@@ -18,7 +18,7 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scene import Scene
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.boundary import outline
-from zwidth.studies.outcome import Outcome, in_si, si_scales, stack
+from zwidth.studies.outcome import Outcome, add_si_columns, si_scales, stack
 from zwidth.studies.passivity import passive_outlines
 from zwidth.studies.step import ResponseStudy
 
@@ -51,7 +51,6 @@ class RecommendStudy(ResponseStudy):
         return super().missing(name)
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
-        """The one device; its wall is a share of the maximum."""
         return ((self.device, None),)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
@@ -69,7 +68,7 @@ class RecommendStudy(ResponseStudy):
         found = _summary(device, wall, verdict, self.stiffness_fraction, float(columns["settling_time_s"]))
         edge, verified = outline(device.delta, device.d, "held")
         passive = passive_outlines(np.array([device.delta]), np.array([device.d]))
-        region = in_si(stack([edge, *passive]), device)
+        region = add_si_columns(stack([edge, *passive]), device)
         notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
         return Outcome(
             table=response,

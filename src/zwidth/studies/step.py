@@ -27,12 +27,12 @@ from zwidth.config.scenes import (
     normalized_wall,
 )
 from zwidth.config.study import HeldOnly
-from zwidth.config.units import Span
 from zwidth.formatting import plain, with_unit
 from zwidth.quantities import Range
 from zwidth.response import step_response
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.outcome import ComputedStudy, Outcome, stack
+from zwidth.units import Span
 
 
 class ResponseStudy(ComputedStudy):
@@ -95,13 +95,11 @@ class ResponseStudy(ComputedStudy):
 
     @property
     def extent(self) -> str:
-        """Responses x points a period."""
         count = len(self.pairs())
         return f"{count} response{'' if count == 1 else 's'} of {self.duration} with {self.substeps} points a period"
 
     @property
     def points(self) -> int:
-        """Points of all responses together."""
         periods = sum(min(self.periods(device), 1e15) for device, _ in self.pairs())
         return int(periods * self.substeps) + len(self.pairs())
 
@@ -182,7 +180,6 @@ class StepStudy(ResponseStudy):
         yield from ((("walls", index), fault) for index, fault in faulty.items())
 
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
-        """Each device with its wall; the wall is None where stiffness_fraction decides it."""
         walls = self.walls or (None,)
         count = max(len(self.devices), len(walls))
         return tuple((self.devices[k % len(self.devices)], walls[k % len(walls)]) for k in range(count))

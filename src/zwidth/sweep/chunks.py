@@ -11,14 +11,14 @@ from zwidth.sweep.store import Store
 
 
 @lru_cache(maxsize=4)
-def _opened(path: str, made: int) -> Store:
+def _open_store(path: str, made: int) -> Store:
     """A store that this process works on; ``made`` tells it from another one that took its place."""
     return Store(Path(path))
 
 
 def perform(path: str, family: str, index: int) -> None:
     """Compute and write one chunk of a store, by its number in a family of outputs, unless it is done already."""
-    store = _opened(path, os.stat(os.path.join(path, "zarr.json")).st_ino)
+    store = _open_store(path, os.stat(os.path.join(path, "zarr.json")).st_ino)
     task = Task("device" if family == "device" else "wall", index)
     if store.is_done(task):
         return

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from zwidth.errors import InputError
-from zwidth.sweep.jobs import Finished, Job, Perform, failure_of
+from zwidth.sweep.jobs import Finished, Job, Perform, describe_failure
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -41,20 +41,20 @@ def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[F
     """
     _check_folder(client, jobs)
     given_up = []
-    for finished in _many(client, jobs, perform):
-        if finished.error and _is_death(finished.error):
+    for finished in _submit_jobs(client, jobs, perform):
+        if finished.error and _tells_of_death(finished.error):
             given_up.append(finished.job)
         else:
             yield finished
     for job in given_up:
-        yield from _many(client, [job], perform)
+        yield from _submit_jobs(client, [job], perform)
 
 
-def _is_death(error: str) -> bool:
+def _tells_of_death(error: str) -> bool:
     return error.startswith("KilledWorker")
 
 
-def _many(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finished]:
+def _submit_jobs(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finished]:
     """Keep a bounded number of chunks on the cluster; only their names travel."""
     from distributed import as_completed
 
@@ -73,7 +73,7 @@ def _many(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finish
                 job.path,
                 job.task.family,
                 job.task.index,
-                key=f"{_name(job)}-{os.urandom(4).hex()}",
+                key=f"{_name_job(job)}-{os.urandom(4).hex()}",
                 pure=False,
             )
             of_future[future.key] = job
@@ -85,18 +85,18 @@ def _many(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finish
         job = of_future.pop(future.key)
         # The result is nothing: to fetch it would only fail where its worker has died since.
         error = None if future.status == "finished" else future.exception()
-        yield Finished(job) if error is None else _failure_of(job, error)
+        yield Finished(job) if error is None else _describe_death(job, error)
         hand_out()
 
 
-def _failure_of(job: Job, error: Any) -> Finished:
+def _describe_death(job: Job, error: Any) -> Finished:
     """What dask says of a task that it could not do, in words of ours where its worker died."""
     if type(error).__name__ == "KilledWorker":
         return Finished(job, "KilledWorker: its worker died every time it was tried")
-    return failure_of(job, error)
+    return describe_failure(job, error)
 
 
-def _name(job: Job) -> str:
+def _name_job(job: Job) -> str:
     return f"{os.path.basename(job.path)}-{job.task.family}-{job.task.index}"
 
 

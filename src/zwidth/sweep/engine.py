@@ -90,12 +90,12 @@ def compute_sweeps(
             from zwidth.sweep.distributed import connected
 
             client = stack.enter_context(connected(scheduler))
-        stores, repaired = _stores(planned, folder, about, shard)
+        stores, repaired = _prepare_stores(planned, folder, about, shard)
         results = {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
         names = {str(store.path): name for name, store in stores.items()}
         points: dict[Job, int] = {}
         for name, store in stores.items():
-            tasks = _share(store.plan, shard)
+            tasks = _pick_share(store.plan, shard)
             missing = [task for task in tasks if not store.is_done(task)]
             points |= {Job(str(store.path), task): store.plan.points(task) for task in missing}
             results[name].total, results[name].skipped = len(tasks), len(tasks) - len(missing)
@@ -115,7 +115,7 @@ def compute_sweeps(
         return sweeps
 
 
-def _share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
+def _pick_share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
     """The chunks that are this run's to compute."""
     tasks = list(plan.tasks())
     return tasks if shard is None else tasks[shard[0] - 1 :: shard[1]]
@@ -134,7 +134,7 @@ def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool)
         check_same(Store(path), study)
 
 
-def _stores(
+def _prepare_stores(
     planned: Sequence[tuple[SweepStudy, Plan]], folder: Path, about: Mapping[str, Any], shard: tuple[int, int] | None
 ) -> tuple[dict[str, Store], dict[str, list[str]]]:
     """The stores of all sweeps, made or found, and what was repaired in them."""
@@ -145,7 +145,7 @@ def _stores(
             stores[study.name] = store = Store(path)
             if shard is None:
                 remove_partials(path)
-            repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _share(store.plan, shard))]
+            repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard))]
         else:
             stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)
             repaired[study.name] = []

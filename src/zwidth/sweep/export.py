@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth.errors import StoreError, StoreExistsError
 from zwidth.files.whole import hidden_beside
-from zwidth.quantities import NOT_COMPUTED
+from zwidth.quantities import NOT_COMPUTED, OUTPUTS, PARAMETERS
 from zwidth.sweep.store import open_dataset
 
 MAX_CSV_POINTS = 1_000_000
@@ -63,8 +63,18 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
         )
     rows = dataset if dataset.sizes else dataset.expand_dims("point")
     with hidden_beside(target) as partial:
-        rows.to_dataframe().to_csv(partial, index=bool(dataset.sizes))
+        # What a folder lists first differs from one machine to the next; a table has one order.
+        table = rows.to_dataframe(dim_order=sorted(map(str, rows.sizes), key=_place))
+        table[sorted(map(str, table.columns), key=_place)].to_csv(partial, index=bool(dataset.sizes))
         os.replace(partial, target)
+
+
+_ORDER = (*PARAMETERS, *OUTPUTS)
+
+
+def _place(name: str) -> int:
+    """Where a variable stands in the declared order; others come last."""
+    return _ORDER.index(name) if name in _ORDER else len(_ORDER)
 
 
 def _plain_attribute(value: Any) -> Any:

@@ -81,7 +81,9 @@ class Grid:
         if not self.physical:
             delta, d = (self._device(name, slices, shape) for name in ("delta", "d"))
             alpha, beta = (self._wall(name, slices, shape) for name in ("alpha", "beta"))
-            return Block(delta, d, *self._paired(alpha, beta, delta.size), np.empty(0), np.empty(0), self._rows)
+            return Block(
+                delta, d, *self._broadcast_walls(alpha, beta, delta.size), np.empty(0), np.empty(0), self._rows
+            )
         return self._physical_block(slices, shape)
 
     @property
@@ -105,7 +107,7 @@ class Grid:
             )
             damped = normalize(mass=mass[:, None], period=period[:, None], virtual_damping=virtual_damping)
         d = delay if in_periods else device.d
-        alpha, beta = self._paired(walls.alpha, damped.beta, mass.size)
+        alpha, beta = self._broadcast_walls(walls.alpha, damped.beta, mass.size)
         return Block(device.delta, np.broadcast_to(d, mass.shape), alpha, beta, mass, period, self._rows)
 
     def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
@@ -131,7 +133,7 @@ class Grid:
         return name if name in self.sizes else None
 
     @staticmethod
-    def _paired(alpha: np.ndarray, beta: np.ndarray, devices: int) -> tuple[np.ndarray, np.ndarray]:
+    def _broadcast_walls(alpha: np.ndarray, beta: np.ndarray, devices: int) -> tuple[np.ndarray, np.ndarray]:
         return np.broadcast_to(alpha, (devices, alpha.shape[1])), np.broadcast_to(beta, (devices, beta.shape[1]))
 
     def size_of(self, family: Family) -> int:

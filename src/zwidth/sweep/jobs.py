@@ -35,11 +35,11 @@ def attempt(perform: Perform, job: Job) -> Finished:
     try:
         perform(job.path, job.task.family, job.task.index)
     except Exception as error:
-        return failure_of(job, error)
+        return describe_failure(job, error)
     return Finished(job)
 
 
-def failure_of(job: Job, error: BaseException) -> Finished:
+def describe_failure(job: Job, error: BaseException) -> Finished:
     """What an exception means for a job and the others."""
     return Finished(job, f"{type(error).__name__}: {error}", hopeless(error))
 

@@ -188,10 +188,7 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
 def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
     """The plan that a store was made with, from what it keeps of it."""
     fresh = make_plan(study)
-    families = tuple(
-        FamilyPlan(plan.family, plan.outputs, plan.dims, plan.shape, tuple(kept["chunks"][plan.family]))
-        for plan in fresh.families
-    )
+    families = tuple(replace(plan, chunks=tuple(kept["chunks"][plan.family])) for plan in fresh.families)
     return replace(fresh, families=families, methods=dict(kept["methods"]))
 
 

@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from zwidth.config.faults import describe
 from zwidth.errors import StoreError
 from zwidth.files.provenance import differences, digest, versions
+from zwidth.formatting import describe
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
 from zwidth.sweep.study import SweepStudy
@@ -55,8 +55,8 @@ def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> Non
     changed = list(differences(old, new))
     if changed:
         lines = [
-            f"{where}: studies[{name}].{key}: the {what} was made with {_shown(before)}, the configuration has "
-            f"{_shown(after)}"
+            f"{where}: studies[{name}].{key}: the {what} was made with {_spell_value(before)}, the configuration has "
+            f"{_spell_value(after)}"
             for key, before, after in changed[:_SHOWN_DIFFERENCES]
         ]
         more = len(changed) - _SHOWN_DIFFERENCES
@@ -75,7 +75,7 @@ def refuse_versions(where: Path, old: dict[str, str]) -> None:
         )
 
 
-def _shown(value: Any) -> str:
+def _spell_value(value: Any) -> str:
     return "nothing" if value is None else describe(value)
 
 

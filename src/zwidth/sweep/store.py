@@ -43,7 +43,7 @@ _DESCRIPTIONS = ("zarr.json", "zwidth.json")
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
+def _silence_zarr() -> Iterator[None]:
     """Keep back what zarr says about every codec and type that is not in its core specification."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*Zarr", category=UserWarning)
@@ -61,7 +61,7 @@ def check_installed() -> None:
             )
 
 
-def _checksums(family: str) -> str:
+def _name_checksums(family: str) -> str:
     return f"{family}_checksum"
 
 
@@ -113,13 +113,13 @@ class Store:
     def _group(self) -> zarr.Group:
         import zarr
 
-        with _quiet():
+        with _silence_zarr():
             return zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
 
     @cached_property
     def _arrays(self) -> dict[str, Any]:
         names = [name for family in self.plan.families for name in family.variables]
-        with _quiet():
+        with _silence_zarr():
             arrays: dict[str, Any] = {name: self._group[name] for name in names}
         # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
@@ -132,7 +132,7 @@ class Store:
 
     def flag(self, task: Task) -> Path:
         """The file that says by being there that a chunk is done."""
-        return self.path / _checksums(task.family) / "c" / str(task.index) / "0"
+        return self.path / _name_checksums(task.family) / "c" / str(task.index) / "0"
 
     def is_done(self, task: Task) -> bool:
         """Whether a chunk is marked as done."""
@@ -148,7 +148,7 @@ class Store:
         place = family.place(task.index)
         files = self.files(task)
         shape = tuple(part.stop - part.start for part in place)
-        with _quiet():
+        with _silence_zarr():
             for name, file in zip(family.variables, files, strict=True):
                 # Zarr would read what is left of a damaged chunk at the edge of the grid before it replaces it.
                 file.unlink(missing_ok=True)
@@ -181,7 +181,7 @@ class Store:
     def restore(self, names: list[str]) -> None:
         """Write such files again; they follow from the store's attributes."""
         attributes = self.attributes
-        with _built(self.path, attributes) as fresh:
+        with _build_beside(self.path, attributes) as fresh:
             for name in names:
                 (self.path / name).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(fresh / name, self.path / name)
@@ -189,7 +189,7 @@ class Store:
 
 def create(path: Path, attributes: dict[str, Any], *, may_exist: bool = False) -> Store:
     """Make an empty store, at once and whole, or take one that another process has made in the meantime."""
-    with _built(path, attributes) as fresh:
+    with _build_beside(path, attributes) as fresh:
         try:
             os.rename(fresh, path)
         except OSError as error:
@@ -203,12 +203,12 @@ def create(path: Path, attributes: dict[str, Any], *, may_exist: bool = False) -
 
 
 @contextmanager
-def _built(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
+def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
     """A complete store without chunks, beside ``path``; what is left of it goes when the block ends."""
     study = SweepStudy.model_validate(attributes["study"])
     plan, grid = kept_plan(study, attributes["plan"]), Grid(study)
     with hidden_beside(path) as fresh:
-        with _quiet():
+        with _silence_zarr():
             _build(fresh, plan, grid)
         files = sorted(file for file in fresh.rglob("*") if file.is_file() and file != fresh / "zarr.json")
         sums = {file.relative_to(fresh).as_posix(): checksum(file) for file in files}
@@ -261,7 +261,7 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
         group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **common, **code)
         group.create_array(
-            _checksums(family.family),
+            _name_checksums(family.family),
             shape=(family.count, len(family.variables)),
             chunks=(1, len(family.variables)),
             dtype="<u4",
@@ -304,14 +304,14 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
         ...     zwidth.open_dataset(folder).stable.values
         array([ True, False])
     """
-    store = one_store(path)
+    store = find_store(path)
     check_installed()
     import xarray
 
     attributes = store.attributes
-    with _quiet():
+    with _silence_zarr():
         dataset = xarray.open_zarr(store.path, consolidated=False, chunks={})
-    dataset = dataset.drop_vars([_checksums(family.family) for family in store.plan.families])
+    dataset = dataset.drop_vars([_name_checksums(family.family) for family in store.plan.families])
     if "device" in dataset.coords:
         # Neither netCDF nor pandas knows NumPy's strings of variable length.
         labels = np.array([str(label) for label in dataset["device"].values])
@@ -320,7 +320,7 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     return dataset.assign_attrs(complete=int(not store.missing()))
 
 
-def one_store(path: str | os.PathLike[str]) -> Store:
+def find_store(path: str | os.PathLike[str]) -> Store:
     """The only store at a path."""
     folder = Path(os.fsdecode(path))
     found = find_stores(folder)

@@ -94,9 +94,7 @@ class Axes(Strict):
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        """Both kinds of parameters, or the period twice."""
-        keys = [key for key in raw if key in PARAMETERS]
-        yield from _mixed(keys, "axes")
+        return _mixed([key for key in raw if key in PARAMETERS], "axes")
 
     def limits(self) -> Iterable[LocatedProblem]:
         """A parameter that is both an axis and a column, and kinds that only the table's columns show."""
@@ -104,10 +102,8 @@ class Axes(Strict):
         own = [name for name in PARAMETERS if getattr(self, name) is not None]
         for name in own:
             if name in columns:
-                what = problem(
-                    "given twice, as an axis and as a column of devices", "each parameter once", "remove one"
-                )
-                yield (name,), what
+                twice = "given twice, as an axis and as a column of devices"
+                yield (name,), problem(twice, "each parameter once", "remove one")
         if columns and not any(name in columns for name in own):
             yield from ((("devices",), what) for _, what in _mixed([*own, *columns], "axes and devices together"))
 
@@ -156,10 +152,8 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
         if (key in PHYSICAL) != physical:
             kinds = "physical key, after normalized ones" if not physical else "normalized key, after physical ones"
             allowed = f"{where} are in SI units or normalized, never both"
-            yield (
-                (key,),
-                problem(kinds, allowed, f"choose from {listing(PHYSICAL if physical else NORMALIZED)}", on_key=True),
-            )
+            remedy = f"choose from {listing(PHYSICAL if physical else NORMALIZED)}"
+            yield (key,), problem(kinds, allowed, remedy, on_key=True)
     if "period" in keys and "rate" in keys:
         second = [key for key in keys if key in ("period", "rate")][1]
         allowed = "the sampling period and its rate say the same"
@@ -250,11 +244,8 @@ class SweepStudy(Study):
             longest *= self.axes.end("rate", True) if "rate" in given else 1.0 / self.axes.end("period", False)
         if not longest <= MAX_DELAY_PERIODS:
             place = ("axes", "devices") if axis is None else ("axes", "delay")
-            allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
-            yield (
-                place,
-                problem(f"the longest delay is {longest:.6g} of the shortest periods", allowed, "check the units"),
-            )
+            what = f"the longest delay is {longest:.6g} of the shortest periods"
+            yield place, problem(what, f"at most {MAX_DELAY_PERIODS:g} periods", "check the units")
 
     @property
     def families(self) -> dict[Family, tuple[str, ...]]:
@@ -266,17 +257,15 @@ class SweepStudy(Study):
 
     @property
     def points(self) -> int:
-        """The product of the sizes of all dimensions."""
         return math.prod(self.axes.sizes.values())
 
     @property
     def nbytes(self) -> int:
-        """All outputs and a status code a point, as they are in memory."""
+        # As they are in memory, with a status code.
         return self.points * (1 + 8 * len(self.outputs))
 
     @property
     def extent(self) -> str:
-        """The dimensions and their sizes."""
         sizes = self.axes.sizes
         return f"{' x '.join(sizes) or 'one point'} = {' x '.join(str(size) for size in sizes.values()) or 1}"
 

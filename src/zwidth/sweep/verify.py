@@ -46,10 +46,10 @@ def verify(
     stores = find_stores(folder)
     if not stores:
         raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
-    return tuple(_verified(store, progress or (lambda done, total: None)) for store in stores)
+    return tuple(_verify_store(store, progress or (lambda done, total: None)) for store in stores)
 
 
-def _verified(path: Path, progress: Callable[[int, int], None]) -> Verification:
+def _verify_store(path: Path, progress: Callable[[int, int], None]) -> Verification:
     store = Store(path)
     try:
         tasks = list(store.plan.tasks())

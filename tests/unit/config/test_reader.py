@@ -12,26 +12,16 @@ import pytest
 import yaml
 
 from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
-from zwidth.config.units import Span
 from zwidth.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
 from zwidth.studies.passivity import PassivityStudy
 from zwidth.studies.ridge import RidgeStudy
+from zwidth.units import Span
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))
 PHYSICAL = "scene: {mass: 100 g, damping: 10 N s/m, rate: 1 kHz, delay: 1.5 periods}\n"
 RIDGE = "studies: [{kind: ridge, name: r}]\n"
-
-
-@pytest.fixture
-def load(tmp_path):
-    def from_text(text):
-        path = tmp_path / "config.yaml"
-        path.write_text(f"version: 1\nname: test\n{text}", encoding="utf-8")
-        return load_config(path)
-
-    return from_text
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)

@@ -8,7 +8,7 @@ import pytest
 
 from zwidth.config.faults import ConfigFileError
 from zwidth.normalization import normalize
-from zwidth.studies.document import Config, config_json_schema, load_config
+from zwidth.studies.document import Config, config_json_schema
 from zwidth.sweep.grid import Grid
 
 ROOT = Path(__file__).parents[3]
@@ -19,16 +19,6 @@ CSV = """label, mass [g], damping (N s/m), source
 small, 50, 1, a guess
 large, 2 kg, 3e1, another
 """
-
-
-@pytest.fixture
-def load(tmp_path):
-    def from_text(text):
-        path = tmp_path / "config.yaml"
-        path.write_text(f"version: 1\nname: test\n{text}", encoding="utf-8")
-        return load_config(path)
-
-    return from_text
 
 
 def sweep(axes, rest=""):

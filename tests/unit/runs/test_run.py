@@ -1,10 +1,7 @@
 """The one run: folders, events, failures, the record, and going on with what is there."""
 
-import contextlib
 import json
-import os
 import shutil
-import threading
 import time
 from pathlib import Path
 
@@ -12,31 +9,12 @@ import numpy as np
 import pytest
 
 import zwidth
-from sweeping import chunk_file, flip
-from zwidth.errors import ConfigError, StoreError, StoreExistsError
+from run_folders import BOTH, SMALL, contents, record_of, states
+from zwidth.errors import ConfigError, StoreExistsError
 from zwidth.runs import run
-from zwidth.runs.run import _pieces
+from zwidth.runs.run import _list_computations
 from zwidth.studies import Config, Outcome, load_config
 from zwidth.studies.map import MapStudy
-
-SMALL = """
-version: 1
-name: small
-studies:
-  - {kind: map, name: one, alpha: [0.1, 0.2], beta: [0.1, 0.4], delta: 0.1, d: 0}
-  - {kind: map, name: two, alpha: 0.1, beta: [0.1, 0.4], delta: 0.1, d: 0}
-"""
-
-
-@pytest.fixture
-def config(tmp_path):
-    file = tmp_path / "small.yaml"
-    file.write_text(SMALL, encoding="utf-8")
-    return file
-
-
-def record_of(folder):
-    return json.loads((folder / "run.json").read_text(encoding="utf-8"))
 
 
 def test_a_run_writes_what_its_record_lists(config, tmp_path):
@@ -114,20 +92,6 @@ def test_a_broken_configuration_makes_no_folder(tmp_path):
     assert [entry.name for entry in tmp_path.iterdir()] == ["bad.yaml"]
 
 
-@pytest.fixture
-def fail(monkeypatch):
-    """Makes the study ``one`` fail until the test is done with it."""
-    real = MapStudy.compute
-
-    def compute(self, scene, alone):
-        if self.name == "one":
-            raise FloatingPointError("no such luck")
-        return real(self, scene, alone)
-
-    monkeypatch.setattr(MapStudy, "compute", compute)
-    return monkeypatch
-
-
 def test_one_failure_does_not_lose_the_other_studies(config, tmp_path, fail):
     result = zwidth.run(config, out=tmp_path / "out")
     assert not result.ok
@@ -137,16 +101,6 @@ def test_one_failure_does_not_lose_the_other_studies(config, tmp_path, fail):
     assert states(result.folder) == {"one": "failed", "two": "done"}
     entry = next(entry for entry in record_of(result.folder)["studies"] if entry["name"] == "one")
     assert entry["error"] == "FloatingPointError: no such luck"
-
-
-def states(folder):
-    return {entry["name"]: entry["state"] for entry in record_of(folder)["studies"]}
-
-
-def contents(folder):
-    """Every file of a run, with what would change if it were written again."""
-    files = [path for path in folder.rglob("*") if path.is_file() and ".locks" not in path.parts]
-    return {path.relative_to(folder).as_posix(): (path.stat().st_ino, path.stat().st_mtime_ns) for path in files}
 
 
 def test_data_stay_when_the_drawing_fails(config, tmp_path, monkeypatch):
@@ -163,37 +117,10 @@ def test_data_stay_when_the_drawing_fails(config, tmp_path, monkeypatch):
 def test_repeated_figures_of_the_paper_bring_its_numbers():
     study = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0, "figure": "fig10"}
     config = Config.model_validate({"version": 1, "name": "p", "studies": [study]})
-    assert [piece.name for piece in _pieces(config)] == ["r", "published"]
+    assert [piece.name for piece in _list_computations(config)] == ["r", "published"]
     del study["figure"]
     plain = Config.model_validate({"version": 1, "name": "p", "studies": [study]})
-    assert [piece.name for piece in _pieces(plain)] == ["r"]
-
-
-# A sweep as well: what holds for one kind of study holds for every other.
-BOTH = (
-    SMALL
-    + """
-  - {kind: sweep, name: swept, axes: {alpha: [0.1, 0.9], beta: [0.1, 0.4], delta: 0.1, d: [0, 1]}}
-"""
-)
-
-
-@pytest.fixture
-def both(tmp_path):
-    file = tmp_path / "both.yaml"
-    file.write_text(BOTH, encoding="utf-8")
-    return file
-
-
-@pytest.fixture
-def finished(both, tmp_path):
-    """The folder of a run that nothing disturbed."""
-    result = run(both, out=tmp_path / "out")
-    assert result.ok
-    assert [(study.name, study.state) for study in result.studies] == [
-        (name, "done") for name in ("one", "two", "swept")
-    ]
-    return result.folder
+    assert [piece.name for piece in _list_computations(plain)] == ["r"]
 
 
 def test_every_kind_of_study_is_in_the_record_and_the_result(finished):
@@ -278,179 +205,3 @@ def test_a_record_that_names_files_elsewhere_removes_none(finished, both, tmp_pa
     (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
     assert run(both, out=finished, overwrite=True).ok
     assert precious.read_text(encoding="utf-8") == "mine"
-
-
-def test_a_finished_run_is_resumed_without_any_work(finished, both):
-    before = contents(finished)
-    result = run(both, out=finished, resume=True)
-    assert result.ok
-    assert [study.state for study in result.studies] == ["kept", "kept", "done"]
-    assert result.sweeps["swept"].computed == 0
-    after = contents(finished)
-    assert {name for name in before if before[name] != after[name]} == {"run.json", "config.yaml"}
-    assert states(finished) == {"one": "done", "two": "done", "swept": "done"}
-
-
-def test_what_failed_is_tried_again(both, tmp_path, fail):
-    out = tmp_path / "out"
-    assert [study.name for study in run(both, out=out).failed] == ["one"]
-    kept = contents(out)["two.npz"]
-    assert [study.name for study in run(both, out=out, resume=True).failed] == ["one"]
-    fail.undo()
-    result = run(both, out=out, resume=True)
-    assert result.ok
-    assert [study.state for study in result.studies] == ["done", "kept", "done"]
-    assert contents(out)["two.npz"] == kept
-    assert states(out) == {"one": "done", "two": "done", "swept": "done"}
-
-
-@pytest.mark.parametrize(
-    "damage, says",
-    [
-        (lambda out: (out / "one.npz").unlink(), "one: one.npz is missing"),
-        (lambda out: flip(out / "one_stable.png"), "one: one_stable.png is damaged"),
-        (lambda out: flip(chunk_file(out / "swept.zarr")), "swept/wall/0 "),
-    ],
-)
-def test_what_is_damaged_is_made_again_and_nothing_else(finished, both, damage, says):
-    values = np.load(finished / "two.npz")["stable"]
-    before = contents(finished)
-    damage(finished)
-    result = run(both, out=finished, resume=True)
-    assert result.ok
-    assert len(result.repaired) == 1
-    assert result.repaired[0].startswith(says)
-    after = contents(finished)
-    assert after.keys() == before.keys()
-    assert after["two.npz"] == before["two.npz"]
-    np.testing.assert_array_equal(np.load(finished / "one.npz")["alpha"], [0.1, 0.2])
-    np.testing.assert_array_equal(np.load(finished / "two.npz")["stable"], values)
-
-
-def test_what_fails_when_it_is_made_again_loses_nothing(finished, both, fail):
-    before = contents(finished)
-    (finished / "one_stable.svg").unlink()
-    assert [study.name for study in run(both, out=finished, resume=True).failed] == ["one"]
-    after = contents(finished)
-    assert {name: after[name] for name in ("one.npz", "one_stable.png")} == {
-        name: before[name] for name in ("one.npz", "one_stable.png")
-    }
-    fail.undo()
-    assert run(both, out=finished, resume=True).ok
-    assert contents(finished).keys() == before.keys()
-
-
-@pytest.mark.parametrize(
-    "old, new, key",
-    [
-        ("name: two, alpha: 0.1", "name: two, alpha: 0.2", "studies[two].alpha"),
-        ("alpha: [0.1, 0.9]", "alpha: [0.1, 0.8]", "studies[swept].axes.alpha[1]"),
-    ],
-)
-def test_another_configuration_is_refused_before_anything_is_computed(finished, both, old, new, key):
-    before = contents(finished)
-    text = both.read_text(encoding="utf-8")
-    assert old in text
-    both.write_text(text.replace(old, new), encoding="utf-8")
-    with pytest.raises(StoreError) as caught:
-        run(both, out=finished, resume=True)
-    assert f"{key}: the run was made with" in str(caught.value)
-    assert "change the configuration back, or choose another folder with --out DIR" in str(caught.value)
-    assert contents(finished) == before
-
-
-def test_a_study_that_is_added_is_computed_and_one_that_is_removed_stays(finished, both, config):
-    three = "  - {kind: map, name: three, alpha: 0.1, beta: [0.1, 0.4], delta: 0, d: 0}\n"
-    both.write_text(BOTH + three + "  - {kind: sweep, name: more, axes: {alpha: 0.1, beta: 0.1, delta: 0.1, d: 0}}\n")
-    result = run(both, out=finished, resume=True)
-    assert [study.state for study in result.studies] == ["kept", "kept", "done", "done", "done"]
-    before = contents(finished)
-    assert run(config, out=finished, resume=True).ok
-    assert contents(finished)["three.npz"] == before["three.npz"]
-    # Its files are the run's own all the same.
-    assert run(config, out=finished, overwrite=True).ok
-    assert not (finished / "three.npz").exists()
-
-
-def test_another_release_is_refused(finished, both, monkeypatch):
-    monkeypatch.setattr("zwidth.files.provenance.__version__", "99.0")
-    with pytest.raises(
-        StoreError, match=r"run\.json: made with zwidth .*, now there is 99\.0; install the same release"
-    ):
-        run(both, out=finished, resume=True)
-
-
-def test_a_run_of_an_earlier_release_is_replaced_but_not_resumed(finished, both):
-    record = record_of(finished)
-    record["format"] = 1
-    for entry in record["studies"]:
-        entry["files"] = list(entry["files"])
-    (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    with pytest.raises(StoreError, match="kept no checksums to go on from; start again with --overwrite"):
-        run(both, out=finished, resume=True)
-    assert run(both, out=finished, overwrite=True).ok
-
-
-@pytest.mark.parametrize("content", ["{", "[]", '{"studies": 1}'])
-def test_a_damaged_record_is_refused(finished, both, content):
-    (finished / "run.json").write_text(content, encoding="utf-8")
-    for resume, overwrite in ((True, False), (False, True), (False, False)):
-        with pytest.raises(StoreError, match=r"run\.json: .*choose another folder with --out DIR, or remove it"):
-            run(both, out=finished, resume=resume, overwrite=overwrite)
-
-
-def test_ctrl_c_keeps_every_finished_study(both, tmp_path):
-    out = tmp_path / "out"
-
-    def interrupt(event):
-        if event.name == "two":
-            raise KeyboardInterrupt
-
-    result = run(both, out=out, progress=interrupt)
-    assert result.interrupted
-    assert not result.ok
-    assert [study.name for study in result.studies] == ["one"]
-    assert states(out) == {"one": "done"}
-    kept = contents(out)["one.npz"]
-    result = run(both, out=out, resume=True)
-    assert [study.state for study in result.studies] == ["kept", "done", "done"]
-    assert contents(out)["one.npz"] == kept
-
-
-def test_a_run_that_ends_at_any_file_is_gone_on_with(both, tmp_path, monkeypatch):
-    real, remove = os.replace, shutil.rmtree
-    left = 0
-
-    def replace(source, target):
-        nonlocal left
-        # Zarr writes in a thread of its own, where the end of the program would only end the thread.
-        left -= threading.current_thread() is threading.main_thread()
-        if left < 0:
-            # As if the process were killed here: nothing after this happens.
-            raise SystemExit
-        real(source, target)
-
-    undisturbed = run(both, out=tmp_path / "undisturbed").folder
-    names = contents(undisturbed).keys()
-    monkeypatch.setattr(os, "replace", replace)
-    monkeypatch.setattr(shutil, "rmtree", lambda path, ignore_errors=False: None)
-    for moment in range(0, 40, 3):
-        out = tmp_path / str(moment)
-        left = moment
-        with contextlib.suppress(SystemExit):
-            run(both, out=out)
-        left = 10**6
-        with monkeypatch.context() as whole:
-            whole.setattr(shutil, "rmtree", remove)
-            assert run(both, out=out, resume=True).ok, moment
-        assert contents(out).keys() == names, moment
-        assert states(out) == {"one": "done", "two": "done", "swept": "done"}
-        np.testing.assert_array_equal(np.load(out / "two.npz")["stable"], np.load(undisturbed / "two.npz")["stable"])
-
-
-def test_what_a_killed_run_leaves_is_swept_up(finished, both):
-    (finished / ".one.12345678.partial").mkdir()
-    (finished / ".one.12345678.partial" / "one.npz").write_bytes(b"half")
-    (finished / ".run.json.12345678.partial").write_bytes(b"{")
-    assert run(both, out=finished, resume=True).ok
-    assert list(finished.glob(".*.partial")) == []

@@ -1,0 +1,184 @@
+#!/usr/bin/env python3
+"""Measure what each trick of `zwidth.xla` gains: the same work with it and without, in turns, in one process.
+
+    python benchmarks/bench_xla.py [--points 65536] [--runs 15] [--only TEXT]
+
+A line gives the time without over the time with, to compile and to run (the best of all runs): above 1 the trick gains.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from unittest.mock import patch
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth import batching, xla
+from zwidth.stability import (
+    boundary_solve,
+    certified_filter,
+    circle,
+    crossover,
+    pole_step,
+    radius,
+    ridge,
+    ridge_kkt,
+    ridge_newton,
+)
+from zwidth.stability.devices import ANY
+
+Make = Callable[[], Callable[..., Any]]
+
+
+def compile_and_run(makes: list[Make], columns: tuple[Any, ...], runs: int) -> list[tuple[float, float]]:
+    """Seconds to the first result and of the fastest run, for each of several ways."""
+    functions, first = [], []
+    for make in makes:
+        start = time.perf_counter()
+        functions.append(make())
+        jax.block_until_ready(functions[-1](*columns))
+        first.append(time.perf_counter() - start)
+    best = [np.inf] * len(makes)
+    for _ in range(runs):
+        for k, function in enumerate(functions):
+            start = time.perf_counter()
+            jax.block_until_ready(function(*columns))
+            best[k] = min(best[k], time.perf_counter() - start)
+    return list(zip(first, best, strict=True))
+
+
+def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, **instead: Any) -> Make:
+    """A kernel compiled anew, with other text for some names of its modules (``module__name``)."""
+
+    def make() -> Callable[..., Any]:
+        function = jax.jit(lambda *columns: kernel(*columns), compiler_options=options)
+
+        def call(*columns: Any) -> Any:
+            with replaced(instead):
+                return function(*columns)
+
+        return call
+
+    return make
+
+
+@contextmanager
+def replaced(names: dict[str, Any]) -> Iterator[None]:
+    """Other functions in place of those of a module, while something is traced."""
+    modules = {"crossover": crossover, "kkt": ridge_kkt, "newton": ridge_newton, "filter": certified_filter}
+    modules |= {"circle": circle, "radius": radius, "step": pole_step}
+    patches = [patch.object(modules[name.split("__")[0]], name.split("__")[1], value) for name, value in names.items()]
+    for each in patches:
+        each.start()
+    try:
+        yield
+    finally:
+        for each in patches:
+            each.stop()
+
+
+def same(values: Any, _witness: Any = None) -> Any:
+    return values
+
+
+def their_angle(re: Any, im: Any) -> Any:
+    return jnp.arctan2(im, re)
+
+
+def their_turn(x: Any, y: Any, xp: Any) -> Any:
+    return 2.0 * xp.arctan2(xp.sqrt(x), xp.sqrt(y))
+
+
+def their_half_turn(x: Any, xp: Any) -> Any:
+    return xp.sin(x), xp.cos(x)
+
+
+def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple[Any, ...]]]:
+    """What is measured: a name, the way with the trick, the way without, and the arguments."""
+    alpha, beta, delta, d = columns
+
+    def stable(*walls: Any) -> Any:
+        return crossover.stable_kernel(*walls, ANY)  # pyright: ignore
+
+    def quick(*walls: Any) -> Any:
+        return radius.quick_kernel(*walls, 1e-9, True)  # pyright: ignore
+
+    def point(a: Any, b: Any) -> Any:
+        return jax.vmap(lambda x, y: ridge_kkt.kkt_kernel(x, y, "held"))(a, b)
+
+    def solved(a: Any, b: Any) -> Any:
+        return jax.vmap(lambda x, y: boundary_solve._point_kernel(x, y, 0.0, 0.1, 1.0, 0.0, 2.0, "held"))(a, b)
+
+    def top(a: Any, b: Any) -> Any:
+        return ridge.ridge_kernel(a, b, "held", ANY)
+
+    strips = batching.compile_strips.__wrapped__
+    wide = xla.WIDE
+    yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
+    yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
+    yield "STRIP, verdict", lambda: strips(stable), compiled(stable, wide), columns
+    few = (delta[:8192], d[:8192])
+    yield "UNFUSED, ridge kkt", compiled(point, xla.UNFUSED), compiled(point), few
+    yield (
+        "store_once, ridge kkt",
+        compiled(point, xla.UNFUSED),
+        compiled(point, xla.UNFUSED, kkt__store_once=same, newton__store_once=same),
+        few,
+    )
+    yield "store_once, ridge", compiled(top), compiled(top, newton__store_once=same), (delta, d)
+    yield "angle, alone", compiled(xla.angle), compiled(their_angle), (alpha - 1.0, beta)
+    other = {"circle__angle": their_angle, "circle__find_turn": their_turn, "radius__angle": their_angle}
+    yield "angle and find_turn, radius", compiled(quick, wide), compiled(quick, wide, **other), columns
+    yield "UNFUSED, boundary point", compiled(solved, xla.UNFUSED), compiled(solved), few
+    by_rule, alone = slopes()
+    yield "custom_jvp, gradient of ridge", lambda: by_rule, lambda: alone, (delta, d)
+    million = tuple(np.tile(np.asarray(column), 16) for column in (delta, d))
+    ridges = batching._compile_elementwise(ridge.ridge_kernel, ("held", ANY))
+    yield "BLOCK, ridge of a million", in_blocks(ridges, 1 << 16), in_blocks(ridges, 1 << 20), million
+    yield "sine series, radius", compiled(quick, wide), compiled(quick, wide, step___half_turn=their_half_turn), columns
+
+
+def in_blocks(function: Callable[..., Any], size: int) -> Make:
+    """A compiled function applied to blocks of one size, on one processor."""
+    return lambda: lambda *columns: batching.map_blocks(function, list(columns), size, 1)
+
+
+def slopes() -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """The first gradient outside `jit`, by the rule of `batching.elementwise` and by JAX alone."""
+    by_rule = batching._compile_elementwise.__wrapped__(ridge.ridge_kernel, ("held", ANY))
+    alone = jax.jit(lambda *columns: ridge.ridge_kernel(*columns, "held", ANY))  # pyright: ignore
+    return tuple(jax.grad(lambda *c, f=f: f(*c).alpha.sum(), argnums=(0, 1)) for f in (by_rule, alone))  # type: ignore
+
+
+def main() -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])  # type: ignore[union-attr]
+    parser.add_argument("--points", type=int, default=1 << 16)
+    parser.add_argument("--runs", type=int, default=15)
+    parser.add_argument("--only", default="", help="lines whose name holds this text")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    rng = np.random.default_rng(0)
+    count = options.points
+    ranges = ((0.01, 1.0), (0.05, 1.0), (0.05, 3.0), (0.0, 5.0))
+    columns = tuple(jnp.asarray(rng.uniform(low, high, count)) for low, high in ranges)
+    print(f"{'':30}{'compile':>9}{'run':>7}{'with: s, ms':>20}")
+    for name, with_it, without, arguments in questions(columns):
+        if options.only in name:
+            show(name, compile_and_run([with_it, without], arguments, options.runs))
+
+
+def show(name: str, times: list[tuple[float, float]]) -> None:
+    (first, run), (other_first, other_run) = times
+    ratios = f"{other_first / first:9.2f}{other_run / run:7.2f}"
+    print(f"{name:30}{ratios}{first:12.2f}{1e3 * run:8.2f}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,107 @@
+"""Tables of studies with made-up columns, and what each function of `zwidth.figures` draws of them."""
+
+import numpy as np
+
+from zwidth.studies.outcome import stack
+
+
+def outline(delta, d=0.0, delay_model="held", line=False):
+    """Half an ellipse from (0, -delta) to (0, 2 + delta); with ``line``, its end runs straight at omega = pi."""
+    omega = np.linspace(0.0, np.pi if line else 2.0, 21)
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 21)
+    alpha, beta = (1.0 + delta) * np.cos(turn), 1.0 + (1.0 + delta) * np.sin(turn)
+    if line:
+        alpha, beta, omega = np.append(alpha, 0.0), np.append(beta, 3.0), np.append(omega, np.pi)
+        alpha[-2] = 0.5
+    keys = {"curve": "boundary", "d": d, "delta": delta, "delay_model": delay_model}
+    return {**keys, "omega": omega, "alpha": alpha, "beta": beta}
+
+
+def ridge(d=0.0, delay_model="held"):
+    delta = np.linspace(0.0, 10.0, 41)
+    columns = {"alpha_max": (1.0 + delta) / (1.0 + d), "beta": 0.5 - 0.1 * delta, "omega": delta / 10}
+    return {"d": d, "delay_model": delay_model, "delta": delta, **columns}
+
+
+def path(d=0.0):
+    given = ridge(d)
+    return {"curve": "ridge_path", **given, "alpha": given.pop("alpha_max")}
+
+
+def interval(d=0.0, delay_model="held", curve="stable"):
+    delta = np.linspace(0.0, 2.0, 11)
+    bounds = {"beta_lower": -delta, "beta_upper": 2.0 / (1.0 + d) + delta}
+    return {"curve": curve, "d": d, "delay_model": delay_model, "delta": delta, **bounds}
+
+
+def passive_outline(delta, d=0.0):
+    columns = {"alpha": np.array([0.0, 2.0 * delta, 0.0]), "beta": np.array([-delta, 0.0, delta])}
+    return {"curve": "passive", "d": d, "delta": delta, "delay_model": "held", **columns}
+
+
+def in_si(columns):
+    """The same walls in N/m and N s/m as well."""
+    walls = {"stiffness_N_per_m": 1e5 * columns["alpha"], "virtual_damping_N_s_per_m": 100.0 * columns["beta"]}
+    return {**columns, **walls}
+
+
+def cost(d):
+    delta = np.linspace(0.0, 4.0, 17)
+    return {"d": d, "delta": delta, "alpha_max": 1.0 + 3.0 * delta, "alpha_max_passive": 2.0 * delta / (1.0 + d)}
+
+
+def response(label="a device", settling_time=0.03, physical=True):
+    time = np.arange(100) * 1e-3
+    position = 1e-4 * (1.0 - np.exp(-time / 0.01))
+    columns = {"time_s": time, "position_m": position, "wall_force_N": -position / 1e-4}
+    columns |= {"final_position_m": 1e-4, "settling_time_s": settling_time}
+    if not physical:
+        columns = {name.rpartition("_")[0]: column for name, column in columns.items()}
+    return {"label": label, "alpha": 0.1, "beta": 0.4, "delta": 0.1, "d": 1.0, **columns}
+
+
+def grid_map(deltas=(0.1,)):
+    alpha, beta = np.linspace(0.0, 1.0, 6), np.linspace(-1.0, 1.0, 5)
+    shape = (alpha.size, beta.size, len(deltas), 1)
+    radius = 0.5 + np.broadcast_to(alpha[:, None, None, None] + beta[None, :, None, None] ** 2, shape)
+    outputs = {"stable": radius < 1, "spectral_radius": radius, "passive": radius < 0.8}
+    return {"alpha": alpha, "beta": beta, "delta": np.array(deltas), "d": np.array([1.0]), **outputs}
+
+
+BOUNDARY = stack([outline(0.5), outline(1.0), outline(0.5, 2.0), outline(1.0, 2.0), path(), path(2.0)])
+RIDGE = stack([ridge(), ridge(0.5), ridge(0.5, "fractional_power")])
+LIMITS = {("held", 0.0): 4.0, ("held", 0.5): 2.5, ("fractional_power", 0.5): 2.5}
+SLOPES = stack(
+    {"delay_model": model, "d": np.linspace(0.0, 1.0, 9), "slope": 4.0 - 3.0 * np.linspace(0.0, 1.0, 9)}
+    for model in ("held", "fractional_power")
+)
+COSTS = stack([cost(0.0), cost(1.0)])
+FOUND = {
+    "maximum": {"stiffness": 1.1e5, "virtual_damping": 100.0},
+    "recommended": {
+        **{"stiffness": 8e4, "virtual_damping": 100.0, "stiffness_fraction": 0.75, "settling_time": 0.03},
+        **{"virtual_damping_lower": 20.0, "virtual_damping_upper": 180.0},
+    },
+}
+REGION = in_si(stack([outline(0.1, 1.0), passive_outline(0.1, 1.0)]))
+
+# What each function draws; the name is the function's, and what is special about the case.
+EVERY_FIGURE = {
+    "draw_boundary": (BOUNDARY,),
+    "draw_boundary with a line": (stack([outline(1.0), outline(3.0, line=True)]),),
+    "draw_boundary with passivity in SI": (in_si(stack([outline(0.5), passive_outline(0.5)])),),
+    "draw_boundary of many deltas": (stack([outline(delta) for delta in np.linspace(0.1, 2.0, 20)]),),
+    "draw_boundary of both models": (stack([outline(0.5, 0.5), outline(0.6, 0.5, "fractional_power")]),),
+    "draw_zero_stiffness": (
+        stack([interval(), interval(0.5), interval(0.5, "fractional_power"), interval(3.0, curve="passive")]),
+    ),
+    "draw_ridge": (RIDGE,),
+    "draw_slope": (RIDGE, SLOPES),
+    "draw_passivity_cost": (COSTS,),
+    "draw_step": (stack([response("first"), response("second", np.nan)]),),
+    "draw_step normalized": (stack([response("first", physical=False)]),),
+    "draw_map of radius": (grid_map(), "spectral_radius"),
+    "draw_map of stable": (in_si(grid_map()), "stable"),
+    "draw_map of many": (grid_map(np.linspace(0, 1, 7)), "passive"),
+    "draw_recommendation": (FOUND, REGION, stack([response()])),
+}

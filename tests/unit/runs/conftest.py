@@ -1,0 +1,46 @@
+"""Configurations of runs, runs of them, and what their folders hold."""
+
+import pytest
+
+from run_folders import BOTH, SMALL
+from zwidth.runs import run
+from zwidth.studies.map import MapStudy
+
+
+@pytest.fixture
+def config(tmp_path):
+    file = tmp_path / "small.yaml"
+    file.write_text(SMALL, encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def both(tmp_path):
+    file = tmp_path / "both.yaml"
+    file.write_text(BOTH, encoding="utf-8")
+    return file
+
+
+@pytest.fixture
+def finished(both, tmp_path):
+    """The folder of a run that nothing disturbed."""
+    result = run(both, out=tmp_path / "out")
+    assert result.ok
+    assert [(study.name, study.state) for study in result.studies] == [
+        (name, "done") for name in ("one", "two", "swept")
+    ]
+    return result.folder
+
+
+@pytest.fixture
+def fail(monkeypatch):
+    """Makes the study ``one`` fail until the test is done with it."""
+    real = MapStudy.compute
+
+    def compute(self, scene, alone):
+        if self.name == "one":
+            raise FloatingPointError("no such luck")
+        return real(self, scene, alone)
+
+    monkeypatch.setattr(MapStudy, "compute", compute)
+    return monkeypatch
