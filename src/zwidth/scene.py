@@ -14,7 +14,9 @@ from zwidth.errors import InputError
 from zwidth.linear.border import Border, Outline, outlines
 from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
+from zwidth.linear.required import RequiredValue, require
 from zwidth.linear.rows import label_walls, stable_intervals
+from zwidth.linear.slopes import SceneSensitivities, differentiate
 from zwidth.linear.stiffest import StiffestWall, stiffest_wall
 from zwidth.linear_loop import LinearLoop
 from zwidth.normalization import Normalized, Physical, denormalize, normalize
@@ -276,6 +278,65 @@ class Scene:
             11942 N/m
         """
         return stiffest_wall(self, negative_damping)
+
+    def sensitivities(self, *, negative_damping: bool | None = None) -> SceneSensitivities:
+        """What a little more of every parameter of every part buys.
+
+        Args:
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
+            "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, with NaN where it is
+            not 0. Whole numbers and coefficients of a filter have none. At zero they are those from the right, at a
+            whole delay both sides agree.
+
+        Numerics:
+            Closed form for a rigid device; otherwise implicit derivatives, which JAX compiles for some seconds once for
+            all scenes of the same parts.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print(f"{scene.sensitivities().per['damping']:.0f} N/m per N s/m")
+            572 N/m per N s/m
+        """
+        return differentiate(self, negative_damping)
+
+    def required(
+        self,
+        parameter: str,
+        stiffness: float,
+        *,
+        within: tuple[float, float] | None = None,
+        negative_damping: bool | None = None,
+    ) -> RequiredValue:
+        """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
+
+        Args:
+            parameter: its dotted path, such as "damping" or "velocity.cutoff".
+            stiffness: wanted, in N/m, > 0.
+            within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value.
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``value``, the nearest to the present one, itself enough; ``enough``, the side of it on which there is
+            enough ("above", "below"), or "everywhere" in the range (then ``value`` is the present one, or the end next
+            to it), or "nowhere"; ``crossings``, all that were found, each proved by a K_max on either side; ``range``;
+            ``status``, UNREACHABLE with NaN where the range never reaches the stiffness.
+
+        Numerics:
+            25 values across the range, then each crossing to 1e-11 relative. K_max need not be monotone; two crossings
+            between neighboring values are not seen.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> needed = scene.required("damping", 25e3)
+            >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
+            19.62 N s/m or above
+        """
+        return require(self, parameter, stiffness, within, negative_damping)
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.

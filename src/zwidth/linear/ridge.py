@@ -71,7 +71,7 @@ def find_ridge(border: Border, negative_damping: bool) -> Ridge | None:
         ArithmeticError: the rows of the plane contradict what was found.
     """
     least = -np.inf if negative_damping else 0.0
-    tops = _tops(border, least)
+    tops = _tops(border, least) if border.curved else []
     for alpha, beta, w, inner in tops[:_MOST_TOPS]:
         # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
         if _reach(border, beta, least) < _NEARLY * alpha:
@@ -87,12 +87,14 @@ def find_ridge(border: Border, negative_damping: bool) -> Ridge | None:
 def _tops(border: Border, least: float) -> list[tuple[float, float, float, bool]]:
     """Local maxima of the edges with beta of ``least`` or more, highest first; whether each lies inside its edge."""
     found = []
-    for edge in (*border.curved, *border.straight):
+    for edge in border.curved:
         padded = np.concatenate([[-np.inf], np.where(edge.beta >= least, edge.alpha, -np.inf), [-np.inf]])
         alpha = padded[1:-1]
         for k in np.flatnonzero((alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0)):
-            inner = edge.line < 0 and 0 < k < edge.w.size - 1
+            inner = 0 < k < edge.w.size - 1
             found.append((float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), bool(inner)))
+    # Straight edges end on the curve or on each other.
+    found += [(*meeting, False) for meeting in border.line_meetings() if meeting[0] > 0 and meeting[1] >= least]
     if np.isfinite(least):
         found += [(*row, False) for row in _end_of_row(border.boundary, least)]
     return sorted(found, key=lambda top: -top[0])
@@ -178,7 +180,8 @@ def _polish(loop: LinearLoop, start: Ridge) -> Ridge | None:
 
 
 def _dampings(border: Border, least: float) -> np.ndarray:
-    return np.maximum(np.concatenate([edge.beta for edge in (*border.curved, *border.straight)]), least)
+    meetings = [np.array([beta]) for _, beta, _ in border.line_meetings()]
+    return np.maximum(np.concatenate([*(edge.beta for edge in border.curved), *meetings]), least)
 
 
 def _reach(border: Border, beta: float, least: float) -> float:
