@@ -100,7 +100,7 @@ def flow(a, b, time):
 
 def velocity_polynomials(scene):
     """Numerator and denominator of F in SI units, highest power first."""
-    period = scene.timing.period
+    period: Any = scene.timing.period
     v: Any = scene.velocity
     top, bottom = np.array([1.0, -1.0]) / period, np.array([1.0, 0.0])
     if isinstance(v, zwidth.WindowedDifference):

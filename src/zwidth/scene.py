@@ -11,23 +11,20 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
-from zwidth.linear import answers
+from zwidth.linear.answers import SceneAnswers
 from zwidth.linear.border import Border, Outline, outlines
 from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
-from zwidth.linear.poles import all_poles
-from zwidth.linear.radius import spectral_radius as linear_radius
 from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear_loop import LinearLoop
-from zwidth.normalization import Normalized, Physical, denormalize, in_periods, normalize
+from zwidth.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
+from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
-from zwidth.stability.labels import is_stable
-from zwidth.stability.poles import poles
-from zwidth.stability.radii import spectral_radius
+from zwidth.stability.labels import StabilityMethod, is_stable
 
 _EXAMPLES = {
     "device": "zwidth.Device(mass=0.1, damping=10)",
@@ -46,7 +43,7 @@ class WallSI(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(SceneAnswers):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
@@ -61,7 +58,7 @@ class Scene:
         >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(device, timing, velocity=zwidth.LowPass(cutoff=100))
         >>> scene.is_stable(10e3, [5, 40])
-        array([ True, False])
+        array([False,  True])
     """
 
     device: Device
@@ -117,7 +114,7 @@ class Scene:
             delay=self.timing.delay,
             stiffness=self.wall.stiffness,
             virtual_damping=self.wall.virtual_damping,
-        )
+        )._replace(d=self.d)
 
     @property
     def alpha(self) -> float:
@@ -137,7 +134,7 @@ class Scene:
     @property
     def d(self) -> float:
         """Delay in periods."""
-        return in_periods(*(np.float64(value) for value in (self.timing.delay, self.timing.period)))
+        return self.timing.d
 
     @property
     def whole_delay(self) -> int:
@@ -190,12 +187,15 @@ class Scene:
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
-    def is_stable(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+    def is_stable(
+        self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
+    ) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.
 
         Args:
             stiffness: K in N/m.
             virtual_damping: B in N s/m. Both broadcast.
+            method: as for `decide_stability`, which has the statuses as well.
 
         Returns:
             Boolean array of the broadcast shape, False for what is NaN.
@@ -205,6 +205,8 @@ class Scene:
             row (`zwidth.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
             costs some microseconds and a stiffness next to nothing.
         """
+        if method != "auto":
+            return self.decide_stability(stiffness, virtual_damping, method=method).stable
         alpha, beta = self.normalize_walls(stiffness, virtual_damping)
         if self.is_rigid:
             return is_stable(alpha, beta, self.delta, self.d)
@@ -253,51 +255,29 @@ class Scene:
             for piece in outlines(self.border)
         ]
 
-    def poles(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
-        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
+    def parameters(self) -> dict[str, Any]:
+        """Every number of every part by its dotted path.
 
-        Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
-        is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
+        Returns:
+            For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;
+            the wall's ``stiffness`` and ``virtual_damping`` come last. What is left out (None) is not listed.
         """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return poles(alpha, beta, self.delta, self.d)
-        return 1.0 + all_poles(self.loop, alpha, beta)
+        return list_parameters(self)
 
-    def pole_table(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> answers.PoleTable:
-        """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        return answers.pole_table(self.loop, alpha, beta, self.timing.period)
+    def replace(self, **changes: Any) -> Scene:
+        """A new scene with one or several parameters changed; all others stay as they are, in SI units.
 
-    def spectral_radius(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
-        """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
+        Args:
+            **changes: by dotted path, as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or ``rate=2000``; or a whole
+                part, as ``operator=zwidth.Operator(mass=0.5)``.
 
-        From all poles; beyond 60 of them by counting poles in circles, at a cost that does not grow with the delay.
+        Raises:
+            InputError: no part of this scene has such a parameter, or the value is refused.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=100))
+            >>> scene.replace(**{"velocity.cutoff": 50}).parameters()["velocity.cutoff"]
+            50.0
         """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return spectral_radius(alpha, beta, self.delta, self.d)
-        stable = label_walls(self.traced_boundary, alpha, beta).reshape(-1)
-        found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
-        return found.reshape(alpha.shape)[()]
-
-    def state_space(self, stiffness: float = 0.0, virtual_damping: float = 0.0) -> answers.StateSpace:
-        """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
-
-        Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
-        """
-        wall = answers.one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
-        return answers.closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
-
-    def open_loop(self, stiffness: float = 0.0, virtual_damping: float = 0.0) -> answers.StateSpace:
-        """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
-        wall = answers.one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
-        return answers.open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
-
-    def frequency_response(self, stiffness: ArrayLike, virtual_damping: ArrayLike, frequency: ArrayLike) -> Array:
-        """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
-
-        All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
-        """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        return answers.frequency_response(self.loop, alpha, beta, frequency, self.timing.period)
+        return replace_parameters(self, changes)

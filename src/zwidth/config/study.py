@@ -8,9 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
 
 from zwidth._types import DELAY_MODELS, DelayModel
-from zwidth.config.faults import LocatedProblem, describe, problem, unlisted
+from zwidth.config.faults import LocatedProblem, problem, unlisted
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.scenes import AnyScene
+from zwidth.formatting import describe
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30

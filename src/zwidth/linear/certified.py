@@ -111,7 +111,8 @@ def _polynomials(scene: Any) -> BallPolynomials:
     chain = chain_of(_exact(scene, period))
     answer, device = _device(chain)
     top, bottom = _estimate(scene.velocity, period)
-    unit = period * period / chain.estimate
+    mass: Any = chain.estimate
+    unit = period * period / mass
     whole = chain.whole + (1 if chain.d > chain.whole else 0)
     waiting = flint.arb_poly([0] * whole + device.coeffs())
     # Exactly 0 is what a sum of exact fractions is; all other estimates are differences.
