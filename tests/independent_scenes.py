@@ -111,7 +111,7 @@ def velocity_polynomials(scene):
         for _ in range(v.order):
             top, bottom = np.convolve(top, [1 - p, 0.0]), np.convolve(bottom, [1.0, -p])
     if isinstance(v, zwidth.Butterworth):
-        designed: Any = scipy.signal.butter(v.order, v.cutoff * 2 * period)
+        designed: Any = scipy.signal.butter(v.order, 2 * period * float(v.cutoff or 0.0))
         top, bottom = np.convolve(top, designed[0]), np.convolve(bottom, designed[1])
     if isinstance(v, zwidth.VelocityFilter):
         return np.array(v.numerator), np.array(v.denominator)

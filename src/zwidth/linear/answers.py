@@ -11,12 +11,14 @@ from zwidth.batching import as_float64
 from zwidth.errors import InputError, check_choice
 from zwidth.linear import state_space
 from zwidth.linear.chain import Chain
+from zwidth.linear.delay_margin import linear_margins
 from zwidth.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
 from zwidth.linear.poles import all_poles, log_size
 from zwidth.linear.radius import spectral_radius as linear_radius
 from zwidth.linear.rows import label_walls
 from zwidth.linear_loop import LinearLoop, circle
 from zwidth.stability.labels import STABILITY_METHODS, Stability, StabilityMethod, decide_stability
+from zwidth.stability.margins import Margins, margins
 from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.poles import poles
 from zwidth.stability.radii import spectral_radius
@@ -198,6 +200,30 @@ class SceneAnswers:
     def is_passive(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
         """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
         return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
+
+    def margins(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Margins:
+        """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
+
+        Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
+        and B together, and ``phase_margin`` the least turn in degrees, that bring a pole to the unit circle; the turn
+        is negative for an unstable wall. ``delay_margin`` in s is the least extra delay that does, held as the hardware
+        does it, fraction by fraction with the exact loop (0 for an unstable wall, NaN where poles counted before and
+        beyond do not confirm it); ``modulus_margin`` is the least distance of L from -1. Where no factor, turn or delay
+        brings a pole there, the first three are infinite for a stable wall, and 0, NaN and 0 for an unstable one.
+        A rigid scene answers by `zwidth.margins`. A wall takes some milliseconds, its delay margin some 0.2 s.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        hertz = 1.0 / (2.0 * np.pi * self.timing.period)
+        if self.is_rigid:
+            found = margins(alpha, beta, self.delta, self.d)
+        else:
+            found = linear_margins(self.chain, self.traced_boundary, alpha, beta)
+        return found._replace(
+            delay_margin=found.delay_margin * self.timing.period,
+            phase_crossover=found.phase_crossover * hertz,
+            gain_crossover=found.gain_crossover * hertz,
+            modulus_frequency=found.modulus_frequency * hertz,
+        )
 
 
 def to_control(scene: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> control.StateSpace:
