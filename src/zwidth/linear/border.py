@@ -146,6 +146,17 @@ class Border:
         ends = float(beta[k]), float(beta[after])
         return _narrow(lambda at: self.boundary.line_borders(place, at), *ends, _LINE_ROUNDS)[0]
 
+    def line_meetings(self) -> list[tuple[float, float, float]]:
+        """Corners of two lines: all other highest points are on the curve."""
+        b = self.boundary
+        found = []
+        for place, line in enumerate(b.lines):
+            for beta in _meetings(b.lines[:place], line):
+                near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
+                if b.line_borders(place, near).any():
+                    found.append((float(line.q - beta * line.f), float(beta), line.w))
+        return found
+
 
 def _meetings(others: Sequence[CrossingLine], line: CrossingLine) -> list[float]:
     """The dampings at which a line meets others that are not parallel to it."""
