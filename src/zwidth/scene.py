@@ -19,6 +19,7 @@ from zwidth.linear_loop import LinearLoop
 from zwidth.normalization import Normalized, Physical, denormalize, in_periods, normalize
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
+from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
@@ -247,3 +248,30 @@ class Scene:
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, piece.hole)
             for piece in outlines(self.border)
         ]
+
+    def parameters(self) -> dict[str, Any]:
+        """Every number of every part by its dotted path.
+
+        Returns:
+            For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;
+            the wall's ``stiffness`` and ``virtual_damping`` come last. What is left out (None) is not listed.
+        """
+        return list_parameters(self)
+
+    def replace(self, **changes: Any) -> Scene:
+        """A new scene with one or several parameters changed; all others stay as they are, in SI units.
+
+        Args:
+            **changes: by dotted path, as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or ``rate=2000``; or a whole
+                part, as ``operator=zwidth.Operator(mass=0.5)``.
+
+        Raises:
+            InputError: no part of this scene has such a parameter, or the value is refused.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=100))
+            >>> scene.replace(**{"velocity.cutoff": 50}).parameters()["velocity.cutoff"]
+            50.0
+        """
+        return replace_parameters(self, changes)

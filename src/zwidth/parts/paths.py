@@ -1,0 +1,74 @@
+"""The parameters of a scene by dotted path, as YAML writes them: ``mass``, ``period``, ``velocity.cutoff``, ...
+
+Device, timing and wall go by bare names, for each name is one thing there; velocity estimate, hand and coupling go by
+their own: ``velocity.``, ``operator.``, ``coupling.``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from zwidth.errors import InputError, describe_choice
+from zwidth.xp import is_jax
+
+_BARE = ("device", "timing", "wall")
+_NAMED = ("velocity", "operator")
+
+
+def _parts(scene: Any) -> Iterator[tuple[str, str, Any]]:
+    """Every part there is: what its paths begin with, its field of the scene, and itself."""
+    for name in _BARE:
+        yield "", name, getattr(scene, name)
+    for name in _NAMED:
+        if getattr(scene, name) is not None:
+            yield f"{name}.", name, getattr(scene, name)
+    if scene.device.coupling is not None:
+        yield "coupling.", "coupling", scene.device.coupling
+
+
+def list_parameters(scene: Any) -> dict[str, Any]:
+    """Every number of a scene by its dotted path, those of the wall last."""
+    found = {
+        (prefix + item.name, name): getattr(part, item.name)
+        for prefix, name, part in _parts(scene)
+        for item in fields(part)
+    }
+    ordered = sorted(found, key=lambda key: key[1] == "wall")
+    return {key[0]: found[key] for key in ordered if _is_number(found[key])}
+
+
+def _is_number(value: Any) -> bool:
+    return is_jax(value) or isinstance(value, int | float | np.number)
+
+
+def replace_parameters(scene: Any, changes: dict[str, Any]) -> Any:
+    """A new scene with some parameters, or whole parts, changed; everything else stays as it is in SI units."""
+    changed: dict[str, dict[str, Any]] = {}
+    whole = {name: changes[name] for name in (*_BARE, *_NAMED) if name in changes}
+    scene = replace(scene, **whole)
+    if "coupling" in changes:
+        scene = replace(scene, device=replace(scene.device, coupling=changes["coupling"]))
+    owners = {
+        prefix + item.name: (name, item.name)
+        for prefix, name, part in _parts(scene)
+        for item in fields(part)
+        if item.name != "coupling"
+    }
+    for path, value in changes.items():
+        if path in whole or path == "coupling":
+            continue
+        if path not in owners:
+            raise InputError(f"parameter: {describe_choice(path, tuple(owners))}")
+        part, name = owners[path]
+        changed.setdefault(part, {})[name] = value
+    if "rate" in changed.get("timing", {}):
+        # Period and rate are one thing; what was given last counts.
+        changed["timing"].setdefault("period", None)
+    if "coupling" in changed:
+        coupling = replace(scene.device.coupling, **changed.pop("coupling"))
+        changed.setdefault("device", {})["coupling"] = coupling
+    return replace(scene, **{part: replace(getattr(scene, part), **own) for part, own in changed.items()})
