@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any, Literal, NamedTuple
 
 from zwidth.config.faults import describe, problem, short, suggestion
-from zwidth.config.numbers import check_range, looks_like_number, number, to_float
+from zwidth.config.numbers import check_range, looks_like_number, number, to_float, whole_number
 from zwidth.domain import SI_RANGE
 from zwidth.normalization import normalize
 from zwidth.quantities import ANY, PARAMETERS, Range
@@ -134,5 +134,5 @@ def make_entry_reader(name: str) -> Callable[[Any], float]:
     """A validator for one value of a parameter."""
     parameter = PARAMETERS[name]
     if parameter.unit == "1":
-        return number(parameter.allowed)
+        return whole_number(parameter.allowed) if parameter.whole else number(parameter.allowed)
     return quantity(find_dimension(parameter.unit), parameter.allowed)

@@ -13,6 +13,7 @@ JSON file, too):
     draw_passivity_cost   stiffest passive and stiffest stable wall over delta
     draw_map              stable, spectral radius or passive over alpha and beta
     draw_recommendation   the recommended wall of a device, in SI units
+    draw_stable_set       outlines of devices with a velocity filter, a hand or a coupling
 
 From the dataset of a sweep, as `zwidth.open_dataset` gives it, or a part of one:
 

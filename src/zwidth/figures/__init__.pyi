@@ -9,6 +9,7 @@ from .recommendation import draw_recommendation as draw_recommendation
 from .ridge import draw_ridge as draw_ridge
 from .slope import draw_slope as draw_slope
 from .stability_map import draw_map as draw_map
+from .stable_set import draw_stable_set as draw_stable_set
 from .step import draw_step as draw_step
 from .style import house_style as house_style
 from .style import save as save
