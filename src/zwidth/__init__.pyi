@@ -1,5 +1,6 @@
 """Every public name, once: what loads it on first use, and what type checkers read."""
 
+from . import devices as devices
 from .assessment import Assessment as Assessment
 from .assessment import assess as assess
 from .design.area import stable_area as stable_area

@@ -18,6 +18,17 @@ class InputError(ZwidthError, ValueError):
     """
 
 
+class UnusableValueError(InputError):
+    """One value that cannot be used: what it is, what is allowed, and the remedy; who raises it knows no field."""
+
+    def __init__(self, what: str, allowed: str = "", remedy: str = "") -> None:
+        super().__init__(what, allowed, remedy)
+        self.parts = what, allowed, remedy
+
+    def __str__(self) -> str:
+        return "; ".join(part for part in self.parts if part)
+
+
 class ConfigError(ZwidthError, ValueError):
     """A configuration file that cannot be used; the message lists every fault with its place."""
 

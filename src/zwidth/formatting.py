@@ -1,10 +1,14 @@
-"""Numbers for people: SI prefixes and a fixed count of significant digits."""
+"""Values for people: numbers with SI prefixes and a fixed count of significant digits, and what was received."""
 
 from __future__ import annotations
 
+import difflib
 import math
+from collections.abc import Iterable, Mapping
+from typing import Any
 
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
+LONGEST_VALUE = 60
 
 
 def plain(value: float, digits: int = 4) -> str:
@@ -27,3 +31,46 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     if abs(float(f"{value / 10**power:.{digits - 1}e}")) >= 1000 and power < 9:
         power += 3
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
+
+
+def describe(value: Any) -> str:
+    """The value received, as YAML spells it, on one line."""
+    if value is None:
+        return "nothing"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, Mapping):
+        return f"a mapping of {_count(len(value), 'key')}"
+    if isinstance(value, list | tuple):
+        return f"a list of {_count(len(value), 'item')}"
+    if isinstance(value, float) and not math.isfinite(value):
+        return ".nan" if math.isnan(value) else (".inf" if value > 0 else "-.inf")
+    if isinstance(value, int) and abs(value) >= 10**LONGEST_VALUE:
+        return f"a whole number beyond 1e{LONGEST_VALUE}"
+    text = repr(value)
+    return text if len(text) <= LONGEST_VALUE else f"{text[: LONGEST_VALUE - 4]}...{text[-1]}"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def resembling(name: Any, known: Iterable[str]) -> str | None:
+    """The known name that looks most like ``name``, if any does."""
+    if not isinstance(name, str):
+        return None
+    by_lower = {candidate.lower(): candidate for candidate in known}
+    found = difflib.get_close_matches(name.lower(), by_lower, n=1)
+    return by_lower[found[0]] if found else None
+
+
+def suggestion(name: Any, known: Iterable[str], otherwise: str) -> str:
+    """A remedy: a question for the known name that ``name`` may stand for, else what is given."""
+    found = resembling(name, known)
+    return f"did you mean {found!r}?" if found else otherwise
+
+
+def short(value: float) -> str:
+    """The shortest text of a number, without ``.0`` where it is whole."""
+    text = f"{value:g}"
+    return text if float(text) == value else repr(value)

@@ -18,6 +18,9 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.xp import namespace
 
+# Nearer to the circle than this a root of the loop is on it: an undamped mode, or a zero of an undamped device.
+ON_CIRCLE = 1e-12
+
 
 class Jet(NamedTuple):
     """A complex function of w and its derivative."""
@@ -50,6 +53,11 @@ def circle(w: Array) -> CirclePoints:
     s, c = xp.sin(half), xp.where(w >= np.pi, 0.0, xp.cos(half))
     before = -2.0 * s * s + 2j * s * c
     return CirclePoints(w, 1.0 + before, before)
+
+
+def depths(offsets: np.ndarray) -> np.ndarray:
+    """``1 - |root|`` of roots given by their offsets from 1, with the digits that they have next to 1."""
+    return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
 
 
 def lag_jet(at: CirclePoints, turns: float) -> Jet:
@@ -138,6 +146,8 @@ class LinearLoop:
         before = circle(w).before[..., None]
         roots = np.concatenate([self.poles, self.zeros, self.estimate.poles, self.estimate.zeros])
         far = np.abs(before + roots) - reach[..., None]
-        floor = np.maximum(1e-3 * np.abs(np.real(roots)), 1e-9)
+        # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
+        depth = np.abs(depths(roots))
+        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, 1e-9)
         near = (1.0 / np.maximum(far, floor)).sum(-1)
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0

@@ -17,7 +17,8 @@ from zwidth.batching import refuse_masked
 from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, WALL_RANGE, void, within
 from zwidth.errors import InputError
 from zwidth.status import Status
-from zwidth.xp import frozen, is_jax, is_traced, namespace
+from zwidth.units import accept_units, in_periods
+from zwidth.xp import is_jax, is_traced, namespace
 
 
 class Normalized(NamedTuple):
@@ -120,19 +121,6 @@ def _formula_at(*arguments: Any) -> tuple[Array, ...]:
     return formula(*(void(_in_range(name, value), value)[0] for name, value in zip(names, values, strict=True)))
 
 
-def in_periods(delay: Array, period: Array) -> Array:
-    """``delay/period``, with a quotient within 4 rounding errors of a whole number taken as that number.
-
-    1.1 ms over 0.1 ms is 11 periods, but its float64 quotient is 11.000000000000002, another polynomial.
-    """
-    xp = namespace(delay, period)
-    quotient = delay / period
-    whole = xp.round(quotient)
-    near = xp.abs(quotient - whole) <= 4 * np.finfo(quotient.dtype).eps * xp.maximum(whole, 1.0)
-    # Rounding is flat; the quotient it corrects is not.
-    return quotient - frozen(xp.where(near & (whole > 0), quotient - whole, 0.0), xp)
-
-
 def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
     """Eqs. (14), (16)."""
     return (
@@ -149,6 +137,7 @@ def _denormalize(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
     return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
 
 
+@accept_units
 def normalize(
     *,
     mass: ArrayLike,

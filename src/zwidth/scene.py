@@ -16,7 +16,7 @@ from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
 from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear_loop import LinearLoop
-from zwidth.normalization import Normalized, Physical, denormalize, in_periods, normalize
+from zwidth.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
 from zwidth.parts.paths import list_parameters, replace_parameters
@@ -57,7 +57,7 @@ class Scene:
         >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(device, timing, velocity=zwidth.LowPass(cutoff=100))
         >>> scene.is_stable(10e3, [5, 40])
-        array([ True, False])
+        array([False,  True])
     """
 
     device: Device
@@ -113,7 +113,7 @@ class Scene:
             delay=self.timing.delay,
             stiffness=self.wall.stiffness,
             virtual_damping=self.wall.virtual_damping,
-        )
+        )._replace(d=self.d)
 
     @property
     def alpha(self) -> float:
@@ -133,7 +133,7 @@ class Scene:
     @property
     def d(self) -> float:
         """Delay in periods."""
-        return in_periods(*(np.float64(value) for value in (self.timing.delay, self.timing.period)))
+        return self.timing.d
 
     @property
     def whole_delay(self) -> int:
@@ -173,18 +173,18 @@ class Scene:
         return Border(self.traced_boundary)
 
     def normalize_walls(self, stiffness: ArrayLike, virtual_damping: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Walls in SI units as arrays of alpha and beta of one shape."""
+        """Walls in SI units as arrays of alpha and beta that broadcast."""
         units = self.units
         both = as_float64("stiffness", stiffness), as_float64("virtual_damping", virtual_damping)
         try:
-            alpha, beta = np.broadcast_arrays(*both)
+            np.broadcast_shapes(both[0].shape, both[1].shape)
         except ValueError as error:
             raise InputError(
                 f"shapes do not broadcast: stiffness {both[0].shape}, virtual_damping {both[1].shape}; make each "
                 "axis equal or 1"
             ) from error
         with np.errstate(all="ignore"):
-            return alpha / units.stiffness, beta / units.virtual_damping
+            return both[0] / units.stiffness, both[1] / units.virtual_damping
 
     def is_stable(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.

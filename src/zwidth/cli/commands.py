@@ -10,6 +10,7 @@ import click
 from zwidth import __version__
 from zwidth.cli import runs
 from zwidth.cli.bench import bench
+from zwidth.cli.devices import devices
 from zwidth.cli.options import json_option, physical_options
 from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.formatting import plain, with_unit
@@ -123,5 +124,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (*runs.COMMANDS, bench):
+for command in (*runs.COMMANDS, devices, bench):
     cli.add_command(command)

@@ -19,18 +19,17 @@ class QuantityType(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
         """Parse one option."""
-
-        from zwidth.config.units import make_entry_reader
+        from zwidth.errors import UnusableValueError
+        from zwidth.units import find_dimension, read_quantity
 
         try:
             number: float | str = float(value)
         except ValueError:
             number = value
         try:
-            return make_entry_reader(self.parameter.name)(number)
-        except ValueError as error:
-            # A problem of a configuration's; the parts that it leaves out stand as empty text between separators.
-            self.fail("; ".join(part for part in str(error).split("; ") if part), param, ctx)
+            return read_quantity(number, find_dimension(self.parameter.unit), self.parameter.allowed)[0]
+        except UnusableValueError as error:
+            self.fail(str(error), param, ctx)
 
 
 def physical_options(*, wall: bool, required: bool) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

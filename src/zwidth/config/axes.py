@@ -15,9 +15,10 @@ import numpy as np
 from pydantic import BeforeValidator, PlainSerializer, PlainValidator, ValidationError, WithJsonSchema, create_model
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.faults import LocatedProblem, describe, problem, problems_of, short, suggestion, validation_error
+from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
 from zwidth.config.fields import Strict, repeated
 from zwidth.config.numbers import number, whole_number
+from zwidth.formatting import describe, short, suggestion
 from zwidth.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
 
 LONGEST_AXIS = 10_000_000

@@ -16,21 +16,12 @@ from pydantic import PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.axes import SPELLED, Entry, read_entries
-from zwidth.config.faults import (
-    LocatedProblem,
-    describe,
-    listing,
-    printable,
-    problem,
-    problems_of,
-    resembling,
-    suggestion,
-    validation_error,
-)
-from zwidth.config.numbers import looks_like_number
+from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.parameters import make_delay_readers
 from zwidth.config.units import make_entry_reader
+from zwidth.formatting import describe, resembling, suggestion
 from zwidth.quantities import PARAMETERS
+from zwidth.units import looks_like_number
 
 LABEL = "label"
 MAX_ROWS = 100_000

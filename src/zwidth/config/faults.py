@@ -6,22 +6,20 @@ adds the path of fields that leads there, and `locate` turns path and problem in
 
 from __future__ import annotations
 
-import difflib
-import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from zwidth.errors import ConfigError
+from zwidth.errors import ConfigError, UnusableValueError
+from zwidth.formatting import LONGEST_VALUE, describe, suggestion
 
 if TYPE_CHECKING:
     from pydantic_core import PydanticCustomError, ValidationError
 
 FieldPath: TypeAlias = tuple[str | int, ...]
+Result = TypeVar("Result")
 LocatedProblem: TypeAlias = "tuple[FieldPath, PydanticCustomError]"
-
-_LONGEST_VALUE = 60
 
 
 @dataclass(frozen=True)
@@ -68,6 +66,18 @@ def problem(what: str, allowed: str = "", remedy: str = "", *, on_key: bool = Fa
     return PydanticCustomError("zwidth", "{what}; {allowed}; {remedy}", context)
 
 
+def raise_problems(read: Callable[[Any], Result]) -> Callable[[Any], Result]:
+    """Make a validator of what reads a value and raises `UnusableValueError`."""
+
+    def validate(value: Any) -> Result:
+        try:
+            return read(value)
+        except UnusableValueError as error:
+            raise problem(*error.parts) from None
+
+    return validate
+
+
 # What pydantic itself finds: what is allowed, and the remedy.
 _PLAIN = {
     "bool_type": ("it must be true or false", "write true or false, without quotes"),
@@ -108,49 +118,6 @@ def validation_error(title: str, problems: Iterable[LocatedProblem]) -> Validati
     return ValidationError.from_exception_data(title, details)
 
 
-def describe(value: Any) -> str:
-    """The value received, as YAML spells it, on one line."""
-    if value is None:
-        return "nothing"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, Mapping):
-        return f"a mapping of {_count(len(value), 'key')}"
-    if isinstance(value, list | tuple):
-        return f"a list of {_count(len(value), 'item')}"
-    if isinstance(value, float) and not math.isfinite(value):
-        return ".nan" if math.isnan(value) else (".inf" if value > 0 else "-.inf")
-    if isinstance(value, int) and abs(value) >= 10**_LONGEST_VALUE:
-        return f"a whole number beyond 1e{_LONGEST_VALUE}"
-    text = repr(value)
-    return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 4]}...{text[-1]}"
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
-
-
-def resembling(name: Any, known: Iterable[str]) -> str | None:
-    """The known name that looks most like ``name``, if any does."""
-    if not isinstance(name, str):
-        return None
-    by_lower = {candidate.lower(): candidate for candidate in known}
-    found = difflib.get_close_matches(name.lower(), by_lower, n=1)
-    return by_lower[found[0]] if found else None
-
-
-def suggestion(name: Any, known: Iterable[str], otherwise: str) -> str:
-    """A remedy: a question for the known name that ``name`` may stand for, else what is given."""
-    found = resembling(name, known)
-    return f"did you mean {found!r}?" if found else otherwise
-
-
-def short(value: float) -> str:
-    """The shortest text of a number, without ``.0`` where it is whole."""
-    text = f"{value:g}"
-    return text if float(text) == value else repr(value)
-
-
 def listing(names: Iterable[str]) -> str:
     """Names for a message: ``'a', 'b', 'c'``."""
     return ", ".join(repr(name) for name in names)
@@ -168,7 +135,7 @@ def dotted(path: FieldPath) -> str:
         if isinstance(part, int):
             text += f"[{part}]"
         else:
-            short = part if len(part) <= _LONGEST_VALUE else f"{part[:_LONGEST_VALUE]}..."
+            short = part if len(part) <= LONGEST_VALUE else f"{part[:LONGEST_VALUE]}..."
             text += ("." if text else "") + printable(short)
     return text
 

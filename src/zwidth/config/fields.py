@@ -18,19 +18,12 @@ from pydantic import (
 )
 from pydantic import ModelWrapValidatorHandler as Handler
 
-from zwidth.config.faults import (
-    LocatedProblem,
-    describe,
-    listing,
-    problem,
-    problems_of,
-    resembling,
-    suggestion,
-    validation_error,
-)
+from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, validation_error
 from zwidth.config.numbers import number
-from zwidth.config.units import DAMPING, MASS, PERIOD_WORDS, STIFFNESS, TIME, Dimension, Span, quantity, span
+from zwidth.config.units import quantity, span
+from zwidth.formatting import describe, resembling, suggestion
 from zwidth.quantities import FRACTION, NOT_NEGATIVE, POSITIVE
+from zwidth.units import DAMPING, MASS, PERIOD_WORDS, STIFFNESS, TIME, Dimension, Span
 
 
 class Strict(BaseModel):

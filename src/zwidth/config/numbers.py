@@ -2,50 +2,21 @@
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Callable
 from typing import Any
 
-from zwidth.config.faults import describe, problem, short
+from zwidth.config.faults import problem, raise_problems
+from zwidth.formatting import describe
 from zwidth.quantities import ANY, Range
+from zwidth.units import check_range, looks_like_number, to_float
 
-# One way only to match a run of digits: a second one costs quadratic time on a long run that fails in the end.
-_NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 _NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
-
-
-def looks_like_number(text: str) -> bool:
-    """Whether a text would be a number without its quotes."""
-    return _NUMBER_TEXT.fullmatch(text) is not None
-
-
-def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") -> float:
-    """Return a finite, admissible value or raise a problem."""
-    bounds = str(allowed)
-    needed = f"it must be {bounds}{f' {unit}' if unit else ''}" if bounds else "it must be finite"
-    if not math.isfinite(value):
-        needed = f"it must be finite{f' and {bounds}' if bounds else ''}"
-        raise problem(f"got {describe(value)}", needed, remedy or "write a finite number")
-    if not allowed.holds(value):
-        raise problem(
-            f"got {short(value)}{f' {unit}' if unit else ''}", needed, remedy or "write a number in this range"
-        )
-    return value
-
-
-def to_float(value: float) -> float:
-    """A whole number beyond float64 becomes infinite, which `check_range` then refuses."""
-    try:
-        return float(value)
-    except OverflowError:
-        return math.inf if value > 0 else -math.inf
 
 
 def number(allowed: Range = ANY, remedy: str = "") -> Callable[[Any], float]:
     """A validator for a number without a unit."""
 
-    def validate(value: Any) -> float:
+    def read(value: Any) -> float:
         if isinstance(value, int | float) and not isinstance(value, bool):
             return check_range(to_float(value), allowed, remedy=remedy)
         hint = "write a number such as 0.5"
@@ -58,13 +29,13 @@ def number(allowed: Range = ANY, remedy: str = "") -> Callable[[Any], float]:
                 hint = "this field has no unit; write the number alone"
         raise problem(f"got {describe(value)}", "it must be one number", hint)
 
-    return validate
+    return raise_problems(read)
 
 
 def whole_number(allowed: Range = ANY) -> Callable[[Any], int]:
     """A validator for a whole number."""
 
-    def validate(value: Any) -> int:
+    def read(value: Any) -> int:
         if isinstance(value, int) and not isinstance(value, bool):
             check_range(to_float(value), allowed)
             return value
@@ -75,4 +46,4 @@ def whole_number(allowed: Range = ANY) -> Callable[[Any], int]:
             hint = "drop the quotes"
         raise problem(f"got {describe(value)}", "it must be a whole number", hint)
 
-    return validate
+    return raise_problems(read)

@@ -9,21 +9,12 @@ from typing import Annotated, Any
 from pydantic import PlainValidator, WithJsonSchema
 
 from zwidth.config.axes import SPELLED, Axis, Entry, axis_schema, make_axis_reader
-from zwidth.config.faults import describe, problem, short
+from zwidth.config.faults import problem
 from zwidth.config.fields import unit_schema
-from zwidth.config.units import (
-    DAMPING,
-    MASS,
-    RATE,
-    STIFFNESS,
-    TIME,
-    Dimension,
-    find_dimension,
-    make_entry_reader,
-    quantity,
-    span,
-)
+from zwidth.config.units import make_entry_reader, quantity, span
+from zwidth.formatting import describe, short
 from zwidth.quantities import NOT_NEGATIVE, OF_PARTS, PARAMETERS, POSITIVE, Range
+from zwidth.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, find_dimension
 
 
 def make_delay_readers() -> tuple[Entry, Entry, Callable[[], bool]]:

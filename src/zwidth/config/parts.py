@@ -11,11 +11,12 @@ from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, WrapValidator
 
 from zwidth.config.axes import read_entries
-from zwidth.config.faults import LocatedProblem, describe, listing, problem, suggestion, validation_error
+from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Damping, Mass, Strict, unit_schema
 from zwidth.config.numbers import number, whole_number
-from zwidth.config.units import MASS, RATE, STIFFNESS, TIME, quantity
+from zwidth.config.units import quantity
 from zwidth.errors import InputError
+from zwidth.formatting import describe, suggestion
 from zwidth.parts.coupling import Coupling
 from zwidth.parts.operator import Operator
 from zwidth.parts.velocity import (
@@ -27,6 +28,7 @@ from zwidth.parts.velocity import (
     WindowedDifference,
 )
 from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE
+from zwidth.units import MASS, RATE, STIFFNESS, TIME
 
 PARTS = ("velocity", "operator", "coupling")
 

@@ -22,7 +22,8 @@ from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
 from zwidth.config.device_table import files_relative_to
-from zwidth.config.faults import ConfigFileError, Fault, FieldPath, describe, dotted, locate, printable, problems_of
+from zwidth.config.faults import ConfigFileError, Fault, FieldPath, dotted, locate, printable, problems_of
+from zwidth.formatting import describe
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

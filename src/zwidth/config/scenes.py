@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DelayModel
-from zwidth.config.faults import LocatedProblem, describe, listing, problem, short
+from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import (
     Damping,
     Delay,
@@ -32,15 +32,17 @@ from zwidth.config.parts import (
     list_parts,
     locate_refusal,
 )
-from zwidth.config.units import RATE, TIME, Span, quantity
+from zwidth.config.units import quantity
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.errors import InputError
+from zwidth.formatting import describe, short
 from zwidth.normalization import normalize
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.parts.wall import VirtualWall
 from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
 from zwidth.scene import Scene
+from zwidth.units import RATE, TIME, Span
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PARTS})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})

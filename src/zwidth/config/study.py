@@ -9,10 +9,11 @@ from pydantic import BeforeValidator, ConfigDict, WrapValidator
 from pydantic_core import PydanticCustomError
 
 from zwidth._types import DELAY_MODELS, DelayModel
-from zwidth.config.faults import LocatedProblem, describe, listing, problem, unlisted
+from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, is_with_parts
+from zwidth.formatting import describe
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30

@@ -22,11 +22,12 @@ from zwidth.batching import elementwise
 from zwidth.design.stiffness import check_stiffness, checked_device
 from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, device_status, poison, within
 from zwidth.errors import InputError
-from zwidth.normalization import denormalize, in_periods, normalize, quantity_status
+from zwidth.normalization import denormalize, normalize, quantity_status
 from zwidth.numerics.roots import last_cell, newton
 from zwidth.stability.devices import ANY, Kind, classify_delays
 from zwidth.stability.ridge import ridge_kernel, slopes_kernel
 from zwidth.status import Status
+from zwidth.units import accept_units, in_periods
 from zwidth.xp import frozen, namespace
 
 _LEAST, _MOST = 0.2, 6.0
@@ -148,6 +149,7 @@ def _answer(kernel: Any, known: ArrayLike | None = None, /, **values: ArrayLike)
     return elementwise(kernel, tuple(values), tuple(values.values()), (kind,), few=_FEW, block=_BLOCK)
 
 
+@accept_units
 def required_damping(
     stiffness: ArrayLike, *, mass: ArrayLike, period: ArrayLike, delay: ArrayLike = 0.0
 ) -> Requirement:
@@ -191,6 +193,7 @@ def _damping_kernel(stiffness: Array, mass: Array, period: Array, delay: Array, 
     return _solve_requirement(path, (0.0 * d, enough), rate, given, inputs, start=_LEAST * enough, free=True)
 
 
+@accept_units
 def required_period(
     stiffness: ArrayLike,
     *,
@@ -267,6 +270,7 @@ def _period_kernel(stiffness: Array, mass: Array, damping: Array, delay: Array, 
     return _solve_requirement(path, (xp.minimum(shortest, longest), longest), xp.ones_like(delay)[()], given, inputs)
 
 
+@accept_units
 def allowed_delay(stiffness: ArrayLike, *, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike) -> Requirement:
     """Return the longest delay with which a wall of the wanted stiffness can be stable.
 
@@ -307,6 +311,7 @@ def _delay_kernel(stiffness: Array, mass: Array, damping: Array, period: Array, 
     return _solve_requirement(path, (0.0 * delta, longest), period, given, inputs, offset=1.0)
 
 
+@accept_units
 def required_mass(
     stiffness: ArrayLike, *, damping: ArrayLike = 0.0, period: ArrayLike, delay: ArrayLike = 0.0
 ) -> Requirement:

@@ -23,6 +23,7 @@ from zwidth.stability.affine import quantities, stable_everywhere
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.labels import is_stable
 from zwidth.status import Status
+from zwidth.units import accept_units
 from zwidth.xp import is_traced
 
 _NAMES = ("mass", "damping", "period", "delay")
@@ -71,6 +72,7 @@ class RobustWall(NamedTuple):
     status: Array
 
 
+@accept_units
 def robust_max_stiffness(
     *, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain, delay: Uncertain = 0.0
 ) -> RobustStiffness:
@@ -112,6 +114,7 @@ def robust_max_stiffness(
     return RobustStiffness(*_each_box(_worst, RobustStiffness._fields, (mass, damping, period, delay)))
 
 
+@accept_units
 def robust_wall(*, mass: Uncertain, damping: Uncertain = 0.0, period: Uncertain, delay: Uncertain = 0.0) -> RobustWall:
     """Find the stiffest single wall (K, B) that is stable on every device of a box.
 

@@ -17,6 +17,7 @@ from zwidth.normalization import Normalized, normalize, quantity_status
 from zwidth.stability.devices import Kind, classify_delays
 from zwidth.stability.ridge import ridge_kernel, slopes_kernel
 from zwidth.status import Status
+from zwidth.units import accept_units
 from zwidth.xp import is_traced, namespace
 
 _NAMES = ("mass", "damping", "period", "delay", "delta", "d")
@@ -38,6 +39,7 @@ def check_stiffness(stiffness: ArrayLike) -> None:
         raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in N/m)")
 
 
+@accept_units
 def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike, delay: ArrayLike = 0.0) -> Array:
     """Return the stiffness below which some virtual damping makes the wall stable.
 
@@ -84,6 +86,7 @@ class Sensitivities(NamedTuple):
     status: Array
 
 
+@accept_units
 def sensitivities(
     *,
     mass: ArrayLike,

@@ -2,24 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.linear.boundary import Boundary, curve_at, zeros_of
+from zwidth.linear.boundary import Boundary, CrossingLine, curve_at, zeros_of
 from zwidth.linear_loop import circle
+from zwidth.numerics.roots import false_position
 from zwidth.stability.ridge import RidgeKind
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
 _ROUNDS = 11
+# The ends of straight edges are drawn only.
+_LINE_ROUNDS = 6
+# Steps towards a corner, and how far beside it, as a share of w, the edge must be seen to end.
+_STEPS, _BESIDE = 60, 1e-11
 _SHARES = np.arange(1, 32) / 32.0
 # Points of a straight edge, and how far beyond the corners one is looked for.
 _LINE_POINTS, _BEYOND = 257, 0.05
-# Two ends nearer than this share of the plane are one corner.
-_SAME = 1e-7
+# Lines whose slopes differ by less, as a share, do not meet.
+_PARALLEL = 1e-12
 
 
 class Edge(NamedTuple):
@@ -84,7 +89,38 @@ class Border:
             return end if np.all(np.isfinite(self._at_end(end))) else float(w[k])
         if piece[after] != piece[k]:
             return float(w[k])
-        return _last_held(self.boundary.borders, float(w[k]), float(w[after]))
+        return self._corner(float(w[k]), float(w[after]))
+
+    def _corner(self, inside: float, outside: float) -> float:
+        """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
+        b = self.boundary
+        inside, outside = _narrow(b.borders, inside, outside, 1)
+        own = int(np.searchsorted([arc.first for arc in b.arcs], inside, side="right")) - 1
+
+        def gaps(w: np.ndarray) -> np.ndarray:
+            here = curve_at(b.loop, w)
+            return b.crossings(here.beta).alpha - here.alpha[:, None]
+
+        ends = gaps(np.array([inside, outside]))
+        ends[:, own] = np.nan
+        meets = np.flatnonzero(np.sign(ends[0]) * np.sign(ends[1]) == -1)
+        if meets.size == 1:
+            (column,), sign = meets, np.sign(ends[0, meets[0]])
+            first, last = (np.abs(ends[k, column]) for k in (0, 1))
+            low, high, at_low, at_high = np.array([[inside], [outside], [first], [-last]])
+            found = false_position(
+                lambda w: sign * gaps(w)[:, column] / (first + last),
+                low,
+                high,
+                at_low / (first + last),
+                at_high / (first + last),
+                _STEPS,
+                2e-16 * outside,
+            )
+            w = float(found[0])
+            if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
+                return w
+        return _narrow(b.borders, inside, outside, _ROUNDS)[0]
 
     @cached_property
     def straight(self) -> list[Edge]:
@@ -111,16 +147,28 @@ class Border:
     def _line_corners(self) -> np.ndarray:
         """The dampings at which two of the lines meet."""
         lines = self.boundary.lines
-        pairs = [
-            (a, b) for k, a in enumerate(lines) for b in lines[:k] if abs(a.f - b.f) > 1e-12 * (abs(a.f) + abs(b.f))
-        ]
-        return np.array([(a.q - b.q) / (a.f - b.f) for a, b in pairs])
+        return np.array([beta for k, line in enumerate(lines) for beta in _meetings(lines[:k], line)])
 
     def _line_end(self, place: int, beta: np.ndarray, k: int, side: int) -> float:
         after = k + side
         if not 0 <= after < beta.size:
             return float(beta[k])
-        return _last_held(lambda at: self.boundary.line_borders(place, at), float(beta[k]), float(beta[after]))
+        ends = float(beta[k]), float(beta[after])
+        return _narrow(lambda at: self.boundary.line_borders(place, at), *ends, _LINE_ROUNDS)[0]
+
+    def _line_meetings(self) -> list[tuple[float, float, float]]:
+        """Corners of two lines: all other highest points are on the curve."""
+        b = self.boundary
+        found = []
+        for place, line in enumerate(b.lines):
+            others = [
+                other for other in b.lines[:place] if abs(other.f - line.f) > 1e-12 * (abs(other.f) + abs(line.f))
+            ]
+            for beta in ((line.q - other.q) / (line.f - other.f) for other in others):
+                near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
+                if b.line_borders(place, near).any():
+                    found.append((float(line.q - beta * line.f), float(beta), line.w))
+        return found
 
     def peak(self) -> StiffestWall | None:
         """The stiffest stable wall, None where no wall is stable."""
@@ -132,24 +180,32 @@ class Border:
             kind = RidgeKind.SMOOTH if inner else RidgeKind.CORNER
             if best is None or edge.alpha[k] > best.alpha:
                 best = StiffestWall(float(edge.alpha[k]), float(edge.beta[k]), w, kind)
-        for edge in self.straight:
-            k = int(np.argmax(edge.alpha))
-            if best is None or edge.alpha[k] > best.alpha * (1 + 1e-9) + 1e-300:
-                best = StiffestWall(float(edge.alpha[k]), float(edge.beta[k]), float(edge.w[k]), RidgeKind.CORNER)
+        for alpha, beta, w in self._line_meetings():
+            if best is None or alpha > best.alpha:
+                best = StiffestWall(alpha, beta, w, RidgeKind.CORNER)
         return best
 
 
-def _last_held(holds: Callable[[np.ndarray], np.ndarray], inside: float, outside: float) -> float:
-    """The last place towards ``outside`` at which a condition still holds; many places are asked at one time."""
-    for _ in range(_ROUNDS):
+def _meetings(others: Sequence[CrossingLine], line: CrossingLine) -> list[float]:
+    """The dampings at which a line meets others that are not parallel to it."""
+    return [
+        (line.q - other.q) / (line.f - other.f)
+        for other in others
+        if abs(other.f - line.f) > _PARALLEL * (abs(other.f) + abs(line.f))
+    ]
+
+
+def _narrow(
+    holds: Callable[[np.ndarray], np.ndarray], inside: float, outside: float, rounds: int
+) -> tuple[float, float]:
+    """Narrow the place towards ``outside`` at which a condition ceases to hold; many places are asked at one time."""
+    for _ in range(rounds):
         places = inside + (outside - inside) * _SHARES
         held = holds(places)
         first = int(np.argmin(held)) if not held.all() else held.size
-        inside, outside = (
-            float(places[first - 1]) if first else inside,
-            float(places[first]) if first < held.size else outside,
-        )
-    return inside
+        inside = float(places[first - 1]) if first else inside
+        outside = float(places[first]) if first < held.size else outside
+    return inside, outside
 
 
 def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:

@@ -8,8 +8,10 @@ import numpy as np
 
 from zwidth.linear.boundary import Boundary
 
-# Rows whose crossings are laid out at one time; and how many walls one row may hold before they are counted in places.
+# Rows whose crossings are laid out at one time.
 _ROWS = 1 << 12
+# With fewer walls a row than this, each wall is compared with its own crossings.
+_FEW_WALLS = 4
 
 
 class Intervals(NamedTuple):
@@ -50,11 +52,49 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> Intervals:
 
 def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
     """Whether each wall is stable; arrays that broadcast. Dampings that repeat are solved once."""
-    alpha, beta = np.broadcast_arrays(alpha, beta)
+    shape = np.broadcast_shapes(alpha.shape, beta.shape)
     rows, place = np.unique(beta, return_inverse=True)
-    inside = stable_intervals(boundary, rows)
+    if rows.size * _FEW_WALLS > np.prod(shape):
+        return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
+    ends = stable_intervals(boundary, rows)
     place = place.reshape(beta.shape)
-    stable = np.zeros(alpha.shape, bool)
-    for k in range(inside.low.shape[1]):
-        stable |= (alpha > inside.low[place, k]) & (alpha < inside.high[place, k])
+    steps = np.diff(alpha.reshape(-1)) if alpha.size > 1 else np.ones(1)
+    in_rows = bool(shape) and alpha.size == shape[-1] and beta.shape == (*shape[:-1], 1)
+    if in_rows and np.all(steps >= 0):
+        return _mark_rows(alpha.reshape(-1), ends, place.reshape(-1)).reshape(shape)
+    stable = np.zeros(shape, bool)
+    for k in range(ends.low.shape[1]):
+        stable |= (alpha > ends.low[:, k][place]) & (alpha < ends.high[:, k][place])
+    return stable
+
+
+def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """The same for walls of their own dampings each: poles are counted, and most crossings need not be solved."""
+    shape = alpha.shape
+    columns, good = (alpha.reshape(-1), beta.reshape(-1)), np.isfinite(alpha + beta).reshape(-1)
+    stable = np.zeros(good.shape, bool)
+    for start in range(0, good.size, _ROWS):
+        part = slice(start, start + _ROWS)
+        alpha, beta = (np.where(good[part], column[part], 0.0) for column in columns)
+        stable[part] = good[part] & (boundary.outside(alpha, beta) == 0)
+    return stable.reshape(shape)
+
+
+def _mark_rows(alpha: np.ndarray, ends: Intervals, place: np.ndarray) -> np.ndarray:
+    """The same for ascending alpha along the last axis: rows are pieces of one pattern, copied at memory speed.
+
+    The pattern is true up to its middle; a row that ends after ``count`` alphas starts ``count`` before the middle.
+    """
+    pattern = np.zeros(2 * alpha.size, bool)
+    pattern[: alpha.size] = True
+    pieces = np.lib.stride_tricks.sliding_window_view(pattern, alpha.size)
+    stable = np.zeros((place.size, alpha.size), bool)
+    for k in range(ends.low.shape[1]):
+        missing = np.isnan(ends.high[:, k])
+        until = np.searchsorted(alpha, np.where(missing, -np.inf, ends.high[:, k]))
+        start = np.searchsorted(alpha, np.where(missing, -np.inf, ends.low[:, k]), side="right")
+        held: np.ndarray = pieces[alpha.size - until[place]]
+        if start.any():
+            held &= ~pieces[alpha.size - np.minimum(start, until)[place]]
+        stable = held if k == 0 else stable | held
     return stable

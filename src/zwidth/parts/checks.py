@@ -2,35 +2,49 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from numbers import Real
 from typing import Any
 
 import numpy as np
 
-from zwidth.domain import SI_RANGE
-from zwidth.errors import InputError
+from zwidth.errors import InputError, UnusableValueError
+from zwidth.formatting import describe
+from zwidth.quantities import NOT_NEGATIVE, Range
+from zwidth.units import Span, find_dimension, read_quantity, read_span, to_float
 from zwidth.xp import is_jax
 
 
 def check_number(field: str, value: Any, unit: str, *, low: float = 0.0, low_open: bool = False) -> Any:
-    """Return one real number in range, a float unless JAX traces or holds it; else raise `InputError`."""
+    """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`.
+
+    A text is a number with a unit, as in configuration files: "70 g".
+    """
     if is_jax(value):
         return value
-    if not isinstance(value, str) and np.ndim(value) != 0:
+    allowed = Range(low, low_open=low_open)
+    return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed)[0])
+
+
+def check_span(field: str, value: Any) -> Any:
+    """Return a length of time as `Span`, in s or in periods as it was given; what JAX holds stays as it is."""
+    return value if is_jax(value) else _read(field, value, lambda known: read_span(known, NOT_NEGATIVE))
+
+
+def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
+    if not isinstance(value, str | Span) and np.ndim(value) != 0:
         raise InputError(f"{field}: got an array of shape {np.shape(value)}; a scene holds single numbers")
-    if isinstance(value, bool | str) or not isinstance(value, Real):
-        raise InputError(f"{field}: got {value!r}; a real number is needed{f' (in {unit})' if unit else ''}")
-    number = float(value)
-    above = number > low if low_open else number >= low
-    if not (math.isfinite(number) and above):
-        bound = "" if low == -math.inf else f" and {'greater than' if low_open else 'at least'} {low:g}"
-        raise InputError(f"{field}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
-    if number and not SI_RANGE[0] <= abs(number) <= SI_RANGE[1]:
-        raise InputError(
-            f"{field}: got {value!r}; it must be 0 or {SI_RANGE[0]:g} to {SI_RANGE[1]:g} in magnitude; check the units"
-        )
-    return number
+    if isinstance(value, Real) and not isinstance(value, bool):
+        # Also what NumPy holds.
+        value = to_float(value)
+    try:
+        return read(value)
+    except UnusableValueError as error:
+        message = str(error)
+        if not isinstance(value, str):
+            # As Python spells it.
+            message = message.replace(f"got {describe(value)};", f"got {value!r};", 1)
+        raise InputError(f"{field}: {message}") from None
 
 
 def check_whole(field: str, value: Any, low: int, high: int) -> int:

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
+
+import numpy as np
 
 from zwidth._types import DELAY_MODELS, DelayModel
 from zwidth.errors import InputError, check_choice
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_number, check_span
+from zwidth.units import Span, in_periods
+from zwidth.xp import is_jax
 
 
 @dataclass(frozen=True)
@@ -16,21 +20,24 @@ class Timing:
 
     Args:
         period: T in s, > 0; or give the rate.
-        delay: t_d, from a sample to the moment its force acts, in s, >= 0, whole periods or not.
+        delay: t_d, from a sample to the moment its force acts, in s, >= 0, whole periods or not; or exactly in
+            periods, as "1.5 periods".
         delay_model: "held" (exact for every delay) or "fractional_power" (the paper's z^(1+d), boundary and
             ridge only).
         rate: 1/T in Hz, > 0, in place of the period.
 
     Example:
         >>> import zwidth
-        >>> zwidth.Timing(rate=4000).period
-        0.00025
+        >>> zwidth.Timing(rate="4 kHz", delay="1.5 periods")
+        Timing(period=0.00025, delay=0.000375, delay_model='held', rate=None)
     """
 
     period: Any = None
     delay: Any = 0.0
     delay_model: DelayModel = "held"
     rate: Any = None
+    # A delay that was given in periods: dividing its seconds by the period might miss it by a rounding error.
+    _periods: ClassVar[float | None] = None
 
     def __post_init__(self) -> None:
         if (self.period is None) == (self.rate is None):
@@ -39,5 +46,15 @@ class Timing:
             object.__setattr__(self, "period", 1.0 / check_number("rate", self.rate, "Hz", low_open=True))
             object.__setattr__(self, "rate", None)
         object.__setattr__(self, "period", check_number("period", self.period, "s", low_open=True))
-        object.__setattr__(self, "delay", check_number("delay", self.delay, "s"))
+        delay = check_span("delay", self.delay)
+        if isinstance(delay, Span):
+            object.__setattr__(self, "_periods", delay.value if delay.unit == "periods" else None)
+            object.__setattr__(self, "delay", delay.seconds(self.period))
         check_choice("delay_model", self.delay_model, DELAY_MODELS)
+
+    @property
+    def d(self) -> Any:
+        """The delay in periods: as given, or the quotient, whole where it is whole but for rounding."""
+        if self._periods is not None:
+            return np.float64(self._periods)
+        return in_periods(*(value if is_jax(value) else np.float64(value) for value in (self.delay, self.period)))

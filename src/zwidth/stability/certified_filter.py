@@ -30,7 +30,7 @@ from zwidth.stability.devices import DeviceTerms, Kind, classify_delays, device
 from zwidth.stability.enclosure import TINY, UNIT, Ball
 from zwidth.stability.layout import Points, pick_points
 from zwidth.status import Status
-from zwidth.xla import COSINE, SINE, store_once
+from zwidth.xla import COSINE, SINE, fit_arcsine, store_once
 from zwidth.xp import horner, namespace
 
 UNSTABLE, STABLE, OPEN = 0, 1, 2
@@ -45,12 +45,7 @@ _EXP_TERMS = [1.0 / factorial(k) for k in range(14)]
 _EXP_LIMIT = -700.0
 
 # asin(sqrt y)/sqrt y by powers of 4 y - 1, within 2^-46 of itself for 0 <= y <= 0.5002, rounding included.
-ARCSINE = [
-    *(1.0471975511965939, 0.053751493591325285, 0.007798902239476116, 0.001519668539770706, 0.0003408637129203685),
-    *(8.302317447211976e-05, 2.1345635825394298e-05, 5.701810038289938e-06, 1.5666403429672824e-06),
-    *(4.400955991598038e-07, 1.2651766241163793e-07, 3.670228515702153e-08, 9.938877829363156e-09),
-    *(2.9355657831219474e-09, 1.3880931000501491e-09, 4.2073851086352364e-10),
-]
+ARCSINE = fit_arcsine(16)
 _LARGEST_U = 1.0002
 # Of both series, on [0, 1.6], the first term left out and the rounding are below 2^-43 (of the angle for the sine).
 _LARGEST_ANGLE = 1.6

@@ -19,12 +19,12 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from zwidth.config.faults import LocatedProblem, describe, listing, problem, suggestion, validation_error
+from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Name, Strict, members
-from zwidth.config.numbers import looks_like_number
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import Study
+from zwidth.formatting import describe, suggestion
 from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
@@ -32,6 +32,7 @@ from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy
 from zwidth.studies.step import StepStudy
 from zwidth.sweep.study import SweepStudy
+from zwidth.units import looks_like_number
 
 FORMAT_VERSION = 1
 

@@ -29,12 +29,12 @@ from zwidth.config.scenes import (
     normalized_wall,
 )
 from zwidth.config.study import HeldOnly, refuse_parts
-from zwidth.config.units import Span
 from zwidth.formatting import plain, with_unit
 from zwidth.quantities import Range
 from zwidth.response import step_response
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.outcome import ComputedStudy, Outcome, stack
+from zwidth.units import Span
 
 
 class ResponseStudy(ComputedStudy):

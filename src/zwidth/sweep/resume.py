@@ -9,9 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from zwidth.config.faults import describe
 from zwidth.errors import StoreError
 from zwidth.files.provenance import differences, digest, versions
+from zwidth.formatting import describe
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
 from zwidth.sweep.study import SweepStudy

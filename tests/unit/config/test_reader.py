@@ -12,11 +12,11 @@ import pytest
 import yaml
 
 from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
-from zwidth.config.units import Span
 from zwidth.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
 from zwidth.studies.passivity import PassivityStudy
 from zwidth.studies.ridge import RidgeStudy
+from zwidth.units import Span
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))

@@ -3,7 +3,8 @@
 import pytest
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Span, quantity
+from zwidth.config.units import quantity
+from zwidth.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Span
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,206 @@
+"""Any linear scene by another way than the library's: absolute coordinates, a dense exponential, every delay a state.
+
+Nothing here shares a formula with `zwidth.linear`: bodies are described by masses, dampers and springs, filters by
+their difference equations, the loop by one matrix whose eigenvalues are the poles. `ball_parts` does the same in
+arithmetic that bounds its own error, for labels where float64 cannot tell.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flint
+import numpy as np
+import scipy.linalg
+import scipy.signal
+
+import zwidth
+
+
+def _masses_and_links(scene: Any) -> tuple[list[list[float]], list[tuple[float, float]]]:
+    """Mass, damping and spring to ground of every body; spring and damper between neighbors."""
+    bodies, links = [[scene.device.mass, scene.device.damping, 0.0]], []
+    tip, hand = scene.device.coupling, scene.operator
+    if tip is not None:
+        bodies.append([tip.mass, 0.0, 0.0])
+        links.append((tip.stiffness, tip.damping))
+    if hand is not None and hand.coupling_stiffness is None:
+        held = bodies[-1]
+        bodies[-1] = [a + b for a, b in zip(held, (hand.mass, hand.damping, hand.stiffness), strict=True)]
+    elif hand is not None:
+        bodies.append([hand.mass, hand.damping, hand.stiffness])
+        links.append((hand.coupling_stiffness, hand.coupling_damping))
+    return bodies, links
+
+
+def _rates(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, int]:
+    """A and B of ``(x, v)' = A (x, v) + B u`` as one table ``[[A, B], [0, 0]]``; bodies; which one the sensor sees."""
+    bodies, links = _masses_and_links(scene)
+    n = len(bodies)
+    table = [[number(0)] * (2 * n + 1) for _ in range(2 * n + 1)]
+    for k, (mass, damping, stiffness) in enumerate(bodies):
+        table[k][n + k] = number(1)
+        table[n + k][k] -= number(stiffness) / number(mass)
+        table[n + k][n + k] -= number(damping) / number(mass)
+    for k, pair in enumerate(links):
+        for place, value in zip((0, n), pair, strict=True):
+            for at, other in ((k, k + 1), (k + 1, k)):
+                share = number(value) / number(bodies[at][0])
+                table[n + at][place + at] -= share
+                table[n + at][place + other] += share
+    table[n][2 * n] = 1 / number(bodies[0][0])
+    tip = scene.device.coupling
+    return table, n, int(tip is not None and tip.sensor == "tip")
+
+
+def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Numerator and denominator of the velocity estimate in m and s, highest power first, of one length."""
+    velocity, period = scene.velocity, scene.timing.period
+    period = getattr(velocity, "coded_period", None) or period
+    top, bottom = np.array([1.0, -1.0]) / period, np.array([1.0, 0.0])
+    if isinstance(velocity, zwidth.VelocityFilter):
+        top, bottom = np.array(velocity.numerator), np.array(velocity.denominator)
+    elif isinstance(velocity, zwidth.WindowedDifference):
+        top, bottom = np.zeros(velocity.samples + 1), np.zeros(velocity.samples + 1)
+        top[[0, -1]] = 1.0 / (velocity.samples * period), -1.0 / (velocity.samples * period)
+        bottom[0] = 1.0
+    elif isinstance(velocity, zwidth.LowPass):
+        tau = velocity.time_constant or 1.0 / (2.0 * np.pi * velocity.cutoff)
+        p = np.exp(-period / tau)
+        for _ in range(velocity.order):
+            top, bottom = np.convolve(top, [-np.expm1(-period / tau), 0.0]), np.convolve(bottom, [1.0, -p])
+    elif isinstance(velocity, zwidth.Butterworth):
+        b, a = scipy.signal.butter(velocity.order, 2.0 * velocity.cutoff * period)
+        top, bottom = np.convolve(b, top), np.convolve(a, bottom)
+    return np.concatenate([np.zeros(bottom.size - top.size), top]), bottom
+
+
+def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> np.ndarray:
+    """One period of the closed loop; state: positions, velocities, filter, then the forces on their way."""
+    table, n, sensor = _rates(scene)
+    period, late = scene.timing.period, scene.whole_delay
+    fraction = scene.d - late
+    rate = np.array(table) * period
+    step, rest, first = (scipy.linalg.expm(rate * part) for part in (1.0, 1.0 - fraction, fraction))
+    size = 2 * n
+    newer, older = rest[:size, size], rest[:size, :size] @ first[:size, size]
+    top, bottom = velocity_polynomials(scene)
+    top, bottom = top / bottom[0], bottom / bottom[0]
+    order = bottom.size - 1
+    queue = late + (1 if fraction else 0)
+    total = size + order + queue
+    force = np.zeros(total)
+    force[sensor] = -(stiffness + virtual_damping * top[0])
+    force[size : size + order] = -virtual_damping * (top[1:] - top[0] * bottom[1:])
+
+    def sample(age: int) -> np.ndarray:
+        """The force computed so many samples ago, as a row of the state."""
+        return force if age == 0 else np.eye(total)[size + order + age - 1]
+
+    matrix = np.zeros((total, total))
+    matrix[:size, :size] = step[:size, :size]
+    matrix[:size] += np.outer(newer, sample(late))
+    if fraction:
+        matrix[:size] += np.outer(older, sample(late + 1))
+    if order:
+        matrix[size, size : size + order] = -bottom[1:]
+        matrix[size + 1 : size + order, size : size + order - 1] = np.eye(order - 1)
+        matrix[size, sensor] += 1.0
+    for age in range(queue):
+        matrix[size + order + age] = sample(age)
+    return matrix
+
+
+def spectral_radius(scene: Any, stiffness: float, virtual_damping: float) -> float:
+    """The largest magnitude of a pole."""
+    return float(np.abs(np.linalg.eigvals(closed_loop_matrix(scene, stiffness, virtual_damping))).max())
+
+
+def _ball(value: Any) -> flint.arb:
+    return flint.arb(value)
+
+
+def _ball_filter(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly]:
+    """The velocity estimate in balls, lowest power first as flint keeps them."""
+    velocity, period = scene.velocity, _ball(scene.timing.period)
+    if isinstance(velocity, zwidth.VelocityFilter):
+        parts = [flint.acb_poly([_ball(c) for c in p[::-1]]) for p in (velocity.numerator, velocity.denominator)]
+        return parts[0], parts[1]
+    coded = getattr(velocity, "coded_period", None)
+    period = period if coded is None else _ball(coded)
+    z = flint.acb_poly([0, 1])
+    if isinstance(velocity, zwidth.WindowedDifference):
+        power = z**velocity.samples
+        return (power - 1) * (1 / (period * velocity.samples)), power
+    top, bottom = (z - 1) * (1 / period), z
+    if isinstance(velocity, zwidth.LowPass):
+        rate = 1 / _ball(velocity.time_constant) if velocity.time_constant else 2 * flint.arb.pi() * velocity.cutoff
+        p = (-period * rate).exp()
+        for _ in range(velocity.order):
+            top, bottom = top * z * (1 - p), bottom * (z - p)
+    if isinstance(velocity, zwidth.Butterworth):
+        warped = (flint.arb.pi() * _ball(velocity.cutoff) * period).tan()
+        for k in range(velocity.order):
+            angle = flint.arb.pi() * (2 * k + 1 + velocity.order) / (2 * velocity.order)
+            s = warped * flint.acb(angle.cos(), angle.sin())
+            # s/(bilinear - s) with the bilinear (z - 1)/(z + 1).
+            top, bottom = top * (z + 1) * (-s), bottom * ((z - 1) - (z + 1) * s)
+    return top, bottom
+
+
+def ball_parts(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly, flint.acb_poly]:
+    """``P = D + K N1 + B N2`` in SI units, in the precision of `flint.ctx`."""
+    table, n, sensor = _rates(scene, _ball)
+    size, late = 2 * n, scene.whole_delay
+    fraction = _ball(scene.d) - late
+    rate = flint.arb_mat(table) * _ball(scene.timing.period)
+    step, rest, first = (_top((rate * part).exp(), size) for part in (_ball(1), 1 - fraction, fraction))
+    own = step[0].charpoly()
+
+    def answer(push: flint.arb_mat) -> flint.arb_poly:
+        """``C adj(z - step) push`` as the change of the determinant."""
+        seen = flint.arb_mat(size, size, [push[i, 0] if j == sensor else 0 for i in range(size) for j in range(size)])
+        return (step[0] - seen).charpoly() - own
+
+    z = flint.acb_poly([0, 1])
+    top, bottom = _ball_filter(scene)
+    if scene.d == late:
+        device, moved = z**late * flint.acb_poly(own), flint.acb_poly(answer(rest[1]))
+    else:
+        older = flint.acb_poly(answer(rest[0] * first[1]))
+        device, moved = z ** (late + 1) * flint.acb_poly(own), z * flint.acb_poly(answer(rest[1])) + older
+    return device * bottom, moved * bottom, moved * top
+
+
+def _top(block: flint.arb_mat, size: int) -> tuple[flint.arb_mat, flint.arb_mat]:
+    a = flint.arb_mat(size, size, [block[i, j] for i in range(size) for j in range(size)])
+    return a, flint.arb_mat(size, 1, [block[i, size] for i in range(size)])
+
+
+def count_outside(scene: Any, stiffness: float, virtual_damping: float, digits: int = 60) -> int | None:
+    """Poles outside the unit circle, proved by disjoint balls; None where one ball meets the circle."""
+    before = flint.ctx.dps
+    try:
+        flint.ctx.dps = digits
+        device, spring, damper = ball_parts(scene)
+        polynomial = device + spring * _ball(stiffness) + damper * _ball(virtual_damping)
+        outside = 0
+        for root in _nonzero(polynomial).roots():
+            size = abs(root)
+            if size > 1:
+                outside += 1
+            elif not size < 1:
+                return None
+        return outside
+    except ValueError:
+        return None
+    finally:
+        flint.ctx.dps = before
+
+
+def _nonzero(polynomial: flint.acb_poly) -> flint.acb_poly:
+    """Without its exact roots at 0, which lie inside and are multiple."""
+    parts = polynomial.coeffs()
+    while parts and parts[0] == 0:
+        parts = parts[1:]
+    return flint.acb_poly(parts)
