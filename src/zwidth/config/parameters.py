@@ -89,6 +89,8 @@ def _schema_of(name: str) -> WithJsonSchema:
     return axis_schema(entry, entry)
 
 
+CutoffAxis = Annotated[Axis, PlainValidator(_reader("velocity.cutoff")), SPELLED, _schema_of("velocity.cutoff")]
+WindowAxis = Annotated[Axis, PlainValidator(_reader("velocity.samples")), SPELLED, _schema_of("velocity.samples")]
 # Of the parameters of parts, by path.
 PART_AXES: dict[str, Any] = {
     name: Annotated[Axis, PlainValidator(_reader(name)), SPELLED, _schema_of(name)] for name in OF_PARTS

@@ -3,6 +3,8 @@
 from .boundary import draw_boundary as draw_boundary
 from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines
+from .filters import draw_filter_noise as draw_filter_noise
+from .filters import draw_filters as draw_filters
 from .passivity_cost import draw_passivity_cost as draw_passivity_cost
 from .plane import draw_plane as draw_plane
 from .recommendation import draw_recommendation as draw_recommendation

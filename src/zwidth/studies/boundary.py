@@ -71,7 +71,7 @@ class BoundaryStudy(CurvesStudy):
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         given = [name for name in ("delta", "d") if name in raw]
-        if len(given) == 1 and is_with_parts(scene):
+        if len(given) == 1 and "device" not in raw and is_with_parts(scene):
             remedy = f"remove {given[0]!r}, or give both delta and d"
             raise problem(f"got {given[0]!r} beside a scene with parts", "a device with parts has its own", remedy)
 

@@ -26,6 +26,8 @@ from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, Scene
 from zwidth.config.study import Study
 from zwidth.formatting import describe, suggestion
 from zwidth.studies.boundary import BoundaryStudy
+from zwidth.studies.compare import CompareStudy
+from zwidth.studies.filters import FiltersStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
 from zwidth.studies.recommend import RecommendStudy
@@ -53,7 +55,17 @@ def register(model: type[Study]) -> type[Study]:
     return model
 
 
-for _model in (BoundaryStudy, MapStudy, RidgeStudy, PassivityStudy, StepStudy, RecommendStudy, SweepStudy):
+for _model in (
+    BoundaryStudy,
+    MapStudy,
+    RidgeStudy,
+    PassivityStudy,
+    StepStudy,
+    RecommendStudy,
+    CompareStudy,
+    FiltersStudy,
+    SweepStudy,
+):
     register(_model)
 
 
