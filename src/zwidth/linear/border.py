@@ -78,7 +78,9 @@ class Border:
             end = 0.0 if side < 0 else np.pi
             return end if np.all(np.isfinite(self.at_end(end))) else float(w[k])
         if piece[after] != piece[k]:
-            return float(w[k])
+            # Towards an angle at which the curve runs to infinity; it may leave the stable set before.
+            limit = self.boundary.infinite[piece[k] if side > 0 else piece[k] - 1]
+            return self._corner(float(w[k]), float(limit))
         return self._corner(float(w[k]), float(w[after]))
 
     def _corner(self, inside: float, outside: float) -> float:
