@@ -7,7 +7,7 @@ monotone, so that each row meets an arc once at most. Along a row a pole leaves 
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
 
-with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide. It is counted once.
+with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide.
 """
 
 from __future__ import annotations
@@ -19,10 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.errors import ZwidthError
-from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths
+from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths, lag_jet, product_jet
 from zwidth.numerics.roots import false_position
-from zwidth.stability.counting import count_poles
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08
@@ -31,6 +29,8 @@ _ROUNDS = 60
 _INSIDE = np.arange(1, 8) / 8.0
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
 _MOST_STEPS, _ARRIVED = 120, 1e-10
+# How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
+_ROOM = 0.02
 # Of |q|: less of an imaginary part than that where Im F vanishes is none.
 _NONE = 1e-11
 
@@ -43,6 +43,7 @@ class CurvePoints(NamedTuple):
     alpha_slope: np.ndarray  # d alpha/dw
     turn: np.ndarray  # Im q' Im F - Im q Im F', of the sign of d beta/dw
     fall: np.ndarray  # Im F
+    size: np.ndarray  # |q| + |beta F|, of which alpha is a difference
 
 
 class Arc(NamedTuple):
@@ -50,6 +51,9 @@ class Arc(NamedTuple):
 
     w: np.ndarray
     beta: np.ndarray
+    alpha: np.ndarray
+    size: np.ndarray
+    leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
 
     @property
     def first(self) -> float:
@@ -86,7 +90,8 @@ def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
         turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
         beta_slope = turn / f.value.imag**2
         alpha_slope = q.slope.real - beta_slope * f.value.real - beta * f.slope.real
-        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag)
+        size = np.abs(q.value) + np.abs(beta * f.value)
+        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag, size)
 
 
 def nodes_of(loop: LinearLoop) -> np.ndarray:
@@ -128,23 +133,23 @@ class Boundary:
         poles = np.union1d(poles, _circle_zeros(loop))
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
-        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns)), (*lines, *_end_lines(loop)), poles)
+        limits = _limits_at(loop, np.array([0.0, np.pi, *(line.w for line in lines)]))
+        arcs = tuple(_arcs(loop, w, here, poles, turns, limits))
+        return cls(loop, w, arcs, (*lines, *_end_lines(loop)), poles)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
-        rows, places, low, high = [], [], [], []
-        for place, arc in enumerate(self.arcs):
-            row = np.flatnonzero((beta >= arc.beta[0]) & (beta <= arc.beta[-1]))
-            k = np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
-            rows.append(row)
-            places.append(np.full(row.size, place))
-            low.append(arc.w[k - 1])
-            high.append(arc.w[k])
-        row, place = np.concatenate(rows), np.concatenate(places)
-        w, alpha, sign = _solve_rows(self.loop, beta[row], np.concatenate(low), np.concatenate(high))
+        cells = [_cells(arc, beta) for arc in self.arcs]
+        row = np.concatenate([rows for rows, _ in cells])
+        place = np.repeat(np.arange(len(cells)), [rows.size for rows, _ in cells])
+        low = np.concatenate([arc.w[k - 1] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
+        high = np.concatenate([arc.w[k] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
+        leaving = np.array([arc.leaving for arc in self.arcs])[place]
+        w, alpha = _solve_rows(self.loop, beta[row], low, high, leaving > 0)
         shape = beta.size, len(self.arcs) + len(self.lines)
         out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
-        out.alpha[row, place], out.w[row, place], out.leaving[row, place] = alpha, w, 2.0 * sign
+        out.alpha[row, place], out.w[row, place] = alpha, w
+        out.leaving[row, place] = leaving
         for place, line in enumerate(self.lines, len(self.arcs)):
             out.alpha[:, place] = line.q - beta * line.f
             out.w[:, place] = line.w
@@ -156,10 +161,31 @@ class Boundary:
         return self.base + self._passed(alpha, beta)
 
     def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> np.ndarray:
-        """Poles that have left below each wall, without those of one column of the crossings."""
-        found = self.crossings(beta)
-        counts = (found.alpha < alpha[:, None]) & (np.arange(found.alpha.shape[1]) != np.reshape(but, (-1, 1)))
-        return np.where(counts, found.leaving, 0.0).sum(-1).astype(int)
+        """Poles that have left below each wall, without those of one column of the crossings.
+
+        Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
+        """
+        but = np.broadcast_to(but, beta.shape)
+        total = np.zeros(beta.shape)
+        near: list[tuple[np.ndarray, ...]] = []
+        for place, arc in enumerate(self.arcs):
+            row, k = _cells(arc, beta)
+            with np.errstate(all="ignore"):
+                ends = np.stack([arc.alpha[k - 1], arc.alpha[k]])
+                room = np.abs(ends[1] - ends[0]) + _ROOM * np.maximum(arc.size[k - 1], arc.size[k])
+                above, below = alpha[row] > ends.max(0) + room, alpha[row] < ends.min(0) - room
+            counted = but[row] != place
+            total[row[above & counted]] += arc.leaving
+            left = ~(above | below) & counted
+            near.append((row[left], np.full(left.sum(), arc.leaving), arc.w[k[left] - 1], arc.w[k[left]]))
+        row, leaving, low, high = (np.concatenate(column) for column in zip(*near, strict=True))
+        if row.size:
+            passed = _solve_rows(self.loop, beta[row], low, high, leaving > 0)[1] < alpha[row]
+            np.add.at(total, row[passed], leaving[passed])
+        for place, line in enumerate(self.lines, len(self.arcs)):
+            passed = (line.q - beta * line.f < alpha) & (but != place)
+            total += np.where(passed, line.poles * np.sign(line.q_turn - beta * line.f_turn), 0.0)
+        return total.astype(int)
 
     def borders(self, w: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of the curve at each angle."""
@@ -180,48 +206,40 @@ class Boundary:
 
     @cached_property
     def base(self) -> int:
-        """Poles outside far below every crossing; three walls that are counted one by one must agree on it."""
-        told = []
-        for alpha, beta in self._witnesses():
-            outside = outside_by_count(self.loop, alpha, beta)
-            told.append(outside - int(self._passed(np.array([alpha]), np.array([beta]))[0]))
-        if len(set(told)) != 1:
-            raise ZwidthError(
-                f"scene: the boundary does not agree with counted poles ({told}); please report this loop"
-            )
-        return told[0]
+        """Poles outside far below every crossing (docs/theory/scenes.md, S14)."""
+        return self._far_outside(-1.0)
 
-    def _witnesses(self) -> list[tuple[float, float]]:
-        """Walls far from every crossing of their rows."""
-        spread = np.concatenate([arc.beta[np.isfinite(arc.beta)] for arc in self.arcs])
-        size = np.quantile(np.abs(spread), 0.25) + 1e-12
-        found = []
-        for beta in (0.31 * size, -0.17 * size, 1.37 * size):
-            alpha = np.sort(self.crossings(np.array([beta])).alpha[0])
-            alpha = alpha[np.isfinite(alpha)]
-            ends = np.concatenate([[alpha[0] - 1.0 - abs(alpha[0])], alpha, [alpha[-1] + 1.0 + abs(alpha[-1])]])
-            # Of the gaps between crossings the one that is widest for its height.
-            gap = np.diff(ends) / (np.abs(ends[1:]) + np.abs(ends[:-1]) + 1e-300)
-            best = int(np.argmax(gap))
-            found.append((0.5 * float(ends[best] + ends[best + 1]), float(beta)))
-        return found
+    @cached_property
+    def top(self) -> int:
+        """Poles outside far above every crossing: every row's crossings must lead from ``base`` to it."""
+        return self._far_outside(1.0)
+
+    def _far_outside(self, side: float) -> int:
+        """Where the wall's spring is all there is, the poles are at the device's zeros, the others at infinity."""
+        loop = self.loop
+        depth = depths(loop.zeros)
+        on = np.abs(depth) <= ON_CIRCLE
+        at = circle(np.abs(np.angle(1.0 - loop.zeros[on])))
+        answer = product_jet(at, loop.zeros, loop.gain).over(product_jet(at, loop.poles, 1.0))
+        answer = answer.times(lag_jet(at, -loop.lag))
+        # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
+        leaving = int(np.sum(side * answer.slope.imag < 0))
+        return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
 
 
-def outside_by_count(loop: LinearLoop, alpha: float, beta: float) -> int:
-    """Poles of one wall outside the unit circle, counted without the boundary."""
-    from zwidth.linear.polynomial import closed_loop_poles, closed_loop_roots
-
-    zeros, poles, gain, lag = closed_loop_roots(loop, alpha, beta)
-    inside = int(count_poles(zeros, poles, gain=gain, lag=max(lag, 0)))
-    if inside >= 0:
-        return max(poles.size + lag, zeros.size) - inside
-    return int(np.sum(np.abs(closed_loop_poles(loop, alpha, beta)) >= 1.0))
+def _cells(arc: Arc, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The rows that meet an arc, and before which of its nodes."""
+    row = np.flatnonzero((beta >= arc.beta[0]) & (beta <= arc.beta[-1]))
+    return row, np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
 
 
-def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, ...]:
-    """The angle between two nodes at which each row crosses, its alpha, and whether a pole leaves there (1, else -1).
+def _solve_rows(
+    loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray, rising: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The angle between two nodes at which each row crosses, and its alpha.
 
-    ``Im q - beta Im F`` over sin w, by Newton's method kept inside its bracket; who has arrived takes no part any more.
+    ``Im q - beta Im F`` over sin w, which is ``rising`` with w where a pair leaves, by Newton's method kept inside its
+    bracket; who has arrived takes no part any more.
     """
     below, above = np.minimum(low, high), np.maximum(low, high)
     first, last = _residual(loop, beta, below)[0], _residual(loop, beta, above)[0]
@@ -229,12 +247,10 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
     found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
-    # By both ends: on a row through a node one of them is rounding.
-    rising = first < last
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
-        value, slope, _, _ = _residual(loop, beta[here], x)
+        value, slope, _ = _residual(loop, beta[here], x)
         ahead = (value < 0) == rising[here]
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
@@ -247,12 +263,11 @@ def _solve_rows(loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.nd
         if not on.any():
             break
         here, x = here[on], new[on]
-    _, _, alpha, leave = _residual(loop, beta, found)
-    return found, alpha, np.where(leave > 0, 1.0, -1.0)
+    return found, _residual(loop, beta, found)[2]
 
 
 def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``Im(q - beta F)/sin w`` with its limits, its derivative; and ``Re(q - beta F)`` and ``Im(q' - beta F')``."""
+    """``Im(q - beta F)/sin w`` with its limits at 0 and pi, its derivative, and ``Re(q - beta F)``."""
     at = circle(w)
     with np.errstate(all="ignore"):
         q, f = loop.needed(at), loop.estimate.jet(at)
@@ -261,7 +276,7 @@ def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.nda
         end = sine == 0
         safe = np.where(end, 1.0, sine)
         ratio = np.where(end, slope.imag / cosine, value.imag / safe)
-        return ratio, (slope.imag - ratio * cosine) / safe, value.real, slope.imag
+        return ratio, (slope.imag - ratio * cosine) / safe, value.real
 
 
 def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
@@ -321,49 +336,58 @@ def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
         with np.errstate(all="ignore"):
             q, f = loop.needed(at), loop.estimate.jet(at)
         numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
-        if np.all(np.isfinite(numbers)) and abs(numbers[0]) < 1e14:
+        infinite = np.any(np.abs(loop.zeros - (2.0 if w else 0.0)) <= ON_CIRCLE)
+        if np.all(np.isfinite(numbers)) and not infinite:
             q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
             lines.append(CrossingLine(w, q_value, f_value, q_turn, f_turn, 1))
     return lines
 
 
-def _arcs(loop: LinearLoop, w: np.ndarray, here: CurvePoints, poles: np.ndarray, turns: np.ndarray) -> list[Arc]:
-    """Cut the curve where beta turns or runs to infinity."""
-    cuts = np.sort(np.concatenate([poles, turns]))
-    ends = np.concatenate([[0.0], cuts, [np.pi]])
+def _arcs(
+    loop: LinearLoop,
+    w: np.ndarray,
+    here: CurvePoints,
+    poles: np.ndarray,
+    turns: np.ndarray,
+    limits: dict[float, float],
+) -> list[Arc]:
+    """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
+    ends = np.unique(np.concatenate([list(limits), poles, turns]))
     at_pole = {float(p) for p in poles}
-    limits = _end_limits(loop)
     arcs = []
     for a, b in pairwise(ends.tolist()):
         inner = (w > a) & (w < b)
-        nodes, beta, slope = w[inner], here.beta[inner], here.turn[inner]
+        nodes, curve = w[inner], CurvePoints(*(values[inner] for values in here))
         if not nodes.size:
             nodes = np.array([0.5 * (a + b)])
-            middle = curve_at(loop, nodes)
-            beta, slope = middle.beta, middle.turn
-        rising = np.sum(np.sign(slope)) > 0
+            curve = curve_at(loop, nodes)
+        rising = np.sum(np.sign(curve.turn)) > 0
+        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
+        leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
         first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
         last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
-        nodes, beta = np.concatenate([[a], nodes, [b]]), np.concatenate([[first], beta, [last]])
+        # What the ends' alpha is no one asks: next to them every wall is compared with the crossing itself.
+        nodes, beta = np.concatenate([[a], nodes, [b]]), np.concatenate([[first], curve.beta, [last]])
+        alpha, size = (np.concatenate([[np.nan], part, [np.nan]]) for part in (curve.alpha, curve.size))
         if not rising:
-            nodes, beta = nodes[::-1], beta[::-1]
+            nodes, beta, alpha, size = nodes[::-1], beta[::-1], alpha[::-1], size[::-1]
         # Next to a limit or an extreme rounding may leave a node out of order; without it nothing is lost.
         good = np.maximum.accumulate(beta) == beta
         good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
         good[[0, -1]] = True
         if beta[0] <= beta[-1]:
-            arcs.append(Arc(nodes[good], beta[good]))
+            arcs.append(Arc(nodes[good], beta[good], alpha[good], size[good], leaving))
     return arcs
 
 
-def _end_limits(loop: LinearLoop) -> dict[float, float]:
-    """``Im q'/Im F'``, the limit of beta, at 0 and at pi; infinite or NaN where there is none."""
-    at = circle(np.array([0.0, np.pi]))
+def _limits_at(loop: LinearLoop, w: np.ndarray) -> dict[float, float]:
+    """``Im q'/Im F'``, the limit of beta where Im q and Im F vanish; infinite or NaN where there is none."""
+    at = circle(w)
     with np.errstate(all="ignore"):
         q, f = loop.needed(at), loop.estimate.jet(at)
         steep = np.abs(f.slope.imag) > 1e-12 * (1.0 + np.abs(f.slope))
         limit = np.where(steep & np.isfinite(q.slope.imag), q.slope.imag / f.slope.imag, np.nan)
-    return {0.0: float(limit[0]), float(np.pi): float(limit[1])}
+    return dict(zip(w.tolist(), limit.tolist(), strict=True))
 
 
 def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:

@@ -10,6 +10,8 @@ from zwidth.linear.boundary import Boundary
 
 # Rows whose crossings are laid out at one time.
 _ROWS = 1 << 12
+# With fewer walls a row than this, each wall is compared with its own crossings.
+_FEW_WALLS = 4
 
 
 class Intervals(NamedTuple):
@@ -52,6 +54,8 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
     """Whether each wall is stable; arrays that broadcast. Dampings that repeat are solved once."""
     shape = np.broadcast_shapes(alpha.shape, beta.shape)
     rows, place = np.unique(beta, return_inverse=True)
+    if rows.size * _FEW_WALLS > np.prod(shape):
+        return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
     ends = stable_intervals(boundary, rows)
     place = place.reshape(beta.shape)
     steps = np.diff(alpha.reshape(-1)) if alpha.size > 1 else np.ones(1)
@@ -62,6 +66,18 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
     for k in range(ends.low.shape[1]):
         stable |= (alpha > ends.low[:, k][place]) & (alpha < ends.high[:, k][place])
     return stable
+
+
+def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+    """The same for walls of their own dampings each: poles are counted, and most crossings need not be solved."""
+    shape = alpha.shape
+    columns, good = (alpha.reshape(-1), beta.reshape(-1)), np.isfinite(alpha + beta).reshape(-1)
+    stable = np.zeros(good.shape, bool)
+    for start in range(0, good.size, _ROWS):
+        part = slice(start, start + _ROWS)
+        alpha, beta = (np.where(good[part], column[part], 0.0) for column in columns)
+        stable[part] = good[part] & (boundary.outside(alpha, beta) == 0)
+    return stable.reshape(shape)
 
 
 def _mark_rows(alpha: np.ndarray, ends: Intervals, place: np.ndarray) -> np.ndarray:
