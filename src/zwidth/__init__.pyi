@@ -33,6 +33,7 @@ from .errors import StoreExistsError as StoreExistsError
 from .errors import TracedDelayError as TracedDelayError
 from .errors import ZwidthError as ZwidthError
 from .kernel_cache import use_compilation_cache as use_compilation_cache
+from .linear.answers import to_control as to_control
 from .loop import char_poly as char_poly
 from .normalization import denormalize as denormalize
 from .normalization import normalize as normalize

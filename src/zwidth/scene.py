@@ -11,9 +11,12 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
+from zwidth.linear import answers
 from zwidth.linear.border import Border, Outline, outlines
 from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
+from zwidth.linear.poles import all_poles
+from zwidth.linear.radius import spectral_radius as linear_radius
 from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear_loop import LinearLoop
 from zwidth.normalization import Normalized, Physical, denormalize, normalize
@@ -24,6 +27,8 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
 from zwidth.stability.labels import is_stable
+from zwidth.stability.poles import poles
+from zwidth.stability.radii import spectral_radius
 
 _EXAMPLES = {
     "device": "zwidth.Device(mass=0.1, damping=10)",
@@ -275,3 +280,52 @@ class Scene:
             50.0
         """
         return replace_parameters(self, changes)
+
+    def poles(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
+        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
+
+        Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
+        is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return poles(alpha, beta, self.delta, self.d)
+        return 1.0 + all_poles(self.loop, alpha, beta)
+
+    def pole_table(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> answers.PoleTable:
+        """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return answers.pole_table(self.loop, alpha, beta, self.timing.period)
+
+    def spectral_radius(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
+
+        From all poles; beyond 60 of them by counting poles in circles, at a cost that does not grow with the delay.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return spectral_radius(alpha, beta, self.delta, self.d)
+        stable = label_walls(self.traced_boundary, alpha, beta).reshape(-1)
+        found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
+        return found.reshape(alpha.shape)[()]
+
+    def state_space(self, stiffness: float = 0.0, virtual_damping: float = 0.0) -> answers.StateSpace:
+        """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
+
+        Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
+        """
+        wall = answers.one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return answers.closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def open_loop(self, stiffness: float = 0.0, virtual_damping: float = 0.0) -> answers.StateSpace:
+        """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
+        wall = answers.one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return answers.open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def frequency_response(self, stiffness: ArrayLike, virtual_damping: ArrayLike, frequency: ArrayLike) -> Array:
+        """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
+
+        All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return answers.frequency_response(self.loop, alpha, beta, frequency, self.timing.period)
