@@ -199,7 +199,7 @@ def count_outside(scene: Any, stiffness: float, virtual_damping: float, digits: 
 
 
 def nonzero(polynomial: flint.acb_poly) -> flint.acb_poly:
-    """Without its roots at 0, which lie inside and are multiple: exact ones, and those of modes gone within a sample."""
+    """Without its roots at 0, which lie inside and are multiple: exact ones, and modes that are gone in a sample."""
     parts = polynomial.coeffs()
     largest = max(abs(part).abs_upper() for part in parts)
     while parts and abs(parts[0]) < largest * flint.arb(10) ** -40:
@@ -219,7 +219,7 @@ def scene_of(parts: dict[str, Any]) -> zwidth.Scene:
 
 
 def random_scene(kind: str, generator: np.random.Generator) -> zwidth.Scene:
-    """One random scene of a kind of `KINDS`: plain filters and hands, couplings soft and stiff, whole delays and not."""
+    """One random scene of a kind of `KINDS`: filters and hands, couplings soft and stiff, whole delays and not."""
     draw = generator.uniform
     mass, period = 10 ** draw(-1.5, 0.5), 10 ** draw(-4, -2.5)
     coupling = hand = None

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -82,7 +84,7 @@ def test_intervals_of_rows_are_those_of_a_dense_scan(kind):
             size = np.max(np.abs(ours), initial=0.0, where=np.isfinite(ours)) or units.stiffness
             cuts = crossings[np.abs(crossings) < 3 * size]
             cuts = np.concatenate([[-size], cuts, [3 * size]]) if cuts.size else np.array([-size, 3 * size])
-            for low, high in zip(cuts[:-1], cuts[1:], strict=True):
+            for low, high in pairwise(cuts):
                 if high - low < 1e-6 * size:
                     continue
                 middle = 0.5 * (low + high)
