@@ -70,8 +70,8 @@ def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
         for _ in range(velocity.order):
             top, bottom = np.convolve(top, [-np.expm1(-period / tau), 0.0]), np.convolve(bottom, [1.0, -p])
     elif isinstance(velocity, zwidth.Butterworth):
-        b, a = scipy.signal.butter(velocity.order, 2.0 * velocity.cutoff * period)
-        top, bottom = np.convolve(b, top), np.convolve(a, bottom)
+        designed: Any = scipy.signal.butter(velocity.order, 2.0 * velocity.cutoff * period)
+        top, bottom = np.convolve(designed[0], top), np.convolve(designed[1], bottom)
     return np.concatenate([np.zeros(bottom.size - top.size), top]), bottom
 
 
@@ -199,7 +199,7 @@ def count_outside(scene: Any, stiffness: float, virtual_damping: float, digits: 
 
 
 def nonzero(polynomial: flint.acb_poly) -> flint.acb_poly:
-    """Without its roots at 0, which lie inside and are multiple: exact ones, and modes that are gone in a sample."""
+    """Without its roots at 0, which lie inside: exact ones, and those of modes gone within a sample."""
     parts = polynomial.coeffs()
     largest = max(abs(part).abs_upper() for part in parts)
     while parts and abs(parts[0]) < largest * flint.arb(10) ** -40:
@@ -219,7 +219,7 @@ def scene_of(parts: dict[str, Any]) -> zwidth.Scene:
 
 
 def random_scene(kind: str, generator: np.random.Generator) -> zwidth.Scene:
-    """One random scene of a kind of `KINDS`: filters and hands, couplings soft and stiff, whole delays and not."""
+    """One random scene of a kind of `KINDS`: filters, hands, couplings soft and stiff, whole delays and not."""
     draw = generator.uniform
     mass, period = 10 ** draw(-1.5, 0.5), 10 ** draw(-4, -2.5)
     coupling = hand = None

@@ -391,7 +391,7 @@ def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
 
 
 def _circle_zeros(loop: LinearLoop) -> np.ndarray:
-    """Angles of zeros on the circle: of an undamped device (q is infinite), and of F (Im F may only touch 0 there)."""
+    """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
     zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
     angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
@@ -410,6 +410,14 @@ def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
             q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
             lines.append(CrossingLine(w, q_value, f_value, q_turn, f_turn, 1))
     return lines
+
+
+def _find_tie(line: CrossingLine, arcs: tuple[Arc, ...]) -> float:
+    """The line's sign on the row on which the arc beside it ends, which counts as one that the arc does not meet."""
+    for arc in (arcs[0], arcs[-1]):
+        if line.w in (arc.w[0], arc.w[-1]):
+            return float(np.sign(line.f_turn)) * (1.0 if arc.w[0] == line.w else -1.0)
+    return 0.0
 
 
 def _arcs(
@@ -453,5 +461,7 @@ def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limit
     if w in at_pole:
         return side * np.inf
     if w in limits:
-        return limits[w] if np.isfinite(limits[w]) else side * np.inf
+        # The row that ends on the line of a real pole is that line's, see `_find_tie`.
+        inward = np.nextafter(limits[w], -side * np.inf) if w in (0.0, np.pi) else limits[w]
+        return float(inward) if np.isfinite(limits[w]) else side * np.inf
     return float(curve_at(loop, np.array([w])).beta[0])
