@@ -9,6 +9,8 @@ from .design.damping import FastestWall as FastestWall
 from .design.damping import fastest_damping as fastest_damping
 from .design.damping import fastest_wall as fastest_wall
 from .design.damping import most_robust_damping as most_robust_damping
+from .design.limits import Limit as Limit
+from .design.limits import limits_of as limits_of
 from .design.passive import passive_area as passive_area
 from .design.requirements import Requirement as Requirement
 from .design.requirements import allowed_delay as allowed_delay
