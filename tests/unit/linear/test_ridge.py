@@ -101,9 +101,17 @@ BOUND = {
         False,
         None,
     ),
-    "double pole": (Scene(Device(1.0, 19.0), Timing(1.0, 0.1), WindowedDifference(4)), False, "MINUS_ONE STATIONARY"),
-    "real pole": (Scene(Device(1.0, 15.4), Timing(1.0), Butterworth(0.117)), False, "PAIR MINUS_ONE"),
-    "row at -1": (Scene(Device(1.0, 31.5), Timing(1.0), LowPass(cutoff=0.0244)), False, "MINUS_ONE NO_DAMPING"),
+    "double pole": (
+        Scene(Device(1.0, 19.0), Timing(1.0, 0.1), velocity=WindowedDifference(4)),
+        False,
+        "MINUS_ONE STATIONARY",
+    ),
+    "real pole": (Scene(Device(1.0, 15.4), Timing(1.0), velocity=Butterworth(0.117)), False, "PAIR MINUS_ONE"),
+    "row at -1": (
+        Scene(Device(1.0, 31.5), Timing(1.0), velocity=LowPass(cutoff=0.0244)),
+        False,
+        "MINUS_ONE NO_DAMPING",
+    ),
 }
 
 
