@@ -25,6 +25,9 @@ from .design.robust import robust_wall as robust_wall
 from .design.stiffness import Sensitivities as Sensitivities
 from .design.stiffness import max_stiffness as max_stiffness
 from .design.stiffness import sensitivities as sensitivities
+from .design.tolerances import Tolerance as Tolerance
+from .design.tolerances import ToleranceEstimate as ToleranceEstimate
+from .design.tolerances import simulate_tolerances as simulate_tolerances
 from .errors import ConfigError as ConfigError
 from .errors import InputError as InputError
 from .errors import PrecisionWarning as PrecisionWarning
@@ -32,6 +35,7 @@ from .errors import StoreExistsError as StoreExistsError
 from .errors import TracedDelayError as TracedDelayError
 from .errors import ZwidthError as ZwidthError
 from .kernel_cache import use_compilation_cache as use_compilation_cache
+from .linear.answers import to_control as to_control
 from .loop import char_poly as char_poly
 from .normalization import denormalize as denormalize
 from .normalization import normalize as normalize

@@ -88,8 +88,8 @@ def assess(scene: Scene) -> Assessment:
         )
     alpha, beta, delta, d = (float(value) for value in scene.normalized)
     period = scene.timing.period
-    spring = scene.device.mass / period**2
-    damper = scene.device.mass / period
+    spring = scene.mass / period**2
+    damper = scene.mass / period
     hertz = 1.0 / (2.0 * math.pi * period)
     rate = float(decay_rate(alpha, beta, delta, d))
     stands = margins(alpha, beta, delta, d)

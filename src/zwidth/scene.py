@@ -11,6 +11,7 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
+from zwidth.linear.answers import SceneAnswers
 from zwidth.linear.border import Border, Outline, outlines
 from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
@@ -26,7 +27,7 @@ from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
-from zwidth.stability.labels import is_stable
+from zwidth.stability.labels import StabilityMethod, is_stable
 
 _EXAMPLES = {
     "device": "zwidth.Device(mass=0.1, damping=10)",
@@ -45,7 +46,7 @@ class WallSI(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(SceneAnswers):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
@@ -189,12 +190,15 @@ class Scene:
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
-    def is_stable(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+    def is_stable(
+        self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
+    ) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.
 
         Args:
             stiffness: K in N/m.
             virtual_damping: B in N s/m. Both broadcast.
+            method: as for `decide_stability`, which has the statuses as well.
 
         Returns:
             Boolean array of the broadcast shape, False for what is NaN.
@@ -204,6 +208,8 @@ class Scene:
             row (`zwidth.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
             costs some microseconds and a stiffness next to nothing.
         """
+        if method != "auto":
+            return self.decide_stability(stiffness, virtual_damping, method=method).stable
         alpha, beta = self.normalize_walls(stiffness, virtual_damping)
         if self.is_rigid:
             return is_stable(alpha, beta, self.delta, self.d)

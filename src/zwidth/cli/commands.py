@@ -11,7 +11,7 @@ from zwidth import __version__
 from zwidth.cli import runs
 from zwidth.cli.bench import bench
 from zwidth.cli.devices import devices
-from zwidth.cli.options import json_option, physical_options
+from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.formatting import plain, with_unit
 
@@ -26,18 +26,14 @@ def cli() -> None:
 
 
 @cli.command()
-@physical_options(wall=True, required=True)
+@scene_options(wall=True, required=True)
+@friction_option
+@resolution_option
 @json_option
-def check(as_json: bool, **given: float) -> None:
-    """Judge one wall: stable, passive, how far from the boundary."""
+def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
+    """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""
     from zwidth.assessment import assess
-    from zwidth.parts.device import Device
-    from zwidth.parts.timing import Timing
-    from zwidth.parts.wall import VirtualWall
-    from zwidth.scene import Scene
 
-    wall = VirtualWall(given["stiffness"], given["virtual_damping"])
-    scene = Scene(Device(given["mass"], given["damping"]), Timing(given["period"], given["delay"]), wall)
     verdict = assess(scene)
     if as_json:
         click.echo(json.dumps(verdict.as_dict(), indent=2, allow_nan=False))
@@ -49,7 +45,7 @@ def check(as_json: bool, **given: float) -> None:
 @cli.command()
 @click.option("--delta", type=float, help="Normalized physical damping b T/m.")
 @click.option("--d", type=float, help="Delay in periods.")
-@physical_options(wall=False, required=False)
+@scene_options(wall=False, required=False)
 @click.option(
     "--delay-model",
     type=click.Choice(["held", "fractional_power"]),
@@ -61,10 +57,7 @@ def check(as_json: bool, **given: float) -> None:
 def ridge(
     delta: float | None,
     d: float | None,
-    mass: float | None,
-    damping: float,
-    period: float | None,
-    delay: float,
+    scene: Any,
     delay_model: str,
     as_json: bool,
 ) -> None:
@@ -75,16 +68,11 @@ def ridge(
     """
     import numpy as np
 
-    from zwidth.parts.device import Device
-    from zwidth.parts.timing import Timing
-    from zwidth.scene import Scene
     from zwidth.stability.ridge import RidgeKind, alpha_max
     from zwidth.status import Status
 
-    physical = mass is not None and period is not None
-    if physical == (delta is not None) or (delta is None) != (d is None):
+    if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
-    scene = Scene(Device(mass, damping), Timing(period, delay)) if mass is not None and period is not None else None
     at_delta, at_d = (scene.delta, scene.d) if scene is not None else (delta, d)
     point = alpha_max(at_delta, at_d, delay=delay_model)  # pyright: ignore[reportArgumentType]  (click checked it)
     if int(point.status) != Status.OK:
