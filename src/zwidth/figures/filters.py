@@ -100,16 +100,17 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factor: float, unit: str) -> N
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * 1e3, stiffness * factor, linestyle="", label="best", **look)
-        text = f"${which}$\n{stiffness * factor:.3g} {unit}"
-        ax.annotate(
-            text,
-            (noise * 1e3, stiffness * factor),
-            xytext=(-7, 3),
-            textcoords="offset points",
-            ha="right",
-            va="bottom",
-            fontsize=8,
-        )
+        text = f"${which}$:  {stiffness * factor:.3g} {unit}"
+        plate = {"facecolor": "white", "alpha": 0.85, "linewidth": 0.0, "pad": 1.0}
+        look = {
+            "xytext": (9, -3),
+            "textcoords": "offset points",
+            "va": "top",
+            "fontsize": 8,
+            "bbox": plate,
+            "zorder": 6,
+        }
+        ax.annotate(text, (noise * 1e3, stiffness * factor), **look)
 
 
 def _dots(rows: Table) -> dict[str, Any]:

@@ -35,7 +35,8 @@ def test_it_is_the_sum_of_the_squared_impulse_response(velocity):
     top, bottom = coefficients(velocity)
     impulse = np.zeros(20_000)
     impulse[0] = 1.0
-    expected = COUNT * np.sqrt(np.sum(signal.lfilter(top, bottom, impulse) ** 2) / 12.0)
+    response = np.asarray(signal.lfilter(top, bottom, impulse))
+    expected = COUNT * np.sqrt(np.sum(response**2) / 12.0)
     assert find_velocity_noise(velocity, PERIOD, COUNT) == pytest.approx(expected, rel=1e-9)
 
 
