@@ -9,6 +9,8 @@ from .design.damping import FastestWall as FastestWall
 from .design.damping import fastest_damping as fastest_damping
 from .design.damping import fastest_wall as fastest_wall
 from .design.damping import most_robust_damping as most_robust_damping
+from .design.limits import Limit as Limit
+from .design.limits import limits_of as limits_of
 from .design.passive import passive_area as passive_area
 from .design.requirements import Requirement as Requirement
 from .design.requirements import allowed_delay as allowed_delay
@@ -30,6 +32,7 @@ from .errors import StoreExistsError as StoreExistsError
 from .errors import TracedDelayError as TracedDelayError
 from .errors import ZwidthError as ZwidthError
 from .kernel_cache import use_compilation_cache as use_compilation_cache
+from .linear.answers import to_control as to_control
 from .loop import char_poly as char_poly
 from .normalization import denormalize as denormalize
 from .normalization import normalize as normalize

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.xp import namespace
+from zwidth.xp import frozen, namespace
 
 # Nearer to the circle than this a root of the loop is on it: an undamped mode, or a zero of an undamped device.
 ON_CIRCLE = 1e-12
@@ -50,7 +50,7 @@ def circle(w: Array) -> CirclePoints:
     """The points of the unit circle at the angles ``w``, exactly -1 at pi."""
     xp = namespace(w)
     half = 0.5 * w
-    s, c = xp.sin(half), xp.where(w >= np.pi, 0.0, xp.cos(half))
+    s, c = xp.sin(half), _exactly_at_pi(w, 0.0, xp.cos(half), xp)
     before = -2.0 * s * s + 2j * s * c
     return CirclePoints(w, 1.0 + before, before)
 
@@ -60,12 +60,19 @@ def depths(offsets: np.ndarray) -> np.ndarray:
     return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
 
 
+def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:
+    """``value`` without its rounding error at pi, which derivatives must not mistake for a constant."""
+    if xp is np:
+        return np.where(w >= np.pi, exact, value)
+    return value - frozen(xp.where(w >= np.pi, value - exact, 0.0), xp)
+
+
 def lag_jet(at: CirclePoints, turns: float) -> Jet:
     """``z^turns``."""
     # At pi a whole number of half turns is a sign.
     even = 1.0 - 2.0 * (turns % 2)
     xp = namespace(at.w)
-    value = xp.where(at.w >= np.pi, even + 0j, xp.exp(1j * turns * at.w))
+    value = _exactly_at_pi(at.w, even + 0j, xp.exp(1j * turns * at.w), xp)
     return Jet(value, 1j * turns * value)
 
 
@@ -148,6 +155,6 @@ class LinearLoop:
         far = np.abs(before + roots) - reach[..., None]
         # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
         depth = np.abs(depths(roots))
-        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, 1e-9)
+        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, np.where(roots == 0, 1e-9, 1e-5))
         near = (1.0 / np.maximum(far, floor)).sum(-1)
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0

@@ -11,10 +11,14 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
+from zwidth.linear.answers import SceneAnswers
 from zwidth.linear.border import Border, Outline, outlines
 from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
+from zwidth.linear.required import RequiredValue, require
 from zwidth.linear.rows import label_walls, stable_intervals
+from zwidth.linear.slopes import SceneSensitivities, differentiate
+from zwidth.linear.stiffest import StiffestWall, stiffest_wall
 from zwidth.linear_loop import LinearLoop
 from zwidth.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device
@@ -23,7 +27,7 @@ from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
-from zwidth.stability.labels import is_stable
+from zwidth.stability.labels import StabilityMethod, is_stable
 
 _EXAMPLES = {
     "device": "zwidth.Device(mass=0.1, damping=10)",
@@ -42,7 +46,7 @@ class WallSI(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(SceneAnswers):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
@@ -186,12 +190,15 @@ class Scene:
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
-    def is_stable(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+    def is_stable(
+        self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
+    ) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.
 
         Args:
             stiffness: K in N/m.
             virtual_damping: B in N s/m. Both broadcast.
+            method: as for `decide_stability`, which has the statuses as well.
 
         Returns:
             Boolean array of the broadcast shape, False for what is NaN.
@@ -201,6 +208,8 @@ class Scene:
             row (`zwidth.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
             costs some microseconds and a stiffness next to nothing.
         """
+        if method != "auto":
+            return self.decide_stability(stiffness, virtual_damping, method=method).stable
         alpha, beta = self.normalize_walls(stiffness, virtual_damping)
         if self.is_rigid:
             return is_stable(alpha, beta, self.delta, self.d)
@@ -248,6 +257,92 @@ class Scene:
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, piece.hole)
             for piece in outlines(self.border)
         ]
+
+    def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
+        """The stiffest stable wall, ``sup {K : some B is stable}``, and what binds it.
+
+        Args:
+            negative_damping: whether walls with B < 0 count. By default they do with the backward difference; behind a
+                filter a negative B is a lead compensator and no damper, and B >= 0 is meant.
+
+        Returns:
+            ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,
+            of the higher one at a corner; ``kind``, a code of `zwidth.RidgeKind`; ``status`` of `zwidth.Status`, with
+            NaN where it is not 0: NO_BOUNDARY where no wall with K > 0 is stable.
+
+        Numerics:
+            Closed form for a rigid device. Otherwise the highest point of all edges of the stable set (50 to 150 ms),
+            about 1e-13 relative, refused where rows of the plane contradict it. Inside a JAX transformation it is
+            finished by optimistix, with implicit derivatives in every parameter of every part. The delay and, with
+            one, the period must be plain numbers there (`TracedDelayError`).
+
+        Example:
+            >>> import zwidth
+            >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=100))
+            >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
+            11942 N/m
+        """
+        return stiffest_wall(self, negative_damping)
+
+    def sensitivities(self, *, negative_damping: bool | None = None) -> SceneSensitivities:
+        """What a little more of every parameter of every part buys.
+
+        Args:
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
+            "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, with NaN where it is
+            not 0. Whole numbers and coefficients of a filter have none. At zero they are those from the right, at a
+            whole delay both sides agree.
+
+        Numerics:
+            Closed form for a rigid device; otherwise implicit derivatives, which JAX compiles for some seconds once for
+            all scenes of the same parts.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print(f"{scene.sensitivities().per['damping']:.0f} N/m per N s/m")
+            572 N/m per N s/m
+        """
+        return differentiate(self, negative_damping)
+
+    def required(
+        self,
+        parameter: str,
+        stiffness: float,
+        *,
+        within: tuple[float, float] | None = None,
+        negative_damping: bool | None = None,
+    ) -> RequiredValue:
+        """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
+
+        Args:
+            parameter: its dotted path, such as "damping" or "velocity.cutoff".
+            stiffness: wanted, in N/m, > 0.
+            within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value.
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``value``, the nearest to the present one, itself enough; ``enough``, the side of it on which there is
+            enough ("above", "below"), or "everywhere" in the range (then ``value`` is the present one, or the end next
+            to it), or "nowhere"; ``crossings``, all that were found, each proved by a K_max on either side; ``range``;
+            ``status``, UNREACHABLE with NaN where the range never reaches the stiffness.
+
+        Numerics:
+            25 values across the range, then each crossing to 1e-11 relative. K_max need not be monotone; two crossings
+            between neighboring values are not seen.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> needed = scene.required("damping", 25e3)
+            >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
+            19.62 N s/m or above
+        """
+        return require(self, parameter, stiffness, within, negative_damping)
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.

@@ -110,7 +110,7 @@ def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") 
     return value
 
 
-def to_float(value: float) -> float:
+def to_float(value: Any) -> float:
     """A whole number beyond float64 becomes infinite, which `check_range` then refuses."""
     try:
         return float(value)

@@ -1,4 +1,4 @@
-"""The edge of the stable set of any linear loop: which parts of the boundary it is, its corners, its highest point."""
+"""The edge of the stable set of any linear loop: which parts of the boundary it is, and its corners."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ import numpy as np
 from zwidth.linear.boundary import Boundary, CrossingLine, curve_at, zeros_of
 from zwidth.linear_loop import circle
 from zwidth.numerics.roots import false_position
-from zwidth.stability.ridge import RidgeKind
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
 _ROUNDS = 11
@@ -34,15 +33,6 @@ class Edge(NamedTuple):
     alpha: np.ndarray
     beta: np.ndarray
     line: int  # which of the boundary's lines, or -1 for the curve
-
-
-class StiffestWall(NamedTuple):
-    """The stiffest stable wall: the end of all stable alpha."""
-
-    alpha: float
-    beta: float
-    omega: float
-    kind: RidgeKind
 
 
 @dataclass(frozen=True)
@@ -69,11 +59,11 @@ class Border:
             alpha, beta = curve.alpha.copy(), curve.beta.copy()
             for k, end in ((0, 0.0), (-1, np.pi)):
                 if at[k] == end:
-                    alpha[k], beta[k] = self._at_end(end)
+                    alpha[k], beta[k] = self.at_end(end)
             edges.append(Edge(at, alpha, beta, -1))
         return edges
 
-    def _at_end(self, w: float) -> tuple[float, float]:
+    def at_end(self, w: float) -> tuple[float, float]:
         """The curve's limit at z = 1 or z = -1."""
         at = circle(np.array([w]))
         with np.errstate(all="ignore"):
@@ -86,7 +76,7 @@ class Border:
         after = k + side
         if not 0 <= after < w.size:
             end = 0.0 if side < 0 else np.pi
-            return end if np.all(np.isfinite(self._at_end(end))) else float(w[k])
+            return end if np.all(np.isfinite(self.at_end(end))) else float(w[k])
         if piece[after] != piece[k]:
             # Towards an angle at which the curve runs to infinity; it may leave the stable set before.
             limit = self.boundary.infinite[piece[k] if side > 0 else piece[k] - 1]
@@ -158,34 +148,16 @@ class Border:
         ends = float(beta[k]), float(beta[after])
         return _narrow(lambda at: self.boundary.line_borders(place, at), *ends, _LINE_ROUNDS)[0]
 
-    def _line_meetings(self) -> list[tuple[float, float, float]]:
+    def line_meetings(self) -> list[tuple[float, float, float]]:
         """Corners of two lines: all other highest points are on the curve."""
         b = self.boundary
         found = []
         for place, line in enumerate(b.lines):
-            others = [
-                other for other in b.lines[:place] if abs(other.f - line.f) > 1e-12 * (abs(other.f) + abs(line.f))
-            ]
-            for beta in ((line.q - other.q) / (line.f - other.f) for other in others):
+            for beta in _meetings(b.lines[:place], line):
                 near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
                 if b.line_borders(place, near).any():
                     found.append((float(line.q - beta * line.f), float(beta), line.w))
         return found
-
-    def peak(self) -> StiffestWall | None:
-        """The stiffest stable wall, None where no wall is stable."""
-        best = None
-        for edge in self.curved:
-            k = int(np.argmax(edge.alpha))
-            w = float(edge.w[k])
-            inner = 0 < k < edge.w.size - 1
-            kind = RidgeKind.SMOOTH if inner else RidgeKind.CORNER
-            if best is None or edge.alpha[k] > best.alpha:
-                best = StiffestWall(float(edge.alpha[k]), float(edge.beta[k]), w, kind)
-        for alpha, beta, w in self._line_meetings():
-            if best is None or alpha > best.alpha:
-                best = StiffestWall(alpha, beta, w, RidgeKind.CORNER)
-        return best
 
 
 def _meetings(others: Sequence[CrossingLine], line: CrossingLine) -> list[float]:

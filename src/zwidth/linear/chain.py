@@ -21,7 +21,7 @@ import numpy as np
 
 from zwidth.errors import InputError
 from zwidth.linear_loop import CirclePoints, Estimate, LinearLoop, circle, lag_jet
-from zwidth.plant import held_plant, undelayed_plant
+from zwidth.plant import Plant, held_plant, undelayed_plant
 from zwidth.xp import namespace
 
 # Stiffer links than this, in units of the first mass over T^2, move so fast that e^A keeps no digits.
@@ -57,12 +57,14 @@ class Chain:
     @property
     def rigid(self) -> bool:
         """Whether it is one mass with a damper."""
-        ground = self.bodies[0].stiffness
-        return len(self.bodies) == 1 and isinstance(ground, float) and ground == 0.0
+        return len(self.bodies) == 1 and _is_zero(self.bodies[0].stiffness)
 
 
-def chain_of(scene: Any) -> Chain:
-    """The chain of a scene, normalized by its period and by the mass the wall's force acts on."""
+def chain_of(scene: Any, delay: tuple[Any, int] | None = None) -> Chain:
+    """The chain of a scene, normalized by its period and by the mass the wall's force acts on.
+
+    ``delay`` is the delay in periods and its whole part, where a trace hides them.
+    """
     device, timing, hand = scene.device, scene.timing, scene.operator
     period = timing.period
     masses = [(device.mass, device.damping, 0.0)]
@@ -79,10 +81,16 @@ def chain_of(scene: Any) -> Chain:
         links.append((hand.coupling_stiffness, hand.coupling_damping))
     unit = masses[0][0]
     force, rub = period * period / unit, period / unit
-    bodies = tuple(Body(m / unit, b * rub, k * force) for m, b, k in masses)
+    # No spring stays none, also where the period is traced.
+    bodies = tuple(Body(m / unit, b * rub, 0.0 if _is_zero(k) else k * force) for m, b, k in masses)
     tied = tuple(Link(k * force, c * rub) for k, c in links)
     sensor = 1 if device.coupling is not None and device.coupling.sensor == "tip" else 0
-    return Chain(bodies, tied, sensor, scene.d, scene.whole_delay, scene.velocity.estimate(period))
+    d, whole = delay or (scene.d, scene.whole_delay)
+    return Chain(bodies, tied, sensor, d, whole, scene.velocity.estimate(period))
+
+
+def _is_zero(value: Any) -> bool:
+    return isinstance(value, float | np.floating) and value == 0.0
 
 
 def rates(chain: Chain) -> tuple[Any, Any]:
@@ -145,25 +153,31 @@ class Sampled(NamedTuple):
     sensor: Any
 
 
+def respond(chain: Chain) -> Sampled | Plant:
+    """The chain between two samples, what `needed` is computed from at every angle."""
+    return _rigid_plant(chain) if chain.rigid else sampled(chain)
+
+
 def sampled(chain: Chain) -> Sampled:
     """Discretize exactly."""
     rate, push = rates(chain)
     xp = namespace(rate)
     psi, full = _flow(rate, push, 1.0)
     fraction = chain.d - chain.whole
-    held = isinstance(fraction, float | np.floating) and fraction == 0.0
-    late = None if held else _flow(rate, push, 1.0 - fraction)[1]
+    late = None if _is_zero(fraction) else _flow(rate, push, 1.0 - fraction)[1]
     count = len(chain.bodies)
     sensor = xp.asarray([1.0] * (chain.sensor + 1) + [0.0] * (2 * count - chain.sensor - 1))
     return Sampled(psi, full, late, sensor)
 
 
-def needed(chain: Chain, w: Any, parts: Sampled | None = None) -> Any:
+def needed(chain: Chain, w: Any, parts: Sampled | Plant | None = None) -> Any:
     """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
     at: CirclePoints = circle(w)
-    if chain.rigid:
-        return _rigid_needed(chain, at)
-    parts = parts or sampled(chain)
+    parts = respond(chain) if parts is None else parts
+    if isinstance(parts, Plant):
+        # N(z)/z = a2 z + a1 + a0/z, around z = 1.
+        answer = parts.a2 * at.z + parts.a1 + parts.a0 / at.z
+        return -lag_jet(at, chain.whole).value * at.before * (at.before + parts.em) / answer
     xp = namespace(parts.psi, w)
     force = parts.full + 0j if parts.late is None else at.before * parts.late + parts.full
     turns = chain.whole if parts.late is None else chain.whole + 1
@@ -171,14 +185,9 @@ def needed(chain: Chain, w: Any, parts: Sampled | None = None) -> Any:
     return -lag_jet(at, turns).value / (parts.sensor @ moved)
 
 
-def _rigid_needed(chain: Chain, at: CirclePoints) -> Any:
-    fraction = chain.d - chain.whole
-    whole = isinstance(fraction, float | np.floating) and fraction == 0.0
-    delta = chain.bodies[0].damping
-    plant = undelayed_plant(delta) if whole else held_plant(delta, fraction)
-    # N(z)/z = a2 z + a1 + a0/z, around z = 1.
-    answer = plant.a2 * at.z + plant.a1 + plant.a0 / at.z
-    return -lag_jet(at, chain.whole).value * at.before * (at.before + plant.em) / answer
+def _rigid_plant(chain: Chain) -> Plant:
+    fraction, delta = chain.d - chain.whole, chain.bodies[0].damping
+    return undelayed_plant(delta) if _is_zero(fraction) else held_plant(delta, fraction)
 
 
 def dynamic_stiffness(chain: Chain) -> np.ndarray:

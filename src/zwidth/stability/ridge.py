@@ -36,6 +36,7 @@ class RidgeKind(IntEnum):
 
     SMOOTH = 0
     CORNER = 1
+    NO_DAMPING = 2  # of a scene where only B >= 0 counts: the end of the row B = 0
 
 
 class RidgePoint(NamedTuple):

@@ -1,0 +1,265 @@
+"""What a scene answers beside its verdicts, in SI units: poles, state space, frequency response."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from zwidth._types import Array, ArrayLike
+from zwidth.batching import as_float64
+from zwidth.errors import InputError, check_choice
+from zwidth.linear import state_space
+from zwidth.linear.chain import Chain
+from zwidth.linear.delay_margin import linear_margins
+from zwidth.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
+from zwidth.linear.poles import all_poles, log_size
+from zwidth.linear.radius import spectral_radius as linear_radius
+from zwidth.linear.rows import label_walls
+from zwidth.linear_loop import LinearLoop, circle
+from zwidth.stability.labels import STABILITY_METHODS, Stability, StabilityMethod, decide_stability
+from zwidth.stability.margins import Margins, margins
+from zwidth.stability.passivity import passivity_margin
+from zwidth.stability.poles import poles
+from zwidth.stability.radii import spectral_radius
+from zwidth.status import Method, Status
+
+if TYPE_CHECKING:
+    import control
+
+
+class StateSpace(NamedTuple):
+    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, a step every ``dt`` seconds."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    dt: float
+
+
+class PoleTable(NamedTuple):
+    """Poles, the slowest first, and the motions they stand for; arrays with a last axis of poles."""
+
+    z: np.ndarray
+    frequency: np.ndarray  # at which it oscillates, in Hz; half the sampling rate for a negative real pole
+    damping_ratio: np.ndarray  # -Re s/|s| with s = log(z)/T; negative for a growing motion
+    time_constant: np.ndarray  # -1/Re s in s; negative for a growing one, infinite on the unit circle
+
+
+def tabulate_poles(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, period: float) -> PoleTable:
+    """The poles of walls of one shape."""
+    zeta: Array = all_poles(loop, alpha, beta)
+    size = log_size(zeta)
+    order = np.argsort(-size, axis=-1, kind="stable")
+    zeta, size = (np.take_along_axis(values, order, -1) for values in (zeta, size))
+    turn = np.abs(np.arctan2(zeta.imag, 1.0 + zeta.real))
+    with np.errstate(all="ignore"):
+        # A pole at z = 0 is gone after one period.
+        ratio = np.where(np.isinf(size), 1.0, -size / np.hypot(size, turn))
+        ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
+        return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
+
+
+def respond(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: ArrayLike, period: float) -> Array:
+    """``L = (alpha + beta F) G`` at frequencies in Hz up to half the sampling rate; NaN for others."""
+    try:
+        hertz, a, b = np.broadcast_arrays(as_float64("frequency", frequency), alpha, beta)
+    except ValueError as error:
+        raise InputError(
+            f"shapes do not broadcast: frequency {np.shape(frequency)}, walls {alpha.shape}; make each axis equal or 1"
+        ) from error
+    w = 2.0 * np.pi * hertz * period
+    # Half the sampling rate is half a turn, whatever the rounding of the quotient.
+    w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
+    inside = (w > 0) & (w <= np.pi)
+    at = circle(np.where(inside, w, 1.0))
+    with np.errstate(all="ignore"):
+        value = -(a + b * loop.estimate.jet(at).value) / loop.needed(at).value
+    return np.where(inside, value, complex(np.nan, np.nan))[()]
+
+
+def closed_loop_si(chain: Chain, alpha: float, beta: float, mass: float, period: float) -> StateSpace:
+    """From a force in N held on the device to the sensed position in m."""
+    return _in_si(chain, state_space.closed_loop(chain, alpha, beta), period, mass, period * period / mass)
+
+
+def open_loop_si(chain: Chain, alpha: float, beta: float, mass: float, period: float) -> StateSpace:
+    """From the position that the wall is given to the one that its force answers, both in m."""
+    return _in_si(chain, state_space.open_loop(chain, alpha, beta), period, mass, 1.0)
+
+
+def _in_si(chain: Chain, loop: state_space.Matrices, period: float, mass: float, unit: float) -> StateSpace:
+    """States in m, m/s and N in place of units of the period and the mass."""
+    count = len(chain.bodies)
+    waiting = state_space.delayed_device(chain).A.shape[0] - 2 * count
+    filtered = loop.A.shape[0] - 2 * count - waiting
+    scale = np.concatenate(
+        [np.ones(filtered + count), np.full(count, 1.0 / period), np.full(waiting, mass / period**2)]
+    )
+    return StateSpace(
+        loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit, loop.C / scale, loop.D * unit, period
+    )
+
+
+class SceneAnswers:
+    """The questions of `zwidth.Scene` that go beyond verdicts; of the scene they need its parts, loop and boundary."""
+
+    def poles(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
+        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
+
+        Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
+        is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return poles(alpha, beta, self.delta, self.d)
+        return 1.0 + all_poles(self.loop, alpha, beta)
+
+    def pole_table(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> PoleTable:
+        """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return tabulate_poles(self.loop, alpha, beta, self.timing.period)
+
+    def spectral_radius(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
+
+        From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return spectral_radius(alpha, beta, self.delta, self.d)
+        stable = label_walls(self.traced_boundary, alpha, beta).reshape(-1)
+        found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
+        return found.reshape(alpha.shape)[()]
+
+    def state_space(self: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> StateSpace:
+        """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
+
+        Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
+        """
+        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def open_loop(self: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> StateSpace:
+        """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
+        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def frequency_response(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike, frequency: ArrayLike) -> Array:
+        """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
+
+        All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return respond(self.loop, alpha, beta, frequency, self.timing.period)
+
+    def decide_stability(
+        self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
+    ) -> Stability:
+        """Labels of walls with a status and what decided each, as `zwidth.decide_stability` has them.
+
+        "auto" and "crossover" count by the signed crossings of each row, "companion" computes all poles, "certified"
+        decides in balls of python-flint, exactly for the numbers given, or says UNDECIDED or ON_BOUNDARY.
+        """
+        check_choice("method", method, STABILITY_METHODS)
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return decide_stability(alpha, beta, self.delta, self.d, method=method)
+        known = np.isfinite(alpha) & np.isfinite(beta)
+        status = np.where(known, np.int32(Status.OK), np.int32(Status.INVALID_INPUT))
+        if method == "certified":
+            from zwidth.linear.certified import decide_walls
+
+            walls = np.broadcast_arrays(np.asarray(stiffness, float), np.asarray(virtual_damping, float))
+            stable, status = decide_walls(self, *walls)
+            used = Method.CERTIFIED
+        elif method == "companion":
+            with np.errstate(invalid="ignore"):
+                stable, used = log_size(all_poles(self.loop, alpha, beta)).max(-1) < 0, Method.COMPANION
+        else:
+            stable, used = label_walls(self.traced_boundary, alpha, beta), Method.CROSSOVER
+        return Stability(stable[()], status[()], np.full(alpha.shape, used, np.int32)[()])
+
+    def passivity_margin(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is not finite.
+
+        Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
+        (`zwidth.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
+        motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip there is
+        no such condition, and InputError says so. A wall that pushes has at most its K T.
+        """
+        check_has_condition(self.device)
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        delta = self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
+        if self.is_rigid:
+            return passivity_margin(alpha, beta, delta, self.d) * self.units.virtual_damping
+        condition = PassivityCondition.derive(self.chain.estimate, self.d)
+        return (passivity_margins(condition, alpha, beta, delta) * self.units.virtual_damping)[()]
+
+    def is_passive(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
+        return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
+
+    def margins(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Margins:
+        """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
+
+        Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
+        and B together, and ``phase_margin`` the least turn in degrees, that bring a pole to the unit circle; the turn
+        is negative for an unstable wall. ``delay_margin`` in s is the least extra delay that does, held as the hardware
+        does it, fraction by fraction with the exact loop (0 for an unstable wall, NaN where poles counted before and
+        beyond do not confirm it); ``modulus_margin`` is the least distance of L from -1. Where no factor, turn or delay
+        brings a pole there, the first three are infinite for a stable wall, and 0, NaN and 0 for an unstable one.
+        A rigid scene answers by `zwidth.margins`. A wall takes some milliseconds, its delay margin some 0.2 s.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        hertz = 1.0 / (2.0 * np.pi * self.timing.period)
+        if self.is_rigid:
+            found = margins(alpha, beta, self.delta, self.d)
+        else:
+            found = linear_margins(self.chain, self.traced_boundary, alpha, beta)
+        return found._replace(
+            delay_margin=found.delay_margin * self.timing.period,
+            phase_crossover=found.phase_crossover * hertz,
+            gain_crossover=found.gain_crossover * hertz,
+            modulus_frequency=found.modulus_frequency * hertz,
+        )
+
+
+def to_control(scene: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> control.StateSpace:
+    """Return the closed loop of a scene and a wall as a model of python-control.
+
+    From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.
+
+    Args:
+        scene: a `zwidth.Scene`.
+        stiffness: K of the wall in N/m, one number.
+        virtual_damping: B of the wall in N s/m, one number.
+
+    Returns:
+        control.StateSpace with ``dt`` the sampling period; states in m, m/s and N.
+
+    Raises:
+        InputError: python-control is not installed.
+
+    References:
+        Fuller, Greiner, Moore, Murray, van Paassen, Yorke 2021 (python-control).
+
+    Example:
+        >>> import zwidth
+        >>> scene = zwidth.Scene(zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3))
+        >>> zwidth.to_control(scene, 10e3, 5).dt
+        0.001
+    """
+    try:
+        import control
+    except ImportError as error:
+        raise InputError("to_control: python-control is not installed; pip install control") from error
+    return control.StateSpace(*scene.state_space(stiffness, virtual_damping))
+
+
+def one_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
+    """The numbers of a single wall."""
+    if alpha.size != 1 or not (np.isfinite(alpha).all() and np.isfinite(beta).all()):
+        raise InputError(f"stiffness, virtual_damping: got shape {alpha.shape}; one wall of finite numbers is needed")
+    return float(alpha.reshape(())), float(beta.reshape(()))

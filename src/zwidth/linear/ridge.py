@@ -1,0 +1,206 @@
+"""The stiffest stable wall of any linear loop, and what binds it.
+
+The top of the stable set is a smooth maximum of its edge, a corner where two conditions meet, or, where only
+dampings beta >= 0 are allowed, the end of the row beta = 0. Each is the solution of two conditions of two equations
+each, with ``r(z) = alpha + beta F(z) - q(z)``:
+
+    first     r(e^(j w1)) = 0 of a pole pair, or of a real pole at z = -1 or z = 1
+    second    the same at w2; or the curve of the first is stationary in alpha; or beta = 0
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.linear.border import Border
+from zwidth.linear.boundary import Boundary
+from zwidth.linear.rows import stable_intervals
+from zwidth.linear_loop import LinearLoop, circle
+from zwidth.stability.ridge import RidgeKind
+
+# Newton steps on a corner at most; the residual, as a share of |q|, at which it holds; how far it may move a start.
+_MOST_STEPS, _HOLDS, _NEAR = 12, 1e-11, 1e-5
+# Rows of which none may hold a stiffer wall, and by what share rounding may make one.
+_ROWS, _ABOVE = 65, 1e-7
+# Rows next to a top, as shares of the plane, that must reach nearly as high; and how many tops are looked at.
+_BESIDE, _NEARLY = np.array([0.0, 1e-3, -1e-3, 1e-5, -1e-5, 1e-7, -1e-7]), 0.99
+_MOST_TOPS = 32
+
+
+class Condition(IntEnum):
+    """What holds at the stiffest wall."""
+
+    PAIR = 0
+    MINUS_ONE = 1
+    PLUS_ONE = 2
+    STATIONARY = 3
+    NO_DAMPING = 4
+
+
+class Ridge(NamedTuple):
+    """The stiffest stable wall and the two conditions that make it so; ``w2`` is pi where the second has no angle."""
+
+    alpha: float
+    beta: float
+    w1: float
+    w2: float
+    first: Condition
+    second: Condition
+
+    @property
+    def omega(self) -> float:
+        """The angle at which the loop oscillates there, the higher one at a corner."""
+        return max(self.w1, self.w2) if self.second <= Condition.PLUS_ONE else self.w1
+
+    @property
+    def kind(self) -> RidgeKind:
+        """Smooth, a corner, or the end of the allowed damping."""
+        if self.second == Condition.NO_DAMPING:
+            return RidgeKind.NO_DAMPING
+        smooth = self.first == Condition.PAIR and self.second == Condition.STATIONARY
+        return RidgeKind.SMOOTH if smooth else RidgeKind.CORNER
+
+
+def find_ridge(border: Border, negative_damping: bool) -> Ridge | None:
+    """The stiffest stable wall with alpha > 0, None where no such wall is stable.
+
+    Raises:
+        ArithmeticError: the rows of the plane contradict what was found.
+    """
+    least = -np.inf if negative_damping else 0.0
+    tops = _tops(border, least) if border.curved else []
+    for alpha, beta, w, inner in tops[:_MOST_TOPS]:
+        # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
+        if _reach(border, beta, least) < _NEARLY * alpha:
+            continue
+        found = _describe(border, alpha, beta, w, inner, negative_damping)
+        _refuse_stiffer(border, found, least)
+        return found
+    if tops and len(tops) > _MOST_TOPS:
+        raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
+    return None
+
+
+def _tops(border: Border, least: float) -> list[tuple[float, float, float, bool]]:
+    """Local maxima of the edges with beta of ``least`` or more, highest first; whether each lies inside its edge."""
+    found = []
+    for edge in border.curved:
+        padded = np.concatenate([[-np.inf], np.where(edge.beta >= least, edge.alpha, -np.inf), [-np.inf]])
+        alpha = padded[1:-1]
+        for k in np.flatnonzero((alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0)):
+            inner = 0 < k < edge.w.size - 1
+            found.append((float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), bool(inner)))
+    # Straight edges end on the curve or on each other.
+    found += [(*meeting, False) for meeting in border.line_meetings() if meeting[0] > 0 and meeting[1] >= least]
+    if np.isfinite(least):
+        found += [(*row, False) for row in _end_of_row(border.boundary, least)]
+    return sorted(found, key=lambda top: -top[0])
+
+
+def _describe(border: Border, alpha: float, beta: float, w: float, inner: bool, negative: bool) -> Ridge:
+    if not negative and beta == 0.0:
+        return Ridge(alpha, beta, w, np.pi, _condition(w), Condition.NO_DAMPING)
+    if inner:
+        return Ridge(alpha, beta, w, np.pi, Condition.PAIR, Condition.STATIONARY)
+    return _corner(border, alpha, beta)
+
+
+def _condition(w: float) -> Condition:
+    if w == 0.0:
+        return Condition.PLUS_ONE
+    return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
+
+
+def _end_of_row(boundary: Boundary, beta: float) -> list[tuple[float, float, float]]:
+    """The top of a row with alpha > 0 as alpha, beta and angle; nothing where none of it is stable."""
+    high = stable_intervals(boundary, np.array([beta])).high
+    high = high[np.isfinite(high) & (high > 0)]
+    if not high.size:
+        return []
+    top = float(high.max())
+    found = boundary.crossings(np.array([beta]))
+    return [(top, beta, float(found.w[0, int(np.nanargmin(np.abs(found.alpha[0] - top)))]))]
+
+
+def _corner(border: Border, alpha: float, beta: float) -> Ridge:
+    """The two conditions that meet at a corner, and the corner to the last place."""
+    found = border.boundary.crossings(np.array([beta]))
+    away = np.abs(found.alpha[0] - alpha)
+    near = [int(k) for k in np.argsort(np.where(np.isnan(away), np.inf, away))[:2]]
+    angles = sorted(float(found.w[0, k]) for k in near)
+    met = len(near) == 2 and away[near[1]] <= 1e-4 * abs(alpha)
+    if met and angles[1] - angles[0] > 1e-6:
+        start = Ridge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
+        held = _polish(border.boundary.loop, start)
+        if held is not None:
+            return held
+    # A double pole at z = -1: the curve ends on the line there.
+    top, damping = border.at_end(np.pi)
+    if not abs(top - alpha) <= _NEAR * abs(alpha):
+        raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
+    return Ridge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
+
+
+def _polish(loop: LinearLoop, start: Ridge) -> Ridge | None:
+    """Newton's method on a corner of two different angles; None where it does not hold near the start."""
+    x = np.array([start.alpha, start.beta, start.w1, start.w2])
+    moves = np.array([start.first == Condition.PAIR, start.second == Condition.PAIR])
+    best, worst = x, np.inf
+    for _ in range(_MOST_STEPS):
+        at = circle(x[2:])
+        q, f = loop.needed(at), loop.estimate.jet(at)
+        rest, slope = x[0] + x[1] * f.value - q.value, x[1] * f.slope - q.slope
+        size = np.abs(q.value) + np.abs(x[1] * f.value) + 1e-300
+        error = float(np.max(np.abs(np.where(moves, rest, rest.real)) / size))
+        if not error < worst:
+            break
+        best, worst = x, error
+        matrix, right = np.zeros((4, 4)), np.zeros(4)
+        for k in range(2):
+            matrix[2 * k, :2], right[2 * k] = (1.0, f.value[k].real), rest[k].real
+            if moves[k]:
+                matrix[2 * k + 1, 1], right[2 * k + 1] = f.value[k].imag, rest[k].imag
+                matrix[2 * k : 2 * k + 2, 2 + k] = slope[k].real, slope[k].imag
+            else:
+                matrix[2 * k + 1, 2 + k] = 1.0
+        try:
+            x = x - np.linalg.solve(matrix, right)
+        except np.linalg.LinAlgError:
+            break
+        if not np.all((x[2:] > 0) & (x[2:] < np.pi) | ~moves):
+            break
+    near = abs(best[0] - start.alpha) <= _NEAR * abs(start.alpha) and abs(best[3] - best[2]) > 1e-7
+    if worst > _HOLDS or not near:
+        return None
+    alpha, beta, w1, w2 = (float(value) for value in best)
+    return start._replace(alpha=alpha, beta=beta, w1=w1, w2=w2)
+
+
+def _dampings(border: Border, least: float) -> np.ndarray:
+    meetings = [np.array([beta]) for _, beta, _ in border.line_meetings()]
+    return np.maximum(np.concatenate([*(edge.beta for edge in border.curved), *meetings]), least)
+
+
+def _reach(border: Border, beta: float, least: float) -> float:
+    """How stiff the walls of the rows next to a damping become."""
+    size = float(np.ptp(_dampings(border, least))) + abs(beta)
+    return _highest(border, np.maximum(beta + size * _BESIDE, least))
+
+
+def _refuse_stiffer(border: Border, found: Ridge, least: float) -> None:
+    """Refuse a ridge above which rows anywhere hold a stable wall."""
+    betas = _dampings(border, least)
+    # Between the ends: a row through a corner is no witness.
+    rows = betas.min() + np.ptp(betas) * (np.arange(_ROWS) + 0.5) / _ROWS
+    highest = _highest(border, rows)
+    if highest > found.alpha * (1.0 + _ABOVE):
+        raise ArithmeticError(f"rows reach {highest!r}, the ridge {found.alpha!r}")
+
+
+def _highest(border: Border, rows: np.ndarray) -> float:
+    """The end of all stable walls of some rows; no row of a held loop is stable to infinity."""
+    high = stable_intervals(border.boundary, rows).high
+    return float(np.max(np.where(np.isfinite(high), high, -np.inf), initial=-np.inf))

@@ -1,0 +1,226 @@
+"""The stiffest wall of any linear loop under JAX: found on the host, finished by optimistix, differentiable.
+
+The unknowns are alpha, beta, w1 and w2; the equations are the two conditions of `zwidth.linear.ridge`. The search for
+which conditions those are has no derivative and needs none: as a parameter moves, the same conditions hold.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+
+from zwidth._types import Array
+from zwidth.batching import compute_concretely, traced_columns
+from zwidth.domain import poison
+from zwidth.errors import InputError, TracedDelayError
+from zwidth.linear.chain import Chain, chain_of, needed, respond
+from zwidth.linear.ridge import Condition
+from zwidth.linear.stiffest import StiffestWall, search
+from zwidth.linear_loop import circle
+from zwidth.normalization import in_periods
+from zwidth.parts.paths import list_parameters, replace_parameters
+from zwidth.parts.wall import VirtualWall
+from zwidth.stability.ridge import RidgeKind
+from zwidth.status import Status
+from zwidth.xp import is_traced
+
+_MAX_STEPS = 16
+# A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
+_NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
+
+
+class Structure(NamedTuple):
+    """What is compiled once: a scene whose moving parameters are placeholders, their paths, and its delay.
+
+    ``held`` tells that the delay is ``whole`` periods and stays so.
+    """
+
+    template: Any
+    paths: tuple[str, ...]
+    whole: int
+    held: bool
+    negative: bool
+
+
+class _Arguments(NamedTuple):
+    """What the equations depend on beside the unknowns."""
+
+    parts: Any
+    gain: Array
+    zeros: Array
+    poles: Array
+    start: Array
+    codes: Array
+    scales: Array
+
+
+def moving_paths(scene: Any) -> tuple[str, ...]:
+    """The parameters of a scene, without the wall's, that K_max can be differentiated in."""
+    bare = replace_parameters(scene, {"wall": VirtualWall(0.0)})
+    paths = [path for path, value in list_parameters(bare).items() if not isinstance(value, int | np.integer)]
+    without = {"stiffness", "virtual_damping"}
+    if scene.operator is not None and scene.operator.rigid:
+        without.add("operator.coupling_damping")
+    return tuple(path for path in paths if path not in without)
+
+
+def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
+    """What is static of a scene when these parameters move.
+
+    Raises:
+        TracedDelayError: how many whole periods the delay has depends on a traced value.
+    """
+    delay, period = scene.timing.delay, scene.timing.period
+    undelayed = isinstance(delay, float) and delay == 0.0
+    if is_traced(delay, period) and not undelayed:
+        raise TracedDelayError(
+            "timing: got a traced delay or period, but the number of poles depends on the whole periods of the delay; "
+            "pass both as plain numbers, or ask scene.sensitivities() for the derivatives in them"
+        )
+    whole = 0 if undelayed else scene.whole_delay
+    fixed = "delay" not in paths and (undelayed or "period" not in paths)
+    held = fixed and (undelayed or scene.d == whole)
+    template = replace_parameters(scene, {"wall": VirtualWall(0.0), **dict.fromkeys(paths, 1.0)})
+    return Structure(template, paths, whole, held, negative)
+
+
+def traced_wall(scene: Any, negative: bool) -> StiffestWall:
+    """`zwidth.Scene.max_stiffness` inside a transformation."""
+    values = scene.parameters()
+    paths = tuple(path for path in moving_paths(scene) if is_traced(values[path]))
+    if not paths:
+        # Only the wall is traced, on which nothing depends.
+        paths = ("mass",)
+    structure = structure_of(scene, paths, negative)
+    return compiled_wall(structure, *traced_columns(tuple(values[path] for path in paths)))
+
+
+@partial(jax.jit, static_argnums=0)
+def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
+    """The stiffest wall for values of the moving parameters."""
+    dtype = values[0].dtype
+    shape = jax.ShapeDtypeStruct((len(_NOWHERE) + 1,), dtype)
+    frozen = [jax.lax.stop_gradient(value) for value in values]
+    told = jax.pure_callback(partial(_search, structure), shape, *frozen, vmap_method="sequential")
+    status = told[-1].astype(jnp.int32)
+    found = status == Status.OK
+    told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
+    scene = replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
+    d = float(structure.whole) if structure.held else in_periods(*map(jnp.asarray, _delay(scene)))
+    alpha, beta, w1, w2, close = _solve(chain_of(scene, (d, structure.whole)), told[:4], told[4:6].astype(jnp.int32))
+    status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
+    spoiled = poison(status == Status.OK, *values)
+    omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
+    units = scene.units
+    return StiffestWall(
+        alpha * units.stiffness + spoiled,
+        beta * units.virtual_damping + spoiled,
+        omega / (2.0 * math.pi * scene.timing.period) + spoiled,
+        told[6].astype(jnp.int32),
+        status,
+    )
+
+
+def _delay(scene: Any) -> tuple[Any, Any]:
+    return scene.timing.delay, scene.timing.period
+
+
+def _search(structure: Structure, *values: np.ndarray) -> np.ndarray:
+    """The ridge on the host, and its status behind it."""
+    dtype = np.asarray(values[0]).dtype
+    bad = (math.nan,) * len(_NOWHERE)
+    numbers = {path: float(value) for path, value in zip(structure.paths, values, strict=True)}
+    try:
+        found, status = search(replace_parameters(structure.template, numbers), structure.negative)
+    except InputError:
+        found, status = None, Status.INVALID_INPUT
+    ridge = bad if found is None else (*found, found.kind)
+    return np.array([*ridge, status], dtype)
+
+
+def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
+    estimate = chain.estimate
+    complexes = jnp.result_type(start.dtype, jnp.complex64)
+    scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
+    scales = jnp.where(scales > 0, scales, 1.0)
+    args = _Arguments(
+        jax.tree.map(jnp.asarray, respond(chain)),
+        jnp.asarray(estimate.gain, start.dtype),
+        jnp.asarray(estimate.zeros, complexes),
+        jnp.asarray(estimate.poles, complexes),
+        start,
+        codes,
+        scales,
+    )
+    tolerance = 16 * float(jnp.finfo(start.dtype).eps)
+    begin = start / scales
+    solution = optimistix.root_find(
+        partial(_residual, chain),
+        optimistix.Newton(rtol=tolerance, atol=tolerance),
+        begin,
+        args=args,
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    # What counts is that Newton stayed where the search had put it; a double root is met to half of the digits.
+    close = jnp.all(jnp.abs(solution.value - begin) <= 64 * tolerance**0.5)
+    return *(solution.value * scales), close
+
+
+def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
+    """The four equations, of order one."""
+    alpha, beta, w1, w2 = unknowns * args.scales
+    estimate = replace(chain.estimate, gain=args.gain, zeros=args.zeros, poles=args.poles)
+
+    def distance(w: Array) -> tuple[Array, Array]:
+        """``r = alpha + beta F - q`` over the size of q, and F."""
+        q, f = needed(chain, w, args.parts), estimate.jet(circle(w)).value
+        size = jax.lax.stop_gradient(jnp.abs(q))
+        return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
+
+    def meet(w: Array, place: int) -> Array:
+        """A pole pair at w, or a real pole where w stays."""
+        r, _ = distance(w)
+        stays = (w - args.start[2 + place]) / args.scales[2 + place]
+        return jnp.stack([r.real, jnp.where(args.codes[place] == Condition.PAIR, r.imag, stays)])
+
+    def stationary() -> Array:
+        (_, f), (slope, _) = jax.jvp(distance, (w1,), (jnp.ones_like(w1),))
+        across = (jnp.conj(f) * slope).imag
+        size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
+        return jnp.stack([across / jnp.where(size > 0, size, 1.0), unknowns[3] - args.start[3] / args.scales[3]])
+
+    def undamped() -> Array:
+        return jnp.stack([unknowns[1], unknowns[3] - args.start[3] / args.scales[3]])
+
+    which = jnp.maximum(args.codes[1] - Condition.PLUS_ONE, 0)
+    second = jax.lax.switch(which, [lambda: meet(w2, 1), stationary, undamped])
+    return jnp.concatenate([meet(w1, 0), second])
+
+
+@partial(jax.jit, static_argnums=0)
+def _slopes(structure: Structure, values: tuple[Array, ...]) -> tuple[StiffestWall, tuple[Array, ...]]:
+    def stiffness(values: tuple[Array, ...]) -> tuple[Array, StiffestWall]:
+        wall = compiled_wall(structure, *values)
+        return wall.stiffness, wall
+
+    (_, wall), slopes = jax.value_and_grad(stiffness, has_aux=True)(values)
+    return wall, slopes
+
+
+def slopes_at(scene: Any, paths: tuple[str, ...], negative: bool) -> tuple[StiffestWall, dict[str, float]]:
+    """The stiffest wall of a scene of plain numbers and its derivatives in some parameters, in float64."""
+    structure = structure_of(scene, paths, negative)
+    values = scene.parameters()
+    with compute_concretely():
+        wall, slopes = _slopes(structure, tuple(jnp.asarray(values[path], float) for path in paths))
+        wall = StiffestWall(*(np.asarray(part)[()] for part in wall))
+        return wall, {path: float(slope) for path, slope in zip(paths, slopes, strict=True)}
