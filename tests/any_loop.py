@@ -70,8 +70,8 @@ def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
         for _ in range(velocity.order):
             top, bottom = np.convolve(top, [-np.expm1(-period / tau), 0.0]), np.convolve(bottom, [1.0, -p])
     elif isinstance(velocity, zwidth.Butterworth):
-        b, a = scipy.signal.butter(velocity.order, 2.0 * velocity.cutoff * period)
-        top, bottom = np.convolve(b, top), np.convolve(a, bottom)
+        designed: Any = scipy.signal.butter(velocity.order, 2.0 * velocity.cutoff * period)
+        top, bottom = np.convolve(designed[0], top), np.convolve(designed[1], bottom)
     return np.concatenate([np.zeros(bottom.size - top.size), top]), bottom
 
 
@@ -185,7 +185,7 @@ def count_outside(scene: Any, stiffness: float, virtual_damping: float, digits: 
         device, spring, damper = ball_parts(scene)
         polynomial = device + spring * _ball(stiffness) + damper * _ball(virtual_damping)
         outside = 0
-        for root in _nonzero(polynomial).roots():
+        for root in nonzero(polynomial).roots(tol=10.0 ** (-digits // 2)):
             size = abs(root)
             if size > 1:
                 outside += 1
@@ -198,9 +198,89 @@ def count_outside(scene: Any, stiffness: float, virtual_damping: float, digits: 
         flint.ctx.dps = before
 
 
-def _nonzero(polynomial: flint.acb_poly) -> flint.acb_poly:
-    """Without its exact roots at 0, which lie inside and are multiple."""
+def nonzero(polynomial: flint.acb_poly) -> flint.acb_poly:
+    """Without its roots at 0, which lie inside: exact ones, and those of modes gone within a sample."""
     parts = polynomial.coeffs()
-    while parts and parts[0] == 0:
+    largest = max(abs(part).abs_upper() for part in parts)
+    while parts and abs(parts[0]) < largest * flint.arb(10) ** -40:
         parts = parts[1:]
     return flint.acb_poly(parts)
+
+
+def scene_of(parts: dict[str, Any]) -> zwidth.Scene:
+    """A scene from plain numbers, as reference files hold them: each part by its name, the velocity with its kind."""
+    device = dict(parts["device"])
+    if coupling := device.pop("coupling", None):
+        device["coupling"] = zwidth.Coupling(**coupling)
+    velocity = dict(parts.get("velocity", {"kind": "BackwardDifference"}))
+    estimate = getattr(zwidth, velocity.pop("kind"))(**velocity)
+    hand = zwidth.Operator(**parts["operator"]) if parts.get("operator") else None
+    return zwidth.Scene(zwidth.Device(**device), zwidth.Timing(**parts["timing"]), velocity=estimate, operator=hand)
+
+
+def random_scene(kind: str, generator: np.random.Generator) -> zwidth.Scene:
+    """One random scene of a kind of `KINDS`: filters, hands, couplings soft and stiff, whole delays and not."""
+    draw = generator.uniform
+    mass, period = 10 ** draw(-1.5, 0.5), 10 ** draw(-4, -2.5)
+    coupling = hand = None
+    velocity: Any = zwidth.BackwardDifference()
+    if kind in ("tip", "motor", "all"):
+        sensor = kind if kind != "all" else str(generator.choice(["tip", "motor"]))
+        stiffness = mass / period**2 * 10 ** draw(-3, 0.5)
+        damping = float(generator.choice([0.0, mass / period * 10 ** draw(-3, -0.5)]))
+        coupling = zwidth.Coupling(mass * 10 ** draw(-1, 0.5), stiffness, damping, sensor)  # type: ignore[arg-type]
+    if kind in ("hand", "soft hand", "all"):
+        hand_mass, damping, stiffness = mass * 10 ** draw(-1, 1), 10 ** draw(-1, 1), 10 ** draw(1, 3)
+        soft = kind == "soft hand" or (kind == "all" and draw() < 0.5)
+        behind = {"coupling_stiffness": 10 ** draw(2, 4), "coupling_damping": 10 ** draw(-1, 1)} if soft else {}
+        hand = zwidth.Operator(hand_mass, damping, stiffness, **behind)
+    if kind in ("filter", "all"):
+        cutoff = 10 ** draw(-2.5, -0.4) / period
+        velocity = (
+            zwidth.BackwardDifference(),
+            zwidth.WindowedDifference(int(generator.integers(2, 15))),
+            zwidth.LowPass(cutoff=cutoff),
+            zwidth.LowPass(time_constant=period * 10 ** draw(-0.5, 1.5), order=2),
+            zwidth.Butterworth(max(cutoff, 0.02 / period), int(generator.integers(1, 5))),
+            zwidth.VelocityFilter(np.convolve([1.0, -1.0], [1.0, 0.3]) / period / 1.3, [1.0, -0.2, 0.0]),
+        )[generator.integers(0, 6)]
+    device = zwidth.Device(mass, float(generator.choice([0.0, 10 ** draw(-1, 1.5)])), coupling)
+    whole, odd = int(generator.integers(0, 12)), float(draw(0, 8))
+    periods = float(generator.choice([0, 1, whole, odd, 0.3, np.nextafter(3, 0)]))
+    return zwidth.Scene(device, zwidth.Timing(period, periods * period), velocity=velocity, operator=hand)
+
+
+KINDS = ("device", "filter", "tip", "motor", "hand", "soft hand", "all")
+
+
+def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np.ndarray, float]:
+    """Every stiffness that puts a pole on the unit circle at a damping, by a dense scan of angles; and their scale.
+
+    The response of the device comes from its matrix, solved at every angle: no roots, no nodes of the library.
+    """
+    table, n, sensor = _rates(scene)
+    late = scene.whole_delay
+    fraction, size = scene.d - late, 2 * n
+    rate = np.array(table) * scene.timing.period
+    step, rest, first = (scipy.linalg.expm(rate * part) for part in (1.0, 1.0 - fraction, fraction))
+    own, newer, older = step[:size, :size], rest[:size, size], rest[:size, :size] @ first[:size, size]
+    top, bottom = velocity_polynomials(scene)
+
+    def needed(w: np.ndarray) -> np.ndarray:
+        """``-1/G - B F``: the stiffness, where it is real."""
+        z = np.exp(1j * w)
+        push = newer[None, :] + older[None, :] / z[:, None] if fraction else np.broadcast_to(newer, (w.size, size))
+        moved = np.linalg.solve(z[:, None, None] * np.eye(size) - own, push[..., None])[:, sensor, 0]
+        return -(z**late) / moved - virtual_damping * np.polyval(top, z) / np.polyval(bottom, z)
+
+    grid = np.unique(np.concatenate([np.geomspace(1e-6, 0.3, angles // 2), np.linspace(1e-3, np.pi - 1e-9, angles)]))
+    value = needed(grid)
+    k = np.flatnonzero(np.sign(value.imag[:-1]) * np.sign(value.imag[1:]) < 0)
+    low, high, sign = grid[k], grid[k + 1], np.sign(value.imag[k])
+    for _ in range(60 if k.size else 0):
+        middle = 0.5 * (low + high)
+        same = np.sign(needed(middle).imag) == sign
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    at_ends = np.array([1e-9, np.pi])
+    found = np.concatenate([needed(0.5 * (low + high)), needed(at_ends)])
+    return found.real, float(np.median(np.abs(value)))

@@ -100,7 +100,7 @@ def flow(a, b, time):
 
 def velocity_polynomials(scene):
     """Numerator and denominator of F in SI units, highest power first."""
-    period = scene.timing.period
+    period: Any = scene.timing.period
     v: Any = scene.velocity
     top, bottom = np.array([1.0, -1.0]) / period, np.array([1.0, 0.0])
     if isinstance(v, zwidth.WindowedDifference):
@@ -111,7 +111,7 @@ def velocity_polynomials(scene):
         for _ in range(v.order):
             top, bottom = np.convolve(top, [1 - p, 0.0]), np.convolve(bottom, [1.0, -p])
     if isinstance(v, zwidth.Butterworth):
-        designed: Any = scipy.signal.butter(v.order, v.cutoff * 2 * period)
+        designed: Any = scipy.signal.butter(v.order, 2 * period * float(v.cutoff or 0.0))
         top, bottom = np.convolve(top, designed[0]), np.convolve(bottom, designed[1])
     if isinstance(v, zwidth.VelocityFilter):
         return np.array(v.numerator), np.array(v.denominator)

@@ -55,16 +55,16 @@ def circle(w: Array) -> CirclePoints:
     return CirclePoints(w, 1.0 + before, before)
 
 
+def depths(offsets: np.ndarray) -> np.ndarray:
+    """``1 - |root|`` of roots given by their offsets from 1, with the digits that they have next to 1."""
+    return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
+
+
 def _exactly_at_pi(w: Array, exact: complex, value: Array, xp: Any) -> Array:
     """``value`` without its rounding error at pi, which derivatives must not mistake for a constant."""
     if xp is np:
         return np.where(w >= np.pi, exact, value)
     return value - frozen(xp.where(w >= np.pi, value - exact, 0.0), xp)
-
-
-def depths(offsets: np.ndarray) -> np.ndarray:
-    """``1 - |root|`` of roots given by their offsets from 1, with the digits that they have next to 1."""
-    return (2.0 * np.real(offsets) - np.abs(offsets) ** 2) / (1.0 + np.abs(1.0 - offsets))
 
 
 def lag_jet(at: CirclePoints, turns: float) -> Jet:
@@ -155,6 +155,6 @@ class LinearLoop:
         far = np.abs(before + roots) - reach[..., None]
         # A factor of a root on the circle changes its size there, not its argument: no need to look closer.
         depth = np.abs(depths(roots))
-        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, 1e-9)
+        floor = np.where(depth > ON_CIRCLE, 0.5 * depth, np.where(roots == 0, 1e-9, 1e-5))
         near = (1.0 / np.maximum(far, floor)).sum(-1)
         return near + abs(self.lag) + self.estimate.window + abs(self.estimate.lag) + 1.0

@@ -56,6 +56,7 @@ class Parameter:
         allowed: its admissible values, in its unit.
         unit: SI base unit; "1" for a normalized quantity.
         definition: of a normalized quantity, in mathtext.
+        whole: whether only whole numbers are admissible.
     """
 
     name: str
@@ -65,6 +66,12 @@ class Parameter:
     allowed: Range
     unit: str = "1"
     definition: str = ""
+    whole: bool = False
+
+    @property
+    def variable(self) -> str:
+        """Its name in a store: CF has no dots in names."""
+        return self.name.replace(".", "_")
 
 
 # In the order of a store's dimensions: a plane of walls lies together, at the end.
@@ -90,6 +97,39 @@ _PARAMETERS = (
         NOT_NEGATIVE,
         definition="b\\,T/m",
     ),
+    Parameter("velocity.cutoff", "cut-off of the velocity filter", "cut-off", "f_c", POSITIVE, "Hz"),
+    Parameter(
+        "velocity.time_constant", "time constant of the velocity filter", "time constant", r"\tau", POSITIVE, "s"
+    ),
+    Parameter("velocity.samples", "window of the velocity estimate", "window", "n", Range(1, 1000), whole=True),
+    Parameter("velocity.order", "order of the velocity filter", "filter order", "n_f", Range(1, 8), whole=True),
+    Parameter(
+        "velocity.coded_period", "period written into the velocity estimate", "coded period", "T_c", PERIODS, "s"
+    ),
+    Parameter("operator.mass", "mass of the hand", "mass of the hand", "m_h", NOT_NEGATIVE, "kg"),
+    Parameter("operator.damping", "damping of the hand to ground", "damping of the hand", "b_h", NOT_NEGATIVE, "N s/m"),
+    Parameter(
+        "operator.stiffness", "stiffness of the hand to ground", "stiffness of the hand", "k_h", NOT_NEGATIVE, "N/m"
+    ),
+    Parameter(
+        "operator.coupling_stiffness",
+        "stiffness of the spring between hand and device",
+        "stiffness of the grasp",
+        "k_g",
+        POSITIVE,
+        "N/m",
+    ),
+    Parameter(
+        "operator.coupling_damping",
+        "damping of the damper between hand and device",
+        "damping of the grasp",
+        "c_g",
+        NOT_NEGATIVE,
+        "N s/m",
+    ),
+    Parameter("coupling.mass", "mass beyond the coupling of the device", "mass of the tip", "m_2", POSITIVE, "kg"),
+    Parameter("coupling.stiffness", "stiffness of the coupling", "stiffness of the coupling", "k", POSITIVE, "N/m"),
+    Parameter("coupling.damping", "damping of the coupling", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m"),
     Parameter("stiffness", "stiffness K of the virtual wall", "stiffness", "K", ANY, "N/m"),
     Parameter(
         "alpha",
@@ -112,6 +152,10 @@ _PARAMETERS = (
 PARAMETERS = {parameter.name: parameter for parameter in _PARAMETERS}
 NORMALIZED = ("alpha", "beta", "delta", "d")
 PHYSICAL = tuple(name for name in PARAMETERS if name not in NORMALIZED)
+OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
+"""Parameters of the parts beside device and timing, by the path that leads to them in a scene."""
+VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
+"""The same by their names in a store."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 
 Family: TypeAlias = Literal["wall", "device"]
@@ -300,6 +344,9 @@ OUTPUTS = {output.name: output for output in _OUTPUTS}
 RADIUS_OUTPUTS = frozenset({"spectral_radius", "margin", "decay_rate", "settling_time"})
 MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
 """NaN there means that the wall has no such margin, as `zwidth.margins` says."""
+
+OUTPUTS_WITH_PARTS = ("stable", "stiffness_max", "virtual_damping_at_max")
+"""What is known of devices with a velocity filter, a hand or a coupling."""
 
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 """The variable that says for each point of a family why it has the values it has."""

@@ -11,12 +11,10 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
-from zwidth.linear import answers
+from zwidth.linear.answers import SceneAnswers
 from zwidth.linear.border import Border, Outline, outlines
 from zwidth.linear.boundary import Boundary, curve_at
 from zwidth.linear.chain import Chain, chain_of, linear_loop
-from zwidth.linear.poles import all_poles
-from zwidth.linear.radius import spectral_radius as linear_radius
 from zwidth.linear.required import RequiredValue, require
 from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear.slopes import SceneSensitivities, differentiate
@@ -29,9 +27,7 @@ from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
-from zwidth.stability.labels import is_stable
-from zwidth.stability.poles import poles
-from zwidth.stability.radii import spectral_radius
+from zwidth.stability.labels import StabilityMethod, is_stable
 
 _EXAMPLES = {
     "device": "zwidth.Device(mass=0.1, damping=10)",
@@ -50,7 +46,7 @@ class WallSI(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class Scene(SceneAnswers):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
@@ -194,12 +190,15 @@ class Scene:
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
-    def is_stable(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+    def is_stable(
+        self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
+    ) -> Array:
         """Whether walls are stable: every pole strictly inside the unit circle.
 
         Args:
             stiffness: K in N/m.
             virtual_damping: B in N s/m. Both broadcast.
+            method: as for `decide_stability`, which has the statuses as well.
 
         Returns:
             Boolean array of the broadcast shape, False for what is NaN.
@@ -209,6 +208,8 @@ class Scene:
             row (`zwidth.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
             costs some microseconds and a stiffness next to nothing.
         """
+        if method != "auto":
+            return self.decide_stability(stiffness, virtual_damping, method=method).stable
         alpha, beta = self.normalize_walls(stiffness, virtual_damping)
         if self.is_rigid:
             return is_stable(alpha, beta, self.delta, self.d)
@@ -369,52 +370,3 @@ class Scene:
             50.0
         """
         return replace_parameters(self, changes)
-
-    def poles(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
-        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
-
-        Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
-        is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
-        """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return poles(alpha, beta, self.delta, self.d)
-        return 1.0 + all_poles(self.loop, alpha, beta)
-
-    def pole_table(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> answers.PoleTable:
-        """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        return answers.pole_table(self.loop, alpha, beta, self.timing.period)
-
-    def spectral_radius(self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
-        """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
-
-        From all poles; beyond 60 of them by counting poles in circles, at a cost that does not grow with the delay.
-        """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return spectral_radius(alpha, beta, self.delta, self.d)
-        stable = label_walls(self.traced_boundary, alpha, beta).reshape(-1)
-        found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
-        return found.reshape(alpha.shape)[()]
-
-    def state_space(self, stiffness: float = 0.0, virtual_damping: float = 0.0) -> answers.StateSpace:
-        """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
-
-        Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
-        """
-        wall = answers.one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
-        return answers.closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
-
-    def open_loop(self, stiffness: float = 0.0, virtual_damping: float = 0.0) -> answers.StateSpace:
-        """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
-        wall = answers.one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
-        return answers.open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
-
-    def frequency_response(self, stiffness: ArrayLike, virtual_damping: ArrayLike, frequency: ArrayLike) -> Array:
-        """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
-
-        All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
-        """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        return answers.frequency_response(self.loop, alpha, beta, frequency, self.timing.period)

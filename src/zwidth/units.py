@@ -47,7 +47,8 @@ DAMPING = Dimension(
 STIFFNESS = Dimension({"N/m": 0, "mN/m": -3, "kN/m": 3, "MN/m": 6, "N/mm": 3, "kN/mm": 6, "N/cm": 2}, "10 kN/m")
 FORCE = Dimension({"N": 0, "mN": -3, "kN": 3}, "0.2 N")
 LENGTH = Dimension({"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "nm": -9}, "10 um")
-_OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, LENGTH)}
+SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
+_OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, LENGTH, SPEED)}
 
 PERIOD_WORDS = ("periods", "period")
 
@@ -109,7 +110,7 @@ def check_range(value: float, allowed: Range, unit: str = "", remedy: str = "") 
     return value
 
 
-def to_float(value: float) -> float:
+def to_float(value: Any) -> float:
     """A whole number beyond float64 becomes infinite, which `check_range` then refuses."""
     try:
         return float(value)

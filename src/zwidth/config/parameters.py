@@ -12,8 +12,8 @@ from zwidth.config.axes import SPELLED, Axis, Entry, axis_schema, make_axis_read
 from zwidth.config.faults import problem
 from zwidth.config.fields import unit_schema
 from zwidth.config.units import make_entry_reader, quantity, span
-from zwidth.formatting import describe
-from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.formatting import describe, short
+from zwidth.quantities import NOT_NEGATIVE, OF_PARTS, PARAMETERS, POSITIVE, Range
 from zwidth.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, find_dimension
 
 
@@ -44,10 +44,26 @@ def _delays(raw: Any) -> Axis:
 
 def _reader(name: str) -> Callable[[Any], Axis]:
     """A validator for an axis of a parameter in SI units."""
-    allowed = PARAMETERS[name].allowed
+    parameter, allowed = PARAMETERS[name], PARAMETERS[name].allowed
+    if parameter.whole:
+        return _whole_axis(make_axis_reader(make_entry_reader(name), make_entry_reader(name)))
     low = max(allowed.low, 0.0)
     positive = Range(low, allowed.high, low_open=low == 0.0)
-    return make_axis_reader(make_entry_reader(name), quantity(find_dimension(PARAMETERS[name].unit), positive))
+    return make_axis_reader(make_entry_reader(name), quantity(find_dimension(parameter.unit), positive))
+
+
+def _whole_axis(read: Callable[[Any], Axis]) -> Callable[[Any], Axis]:
+    """A validator for an axis of whole numbers, which equal steps or ratios may miss."""
+
+    def validate(raw: Any) -> Axis:
+        axis = read(raw)
+        missed = [value for value in axis.values().tolist() if not value.is_integer()]
+        if missed:
+            allowed = "every value is a whole number"
+            raise problem(f"got {short(missed[0])} as one of the steps", allowed, "change num, or write a list")
+        return axis
+
+    return validate
 
 
 def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
@@ -63,3 +79,19 @@ DampingAxis = Annotated[Axis, PlainValidator(_reader("damping")), SPELLED, _sche
 StiffnessAxis = Annotated[Axis, PlainValidator(_reader("stiffness")), SPELLED, _schema(STIFFNESS)]
 VirtualDampingAxis = Annotated[Axis, PlainValidator(_reader("virtual_damping")), SPELLED, _schema(DAMPING)]
 TimeAxis = Annotated[Axis, PlainValidator(_delays), SPELLED, _schema(TIME, "periods", "period")]
+
+
+def _schema_of(name: str) -> WithJsonSchema:
+    parameter = PARAMETERS[name]
+    if not parameter.whole:
+        return _schema(find_dimension(parameter.unit))
+    entry = {"type": "integer", "minimum": int(parameter.allowed.low), "maximum": int(parameter.allowed.high)}
+    return axis_schema(entry, entry)
+
+
+CutoffAxis = Annotated[Axis, PlainValidator(_reader("velocity.cutoff")), SPELLED, _schema_of("velocity.cutoff")]
+WindowAxis = Annotated[Axis, PlainValidator(_reader("velocity.samples")), SPELLED, _schema_of("velocity.samples")]
+# Of the parameters of parts, by path.
+PART_AXES: dict[str, Any] = {
+    name: Annotated[Axis, PlainValidator(_reader(name)), SPELLED, _schema_of(name)] for name in OF_PARTS
+}

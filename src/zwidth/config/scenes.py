@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
@@ -22,6 +23,15 @@ from zwidth.config.fields import (
     unit_schema,
 )
 from zwidth.config.numbers import number
+from zwidth.config.parts import (
+    PARTS,
+    CouplingSection,
+    OperatorSection,
+    VelocityField,
+    build_velocity,
+    list_parts,
+    locate_refusal,
+)
 from zwidth.config.units import quantity
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.errors import InputError
@@ -34,7 +44,7 @@ from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
 from zwidth.scene import Scene
 from zwidth.units import RATE, TIME, Span
 
-_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping"})
+_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PARTS})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
 
 
@@ -47,6 +57,13 @@ class _OneKind(Strict):
     def unknown(cls, name: str) -> tuple[str, str, str]:
         if name not in cls.foreign:
             return super().unknown(name)
+        if name in PARTS:
+            allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
+            return (
+                f"got {name!r} after normalized keys",
+                allowed,
+                "write mass, damping and period in place of delta and d",
+            )
         kind, other = ("physical", "normalized") if name in _NORMALIZED else ("normalized", "physical")
         return (
             f"{other} key, after {kind} ones",
@@ -94,6 +111,15 @@ class _PhysicalPlant(_OneKind):
     delay: Delay = Span(0.0, "s")
     """Delay t_d from the sample to the moment its force acts, in s or in periods, >= 0."""
 
+    velocity: VelocityField | None = None
+    """How the velocity is estimated; the difference of two samples where left out."""
+
+    operator: OperatorSection | None = None
+    """The hand that holds the device; nobody's where left out."""
+
+    coupling: CouplingSection | None = None
+    """The mass beyond a spring and damper of the device; a rigid one where left out."""
+
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         if "period" in raw and "rate" in raw:
@@ -107,8 +133,15 @@ class _PhysicalPlant(_OneKind):
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
             yield ("delay",), problem(f"got {self.delay}, which is {short(delay)} periods", allowed, "check the units")
             return
+        try:
+            scene = self.to_scene()
+            # Where it is not rigid: what the parts refuse only together, such as a cut-off beyond half the rate.
+            _ = scene.is_rigid or scene.loop
+        except InputError as error:
+            yield locate_refusal(error)
+            return
         with np.errstate(all="ignore"):
-            numbers = self.to_scene().normalized
+            numbers = scene.normalized
         for field, name in (("damping", "delta"), ("stiffness", "alpha"), ("virtual_damping", "beta")):
             least, most = (0.0, LARGEST_DAMPING) if name == "delta" else WALL_RANGE
             value = float(getattr(numbers, name))
@@ -118,6 +151,16 @@ class _PhysicalPlant(_OneKind):
                     f"{name} must be at most {most:g}" if not least else f"{name} must be 0 or {least:g} to {most:g}"
                 )
                 yield (field,), problem(what, allowed, "check the units and the mass")
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether it is a rigid mass with the backward difference, for which every kind of study answers."""
+        return self.to_scene().is_rigid
+
+    @property
+    def moving_mass(self) -> float:
+        """The mass that the wall's force acts on, in kg: the device's, and that of a hand held rigidly."""
+        return self.to_scene().mass
 
     @property
     def delta(self) -> float:
@@ -132,7 +175,10 @@ class _PhysicalPlant(_OneKind):
     def to_scene(self) -> Scene:
         """The device and its timing in SI units."""
         timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
-        return Scene(Device(mass=self.mass, damping=self.damping), timing)
+        coupling = None if self.coupling is None else self.coupling.to_part()
+        operator = None if self.operator is None else self.operator.to_part()
+        device = Device(mass=self.mass, damping=self.damping, coupling=coupling)
+        return Scene(device, timing, velocity=build_velocity(self.velocity), operator=operator)
 
 
 class _NormalizedPlant(_OneKind):
@@ -184,12 +230,19 @@ class PhysicalScene(_PhysicalPlant):
         bare = super().to_scene()
         wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
         timing = Timing(period=bare.timing.period, delay=bare.timing.delay, delay_model=self.delay_model)
-        return Scene(bare.device, timing, wall)
+        return replace(bare, timing=timing, wall=wall)
 
     @property
     def device(self) -> PhysicalDevice:
         """The scene without its wall."""
-        return PhysicalDevice(mass=self.mass, damping=self.damping, period=self.period, delay=self.delay)
+        parts = list_parts(self)
+        return PhysicalDevice(mass=self.mass, damping=self.damping, period=self.period, delay=self.delay, **parts)
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        if self.delay_model != "held" and not self.is_rigid:
+            allowed = "velocity filters, hands and couplings are computed in the model 'held'"
+            yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
 
     @property
     def wall(self) -> PhysicalWall | None:
@@ -252,6 +305,11 @@ class NormalizedWall(_OneKind):
     """Normalized damping B T/m."""
 
 
+def is_with_parts(owner: AnyScene | AnyDevice) -> bool:
+    """Whether a scene or a device is more than a rigid mass with the difference of two samples."""
+    return isinstance(owner, PhysicalScene | PhysicalDevice) and not owner.is_rigid
+
+
 def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
     """``alpha`` and ``beta`` of a wall on a device; a wall in SI units needs a device in SI units."""
     if isinstance(wall, NormalizedWall):
@@ -260,7 +318,10 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
         raise InputError("wall: got one in SI units for a normalized device; give alpha and beta")
     with np.errstate(over="ignore"):
         plain = normalize(
-            mass=device.mass, period=device.period, stiffness=wall.stiffness, virtual_damping=wall.virtual_damping
+            mass=device.moving_mass,
+            period=device.period,
+            stiffness=wall.stiffness,
+            virtual_damping=wall.virtual_damping,
         )
     return float(plain.alpha), float(plain.beta)
 

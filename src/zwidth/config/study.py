@@ -6,15 +6,20 @@ from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal, get_args
 
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
+from pydantic_core import PydanticCustomError
 
 from zwidth._types import DELAY_MODELS, DelayModel
-from zwidth.config.faults import LocatedProblem, problem, unlisted
+from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Name, Strict, members
-from zwidth.config.scenes import AnyScene
+from zwidth.config.parts import list_parts
+from zwidth.config.scenes import AnyScene, is_with_parts
 from zwidth.formatting import describe
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
+
+KINDS_WITH_PARTS = ("boundary", "recommend", "compare", "filters", "sweep")
+"""The kinds that answer for devices with parts, for messages."""
 
 
 def _only_held(value: Any) -> str:
@@ -28,6 +33,14 @@ def _only_held(value: Any) -> str:
             "write 'delay_model: held' in this study, or use the kind 'boundary' or 'ridge'",
         )
     return str(value)
+
+
+def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
+    """The problem of a device with parts in a study that would forget them."""
+    what = f"got a device with {' and '.join(parts)}"
+    allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
+    kinds = f"use one of the kinds {listing(KINDS_WITH_PARTS)}"
+    return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
 
 
 HeldOnly = Annotated[Literal["held"], BeforeValidator(_only_held)]
@@ -47,6 +60,9 @@ class Study(Strict):
 
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d")
     """Fields that the file's scene supplies where the study leaves them out."""
+
+    takes_parts: ClassVar[bool] = False
+    """Whether it answers for a device with a velocity filter, a hand or a coupling; it then has the field device."""
 
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
 
@@ -69,6 +85,13 @@ class Study(Strict):
             "delay_models": [scene.delay_model],
         }
         return {**{name: supplied[name] for name in cls.from_scene}, **raw}
+
+    @classmethod
+    def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
+        """Refuse a scene with parts of which the study would take numbers and forget the rest."""
+        taken = [name for name in cls.from_scene if name not in raw and not name.startswith("delay_model")]
+        if taken and not cls.takes_parts and is_with_parts(scene):
+            raise refuse_parts(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:

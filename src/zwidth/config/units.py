@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 from zwidth.config.faults import raise_problems
-from zwidth.config.numbers import number
+from zwidth.config.numbers import number, whole_number
 from zwidth.quantities import ANY, PARAMETERS, Range
 from zwidth.units import Dimension, Span, find_dimension, read_quantity, read_span
 
@@ -24,5 +24,5 @@ def make_entry_reader(name: str) -> Callable[[Any], float]:
     """A validator for one value of a parameter."""
     parameter = PARAMETERS[name]
     if parameter.unit == "1":
-        return number(parameter.allowed)
+        return whole_number(parameter.allowed) if parameter.whole else number(parameter.allowed)
     return quantity(find_dimension(parameter.unit), parameter.allowed)

@@ -13,6 +13,9 @@ JSON file, too):
     draw_passivity_cost   stiffest passive and stiffest stable wall over delta
     draw_map              stable, spectral radius or passive over alpha and beta
     draw_recommendation   the recommended wall of a device, in SI units
+    draw_stable_set       outlines of devices with a velocity filter, a hand or a coupling
+    draw_filters          maximum stiffness over the cut-off of a velocity filter and over its window
+    draw_filter_noise     the same over the noise that the filter lets through
 
 From the dataset of a sweep, as `zwidth.open_dataset` gives it, or a part of one:
 

@@ -3,12 +3,15 @@
 from .boundary import draw_boundary as draw_boundary
 from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines
+from .filters import draw_filter_noise as draw_filter_noise
+from .filters import draw_filters as draw_filters
 from .passivity_cost import draw_passivity_cost as draw_passivity_cost
 from .plane import draw_plane as draw_plane
 from .recommendation import draw_recommendation as draw_recommendation
 from .ridge import draw_ridge as draw_ridge
 from .slope import draw_slope as draw_slope
 from .stability_map import draw_map as draw_map
+from .stable_set import draw_stable_set as draw_stable_set
 from .step import draw_step as draw_step
 from .style import house_style as house_style
 from .style import save as save

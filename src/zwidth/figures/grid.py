@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import style
-from zwidth.quantities import NOT_COMPUTED, OUTPUTS, PARAMETERS, STATUS_OF, WALL
+from zwidth.quantities import NOT_COMPUTED, OF_PARTS, OUTPUTS, STATUS_OF, VARIABLES, WALL
 
 if TYPE_CHECKING:
     import xarray
@@ -21,7 +21,9 @@ _RESOLVED, _RESOLVED_BY_MANY = 1000, 500
 _ACROSS = 3
 _MANY_PANELS = 9
 # What an axis of a plane is, rather than a choice of panels: the first two that vary.
-_ORDER = ("alpha", "stiffness", "beta", "virtual_damping", "delta", "damping", "d", "delay", "rate", "period", "mass")
+_FIRST = ("alpha", "stiffness", "beta", "virtual_damping")
+_PARTS = tuple(parameter.variable for parameter in VARIABLES.values() if parameter.name in OF_PARTS)
+_ORDER = (*_FIRST, *_PARTS, "delta", "damping", "d", "delay", "rate", "period", "mass")
 
 
 def list_varied(data: xarray.Dataset, name: str) -> list[str]:
@@ -61,7 +63,7 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
             values = (values * factor).where(data[status] != NOT_COMPUTED).assign_attrs(units=unit)
         data[name] = values
     for name, values in data.coords.items():
-        if name in PARAMETERS:
+        if name in VARIABLES:
             factor, unit = _readable(values.values, str(values.attrs.get("units", "1")))
             data = data.assign_coords({name: (values * factor).assign_attrs(units=unit, factor=factor)})
     return data.drop_vars(status)
@@ -103,18 +105,18 @@ def spell(value: xarray.DataArray) -> str:
         return str(value.values)
     unit = {"1": "", "sampling periods": "periods"}.get(value.attrs["units"], value.attrs["units"])
     unit = rf"\,\mathrm{{{unit.replace(' ', '~')}}}" if unit else ""
-    return rf"${PARAMETERS[str(value.name)].symbol} = {float(value):.4g}{unit}$"
+    return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.4g}{unit}$"
 
 
 def title(part: xarray.Dataset) -> str:
     """The single values of a part of a dataset."""
-    names = [name for name in ("device", *PARAMETERS) if name in part.coords and not part[name].ndim]
+    names = [name for name in ("device", *VARIABLES) if name in part.coords and not part[name].ndim]
     return ",  ".join(spell(part[name]) for name in names)
 
 
 def axis_label(data: xarray.Dataset, name: str) -> str:
     """A parameter in words, with symbol and unit."""
-    parameter = PARAMETERS[name]
+    parameter = VARIABLES[name]
     definition = f" = {parameter.definition}" if parameter.definition else ""
     return f"{parameter.words}  ${parameter.symbol}{definition}$" + _in_unit(data, name)
 

@@ -12,7 +12,6 @@ from zwidth.figures import style
 from zwidth.figures.table import Table, curves
 
 # In gray these differ in lightness from one to the next.
-_COLORS = (style.BLUE, style.ORANGE, style.BLACK, style.GREEN, style.VERMILION, style.SKY, style.PURPLE)
 _STYLES = (style.SOLID, style.DASHED, style.DASH_DOTTED, style.DOTTED)
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
@@ -84,7 +83,9 @@ def _read_responses(table: Table) -> list[Any]:
 
 def _assign_colors(responses: list[Any]) -> list[tuple[Any, Any, Any]]:
     """Each with a color and a line style."""
-    return [(each, _COLORS[k % len(_COLORS)], _STYLES[k % len(_STYLES)]) for k, each in enumerate(responses)]
+    return [
+        (each, style.DISTINCT[k % len(style.DISTINCT)], _STYLES[k % len(_STYLES)]) for k, each in enumerate(responses)
+    ]
 
 
 def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:

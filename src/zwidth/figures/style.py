@@ -21,6 +21,7 @@ from matplotlib.lines import Line2D
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
 BLUE, VERMILION, PURPLE = "#0072B2", "#D55E00", "#CC79A7"
 GRAY = "#6E6E6E"
+DISTINCT = (BLUE, ORANGE, BLACK, GREEN, VERMILION, SKY, PURPLE)
 
 # Line styles carry the meaning that the paper gives them, so that it survives in gray.
 SOLID = "-"

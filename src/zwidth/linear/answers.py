@@ -8,11 +8,21 @@ import numpy as np
 
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64
-from zwidth.errors import InputError
+from zwidth.errors import InputError, check_choice
 from zwidth.linear import state_space
 from zwidth.linear.chain import Chain
+from zwidth.linear.delay_margin import linear_margins
+from zwidth.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
 from zwidth.linear.poles import all_poles, log_size
+from zwidth.linear.radius import spectral_radius as linear_radius
+from zwidth.linear.rows import label_walls
 from zwidth.linear_loop import LinearLoop, circle
+from zwidth.stability.labels import STABILITY_METHODS, Stability, StabilityMethod, decide_stability
+from zwidth.stability.margins import Margins, margins
+from zwidth.stability.passivity import passivity_margin
+from zwidth.stability.poles import poles
+from zwidth.stability.radii import spectral_radius
+from zwidth.status import Method, Status
 
 if TYPE_CHECKING:
     import control
@@ -37,7 +47,7 @@ class PoleTable(NamedTuple):
     time_constant: np.ndarray  # -1/Re s in s; negative for a growing one, infinite on the unit circle
 
 
-def pole_table(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, period: float) -> PoleTable:
+def tabulate_poles(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, period: float) -> PoleTable:
     """The poles of walls of one shape."""
     zeta: Array = all_poles(loop, alpha, beta)
     size = log_size(zeta)
@@ -51,9 +61,7 @@ def pole_table(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, period: fl
         return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
 
 
-def frequency_response(
-    loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: ArrayLike, period: float
-) -> Array:
+def respond(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: ArrayLike, period: float) -> Array:
     """``L = (alpha + beta F) G`` at frequencies in Hz up to half the sampling rate; NaN for others."""
     try:
         hertz, a, b = np.broadcast_arrays(as_float64("frequency", frequency), alpha, beta)
@@ -92,6 +100,130 @@ def _in_si(chain: Chain, loop: state_space.Matrices, period: float, mass: float,
     return StateSpace(
         loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit, loop.C / scale, loop.D * unit, period
     )
+
+
+class SceneAnswers:
+    """The questions of `zwidth.Scene` that go beyond verdicts; of the scene they need its parts, loop and boundary."""
+
+    def poles(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
+        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
+
+        Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
+        is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return poles(alpha, beta, self.delta, self.d)
+        return 1.0 + all_poles(self.loop, alpha, beta)
+
+    def pole_table(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> PoleTable:
+        """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return tabulate_poles(self.loop, alpha, beta, self.timing.period)
+
+    def spectral_radius(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
+
+        From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return spectral_radius(alpha, beta, self.delta, self.d)
+        stable = label_walls(self.traced_boundary, alpha, beta).reshape(-1)
+        found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
+        return found.reshape(alpha.shape)[()]
+
+    def state_space(self: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> StateSpace:
+        """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
+
+        Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
+        """
+        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def open_loop(self: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> StateSpace:
+        """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
+        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def frequency_response(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike, frequency: ArrayLike) -> Array:
+        """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
+
+        All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return respond(self.loop, alpha, beta, frequency, self.timing.period)
+
+    def decide_stability(
+        self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
+    ) -> Stability:
+        """Labels of walls with a status and what decided each, as `zwidth.decide_stability` has them.
+
+        "auto" and "crossover" count by the signed crossings of each row, "companion" computes all poles, "certified"
+        decides in balls of python-flint, exactly for the numbers given, or says UNDECIDED or ON_BOUNDARY.
+        """
+        check_choice("method", method, STABILITY_METHODS)
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return decide_stability(alpha, beta, self.delta, self.d, method=method)
+        known = np.isfinite(alpha) & np.isfinite(beta)
+        status = np.where(known, np.int32(Status.OK), np.int32(Status.INVALID_INPUT))
+        if method == "certified":
+            from zwidth.linear.certified import decide_walls
+
+            walls = np.broadcast_arrays(np.asarray(stiffness, float), np.asarray(virtual_damping, float))
+            stable, status = decide_walls(self, *walls)
+            used = Method.CERTIFIED
+        elif method == "companion":
+            with np.errstate(invalid="ignore"):
+                stable, used = log_size(all_poles(self.loop, alpha, beta)).max(-1) < 0, Method.COMPANION
+        else:
+            stable, used = label_walls(self.traced_boundary, alpha, beta), Method.CROSSOVER
+        return Stability(stable[()], status[()], np.full(alpha.shape, used, np.int32)[()])
+
+    def passivity_margin(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is not finite.
+
+        Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
+        (`zwidth.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
+        motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip there is
+        no such condition, and InputError says so. A wall that pushes has at most its K T.
+        """
+        check_has_condition(self.device)
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        delta = self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
+        if self.is_rigid:
+            return passivity_margin(alpha, beta, delta, self.d) * self.units.virtual_damping
+        condition = PassivityCondition.derive(self.chain.estimate, self.d)
+        return (passivity_margins(condition, alpha, beta, delta) * self.units.virtual_damping)[()]
+
+    def is_passive(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+        """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
+        return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
+
+    def margins(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Margins:
+        """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
+
+        Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
+        and B together, and ``phase_margin`` the least turn in degrees, that bring a pole to the unit circle; the turn
+        is negative for an unstable wall. ``delay_margin`` in s is the least extra delay that does, held as the hardware
+        does it, fraction by fraction with the exact loop (0 for an unstable wall, NaN where poles counted before and
+        beyond do not confirm it); ``modulus_margin`` is the least distance of L from -1. Where no factor, turn or delay
+        brings a pole there, the first three are infinite for a stable wall, and 0, NaN and 0 for an unstable one.
+        A rigid scene answers by `zwidth.margins`. A wall takes some milliseconds, its delay margin some 0.2 s.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        hertz = 1.0 / (2.0 * np.pi * self.timing.period)
+        if self.is_rigid:
+            found = margins(alpha, beta, self.delta, self.d)
+        else:
+            found = linear_margins(self.chain, self.traced_boundary, alpha, beta)
+        return found._replace(
+            delay_margin=found.delay_margin * self.timing.period,
+            phase_crossover=found.phase_crossover * hertz,
+            gain_crossover=found.gain_crossover * hertz,
+            modulus_frequency=found.modulus_frequency * hertz,
+        )
 
 
 def to_control(scene: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> control.StateSpace:

@@ -78,7 +78,9 @@ class Border:
             end = 0.0 if side < 0 else np.pi
             return end if np.all(np.isfinite(self.at_end(end))) else float(w[k])
         if piece[after] != piece[k]:
-            return float(w[k])
+            # Towards an angle at which the curve runs to infinity; it may leave the stable set before.
+            limit = self.boundary.infinite[piece[k] if side > 0 else piece[k] - 1]
+            return self._corner(float(w[k]), float(limit))
         return self._corner(float(w[k]), float(w[after]))
 
     def _corner(self, inside: float, outside: float) -> float:
@@ -151,10 +153,7 @@ class Border:
         b = self.boundary
         found = []
         for place, line in enumerate(b.lines):
-            others = [
-                other for other in b.lines[:place] if abs(other.f - line.f) > 1e-12 * (abs(other.f) + abs(line.f))
-            ]
-            for beta in ((line.q - other.q) / (line.f - other.f) for other in others):
+            for beta in _meetings(b.lines[:place], line):
                 near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
                 if b.line_borders(place, near).any():
                     found.append((float(line.q - beta * line.f), float(beta), line.w))

@@ -1,13 +1,13 @@
 """The boundary curve of any linear loop, cut into arcs on which the damping is monotone; rows of it and their counts.
 
 On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``
-(docs/theory/one-crossover.md tells it for the rigid loop). Between the zeros of ``d beta/dw`` and of Im F beta is
-monotone, so that each row meets an arc once at most. Along a row a pole leaves the circle where
+(docs/theory/scenes.md, V8). Between the zeros of ``d beta/dw`` and of Im F beta is monotone (V12), so that each row
+meets an arc once at most. Along a row a pole leaves the circle where
 ``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
 
-with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide.
+with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide (V13, V14).
 """
 
 from __future__ import annotations
@@ -25,6 +25,8 @@ from zwidth.numerics.roots import false_position
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08
 _ROUNDS = 60
+# How near to z = -1 the last node is, for a loop without roots there.
+_LAST = 1e-4
 # Shares of a step at which a dip of the slope between two nodes is looked for.
 _INSIDE = np.arange(1, 8) / 8.0
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
@@ -33,6 +35,10 @@ _MOST_STEPS, _ARRIVED = 120, 1e-10
 _ROOM = 0.02
 # Of |q|: less of an imaginary part than that where Im F vanishes is none.
 _NONE = 1e-11
+# A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
+_FLAT = 1e-12
+# By what share a row is moved, at most, that rounding keeps from being counted.
+_SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 
 
 class CurvePoints(NamedTuple):
@@ -71,6 +77,17 @@ class CrossingLine(NamedTuple):
     f_turn: float
     poles: int  # 1 at z = 1 and z = -1, else 2
 
+    @property
+    def meeting(self) -> float:
+        """The damping at which the curve meets the line, ``Im q'/Im F'``; NaN where it does not."""
+        return self.q_turn / self.f_turn if abs(self.f_turn) > _FLAT else np.nan
+
+    def leaving(self, beta: np.ndarray) -> np.ndarray:
+        """Poles that leave the circle there as alpha rises; on the row through the meeting, as just above it."""
+        if np.isnan(self.meeting):
+            return np.full(beta.shape, self.poles * np.sign(self.q_turn))
+        return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
+
 
 class Crossings(NamedTuple):
     """Where rows cross the boundary: shape (rows, arcs and lines), NaN where one does not."""
@@ -78,6 +95,7 @@ class Crossings(NamedTuple):
     alpha: np.ndarray
     w: np.ndarray
     leaving: np.ndarray  # poles that leave the circle as alpha rises past the crossing; negative for entering ones
+    sound: np.ndarray  # of each row: whether its crossings lead from the count far below to that far above
 
 
 def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
@@ -96,10 +114,14 @@ def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
 
 def nodes_of(loop: LinearLoop) -> np.ndarray:
     """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
-    sizes = np.abs(np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros]))
-    slowest = min([1.0 / (abs(loop.lag) + loop.estimate.window + 1.0), *sizes[sizes > 1e-13]])
-    first = 1e-3 * min(slowest, 1.0)
-    w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - 1e-6, 32)[1:]])
+    roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
+    sizes, far = np.abs(roots), np.abs(roots - 2.0)
+    turn = 1.0 / (abs(loop.lag) + loop.estimate.window + 1.0)
+    first = 1e-3 * min([turn, *sizes[sizes > 1e-13]])
+    # Next to z = -1 imaginary parts x = pi - w have lost eps/x of themselves, and beta varies by (x/far)^2: closer than
+    # this its slope is rounding.
+    last = _LAST * min([turn, *far[far > 1e-13]]) ** (2.0 / 3.0)
+    w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
     for _ in range(_ROUNDS):
         half = 0.5 * np.diff(w)
         wide = 2.0 * half * loop.turning(w[:-1] + half, half) > _STEP * 16.0
@@ -127,45 +149,81 @@ class Boundary:
         here = curve_at(loop, w)
         w = np.unique(np.concatenate([w, _dips(loop, w, here)]))
         here = curve_at(loop, w)
-        poles = zeros_of(loop, w, here.fall, "fall")
-        lines = tuple(line for p in poles if (line := _interior_line(loop, p)) is not None)
-        poles = np.array([p for p in poles if all(abs(p - line.w) > 1e-9 for line in lines)])
-        poles = np.union1d(poles, _circle_zeros(loop))
+        vertical = zeros_of(loop, w, here.fall, "fall")
+        touched = [p for p in _circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
+        vertical = np.union1d(vertical, touched)
+        lines = tuple(line for p in vertical if (line := _interior_line(loop, p)) is not None)
+        poles = np.array([p for p in vertical if all(p != line.w for line in lines)])
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
-        limits = _limits_at(loop, np.array([0.0, np.pi, *(line.w for line in lines)]))
-        arcs = tuple(_arcs(loop, w, here, poles, turns, limits))
-        return cls(loop, w, arcs, (*lines, *_end_lines(loop)), poles)
+        lines = (*lines, *_end_lines(loop))
+        limits = {0.0: np.nan, np.pi: np.nan} | {line.w: line.meeting for line in lines}
+        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns, limits)), lines, poles)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
+        beta, sound = self._settle(beta)
         cells = [_cells(arc, beta) for arc in self.arcs]
         row = np.concatenate([rows for rows, _ in cells])
         place = np.repeat(np.arange(len(cells)), [rows.size for rows, _ in cells])
         low = np.concatenate([arc.w[k - 1] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
         high = np.concatenate([arc.w[k] for arc, (_, k) in zip(self.arcs, cells, strict=True)])
         leaving = np.array([arc.leaving for arc in self.arcs])[place]
-        w, alpha = _solve_rows(self.loop, beta[row], low, high, leaving > 0)
+        w, alpha = _solve_rows(self.loop, self._fixed, beta[row], low, high, leaving)
         shape = beta.size, len(self.arcs) + len(self.lines)
-        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape))
+        out = Crossings(np.full(shape, np.nan), np.full(shape, np.nan), np.zeros(shape), sound)
         out.alpha[row, place], out.w[row, place] = alpha, w
         out.leaving[row, place] = leaving
         for place, line in enumerate(self.lines, len(self.arcs)):
             out.alpha[:, place] = line.q - beta * line.f
             out.w[:, place] = line.w
-            out.leaving[:, place] = line.poles * np.sign(line.q_turn - beta * line.f_turn)
+            out.leaving[:, place] = line.leaving(beta)
         return out
 
-    def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
-        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,)."""
-        return self.base + self._passed(alpha, beta)
+    @property
+    def _fixed(self) -> list[float]:
+        """The angles besides 0 and pi at which ``Im(q - beta F)`` vanishes on every row."""
+        return [line.w for line in self.lines if line.poles == 2]
 
-    def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> np.ndarray:
-        """Poles that have left below each wall, without those of one column of the crossings.
+    def _settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Rows whose crossings lead from the count far below to that far above, and which ones do (V15).
+
+        A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
+        """
+        missed = self._missed(beta)
+        for shift in _SHIFTS:
+            row = np.flatnonzero(missed)
+            if not row.size:
+                break
+            beta = beta.copy()
+            beta[row] = beta[row] * (1.0 + shift)
+            missed[row] = self._missed(beta[row])
+        return beta, missed == 0
+
+    def _missed(self, beta: np.ndarray) -> np.ndarray:
+        """By how many poles the crossings of each row fail to lead to the count far above."""
+        total = np.full(beta.shape, float(self.base - self.top))
+        for arc in self.arcs:
+            total += np.where((beta >= arc.beta[0]) & (beta < arc.beta[-1]), arc.leaving, 0.0)
+        for line in self.lines:
+            total += line.leaving(beta)
+        return total
+
+    def outside(self, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+        """How many poles of each wall lie outside the unit circle, for arrays of one shape (points,).
+
+        -1 where the row's crossings contradict each other.
+        """
+        passed, sound = self._passed(alpha, beta)
+        return np.where(sound, self.base + passed, -1)
+
+    def _passed(self, alpha: np.ndarray, beta: np.ndarray, but: np.ndarray | int = -1) -> tuple[np.ndarray, np.ndarray]:
+        """Poles that have left below each wall, without those of one column of the crossings; and if that is sound.
 
         Most walls are far above or below where an arc crosses their row, which the nodes beside tell.
         """
         but = np.broadcast_to(but, beta.shape)
+        beta, sound = self._settle(beta)
         total = np.zeros(beta.shape)
         near: list[tuple[np.ndarray, ...]] = []
         for place, arc in enumerate(self.arcs):
@@ -180,33 +238,33 @@ class Boundary:
             near.append((row[left], np.full(left.sum(), arc.leaving), arc.w[k[left] - 1], arc.w[k[left]]))
         row, leaving, low, high = (np.concatenate(column) for column in zip(*near, strict=True))
         if row.size:
-            passed = _solve_rows(self.loop, beta[row], low, high, leaving > 0)[1] < alpha[row]
+            passed = _solve_rows(self.loop, self._fixed, beta[row], low, high, leaving)[1] < alpha[row]
             np.add.at(total, row[passed], leaving[passed])
         for place, line in enumerate(self.lines, len(self.arcs)):
             passed = (line.q - beta * line.f < alpha) & (but != place)
-            total += np.where(passed, line.poles * np.sign(line.q_turn - beta * line.f_turn), 0.0)
-        return total.astype(int)
+            total += np.where(passed, line.leaving(beta), 0.0)
+        return total.astype(int), sound
 
     def borders(self, w: np.ndarray) -> np.ndarray:
-        """Whether the stable set lies on one side of the curve at each angle."""
+        """Whether the stable set lies on one side of the curve at each angle (V18)."""
         here = curve_at(self.loop, w)
-        with np.errstate(all="ignore"):
-            leaves = here.turn * here.fall > 0
         own = np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
+        # By the arc: next to z = -1 the slope at one angle may be rounding.
+        leaves = np.array([arc.leaving for arc in self.arcs])[own] > 0
         finite = np.isfinite(here.alpha) & np.isfinite(here.beta)
         at = np.where(finite, here.alpha, 0.0), np.where(finite, here.beta, 0.0)
-        return finite & (self.base + self._passed(*at, own) == np.where(leaves, 0, 2))
+        passed, sound = self._passed(*at, own)
+        return finite & sound & (self.base + passed == np.where(leaves, 0, 2))
 
     def line_borders(self, line: int, beta: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of a line at each damping."""
         at = self.lines[line]
-        turn = at.q_turn - beta * at.f_turn
-        others = self.base + self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
-        return others == np.where(turn > 0, 0, at.poles)
+        passed, sound = self._passed(at.q - beta * at.f, beta, len(self.arcs) + line)
+        return sound & (self.base + passed == np.where(at.leaving(beta) > 0, 0, at.poles))
 
     @cached_property
     def base(self) -> int:
-        """Poles outside far below every crossing (docs/theory/scenes.md, S14)."""
+        """Poles outside far below every crossing (docs/theory/scenes.md, V14)."""
         return self._far_outside(-1.0)
 
     @cached_property
@@ -229,20 +287,23 @@ class Boundary:
 
 def _cells(arc: Arc, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The rows that meet an arc, and before which of its nodes."""
-    row = np.flatnonzero((beta >= arc.beta[0]) & (beta <= arc.beta[-1]))
+    # A row through an end of arcs is counted as the row just above it.
+    row = np.flatnonzero((beta >= arc.beta[0]) & (beta < arc.beta[-1]))
     return row, np.clip(np.searchsorted(arc.beta, beta[row]), 1, arc.beta.size - 1)
 
 
 def _solve_rows(
-    loop: LinearLoop, beta: np.ndarray, low: np.ndarray, high: np.ndarray, rising: np.ndarray
+    loop: LinearLoop, fixed: list[float], beta: np.ndarray, low: np.ndarray, high: np.ndarray, leaving: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The angle between two nodes at which each row crosses, and its alpha.
 
-    ``Im q - beta Im F`` over sin w, which is ``rising`` with w where a pair leaves, by Newton's method kept inside its
-    bracket; who has arrived takes no part any more.
+    ``Im(q - beta F)``, which rises with w where a pair leaves, over what vanishes on every row, by Newton's method kept
+    inside its bracket; who has arrived takes no part any more.
     """
+    cosine = np.cos(0.5 * (low + high))
+    rising = leaving * np.prod([np.sign(cosine - np.cos(w)) for w in fixed], axis=0) > 0
     below, above = np.minimum(low, high), np.maximum(low, high)
-    first, last = _residual(loop, beta, below)[0], _residual(loop, beta, above)[0]
+    first, last = _residual(loop, fixed, beta, below)[0], _residual(loop, fixed, beta, above)[0]
     with np.errstate(all="ignore"):
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
@@ -250,7 +311,7 @@ def _solve_rows(
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
-        value, slope, _ = _residual(loop, beta[here], x)
+        value, slope, _ = _residual(loop, fixed, beta[here], x)
         ahead = (value < 0) == rising[here]
         below[here], above[here] = np.where(ahead, x, below[here]), np.where(ahead, above[here], x)
         with np.errstate(all="ignore"):
@@ -263,20 +324,24 @@ def _solve_rows(
         if not on.any():
             break
         here, x = here[on], new[on]
-    return found, _residual(loop, beta, found)[2]
+    return found, _residual(loop, fixed, beta, found)[2]
 
 
-def _residual(loop: LinearLoop, beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """``Im(q - beta F)/sin w`` with its limits at 0 and pi, its derivative, and ``Re(q - beta F)``."""
+def _residual(loop: LinearLoop, fixed: list[float], beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
+    """``Im(q - beta F)`` over ``sin w prod(cos w - cos fixed)``, its derivative; and ``Re(q - beta F)``."""
     at = circle(w)
     with np.errstate(all="ignore"):
         q, f = loop.needed(at), loop.estimate.jet(at)
         value, slope = q.value - beta * f.value, q.slope - beta * f.slope
-        sine, cosine = np.where(w >= np.pi, 0.0, np.sin(w)), np.cos(w)
-        end = sine == 0
-        safe = np.where(end, 1.0, sine)
-        ratio = np.where(end, slope.imag / cosine, value.imag / safe)
-        return ratio, (slope.imag - ratio * cosine) / safe, value.real
+        whole = np.where(w >= np.pi, 0.0, np.sin(w))
+        turn = np.cos(w)
+        for angle in fixed:
+            factor = -2.0 * np.sin(0.5 * (w + angle)) * np.sin(0.5 * (w - angle))
+            whole, turn = whole * factor, turn * factor - whole * np.sin(w)
+        end = whole == 0
+        safe = np.where(end, 1.0, whole)
+        ratio = np.where(end, slope.imag / turn, value.imag / safe)
+        return ratio, (slope.imag - ratio * turn) / safe, value.real
 
 
 def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
@@ -315,6 +380,9 @@ def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
 def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
     """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
     at = circle(np.array([w]))
+    if np.min(np.abs(at.before + loop.zeros), initial=1.0) < 1e-9:
+        # q is infinite, not real.
+        return None
     q, f = loop.needed(at), loop.estimate.jet(at)
     if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
         return None
@@ -323,9 +391,10 @@ def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
 
 
 def _circle_zeros(loop: LinearLoop) -> np.ndarray:
-    """Angles of the device's zeros on the circle, where q is infinite: nothing damps the masses beyond the sensor."""
-    angles = np.angle(1.0 - loop.zeros[np.abs(depths(loop.zeros)) <= ON_CIRCLE])
-    return angles[(angles > 0) & (angles < np.pi - 1e-6)]
+    """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
+    zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
+    angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
+    return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 
 def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
@@ -378,16 +447,6 @@ def _arcs(
         if beta[0] <= beta[-1]:
             arcs.append(Arc(nodes[good], beta[good], alpha[good], size[good], leaving))
     return arcs
-
-
-def _limits_at(loop: LinearLoop, w: np.ndarray) -> dict[float, float]:
-    """``Im q'/Im F'``, the limit of beta where Im q and Im F vanish; infinite or NaN where there is none."""
-    at = circle(w)
-    with np.errstate(all="ignore"):
-        q, f = loop.needed(at), loop.estimate.jet(at)
-        steep = np.abs(f.slope.imag) > 1e-12 * (1.0 + np.abs(f.slope))
-        limit = np.where(steep & np.isfinite(q.slope.imag), q.slope.imag / f.slope.imag, np.nan)
-    return dict(zip(w.tolist(), limit.tolist(), strict=True))
 
 
 def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:

@@ -56,7 +56,7 @@ def draw_stores(
         raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
     beside = folder.parent if stores == [folder] else folder
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
-    wanted = dict(at or {})
+    wanted = {name.replace(".", "_"): value for name, value in (at or {}).items()}
     datasets = {store: open_dataset(store).reset_coords(drop=True) for store in stores}
     known = dict.fromkeys(str(dim) for data in datasets.values() for dim in data.dims)
     unknown = [name for name in wanted if name not in known]

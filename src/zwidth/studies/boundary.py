@@ -13,7 +13,8 @@ from zwidth import figures
 from zwidth._types import DelayModel
 from zwidth.batching import map_flat
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.scenes import AnyScene
+from zwidth.config.parts import list_parts
+from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.stability.region import Piece, stable_region
@@ -21,6 +22,8 @@ from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, add_si_of_scene, stack
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
+from zwidth.studies.stable_set import tabulate_walls, trace_outlines
+from zwidth.sweep.stiffest import find_stiffest
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 
@@ -37,8 +40,12 @@ class BoundaryStudy(CurvesStudy):
     what: ClassVar[str] = "a boundary study"
     from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_models")
     reads_scene: ClassVar[bool] = True
+    takes_parts: ClassVar[bool] = True
 
     kind: Literal["boundary"]
+
+    device: PhysicalDevice | None = None
+    """A device in SI units, in place of delta and d; the scene's where it has parts and they are left out."""
 
     plane: Plane = "alpha_beta"
     """Boundary over alpha and beta, or over delta and beta at alpha -> 0."""
@@ -54,6 +61,30 @@ class BoundaryStudy(CurvesStudy):
 
     figure: Literal["fig5", "fig6", "fig7", "fig8", "fig9"] | None = None
     """Layout of the figure; a generic one where left out."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        if "device" in raw or (is_with_parts(scene) and not {"delta", "d"} & set(raw)):
+            return {"delay_models": [scene.delay_model], "device": scene.device, **raw}
+        return super().fill(raw, scene)
+
+    @classmethod
+    def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
+        given = [name for name in ("delta", "d") if name in raw]
+        if len(given) == 1 and "device" not in raw and is_with_parts(scene):
+            remedy = f"remove {given[0]!r}, or give both delta and d"
+            raise problem(f"got {given[0]!r} beside a scene with parts", "a device with parts has its own", remedy)
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        """Take delta and d from the device; a faulty one is reported at its own place."""
+        if "device" not in raw:
+            return raw
+        try:
+            device = PhysicalDevice.model_validate(raw["device"])
+        except ValueError:
+            return {"delta": 0.0, "d": 0.0, **raw}
+        return {"delta": device.delta, "d": device.d, **raw}
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
@@ -75,6 +106,19 @@ class BoundaryStudy(CurvesStudy):
         if self.plane == "delta_beta" and self.delta.size < 2:
             allowed = "the plane delta_beta needs two values of delta or more, its curves run over delta"
             yield ("delta",), problem("got one value", allowed, "give delta as a list, linear or log axis")
+        if self.device is None:
+            return
+        for name in ("delta", "d"):
+            if getattr(self, name).values().tolist() != [getattr(self.device, name)]:
+                what = f"got {name!r} beside a device"
+                yield (name,), problem(what, "a device has its own", "remove one", on_key=True)
+        if self.device.is_rigid:
+            return
+        asked = {"plane": "alpha_beta", "delay_models": ("held",), "ridge_path": False, "passivity": False}
+        for name in [name for name, known in {**asked, "figure": None}.items() if getattr(self, name) != known]:
+            parts = " and ".join(list_parts(self.device))
+            allowed = f"it is known for a rigid mass with the difference of two samples, not for one with {parts}"
+            yield (name,), problem(f"got {name!r}", allowed, "remove it", on_key=True)
 
     @property
     def points(self) -> int:
@@ -82,7 +126,9 @@ class BoundaryStudy(CurvesStudy):
         return super().points * (_POINTS_PER_CURVE if self.plane == "alpha_beta" else 1)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """One boundary for every delta, d and delay model, as a table and a figure."""
+        """One boundary for every delta, d and delay model, or that of a device with parts, as a table and a figure."""
+        if self.device is not None and not self.device.is_rigid:
+            return outline_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
         models = needed_models(self.delay_models, delays)
         if self.plane == "delta_beta":
@@ -105,8 +151,19 @@ class BoundaryStudy(CurvesStudy):
             parts.append({"curve": "ridge_path", **path})
             notes += remarks
         parts += passive_outlines(deltas, delays) if self.passivity else ()
-        table = add_si_of_scene(stack(parts), self.delta, self.d, scene)
+        table = add_si_of_scene(stack(parts), self.delta, self.d, self.device or scene)
         return Outcome(table=table, figures={"": partial(figures.draw_boundary, table)}, notes=tuple(notes))
+
+
+def outline_device(device: PhysicalDevice, label: str) -> Outcome:
+    """The outlines of a device with parts, islands and holes told apart, and its stiffest wall."""
+    scene = device.to_scene()
+    found = trace_outlines(scene, label=label, d=device.d, delta=device.delta)
+    table = stack({"curve": "boundary", "delay_model": "held", **one} for one in found)
+    if not table:
+        return Outcome(notes=("no wall of this device is stable",))
+    walls = tabulate_walls(label, {"stiffest": find_stiffest(scene)})
+    return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
 
 
 def outline(delta: float, d: float, delay: DelayModel) -> tuple[dict[str, Any], bool]:

@@ -17,7 +17,7 @@ from pydantic import (
     WithJsonSchema,
     WrapValidator,
 )
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Name, Strict, members
@@ -26,6 +26,8 @@ from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, Scene
 from zwidth.config.study import Study
 from zwidth.formatting import describe, suggestion
 from zwidth.studies.boundary import BoundaryStudy
+from zwidth.studies.compare import CompareStudy
+from zwidth.studies.filters import FiltersStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
 from zwidth.studies.recommend import RecommendStudy
@@ -53,7 +55,17 @@ def register(model: type[Study]) -> type[Study]:
     return model
 
 
-for _model in (BoundaryStudy, MapStudy, RidgeStudy, PassivityStudy, StepStudy, RecommendStudy, SweepStudy):
+for _model in (
+    BoundaryStudy,
+    MapStudy,
+    RidgeStudy,
+    PassivityStudy,
+    StepStudy,
+    RecommendStudy,
+    CompareStudy,
+    FiltersStudy,
+    SweepStudy,
+):
     register(_model)
 
 
@@ -69,6 +81,8 @@ def _read_study(raw: Any) -> Any:
     """A validator that reads a mapping as the study that its kind names."""
     if isinstance(raw, Study):
         return raw
+    if isinstance(raw, PydanticCustomError):
+        raise raw
     kinds = f"a study is a mapping with one of the kinds {listing(KINDS)}"
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", kinds, "write '- kind: boundary' and its fields, or remove the entry")
@@ -184,7 +198,14 @@ def _scene_or_stand_in(raw: Any) -> AnyScene:
 def _fill_study(study: Any, scene: AnyScene) -> Any:
     """A study's mapping with what the scene supplies; anything else as it is."""
     model = _find_model(study.get("kind")) if isinstance(study, dict) else None
-    return study if model is None else model.fill(study, scene)
+    if model is None:
+        return study
+    try:
+        model.check_parts(study, scene)
+    except PydanticCustomError as refusal:
+        # Raised where the study is read, at its place in the file.
+        return refusal
+    return model.fill(study, scene)
 
 
 def config_json_schema() -> dict[str, Any]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from zwidth import figures
 from zwidth.config.axes import Axis
-from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import Study
 from zwidth.figures.table import SI_COLUMNS
 
@@ -70,22 +70,24 @@ class ComputedStudy(Study):
         raise NotImplementedError
 
 
-def si_scales(device: PhysicalDevice) -> tuple[float, float]:
+def si_scales(device: PhysicalDevice | PhysicalScene) -> tuple[float, float]:
     """N/m for alpha = 1 and N s/m for beta = 1."""
-    return device.mass / device.period**2, device.mass / device.period
+    mass = device.moving_mass
+    return mass / device.period**2, mass / device.period
 
 
-def add_si_columns(table: Table, device: PhysicalDevice) -> Table:
+def add_si_columns(table: Table, device: PhysicalDevice | PhysicalScene) -> Table:
     """A table with its walls in N/m and N s/m as well."""
     stiffness, damping = si_scales(device)
     return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 
-def add_si_of_scene(table: Table, delta: Axis, d: Axis, scene: AnyScene | None) -> Table:
-    """A table of walls, in SI units as well where delta and d are those of the file's scene alone."""
-    if isinstance(scene, PhysicalScene) and _is_single(delta, scene.delta) and _is_single(d, scene.d):
-        return add_si_columns(table, scene.device)
-    return table
+def add_si_of_scene(table: Table, delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Table:
+    """A table of walls, in SI units as well where delta and d are those of a rigid scene or device alone."""
+    if not isinstance(owner, PhysicalScene | PhysicalDevice) or not owner.is_rigid:
+        return table
+    own = _is_single(delta, owner.delta) and _is_single(d, owner.d)
+    return add_si_columns(table, owner) if own else table
 
 
 def _is_single(axis: Axis, value: float) -> bool:

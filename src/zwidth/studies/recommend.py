@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Literal
 
@@ -15,11 +16,11 @@ from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.formatting import plain, with_unit
 from zwidth.parts.wall import VirtualWall
-from zwidth.scene import Scene
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, add_si_columns, si_scales, stack
 from zwidth.studies.passivity import passive_outlines
+from zwidth.studies.recommend_with_parts import recommend_with_parts
 from zwidth.studies.step import ResponseStudy
 
 
@@ -28,6 +29,8 @@ class RecommendStudy(ResponseStudy):
 
     what: ClassVar[str] = "a recommend study"
     from_scene: ClassVar[tuple[str, ...]] = ("device", "delay_model")
+
+    takes_parts: ClassVar[bool] = True
 
     kind: Literal["recommend"]
 
@@ -58,11 +61,13 @@ class RecommendStudy(ResponseStudy):
         stem = "recommendation" if alone else f"{self.name}_recommendation"
         device = self.device
         bare = device.to_scene()
+        if not device.is_rigid:
+            return recommend_with_parts(bare, device.label or self.name, self.stiffness_fraction, stem)
         ridge = alpha_max(device.delta, device.d)
         alpha, beta = self.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
         stiffness, damping = si_scales(device)
         wall = VirtualWall(stiffness=alpha * stiffness, virtual_damping=beta * damping)
-        verdict = assess(Scene(bare.device, bare.timing, wall))
+        verdict = assess(replace(bare, wall=wall))
         columns, note = self.respond(device, alpha, beta, label=device.label or self.name, physical=True)
         response = stack([columns])
         found = _summary(device, wall, verdict, self.stiffness_fraction, float(columns["settling_time_s"]))

@@ -15,6 +15,7 @@ from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Duration, Fraction, members
 from zwidth.config.numbers import whole_number
+from zwidth.config.parts import list_parts
 from zwidth.config.scenes import (
     AnyDevice,
     AnyScene,
@@ -24,9 +25,10 @@ from zwidth.config.scenes import (
     PhysicalDevice,
     PhysicalWall,
     WallField,
+    is_with_parts,
     normalized_wall,
 )
-from zwidth.config.study import HeldOnly
+from zwidth.config.study import HeldOnly, refuse_parts
 from zwidth.formatting import plain, with_unit
 from zwidth.quantities import Range
 from zwidth.response import step_response
@@ -73,7 +75,7 @@ class ResponseStudy(ComputedStudy):
         clock, length, units = 1.0, 1.0, ("", "", "", "")
         if physical:
             assert isinstance(device, PhysicalDevice), "only a device with mass and period has SI units"
-            clock, length = device.period, device.period**2 / device.mass
+            clock, length = device.period, device.period**2 / device.moving_mass
             units = ("_s", "_m", "_m_per_s", "_N")
         second, meter, speed, newton = units
         time, settling_time = raw.time * clock, raw.settling_time * clock
@@ -151,6 +153,9 @@ class StepStudy(ResponseStudy):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
+        for index, device in enumerate(self.devices):
+            if is_with_parts(device):
+                yield ("devices", index), refuse_parts("step", list_parts(device))
         sizes = len(self.devices), len(self.walls or (None,))
         if min(sizes) > 1 and sizes[0] != sizes[1]:
             allowed = "one wall for all devices, one for each, or one device for all walls"

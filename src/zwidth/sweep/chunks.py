@@ -22,9 +22,15 @@ def perform(path: str, family: str, index: int) -> None:
     task = Task("device" if family == "device" else "wall", index)
     if store.is_done(task):
         return
+    plan = store.plan.family(family)
+    if store.study.with_parts:
+        from zwidth.sweep.scenes import compute_scenes
+
+        block = store.grid.scene_block(plan.place(index))
+        store.write(task, compute_scenes(plan.family, plan.outputs, store.study, block))
+        return
     # Loads JAX, which a process that only hands out work has no use for.
     from zwidth.sweep.compute import compute
 
-    plan = store.plan.family(family)
     block = store.grid.block(plan.place(index))
     store.write(task, compute(plan.family, plan.outputs, block, store.study.accuracy))

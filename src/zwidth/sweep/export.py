@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth.errors import StoreError, StoreExistsError
 from zwidth.files.whole import hidden_beside
-from zwidth.quantities import NOT_COMPUTED, OUTPUTS, PARAMETERS
+from zwidth.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 from zwidth.sweep.store import open_dataset
 
 MAX_CSV_POINTS = 1_000_000
@@ -69,7 +69,7 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
         os.replace(partial, target)
 
 
-_ORDER = (*PARAMETERS, *OUTPUTS)
+_ORDER = (*VARIABLES, *OUTPUTS)
 
 
 def _place(name: str) -> int:

@@ -26,6 +26,14 @@ class Block(NamedTuple):
     rows: int  # how many betas the whole grid has, of which the block may hold a part only
 
 
+class SceneBlock(NamedTuple):
+    """A block of the grid in SI units: D devices by their parameters, with A x B walls each."""
+
+    parameters: dict[str, np.ndarray]  # each of shape (D,)
+    stiffness: np.ndarray  # shape (D, A)
+    virtual_damping: np.ndarray  # shape (D, B)
+
+
 class Grid:
     """The dimensions of a sweep, those of walls last, and what lies at each of their points."""
 
@@ -55,7 +63,7 @@ class Grid:
         return columns | {name: axis.values() for name, axis in own.items() if axis is not None}
 
     def coordinates(self) -> dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]]:
-        """Dimensions, values and attributes of every parameter, and the labels of the devices."""
+        """Dimensions, values and attributes of every parameter by its name in a store, and the labels of devices."""
         table = self.axes.devices
         found: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, Any]]] = {}
         if table is not None:
@@ -64,20 +72,18 @@ class Grid:
         for name, values in self._values.items():
             units = "sampling periods" if name == "delay" and self.axes.delay_in_periods else PARAMETERS[name].unit
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
+            variable = PARAMETERS[name].variable
             if table is not None and name in table.columns:
-                found[name] = (("device",), values, attributes)
+                found[variable] = (("device",), values, attributes)
             elif name in self.sizes:
-                found[name] = ((name,), values, attributes)
+                found[variable] = ((variable,), values, attributes)
             else:
-                found[name] = ((), values[0], attributes)
+                found[variable] = ((), values[0], attributes)
         return found
 
     def block(self, place: tuple[slice, ...]) -> Block:
         """The normalized parameters of a block, given one slice for every dimension, or for those of devices."""
-        slices = dict(zip(self.dims, place, strict=False))
-        for name in self.wall_dims:
-            slices.setdefault(name, slice(0, 1))
-        shape = tuple(len(range(*slices[name].indices(self.sizes[name]))) for name in self.device_dims)
+        slices, shape = self._cut(place)
         if not self.physical:
             delta, d = (self._device(name, slices, shape) for name in ("delta", "d"))
             alpha, beta = (self._wall(name, slices, shape) for name in ("alpha", "beta"))
@@ -85,6 +91,21 @@ class Grid:
                 delta, d, *self._broadcast_walls(alpha, beta, delta.size), np.empty(0), np.empty(0), self._rows
             )
         return self._physical_block(slices, shape)
+
+    def scene_block(self, place: tuple[slice, ...]) -> SceneBlock:
+        """The same in SI units, of a sweep whose devices have parts."""
+        slices, shape = self._cut(place)
+        names = [name for name in self.axes.given if name not in WALL]
+        parameters = {name: self._device(name, slices, shape) for name in names}
+        stiffness, damping = (self._wall(name, slices, shape) for name in ("stiffness", "virtual_damping"))
+        return SceneBlock(parameters, *self._broadcast_walls(stiffness, damping, math.prod(shape)))
+
+    def _cut(self, place: tuple[slice, ...]) -> tuple[dict[str, slice], tuple[int, ...]]:
+        """The slice of every dimension, and the shape of the devices."""
+        slices = dict(zip(self.dims, place, strict=False))
+        for name in self.wall_dims:
+            slices.setdefault(name, slice(0, 1))
+        return slices, tuple(len(range(*slices[name].indices(self.sizes[name]))) for name in self.device_dims)
 
     @property
     def _rows(self) -> int:

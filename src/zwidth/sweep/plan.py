@@ -37,6 +37,8 @@ _RATES = {
     **{"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 1e6},
     **{"gain_margin": 2e5, "delay_margin": 2e4, "modulus_margin": 2e4},
 }
+# To lay out the boundary of one device with parts, and to find its edge.
+_SCENE_SECONDS = 0.1
 _FOLLOWS_FROM = dict.fromkeys(RADIUS_OUTPUTS, "spectral_radius")
 _FOLLOWS_FROM |= {"passivity_margin": "passive", "phase_margin": "gain_margin"}
 
@@ -171,6 +173,9 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
         slowness = sum(1.0 / _RATES[name] for name in _costly(outputs))
+        if study.with_parts:
+            walls = grid.size_of(family) // grid.size_of("device")
+            slowness += _SCENE_SECONDS / walls
         per_point = _bytes_per_point(outputs)
         size = grid.size_of(family)
         target = min((memory - _LAID_OUT_BYTES) // per_point, _LARGEST_CHUNK, int(_CHUNK_SECONDS / slowness))
@@ -181,7 +186,7 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
     disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
-    model = _model(_most_periods(study, grid))
+    model = "device with parts, held delay" if study.with_parts else _model(_most_periods(study, grid))
     return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
@@ -207,6 +212,9 @@ def chunk_shape(shape: tuple[int, ...], target: int) -> tuple[int, ...]:
 def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
     """The method of every output that has a choice, and why; it depends on the study alone, never on the machine."""
     methods = {}
+    if study.with_parts:
+        reason = "one boundary for each device, on which the poles that cross are counted along every row"
+        return {name: ("crossings", reason) for name in study.outputs if name in ("stable", "stiffness_max")}
     if "stable" in study.outputs:
         methods["stable"] = ("crossover", "no pole is needed: the end of each row in closed form, then a comparison")
     if RADIUS_OUTPUTS & set(study.outputs):

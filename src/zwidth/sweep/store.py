@@ -213,7 +213,9 @@ def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
         files = sorted(file for file in fresh.rglob("*") if file.is_file() and file != fresh / "zarr.json")
         sums = {file.relative_to(fresh).as_posix(): checksum(file) for file in files}
         # The coordinates that are no dimension, as CF lists them.
-        auxiliary = " ".join(name for name in grid.coordinates() if name not in grid.dims)
+        auxiliary = " ".join(
+            name for name in grid.coordinates() if name not in {dim.replace(".", "_") for dim in grid.dims}
+        )
         described = {"Conventions": "CF-1.11", "zwidth_format": FORMAT, "coordinates": auxiliary, **attributes}
         described = {key: value for key, value in described.items() if key not in (_FILES, _SEAL)} | {_FILES: sums}
         document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8"))
@@ -251,7 +253,11 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
     code: dict[str, Any] = {"compressors": [ZstdCodec(level=3)], "fill_value": NOT_COMPUTED}
     keeping = {"bool": packed, "float64": number, "uint8": code}
     for family in plan.families:
-        common: dict[str, Any] = {"shape": family.shape, "chunks": family.chunks, "dimension_names": family.dims}
+        common: dict[str, Any] = {
+            "shape": family.shape,
+            "chunks": family.chunks,
+            "dimension_names": [name.replace(".", "_") for name in family.dims],
+        }
         for name in family.outputs:
             output = OUTPUTS[name]
             attributes = {"long_name": output.long_name, **output.attributes}

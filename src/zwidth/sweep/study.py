@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.axes import AnyAxis, Axis, DelayAxis, DeltaAxis
@@ -15,6 +15,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, members
 from zwidth.config.numbers import number
 from zwidth.config.parameters import (
+    PART_AXES,
     DampingAxis,
     MassAxis,
     PeriodAxis,
@@ -23,12 +24,26 @@ from zwidth.config.parameters import (
     TimeAxis,
     VirtualDampingAxis,
 )
-from zwidth.config.scenes import AnyScene, PhysicalScene
+from zwidth.config.parts import (
+    CouplingSection,
+    OperatorSection,
+    VelocityField,
+    build_velocity,
+    list_parts,
+    locate_refusal,
+)
+from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study
+from zwidth.errors import InputError
+from zwidth.parts.device import Device
+from zwidth.parts.operator import Operator
+from zwidth.parts.timing import Timing
 from zwidth.quantities import (
     MAX_DELAY_PERIODS,
     NORMALIZED,
+    OF_PARTS,
     OUTPUTS,
+    OUTPUTS_WITH_PARTS,
     PARAMETERS,
     PHYSICAL,
     STATUS_OF,
@@ -36,6 +51,7 @@ from zwidth.quantities import (
     Family,
     Range,
 )
+from zwidth.scene import Scene
 
 MAX_SWEEP_POINTS = 10**12
 
@@ -51,7 +67,15 @@ OutputName = Annotated[str, BeforeValidator(_check_output), WithJsonSchema({"typ
 _ACCURACY = Range(1e-12, 0.1)
 
 
-class Axes(Strict):
+# Field names with dots, which a class body cannot have.
+_PART_FIELDS: Any = {
+    name: (form | None, Field(default=None, description=f"{PARAMETERS[name].long_name}; the scene's where left out."))
+    for name, form in PART_AXES.items()
+}
+_PartAxes: Any = create_model("_PartAxes", __base__=Strict, **_PART_FIELDS)
+
+
+class Axes(_PartAxes):
     """The parameters of a sweep and the values that each of them takes."""
 
     what: ClassVar[str] = "the axes of a sweep"
@@ -114,6 +138,11 @@ class Axes(Strict):
         return tuple(name for name in PARAMETERS if name in columns or getattr(self, name) is not None)
 
     @property
+    def given_of_parts(self) -> tuple[str, ...]:
+        """Those of them that belong to a velocity filter, a hand or a coupling."""
+        return tuple(name for name in self.given if name in OF_PARTS)
+
+    @property
     def physical(self) -> bool:
         """Whether the parameters are SI quantities."""
         return any(name in PHYSICAL for name in self.given)
@@ -165,11 +194,21 @@ class SweepStudy(Study):
 
     what: ClassVar[str] = "a sweep study"
     from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
+    takes_parts: ClassVar[bool] = True
 
     kind: Literal["sweep"]
 
     axes: Axes
     """The parameters and their values; every combination is computed."""
+
+    velocity: VelocityField | None = None
+    """How the velocity is estimated; the scene's where left out. Its keys may be axes, as ``velocity.cutoff``."""
+
+    operator: OperatorSection | None = None
+    """The hand that holds the device; the scene's where left out. Its keys may be axes, as ``operator.mass``."""
+
+    coupling: CouplingSection | None = None
+    """The mass beyond a spring and damper; the scene's where left out. Its keys may be axes as well."""
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""
@@ -200,9 +239,25 @@ class SweepStudy(Study):
                 return raw
             supplied: dict[str, Any] = {"mass": scene.mass, "damping": scene.damping, "delay": str(scene.delay)}
             supplied |= {} if given & {"period", "rate"} else {"period": scene.period}
+            raw = {**list_parts(scene), **raw}
         else:
             supplied = {"delta": scene.delta, "d": scene.d}
         return {**raw, "axes": {**axes, **{key: value for key, value in supplied.items() if key not in given}}}
+
+    @classmethod
+    def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
+        axes = raw.get("axes")
+        if not isinstance(axes, dict) or not is_with_parts(scene):
+            return
+        keys = {key for key in axes if key in PARAMETERS} | _columns(axes.get("devices"))
+        if not keys & set(PHYSICAL) and not {"delta", "d"} <= keys:
+            what = f"got normalized axes for a scene with {' and '.join(list_parts(scene))}"
+            raise problem(what, "its parts are in SI units", "choose axes such as 'stiffness' and 'virtual_damping'")
+
+    @property
+    def with_parts(self) -> bool:
+        """Whether its devices have parts, so that every one of them is a scene of its own."""
+        return bool(list_parts(self) or self.axes.given_of_parts)
 
     def limits(self) -> Iterable[LocatedProblem]:
         """Parameters that are missing or move nothing, delays that are too long, and too many points."""
@@ -215,6 +270,8 @@ class SweepStudy(Study):
                 yield ("axes",), problem(f"{name} missing", kinds, f"add '{name}: {example}', or a scene")
         yield from self._outputs_limits(given, physical)
         yield from self._delay_limits(given)
+        if self.with_parts:
+            yield from self._part_limits(given, physical)
         if self.points > MAX_SWEEP_POINTS:
             what = f"{self.extent} is {self.points:.4g} points"
             yield (), problem(what, f"at most {MAX_SWEEP_POINTS:.4g} points a study", self.remedy_if_too_large)
@@ -234,6 +291,56 @@ class SweepStudy(Study):
             if OUTPUTS[name].physical_only and not physical:
                 allowed = "it needs a device in SI units"
                 yield ("outputs", index), problem(f"got {name!r}", allowed, "write alpha_max, or mass and period")
+
+    def _part_limits(self, given: tuple[str, ...], physical: bool) -> Iterable[LocatedProblem]:
+        """Outputs that nobody knows for parts, axes of parts that are not there, and values that parts refuse."""
+        if not physical:
+            for name in list_parts(self):
+                yield (name,), problem(f"got {name!r} beside normalized axes", "parts are in SI units", "remove it")
+            return
+        for index, name in enumerate(self.outputs):
+            if name not in OUTPUTS_WITH_PARTS:
+                allowed = f"with a velocity filter, a hand or a coupling there are {listing(OUTPUTS_WITH_PARTS)}"
+                yield ("outputs", index), problem(f"got {name!r}", allowed, "choose from these")
+        if not {"mass"} <= set(given) or not {"period", "rate"} & set(given):
+            return
+        seen: set[tuple[Any, ...]] = set()
+        for path, values in self.trial_values():
+            try:
+                scene = self.make_scene(values)
+                _ = scene.is_rigid or scene.loop
+            except InputError as error:
+                _, what = locate_refusal(error)
+                place = ("axes", path) if path else ("axes",)
+                if (place, str(error)) not in seen:
+                    seen.add((place, str(error)))
+                    yield place, what
+
+    def trial_values(self) -> Iterable[tuple[str, dict[str, float]]]:
+        """Parameters at the first of all values, and with one of them after another at its ends."""
+        names = [name for name in self.axes.given if name not in WALL]
+        first = {name: self.axes.end(name, largest=False) for name in names}
+        yield "", first
+        for name in self.axes.given_of_parts:
+            for largest in (False, True):
+                yield name, {**first, name: self.axes.end(name, largest)}
+
+    def make_scene(self, values: dict[str, float]) -> Scene:
+        """The scene at a point of the grid, from the parameters that the axes give.
+
+        Raises:
+            InputError: the parts refuse the values.
+        """
+        given = dict(values)
+        period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
+        delay = given.pop("delay", 0.0) * (period if self.axes.delay_in_periods else 1.0)
+        coupling = None if self.coupling is None else self.coupling.to_part()
+        needs_hand = any(name.startswith("operator.") for name in given)
+        operator = self.operator.to_part() if self.operator else (Operator() if needs_hand else None)
+        device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0), coupling=coupling)
+        timing = Timing(period=period, delay=delay)
+        bare = Scene(device, timing, velocity=build_velocity(self.velocity), operator=operator)
+        return bare.replace(**given)
 
     def _delay_limits(self, given: tuple[str, ...]) -> Iterable[LocatedProblem]:
         if "delay" not in given or not {"period", "rate"} & set(given):

@@ -1,0 +1,93 @@
+"""The compare study: several devices side by side, their stable walls and the stiffest of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import WrapValidator
+
+from zwidth import figures
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import members
+from zwidth.config.parts import list_parts
+from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.figures.table import SI_COLUMNS
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, stack
+from zwidth.studies.stable_set import tabulate_walls, trace_outlines
+from zwidth.sweep.stiffest import find_stiffest
+
+# An outline has some hundreds of points, of which an estimate of the size may rest on.
+_POINTS_PER_OUTLINE = 1000
+
+
+class CompareStudy(ComputedStudy):
+    """The stable walls of several devices in one figure, and the stiffest wall of each in a table."""
+
+    what: ClassVar[str] = "a compare study"
+    from_scene: ClassVar[tuple[str, ...]] = ()
+    takes_parts: ClassVar[bool] = True
+
+    kind: Literal["compare"]
+
+    devices: Annotated[tuple[PhysicalDevice, ...], WrapValidator(members("devices"))]
+    """Devices in SI units, each with a label; what one of them leaves out is the scene's."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        devices = raw.get("devices")
+        if not isinstance(scene, PhysicalScene) or not isinstance(devices, list | tuple):
+            return raw
+        return {**raw, "devices": [_complete(device, scene) for device in devices]}
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        labels = [device.label for device in self.devices]
+        for index, label in enumerate(labels):
+            if label is None:
+                yield ("devices", index), problem("label missing", "the figure names each device", "add 'label: NAME'")
+            elif label in labels[:index]:
+                yield ("devices", index, "label"), problem(f"got {label!r} twice", "each label once", "rename one")
+
+    @property
+    def extent(self) -> str:
+        return f"devices = {len(self.devices)}"
+
+    @property
+    def points(self) -> int:
+        return len(self.devices) * _POINTS_PER_OUTLINE
+
+    @property
+    def nbytes(self) -> int:
+        return self.points * 64
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """The outlines of every device, and a table of the stiffest walls with B >= 0."""
+        rows, outlines, walls = [], [], []
+        for device in self.devices:
+            label, loop = str(device.label), device.to_scene()
+            top = find_stiffest(loop)
+            pieces = list(trace_outlines(loop, label=label))
+            islands = sum(piece["piece"] == "island" for piece in pieces)
+            wall = dict(zip(SI_COLUMNS, (top.stiffness, top.virtual_damping), strict=True))
+            rows.append({"label": label, **wall, "frequency_Hz": top.frequency, "kind": top.kind, "islands": islands})
+            outlines += pieces
+            walls.append(tabulate_walls(label, {"stiffest": top}))
+        bare = [row["label"] for row in rows if row["kind"] == "none"]
+        table = stack(outlines)
+        return Outcome(
+            table=stack(rows),
+            figures={"": partial(figures.draw_stable_set, table, stack(walls))} if table else {},
+            documents={f"{self.name}_outlines.csv": csv_text(table)},
+            notes=tuple(f"{label}: no wall with B >= 0 is stable" for label in bare),
+        )
+
+
+def _complete(device: Any, scene: PhysicalScene) -> Any:
+    """A device's mapping with what the scene knows and it leaves out; anything else as it is."""
+    if not isinstance(device, dict):
+        return device
+    supplied = {"mass": scene.mass, "damping": scene.damping, "delay": scene.delay, **list_parts(scene)}
+    supplied |= {} if {"period", "rate"} & set(device) else {"period": scene.period}
+    return {**supplied, **device}

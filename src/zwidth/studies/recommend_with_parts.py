@@ -1,0 +1,95 @@
+"""The recommendation for a device with a velocity filter, a hand or a coupling: walls, outlines, no response."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from typing import Any
+
+from zwidth import figures
+from zwidth.formatting import with_unit
+from zwidth.scene import Scene
+from zwidth.studies.outcome import Outcome, stack
+from zwidth.studies.stable_set import bound_damping, tabulate_walls, trace_outlines
+from zwidth.sweep.stiffest import Stiffest, find_stiffest
+
+_NOT_KNOWN = "passivity and the response are not computed for a device with parts"
+
+
+def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -> Outcome:
+    """The stiffest stable wall with B >= 0 and one at a share of its stiffness, with the stable damping around that."""
+    top = find_stiffest(scene)
+    wall = top._replace(stiffness=fraction * top.stiffness)
+    stable = bool(scene.is_stable(wall.stiffness, wall.virtual_damping))
+    ends = bound_damping(scene, wall.stiffness, wall.virtual_damping) if stable else (math.nan, math.nan)
+    found = _summarize(scene, top, wall, fraction, stable, ends)
+    outlines = stack(trace_outlines(scene, label=label))
+    marked = {"stiffest": top, "recommended": wall} if stable else {"stiffest": top}
+    notes = [_NOT_KNOWN]
+    if not stable:
+        notes.append(f"no stable wall at {fraction:g} of the largest stiffness with its damping; choose another share")
+    return Outcome(
+        table=outlines,
+        figures={} if not outlines else {"": partial(figures.draw_stable_set, outlines, tabulate_walls(label, marked))},
+        documents={
+            f"{stem}.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
+            f"{stem}.md": _describe(scene, found),
+        },
+        notes=tuple(notes),
+    )
+
+
+def _summarize(
+    scene: Scene, top: Stiffest, wall: Stiffest, fraction: float, stable: bool, ends: tuple[float, float]
+) -> dict[str, Any]:
+    """All numbers of the recommendation, in SI units; what is not known is None."""
+    numbers = {name: _known(value) for name, value in scene.parameters().items()}
+    device = {name: value for name, value in numbers.items() if name not in ("stiffness", "virtual_damping")}
+    return {
+        "units": {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m", "frequency": "Hz"},
+        "device": {**device, "velocity": type(scene.velocity).__name__},
+        "maximum": {name: _known(value) for name, value in top._asdict().items()},
+        "recommended": {
+            "stiffness_fraction": fraction,
+            "stiffness": _known(wall.stiffness),
+            "virtual_damping": _known(wall.virtual_damping),
+            "virtual_damping_lower": _known(ends[0]),
+            "virtual_damping_upper": _known(ends[1]),
+            "stable": stable,
+        },
+    }
+
+
+def _known(value: Any) -> Any:
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _describe(scene: Scene, found: dict[str, Any]) -> str:
+    """The recommendation for a reader."""
+    best, most = found["recommended"], found["maximum"]
+
+    def spell(value: float | None, unit: str) -> str:
+        return "not known" if value is None else with_unit(value, unit)
+
+    units = {"stiffness": "N/m", "virtual_damping": "N s/m"}
+    top, wall = ([spell(row[name], unit) for name, unit in units.items()] for row in (most, best))
+    lower, upper = (spell(best[f"virtual_damping_{end}"], "N s/m") for end in ("lower", "upper"))
+    lines = [
+        "# Recommended virtual wall",
+        "",
+        f"Device: {', '.join(f'{name} = {value}' for name, value in found['device'].items())} (SI units).",
+        "",
+        "| | stiffness K | virtual damping B |",
+        "|---|---|---|",
+        f"| stiffest stable wall with B >= 0 | {top[0]} | {top[1]} |",
+        f"| **recommended, {100 * best['stiffness_fraction']:g} % of it** | **{wall[0]}** | **{wall[1]}** |",
+        "",
+        "The recommended wall",
+        "",
+        f"- is {'stable' if best['stable'] else 'NOT stable'};",
+        f"- stays stable at this K for B between {lower} and {upper};",
+        f"- {_NOT_KNOWN}.",
+        "",
+    ]
+    return "\n".join(lines)

@@ -1,0 +1,163 @@
+"""Velocity estimate, hand and coupling as keys of a scene: what is read, what is refused and where."""
+
+import pytest
+
+import zwidth
+from zwidth.config.faults import ConfigFileError
+from zwidth.config.study import KINDS_WITH_PARTS
+from zwidth.studies.document import KINDS, Config
+
+SCENE = "scene: {mass: 100 g, damping: 10 N s/m, period: 1 ms, delay: 1 ms"
+BOUNDARY = "studies: [{kind: boundary, name: b}]\n"
+
+
+def part(text, studies=BOUNDARY):
+    return f"{SCENE}, {text}}}\n{studies}"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("{kind: backward_difference, coded_period: 0.1 ms}", zwidth.BackwardDifference(coded_period=1e-4)),
+        ("{kind: windowed_difference, samples: 15}", zwidth.WindowedDifference(15)),
+        ("{kind: low_pass, cutoff: 0.1 kHz, order: 2}", zwidth.LowPass(cutoff=100, order=2)),
+        ("{kind: low_pass, time_constant: 50 ms}", zwidth.LowPass(time_constant=0.05)),
+        ("{kind: butterworth, cutoff: 25, order: 4}", zwidth.Butterworth(25, 4)),
+        ("{kind: filter, numerator: [1000, -1000], denominator: [1, 0]}", zwidth.VelocityFilter([1e3, -1e3], [1, 0])),
+    ],
+)
+def test_every_velocity_estimate(load, text, expected):
+    config = load(part(f"velocity: {text}"))
+    assert config.scene.to_scene().velocity == expected
+    # What a run keeps of a configuration says the same.
+    assert Config.model_validate(config.model_dump(mode="json", exclude_none=True)) == config
+
+
+def test_hand_and_coupling_in_units(load):
+    hand = "operator: {mass: 554 g, damping: 6.45, stiffness: 135, coupling_stiffness: 1 N/mm, coupling_damping: 5}"
+    scene = load(
+        part(f"{hand}, coupling: {{mass: 50 g, stiffness: 20 kN/m, damping: 1, sensor: tip}}")
+    ).scene.to_scene()
+    assert scene.operator == zwidth.Operator(0.554, 6.45, 135, 1000, 5)
+    assert scene.device.coupling == zwidth.Coupling(0.05, 20e3, 1, "tip")
+
+
+def test_a_hand_held_rigidly_adds_to_the_mass_of_every_kind(load):
+    """Such a scene is the rigid one of both masses: the same walls in the same units."""
+    studies = "studies: [{kind: recommend, name: r}]\n"
+    held, heavy = (
+        load(text)
+        for text in (
+            part("operator: {mass: 0.4}", studies),
+            "scene: {mass: 0.5, damping: 10, period: 1 ms, delay: 1 ms}\n" + studies,
+        )
+    )
+    found = [config.studies[0].compute(config.scene, True).documents["recommendation.json"] for config in (held, heavy)]
+    assert found[0].replace('"mass": 0.1', '"mass": 0.5') == found[1]
+
+
+FAULTS = {
+    "velocity: {kind: low_pas}": ("velocity.kind", "did you mean 'low_pass'?"),
+    "velocity: {cutoff: 100}": ("velocity.kind", "missing"),
+    "velocity: 100 Hz": ("velocity", "a mapping with one of the kinds"),
+    "velocity: {kind: low_pass}": ("velocity", "either cutoff"),
+    "velocity: {kind: low_pass, cutoff: 10, time_constant: 1 ms}": ("velocity", "only one of them"),
+    "velocity: {kind: low_pass, cutoff: 10 ms}": ("velocity.cutoff", "units allowed are Hz"),
+    "velocity: {kind: low_pass, cutoff: 500 Hz}": ("velocity.cutoff", "below half the sampling rate"),
+    "velocity: {kind: low_pass, cutoff: 10, order: 3}": ("velocity.order", "from 1 to 2"),
+    "velocity: {kind: windowed_difference, samples: 2.5}": ("velocity.samples", "whole number"),
+    "velocity: {kind: windowed_difference, samples: 2, cutoff: 3}": ("velocity.cutoff", "unknown key"),
+    "velocity: {kind: filter, numerator: [1, 0], denominator: [1]}": ("velocity.numerator", "samples of the future"),
+    "velocity: {kind: filter, numerator: [1], denominator: [1, -1]}": ("velocity.denominator", "unit circle"),
+    "velocity: {kind: filter, numerator: 3, denominator: [1]}": ("velocity.numerator", "a list, highest power first"),
+    "operator: {mass: -1}": ("operator.mass", "at least 0"),
+    "operator: {coupling_stiffness: 1000}": ("operator.mass", "greater than 0"),
+    "operator: {mass: 1, coupling_damping: 1}": ("operator.coupling_damping", "without a spring"),
+    "coupling: {mass: 1}": ("coupling.stiffness", "missing"),
+    "coupling: {mass: 1, stiffness: 1 kN/m, sensor: middle}": ("coupling.sensor", "'motor', 'tip'"),
+    "velocity: {kind: butterworth, cutoff: 30}, delay_model: fractional_power": (
+        "delay_model",
+        "write 'delay_model: held'",
+    ),
+}
+
+
+@pytest.mark.parametrize("text", FAULTS)
+def test_faults_have_their_place(load, text):
+    field, said = FAULTS[text]
+    with pytest.raises(ConfigFileError) as caught:
+        load(part(text))
+    (fault,) = caught.value.faults
+    assert fault.field == f"scene.{field}"
+    # Line 3 of the file; right of the scene's own keys.
+    assert (fault.line, fault.column > len(SCENE)) == (3, True)
+    assert said in str(fault)
+
+
+def test_a_normalized_scene_has_no_parts(load):
+    with pytest.raises(ConfigFileError, match="a scene that is normalized has no parts") as caught:
+        load("scene: {delta: 0.1, d: 1, velocity: {kind: low_pass, cutoff: 100}}\n" + BOUNDARY)
+    assert [fault.field for fault in caught.value.faults] == ["scene.velocity"]
+
+
+OTHERS = {
+    "ridge": "",
+    "passivity": "",
+    "step": ", stiffness_fraction: 0.5",
+    "map": ", alpha: 1, beta: 1",
+}
+
+
+def test_every_kind_answers_for_parts_or_is_among_those_that_refuse():
+    assert set(KINDS_WITH_PARTS) == {name for name, model in KINDS.items() if model.takes_parts}
+    assert set(OTHERS) | set(KINDS_WITH_PARTS) == set(KINDS)
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_other_kinds_name_those_that_answer(load, kind):
+    studies = f"studies: [{{kind: {kind}, name: s{OTHERS[kind]}}}]\n"
+    with pytest.raises(
+        ConfigFileError, match=r"got a device with velocity and operator; .* 'boundary', 'recommend'"
+    ) as caught:
+        load(part("velocity: {kind: low_pass, cutoff: 100}, operator: {stiffness: 10}", studies))
+    assert [fault.field for fault in caught.value.faults] == ["studies[0]"]
+
+
+def test_a_kind_that_takes_nothing_of_the_scene_is_not_refused(load):
+    config = load(
+        part("velocity: {kind: low_pass, cutoff: 100}", "studies: [{kind: ridge, name: r, delta: 1, d: 0}]\n")
+    )
+    assert config.studies[0].delta.values() == [1.0]
+
+
+@pytest.mark.parametrize(
+    ("study", "field", "said"),
+    [
+        ("kind: boundary, name: b, delta: 1", "studies[0]", "remove 'delta', or give both"),
+        ("kind: boundary, name: b, passivity: true", "studies[0].passivity", "not for one with velocity"),
+        ("kind: boundary, name: b, figure: fig5", "studies[0].figure", "not for one with velocity"),
+        ("kind: boundary, name: b, device: {mass: 1, period: 1}, delta: 3", "studies[0].delta", "a device has its own"),
+        (
+            "kind: step, name: s, stiffness_fraction: 0.5, devices: [{mass: 1, period: 1, operator: {stiffness: 1}}]",
+            "studies[0].devices[0]",
+            "got a device with operator",
+        ),
+        ("kind: sweep, name: s, axes: {alpha: 1}", "studies[0]", "its parts are in SI units"),
+        (
+            "kind: sweep, name: s, axes: {stiffness: 1}, outputs: [passive]",
+            "studies[0].outputs[0]",
+            "there are 'stable'",
+        ),
+        ("kind: compare, name: c, devices: [{mass: 1}]", "studies[0].devices[0]", "label missing"),
+        ("kind: compare, name: c, devices: [{label: a}, {label: a, mass: 1}]", "studies[0].devices[1].label", "twice"),
+        ("kind: filters, name: f", "studies[0]", "cutoff and samples are missing"),
+        ("kind: filters, name: f, cutoff: [600]", "studies[0].cutoff", "below half the sampling rate"),
+        ("kind: filters, name: f, samples: [3], noise_limit: 1 mm/s", "studies[0].noise_limit", "add 'resolution'"),
+        ("kind: filters, name: f, samples: {linear: {start: 1, stop: 4, num: 3}}", "studies[0].samples", "2.5 as one"),
+    ],
+)
+def test_studies_of_a_scene_with_parts_are_refused_at_their_place(load, study, field, said):
+    with pytest.raises(ConfigFileError) as caught:
+        load(part("velocity: {kind: low_pass, cutoff: 100}", f"studies: [{{{study}}}]\n"))
+    assert [fault.field for fault in caught.value.faults] == [field]
+    assert said in str(caught.value)
