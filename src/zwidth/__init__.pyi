@@ -2,6 +2,7 @@
 
 from . import devices as devices
 from .assessment import Assessment as Assessment
+from .assessment import SceneAssessment as SceneAssessment
 from .assessment import assess as assess
 from .design.area import stable_area as stable_area
 from .design.damping import DampingChoice as DampingChoice

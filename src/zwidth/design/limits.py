@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from zwidth.errors import InputError
 from zwidth.linear.stiffest import stiffest_wall
 from zwidth.parts.velocity import BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scene import Scene
@@ -56,7 +57,11 @@ def limits_of(scene: Scene) -> list[Limit]:
 
 
 def _stiffness(scene: Scene) -> float:
-    wall = stiffest_wall(scene)
+    try:
+        wall = stiffest_wall(scene)
+    except InputError:
+        # Many times faster a long delay may be more periods than the model is computed for.
+        return float("nan")
     return float(wall.stiffness) if wall.status == Status.OK else float("nan")
 
 

@@ -140,14 +140,13 @@ def _factors(generator: np.random.Generator, share: float, distribution: str, co
 def _judge_rigid(scene: Scene, drawn: dict[str, np.ndarray], count: int) -> tuple[Array, Array, Array]:
     """Labels, and the stiffest wall at the scene's damping and at the best one, of devices as arrays."""
     timing, wall = scene.timing, scene.wall
-    nominal = {"mass": scene.mass, "damping": scene.damping, "period": timing.period}
-    values = {name: np.broadcast_to(drawn.get(name, value), count) for name, value in nominal.items()}
+    nominal = {"mass": scene.mass, "damping": scene.damping, "period": timing.period, "delay": timing.delay}
+    values: dict[str, Any] = {name: drawn.get(name, np.full(count, value)) for name, value in nominal.items()}
     # The hand of a rigid grasp does not vary with the device.
     if "mass" in drawn:
         values["mass"] = values["mass"] + (scene.mass - scene.device.mass)
     if "damping" in drawn:
         values["damping"] = values["damping"] + (scene.damping - scene.device.damping)
-    values["delay"] = np.broadcast_to(drawn.get("delay", timing.delay), count)
     mass, damping, period, delay = (values[name] for name in _RIGID)
     rate = mass / period
     d = delay / period if {"delay", "period"} & set(drawn) else np.full(count, float(scene.d))
