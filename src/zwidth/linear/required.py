@@ -115,9 +115,8 @@ def _cross(surplus: Callable[[float], float], low: float, high: float) -> Crossi
     """The crossing between two values, proved by a value on each side of it; None where it cannot be."""
     from scipy.optimize import brentq
 
-    place = float(
-        np.clip(math.exp(float(brentq(lambda x: surplus(math.exp(x)), math.log(low), math.log(high)))), low, high)
-    )
+    root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
+    place = math.exp(cast("float", root))
     for share in _BESIDE:
         ends = place * (1.0 - share), place * (1.0 + share)
         below, above = (surplus(end) >= 0 for end in ends)
