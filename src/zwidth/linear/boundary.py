@@ -1,13 +1,13 @@
 """The boundary curve of any linear loop, cut into arcs on which the damping is monotone; rows of it and their counts.
 
 On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``
-(docs/theory/one-crossover.md tells it for the rigid loop). Between the zeros of ``d beta/dw`` and of Im F beta is
-monotone, so that each row meets an arc once at most. Along a row a pole leaves the circle where
+(docs/theory/scenes.md, V8). Between the zeros of ``d beta/dw`` and of Im F beta is monotone (V12), so that each row
+meets an arc once at most. Along a row a pole leaves the circle where
 ``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
 
-with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide.
+with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide (V13, V14).
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ class Boundary:
         return [line.w for line in self.lines if line.poles == 2]
 
     def _settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows whose crossings lead from the count far below to that far above, and which ones do.
+        """Rows whose crossings lead from the count far below to that far above, and which ones do (V15).
 
         A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
         """
@@ -246,7 +246,7 @@ class Boundary:
         return total.astype(int), sound
 
     def borders(self, w: np.ndarray) -> np.ndarray:
-        """Whether the stable set lies on one side of the curve at each angle."""
+        """Whether the stable set lies on one side of the curve at each angle (V18)."""
         here = curve_at(self.loop, w)
         own = np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
         # By the arc: next to z = -1 the slope at one angle may be rounding.
@@ -264,7 +264,7 @@ class Boundary:
 
     @cached_property
     def base(self) -> int:
-        """Poles outside far below every crossing (docs/theory/scenes.md, S14)."""
+        """Poles outside far below every crossing (docs/theory/scenes.md, V14)."""
         return self._far_outside(-1.0)
 
     @cached_property
@@ -380,6 +380,9 @@ def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
 def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
     """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
     at = circle(np.array([w]))
+    if np.min(np.abs(at.before + loop.zeros), initial=1.0) < 1e-9:
+        # q is infinite, not real.
+        return None
     q, f = loop.needed(at), loop.estimate.jet(at)
     if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
         return None

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.linear_loop import CirclePoints, Jet, LinearLoop, circle, lag_jet, product_jet
+from zwidth.linear_loop import CirclePoints, Jet, LinearLoop, circle
 
 # Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
 _HALVINGS, _SHARE = 40, 0.25
@@ -90,9 +90,8 @@ class OpenLoop(NamedTuple):
         """Lowest points between nodes of one sign from which the tangents lead to the other sign."""
         step, sign = np.diff(w), np.sign(value[:-1])
         toward = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
-        lowest = np.minimum(
-            np.abs(value[:-1]) - np.abs(slope[:-1]) * step, np.abs(value[1:]) - np.abs(slope[1:]) * step
-        )
+        size, fall = np.abs(value), np.abs(slope)
+        lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
         k = np.flatnonzero(toward & (lowest < 0))
         low, high, sign = w[k], w[k + 1], sign[k]
         for _ in range(40 if k.size else 0):
@@ -123,13 +122,11 @@ class OpenLoop(NamedTuple):
         return float(distances[best]), float(places[best])
 
 
-def answer(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet:
+def answer(loop: LinearLoop, alpha: float, beta: float, at: CirclePoints) -> Jet:
     """L and its derivative in w."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(at)
-        # G itself: a zero of it at z = -1, as of an undamped device, leaves no quotient.
-        device = product_jet(at, loop.zeros, loop.gain).over(product_jet(at, loop.poles, 1.0))
-        found = Jet(alpha + beta * f.value, beta * f.slope).times(device).times(lag_jet(at, -loop.lag))
+        found = Jet(-(alpha + beta * f.value), -beta * f.slope).over(loop.needed(at))
         # At pi it is real.
         real = at.w >= np.pi
         return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)
