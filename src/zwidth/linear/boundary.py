@@ -1,8 +1,8 @@
 """The boundary curve of any linear loop, cut into arcs on which the damping is monotone; rows of it and their counts.
 
 On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``
-(docs/theory/scenes.md, V8). Between the zeros of ``d beta/dw`` and of Im F beta is
-monotone (V12), so that each row meets an arc once at most. Along a row a pole leaves the circle where
+(docs/theory/scenes.md, V8). Between the zeros of ``d beta/dw`` and of Im F beta is monotone (V12), so that each row
+meets an arc once at most. Along a row a pole leaves the circle where
 ``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
@@ -412,14 +412,6 @@ def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
     return lines
 
 
-def _find_tie(line: CrossingLine, arcs: tuple[Arc, ...]) -> float:
-    """The line's sign on the row on which the arc beside it ends, which counts as one that the arc does not meet."""
-    for arc in (arcs[0], arcs[-1]):
-        if line.w in (arc.w[0], arc.w[-1]):
-            return float(np.sign(line.f_turn)) * (1.0 if arc.w[0] == line.w else -1.0)
-    return 0.0
-
-
 def _arcs(
     loop: LinearLoop,
     w: np.ndarray,
@@ -461,7 +453,5 @@ def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limit
     if w in at_pole:
         return side * np.inf
     if w in limits:
-        # The row that ends on the line of a real pole is that line's, see `_find_tie`.
-        inward = np.nextafter(limits[w], -side * np.inf) if w in (0.0, np.pi) else limits[w]
-        return float(inward) if np.isfinite(limits[w]) else side * np.inf
+        return limits[w] if np.isfinite(limits[w]) else side * np.inf
     return float(curve_at(loop, np.array([w])).beta[0])
