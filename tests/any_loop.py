@@ -266,7 +266,7 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
     own, newer, older = step[:size, :size], rest[:size, size], rest[:size, :size] @ first[:size, size]
     top, bottom = velocity_polynomials(scene)
 
-    def needed(w: np.ndarray) -> np.ndarray:
+    def needed(w: np.ndarray) -> Any:
         """``-1/G - B F``: the stiffness, where it is real."""
         z = np.exp(1j * w)
         push = newer[None, :] + older[None, :] / z[:, None] if fraction else np.broadcast_to(newer, (w.size, size))
