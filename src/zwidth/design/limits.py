@@ -42,6 +42,9 @@ def limits_of(scene: Scene) -> list[Limit]:
         what it were at another rate; with parts and a delay of several periods it is made less than 64 times as fast.
         NaN where a K_max cannot be computed; those come last.
 
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII (what damping, mass, rate and delay change of a rigid device).
+
     Example:
         >>> import zwidth
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
