@@ -97,13 +97,20 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factor: float, unit: str) -> N
     """The stiffest wall within the limit, and the filter that allows it."""
     for row in zip(rows["velocity_noise_m_per_s"], rows[_STIFFNESS], rows["cutoff_Hz"], rows["samples"], strict=True):
         noise, stiffness, cutoff, samples = (float(value) for value in row)
-        which = f"n = {samples:g}" if np.isfinite(samples) else f"f_c = {cutoff:.3g}$ Hz$"
+        which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * 1e3, stiffness * factor, linestyle="", label="best", **look)
-        text = f"${which}$\n{stiffness * factor:.3g} {unit}"
-        ax.annotate(
-            text, (noise * 1e3, stiffness * factor), xytext=(8, -4), textcoords="offset points", va="top", fontsize=8
-        )
+        text = f"${which}$:  {stiffness * factor:.3g} {unit}"
+        plate = {"facecolor": "white", "alpha": 0.85, "linewidth": 0.0, "pad": 1.0}
+        look = {
+            "xytext": (9, -3),
+            "textcoords": "offset points",
+            "va": "top",
+            "fontsize": 8,
+            "bbox": plate,
+            "zorder": 6,
+        }
+        ax.annotate(text, (noise * 1e3, stiffness * factor), **look)
 
 
 def _dots(rows: Table) -> dict[str, Any]:

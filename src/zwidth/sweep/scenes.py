@@ -11,6 +11,7 @@ from zwidth.quantities import STATUS_OF, Family
 from zwidth.scene import Scene
 from zwidth.status import Status
 from zwidth.sweep.grid import SceneBlock
+from zwidth.sweep.part_axes import make_scene
 from zwidth.sweep.stiffest import find_stiffest
 from zwidth.sweep.study import SweepStudy
 
@@ -32,7 +33,7 @@ def compute_scenes(
     for k in range(devices):
         values = {name: float(column[k]) for name, column in block.parameters.items()}
         try:
-            scene = _keep(study.make_scene(values))
+            scene = _keep(make_scene(study, values))
             one = _compute_walls(scene, block, k) if family == "wall" else _compute_device(scene)
         except InputError:
             status[k] = Status.INVALID_INPUT

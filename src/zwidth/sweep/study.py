@@ -28,16 +28,10 @@ from zwidth.config.parts import (
     CouplingSection,
     OperatorSection,
     VelocityField,
-    build_velocity,
     list_parts,
-    locate_refusal,
 )
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study
-from zwidth.errors import InputError
-from zwidth.parts.device import Device
-from zwidth.parts.operator import Operator
-from zwidth.parts.timing import Timing
 from zwidth.quantities import (
     MAX_DELAY_PERIODS,
     NORMALIZED,
@@ -51,7 +45,7 @@ from zwidth.quantities import (
     Family,
     Range,
 )
-from zwidth.scene import Scene
+from zwidth.sweep.part_axes import find_faults
 
 MAX_SWEEP_POINTS = 10**12
 
@@ -304,43 +298,7 @@ class SweepStudy(Study):
                 yield ("outputs", index), problem(f"got {name!r}", allowed, "choose from these")
         if not {"mass"} <= set(given) or not {"period", "rate"} & set(given):
             return
-        seen: set[tuple[Any, ...]] = set()
-        for path, values in self.trial_values():
-            try:
-                scene = self.make_scene(values)
-                _ = scene.is_rigid or scene.loop
-            except InputError as error:
-                _, what = locate_refusal(error)
-                place = ("axes", path) if path else ("axes",)
-                if (place, str(error)) not in seen:
-                    seen.add((place, str(error)))
-                    yield place, what
-
-    def trial_values(self) -> Iterable[tuple[str, dict[str, float]]]:
-        """Parameters at the first of all values, and with one of them after another at its ends."""
-        names = [name for name in self.axes.given if name not in WALL]
-        first = {name: self.axes.end(name, largest=False) for name in names}
-        yield "", first
-        for name in self.axes.given_of_parts:
-            for largest in (False, True):
-                yield name, {**first, name: self.axes.end(name, largest)}
-
-    def make_scene(self, values: dict[str, float]) -> Scene:
-        """The scene at a point of the grid, from the parameters that the axes give.
-
-        Raises:
-            InputError: the parts refuse the values.
-        """
-        given = dict(values)
-        period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
-        delay = given.pop("delay", 0.0) * (period if self.axes.delay_in_periods else 1.0)
-        coupling = None if self.coupling is None else self.coupling.to_part()
-        needs_hand = any(name.startswith("operator.") for name in given)
-        operator = self.operator.to_part() if self.operator else (Operator() if needs_hand else None)
-        device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0), coupling=coupling)
-        timing = Timing(period=period, delay=delay)
-        bare = Scene(device, timing, velocity=build_velocity(self.velocity), operator=operator)
-        return bare.replace(**given)
+        yield from find_faults(self)
 
     def _delay_limits(self, given: tuple[str, ...]) -> Iterable[LocatedProblem]:
         if "delay" not in given or not {"period", "rate"} & set(given):

@@ -1,0 +1,81 @@
+"""Sweeps over the parameters of a velocity filter, a hand and a coupling: the scene at a point, and what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.parts import build_velocity, locate_refusal
+from zwidth.errors import InputError
+from zwidth.parts.device import Device
+from zwidth.parts.operator import Operator
+from zwidth.parts.timing import Timing
+from zwidth.quantities import WALL
+from zwidth.scene import Scene
+
+if TYPE_CHECKING:
+    from zwidth.sweep.study import Axes, SweepStudy
+
+_EXAMPLES = {
+    "velocity": "velocity: {kind: low_pass, cutoff: 100 Hz}",
+    "coupling": "coupling: {mass: 50 g, stiffness: 20 kN/m}",
+}
+
+
+def make_scene(study: SweepStudy, values: dict[str, float]) -> Scene:
+    """The scene at a point of the grid, from the parameters that the axes give.
+
+    Raises:
+        InputError: the parts refuse the values.
+    """
+    given = dict(values)
+    period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
+    delay = given.pop("delay", 0.0) * (period if study.axes.delay_in_periods else 1.0)
+    coupling = None if study.coupling is None else study.coupling.to_part()
+    needs_hand = any(name.startswith("operator.") for name in given)
+    operator = study.operator.to_part() if study.operator else (Operator() if needs_hand else None)
+    device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0), coupling=coupling)
+    timing = Timing(period=period, delay=delay)
+    return Scene(device, timing, velocity=build_velocity(study.velocity), operator=operator).replace(**given)
+
+
+def find_faults(study: SweepStudy) -> Iterator[LocatedProblem]:
+    """Axes of parts that are not there, and values that the parts refuse."""
+    axes = study.axes
+    absent = [name for name in axes.given_of_parts if not _has_parameter(study, name)]
+    for name in absent:
+        part, _, key = name.partition(".")
+        what = f"got the axis {name!r}, but no {part} with the key {key!r}"
+        remedy = f"add {_EXAMPLES.get(part, part)!r}"
+        yield _place_axis(axes, name), problem(what, "an axis changes a part that is there", remedy)
+    found = {} if absent else {str(error): locate_refusal(error) for error in _find_refusals(study)}
+    for field, what in found.values():
+        name = ".".join(map(str, field))
+        yield (_place_axis(axes, name) if name in axes.given else ("axes",)), what
+
+
+def _has_parameter(study: SweepStudy, name: str) -> bool:
+    """Whether the part that an axis belongs to is there, and has such a key."""
+    part, _, key = name.partition(".")
+    section = getattr(study, part)
+    if section is None:
+        # Without a section there is nobody's hand, and the difference of two samples.
+        return part == "operator" or name == "velocity.coded_period"
+    return key in type(section).model_fields
+
+
+def _place_axis(axes: Axes, name: str) -> tuple[str, ...]:
+    return ("axes", "devices") if getattr(axes, name) is None else ("axes", name)
+
+
+def _find_refusals(study: SweepStudy) -> Iterator[InputError]:
+    """What the parts refuse with every parameter at its least value, and with those of parts at their ends in turn."""
+    least = {name: study.axes.end(name, largest=False) for name in study.axes.given if name not in WALL}
+    ends = [{name: study.axes.end(name, largest=True)} for name in study.axes.given_of_parts]
+    for changed in ({}, *ends):
+        try:
+            scene = make_scene(study, {**least, **changed})
+            _ = scene.is_rigid or scene.loop
+        except InputError as error:
+            yield error

@@ -1,0 +1,133 @@
+"""Studies of devices with parts: outlines, recommendations, comparisons and filters, against scenes and pole counts."""
+
+import json
+
+import numpy as np
+import pytest
+from matplotlib.path import Path as Polygon
+
+import zwidth
+from zwidth import figures
+from zwidth.figures.table import SI_COLUMNS, select
+from zwidth.studies.boundary import BoundaryStudy
+from zwidth.studies.compare import CompareStudy
+from zwidth.studies.filters import FiltersStudy
+from zwidth.studies.recommend import RecommendStudy
+
+DEVICE = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": "1 periods"}
+ISLANDS = {**DEVICE, "velocity": {"kind": "windowed_difference", "samples": 24}}
+# Where the curve runs to infinity between two stable walls.
+POLES = {**DEVICE, "velocity": {"kind": "windowed_difference", "samples": 25}}
+TIP = {**DEVICE, "coupling": {"mass": 0.05, "stiffness": 2e4, "damping": 2, "sensor": "tip"}}
+HELD = {**DEVICE, "operator": {"mass": 0.554, "damping": 6.45, "stiffness": 135, "coupling_stiffness": 1000}}
+
+
+def boundary_of(device):
+    return BoundaryStudy.model_validate({"kind": "boundary", "name": "b", "device": device})
+
+
+@pytest.mark.parametrize("device", [ISLANDS, POLES, TIP, HELD], ids=["islands", "poles", "tip", "held"])
+def test_outlines_hold_the_stable_walls_and_no_others(device):
+    study = boundary_of(device)
+    assert study.device is not None
+    scene, table = study.device.to_scene(), study.compute(None, True).table
+    assert {"d", "delta", "alpha", "beta", "piece", "number"} <= set(table)
+    inside = np.zeros((80, 80), int)
+    corners = [table[name] for name in SI_COLUMNS]
+    grid = [np.linspace(part.min() - 0.1 * np.ptp(part), part.max() + 0.1 * np.ptp(part), 80) for part in corners]
+    points = np.stack([part.ravel() for part in np.meshgrid(*grid, indexing="ij")], -1)
+    for number in np.unique(table["number"]):
+        piece = select(table, number=number)
+        outline = np.stack([piece[name] for name in SI_COLUMNS], -1)
+        np.testing.assert_array_equal(outline[0], outline[-1])
+        inside += Polygon(outline, closed=True).contains_points(points).reshape(inside.shape)
+    stable = scene.is_stable(grid[0][:, None], grid[1][None, :])
+    # A polygon of some hundreds of points misses walls next to the edge, one in a hundred of those near it at most.
+    assert np.mean((inside % 2 == 1) != stable) < 2e-3
+    assert 0.02 < stable.mean() < 0.9
+
+
+def test_islands_are_told_apart_and_drawn():
+    outcome = boundary_of(ISLANDS).compute(None, True)
+    assert list(dict.fromkeys(outcome.table["piece"].tolist())) == ["outline", "island"]
+    (ax,) = outcome.figures[""]()
+    assert [line.get_label() for line in ax.lines[:3]] == ["outline 1", "island 2", "stiffest"]
+
+
+def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
+    study = RecommendStudy.model_validate({"kind": "recommend", "name": "r", "device": HELD})
+    outcome = study.compute(None, True)
+    found = json.loads(outcome.documents["recommendation.json"])
+    best, scene = found["recommended"], study.device.to_scene()
+    stiffness = best["stiffness"]
+    assert stiffness == pytest.approx(0.75 * found["maximum"]["stiffness"])
+    lower, upper = best["virtual_damping_lower"], best["virtual_damping_upper"]
+    inside = np.linspace(lower, upper, 101)[1:-1]
+    assert best["stable"]
+    assert scene.is_stable(stiffness, inside).all()
+    beyond = np.array([lower, upper]) + 1e-6 * (upper - lower) * np.array([-1, 1])
+    assert not scene.is_stable(stiffness, beyond).any()
+    assert "passivity and the response are not computed" in outcome.notes[0]
+    assert len(outcome.figures[""]()) == 1
+
+
+def test_a_share_of_an_island_that_is_not_stable_is_said_to_be_so():
+    study = RecommendStudy.model_validate({"kind": "recommend", "name": "r", "device": ISLANDS})
+    outcome = study.compute(None, True)
+    assert json.loads(outcome.documents["recommendation.json"])["recommended"]["stable"] is False
+    assert "is NOT stable" in outcome.documents["recommendation.md"]
+    assert any("choose another share" in note for note in outcome.notes)
+
+
+def test_a_comparison_has_a_row_and_outlines_for_each_device():
+    devices = [{"label": "free", **DEVICE}, {"label": "held", **HELD}, {"label": "windowed", **ISLANDS}]
+    study = CompareStudy.model_validate({"kind": "compare", "name": "c", "devices": devices})
+    outcome = study.compute(None, True)
+    assert outcome.table["label"].tolist() == ["free", "held", "windowed"]
+    assert outcome.table["islands"].tolist() == [0, 0, 1]
+    # The first one is the paper's own device, for which there is a closed form.
+    ridge = zwidth.alpha_max(0.1, 1.0)
+    assert outcome.table[SI_COLUMNS[0]][0] == pytest.approx(1e5 * float(ridge.alpha), rel=1e-9)
+    assert "free,1,outline" in outcome.documents["c_outlines.csv"]
+    (ax,) = outcome.figures[""]()
+    assert [line.get_label() for line in ax.lines].count("stiffest") == 3
+
+
+@pytest.fixture(scope="module")
+def filters():
+    values = {"damping": [0, 10], "cutoff": [10, 30, 100], "samples": [5, 10, 15], "resolution": "20 um"}
+    raw = {"kind": "filters", "name": "f", "device": DEVICE, "noise_limit": "1 mm/s", **values}
+    return FiltersStudy.model_validate(raw).compute(None, True)
+
+
+def test_filters_of_real_programs(filters):
+    """From a grid search with polynomial roots: K_max in kN/m, to three digits."""
+    expected = {
+        "backward_difference": [[14.44], [19.86]],
+        "low_pass": [[1.01, 2.80, 7.27], [6.85, 7.49, 11.94]],
+        "windowed_difference": [[4.49, 2.05, 1.21], [8.75, 6.85, 6.85]],
+    }
+    for kind, rows in expected.items():
+        for damping, row in zip((0.0, 10.0), rows, strict=True):
+            found = select(filters.table, estimate=kind, damping_N_s_per_m=damping)[SI_COLUMNS[0]]
+            np.testing.assert_allclose(found / 1e3, row, rtol=5e-3)
+
+
+def test_the_best_filter_is_the_stiffest_of_those_that_are_quiet(filters):
+    for damping in (0.0, 10.0):
+        rows = select(filters.table, damping_N_s_per_m=damping)
+        quiet = rows["velocity_noise_m_per_s"] <= 1e-3
+        assert 0 < quiet.sum() < quiet.size
+        assert rows[SI_COLUMNS[0]][rows["best"]].tolist() == [rows[SI_COLUMNS[0]][quiet].max()]
+
+
+def test_figures_of_filters(filters):
+    both = filters.figures[""]()
+    assert [line.get_label() for line in both[0].lines[::2]] == ["b = 0", "b = 10"]
+    (ax,) = filters.figures["_noise"]()
+    assert [line.get_label() for line in ax.lines].count("best") == 2
+    (line,) = [line for line in ax.lines if line.get_label() == "low_pass, b = 10"]
+    np.testing.assert_allclose(
+        line.get_ydata(), select(filters.table, estimate="low_pass", damping_N_s_per_m=10.0)[SI_COLUMNS[0]] / 1e3
+    )
+    assert figures.draw_filters(filters.table, both) is not None

@@ -1,0 +1,210 @@
+"""Sweeps over the parameters of a velocity filter, a hand and a coupling, against scenes asked one by one."""
+
+import numpy as np
+import pytest
+
+import zwidth
+from sweeping import config_of, study
+from zwidth.config.faults import ConfigFileError
+from zwidth.linear.polynomial import closed_loop_poles
+from zwidth.runs.draw import draw_stores
+from zwidth.status import Status
+from zwidth.studies.document import Config
+from zwidth.sweep.chunks import perform
+from zwidth.sweep.export import to_csv, to_netcdf
+from zwidth.sweep.part_axes import make_scene
+from zwidth.sweep.store import open_dataset
+from zwidth.sweep.study import SweepStudy
+from zwidth.sweep.verify import verify
+
+CUTOFFS, DAMPINGS = [10.0, 30.0, 100.0], [0.0, 10.0]
+STIFFNESS, VIRTUAL = np.linspace(100, 15_000, 23), np.linspace(-5, 60, 14)
+DEVICE = {"mass": 0.1, "period": 1e-3, "delay": "1 periods", "damping": DAMPINGS}
+FILTER = {"velocity": {"kind": "low_pass", "cutoff": "1 Hz"}}
+WALLS = {"stiffness": STIFFNESS.tolist(), "virtual_damping": VIRTUAL.tolist()}
+AXES = {**DEVICE, "velocity.cutoff": CUTOFFS}
+
+
+def scene_of(cutoff, damping):
+    return zwidth.Scene(zwidth.Device(0.1, damping), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.LowPass(cutoff=cutoff))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    config = config_of(
+        study("walls", {**AXES, **WALLS}, ("stable",), **FILTER),
+        study("devices", AXES, ("stiffness_max", "virtual_damping_at_max"), **FILTER),
+    )
+    out = tmp_path_factory.mktemp("scenes")
+    assert zwidth.run(config, out=out).ok
+    return out
+
+
+def test_walls_are_those_whose_poles_lie_inside(folder):
+    """The reference: eigenvalues of the closed loop's companion matrix."""
+    data = open_dataset(folder / "walls.zarr")
+    assert data.stable.dims == ("damping", "velocity_cutoff", "stiffness", "virtual_damping")
+    assert (data.status == Status.OK).all()
+    wrong = near = 0
+    for damping in DAMPINGS:
+        for cutoff in CUTOFFS:
+            scene = scene_of(cutoff, damping)
+            found = data.stable.sel(damping=damping, velocity_cutoff=cutoff).values
+            for k, stiffness in enumerate(STIFFNESS):
+                for j, virtual in enumerate(VIRTUAL):
+                    walls = stiffness / scene.units.stiffness, virtual / scene.units.virtual_damping
+                    radius = np.abs(closed_loop_poles(scene.loop, *walls)).max()
+                    near += abs(radius - 1) < 1e-9
+                    wrong += abs(radius - 1) >= 1e-9 and found[k, j] != (radius < 1)
+    # Without physical damping a wall without virtual damping is never far from the boundary.
+    assert (wrong, near) == (0, 0)
+
+
+def test_the_stiffest_walls_are_at_the_edge(folder):
+    data = open_dataset(folder / "devices.zarr").load()
+    for damping in DAMPINGS:
+        for cutoff in CUTOFFS:
+            one = data.sel(damping=damping, velocity_cutoff=cutoff)
+            stiffness, virtual = float(one.stiffness_max), float(one.virtual_damping_at_max)
+            scene = scene_of(cutoff, damping)
+            assert virtual >= 0
+            assert list(scene.is_stable(stiffness * np.array([1 - 1e-6, 1 + 1e-6]), virtual)) == [True, False]
+            # No row of a fine comb of dampings reaches further.
+            ends = scene.stable_stiffness(np.linspace(0, 100, 2001))
+            assert np.nanmax(ends) <= stiffness * (1 + 1e-9)
+
+
+def test_numbers_of_published_filters(folder):
+    """From a grid search with polynomial roots: what 10, 30 and 100 Hz leave, in kN/m, to three digits."""
+    found = open_dataset(folder / "devices.zarr").stiffness_max.values
+    np.testing.assert_allclose(found, 1e3 * np.array([[1.01, 2.80, 7.27], [6.85, 7.49, 11.94]]), rtol=5e-3)
+
+
+def test_names_in_stores_tables_and_netcdf_have_no_dots(folder, tmp_path):
+    to_csv(folder / "devices.zarr", tmp_path / "devices.csv")
+    header = (tmp_path / "devices.csv").read_text().splitlines()[0].split(",")
+    assert header[:2] == ["damping", "velocity_cutoff"]
+    to_netcdf(folder / "walls.zarr", tmp_path / "walls.nc")
+    data = open_dataset(folder / "walls.zarr")
+    assert data.velocity_cutoff.attrs["units"] == "Hz"
+    assert not [name for name in data.variables if "." in str(name)]
+
+
+def test_figures_are_drawn_and_sliced_by_path(folder, tmp_path):
+    files = {file.name for file in draw_stores(folder, tmp_path, at={"velocity.cutoff": 40.0})}
+    assert {"walls_stable.png", "walls_boundaries.png", "devices_stiffness_max.png"} <= files
+
+
+def test_a_run_goes_on_and_is_verified(folder, tmp_path):
+    config = config_of(
+        study("walls", {**AXES, **WALLS}, ("stable",), **FILTER), study("other", AXES, ("stiffness_max",), **FILTER)
+    )
+    done = []
+
+    def stop_after_one(path, family, index):
+        if done:
+            raise KeyboardInterrupt
+        perform(path, family, index)
+        done.append(family)
+
+    zwidth.run(config, out=tmp_path, perform=stop_after_one)
+    assert zwidth.run(config, out=tmp_path, resume=True).ok
+    assert all(each.ok for each in verify(tmp_path))
+    one, other = (open_dataset(place / "walls.zarr").load() for place in (folder, tmp_path))
+    np.testing.assert_array_equal(one.stable, other.stable)
+
+
+@pytest.mark.parametrize(
+    ("path", "values", "parts"),
+    [
+        ("velocity.samples", [1, 5, 15], {"velocity": {"kind": "windowed_difference", "samples": 3}}),
+        ("velocity.time_constant", ["1 ms", "5 ms"], {"velocity": {"kind": "low_pass", "time_constant": 1}}),
+        ("velocity.order", [1, 2], {"velocity": {"kind": "low_pass", "cutoff": 50}}),
+        ("velocity.coded_period", ["0.1 ms", "1 ms"], {"velocity": {"kind": "backward_difference"}}),
+        ("operator.mass", [0, "0.5 kg"], {}),
+        ("operator.damping", [0, 6.45], {"operator": {"mass": 0.5}}),
+        ("operator.stiffness", [0, 135], {"operator": {"mass": 0.5}}),
+        ("operator.coupling_stiffness", [500, "5 kN/m"], {"operator": {"mass": 0.5, "damping": 5}}),
+        ("operator.coupling_damping", [1, 5], {"operator": {"mass": 0.5, "coupling_stiffness": 1000}}),
+        ("coupling.mass", ["20 g", "50 g"], {"coupling": {"mass": 0.1, "stiffness": 2e4, "damping": 1}}),
+        ("coupling.stiffness", ["20 kN/m", "50 kN/m"], {"coupling": {"mass": 0.1, "stiffness": 2e4, "damping": 1}}),
+        ("coupling.damping", [0.5, 2], {"coupling": {"mass": 0.1, "stiffness": 2e4, "sensor": "tip"}}),
+    ],
+)
+def test_every_parameter_of_every_part_is_an_axis(path, values, parts, tmp_path):
+    axes = {"mass": 0.1, "damping": 2, "period": 1e-3, path: values}
+    config = config_of(study("s", axes, ("stiffness_max",), **parts))
+    assert zwidth.run(config, out=tmp_path).ok
+    found = open_dataset(tmp_path).load()
+    assert (found.ridge_status == Status.OK).all()
+    sweep = config.studies[0]
+    assert isinstance(sweep, SweepStudy)
+    axis = getattr(sweep.axes, path).values().tolist()
+    for value, stiffness in zip(axis, found.stiffness_max.values, strict=True):
+        scene = make_scene(sweep, {"mass": 0.1, "damping": 2.0, "period": 1e-3, path: value})
+        assert scene.parameters()[path] == value
+        ends = scene.stable_stiffness(np.linspace(0, 300, 601))
+        assert np.nanmax(ends) <= stiffness * (1 + 1e-9)
+
+
+def test_a_device_that_its_parts_refuse_spoils_no_other(tmp_path):
+    """At 100 Hz a cut-off of 80 Hz cannot be; at 1 kHz it can."""
+    axes = {**DEVICE, "damping": 10, "period": ["1 ms", "10 ms"], "velocity.cutoff": [20, 80], "stiffness": [100, 200]}
+    config = config_of(study("s", axes, ("stable", "stiffness_max"), **FILTER))
+    assert zwidth.run(config, out=tmp_path).ok
+    data = open_dataset(tmp_path).load()
+    bad = np.array([[False, False], [False, True]])
+    np.testing.assert_array_equal(data.ridge_status == Status.INVALID_INPUT, bad)
+    np.testing.assert_array_equal(np.isnan(data.stiffness_max), bad)
+    np.testing.assert_array_equal((data.status == Status.INVALID_INPUT).all("stiffness"), bad)
+
+
+def test_devices_of_a_table_have_parts_of_their_own(tmp_path):
+    devices = {"label": ["a", "b"], "mass": [0.1, 0.2], "velocity.cutoff": ["30 Hz", "0.1 kHz"]}
+    axes = {"devices": devices, "period": 1e-3, "delay": 1e-3, "damping": 0}
+    config = config_of(study("s", axes, ("stiffness_max",), **FILTER))
+    assert zwidth.run(config, out=tmp_path).ok
+    found = open_dataset(tmp_path).stiffness_max.values
+    np.testing.assert_allclose(found, [2795.31, 2 * 7279.64], rtol=1e-5)
+
+
+FAULTS = {
+    ("velocity.cutoff: [1, 2]", ""): ("axes.velocity.cutoff", "velocity.cutoff"),
+    ("velocity.samples: [3]", "velocity: {kind: low_pass, cutoff: 10}"): ("axes.velocity.samples", "velocity.samples"),
+    ("velocity.cutoff: [10, 600]", "velocity: {kind: low_pass, cutoff: 10}"): ("axes.velocity.cutoff", "600 Hz"),
+    ("velocity.samples: [1.5]", "velocity: {kind: windowed_difference, samples: 3}"): (
+        "axes.velocity.samples[0]",
+        "whole number",
+    ),
+    ("velocity.cutof: [10]", ""): ("axes.velocity.cutof", "did you mean 'velocity.cutoff'?"),
+    ("coupling.mass: [1]", ""): ("axes.coupling.mass", "coupling.mass"),
+}
+
+
+@pytest.mark.parametrize("axes", FAULTS)
+def test_axes_of_parts_that_are_not_there(axes, tmp_path):
+    file = tmp_path / "c.yaml"
+    given, parts = axes
+    rest = f", {parts}" if parts else ""
+    file.write_text(
+        "version: 1\nname: c\nstudies:\n"
+        f"  - {{kind: sweep, name: s, axes: {{stiffness: 1, mass: 1, period: 1 ms, {given}}}{rest}}}\n"
+    )
+    field, said = FAULTS[axes]
+    with pytest.raises(ConfigFileError) as caught:
+        zwidth.load_config(file)
+    assert {fault.field for fault in caught.value.faults} == {f"studies[0].{field}"}
+    assert caught.value.faults[0].line == 4
+    assert said in str(caught.value)
+
+
+def test_a_rigid_scene_takes_the_rigid_path():
+    config = Config.model_validate(
+        {
+            **{"version": 1, "name": "c", "scene": {"mass": 0.1, "period": 1e-3}},
+            "studies": [study("s", {"stiffness": [1.0]})],
+        }
+    )
+    sweep = config.studies[0]
+    assert isinstance(sweep, SweepStudy)
+    assert not sweep.with_parts
