@@ -40,6 +40,9 @@ def limits_of(scene: Scene) -> list[Limit]:
         tip that is loose may help. The sampling of a filter given by its coefficients is left out, for nobody knows
         what it were at another rate. NaN where a K_max cannot be computed; those come last.
 
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII (what damping, mass, rate and delay change of a rigid device).
+
     Example:
         >>> import zwidth
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)

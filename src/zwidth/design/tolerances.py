@@ -77,6 +77,9 @@ def simulate_tolerances(
         InputError: an unknown parameter, a share that is not between 0 and 1 (normal: up to 1/3), or a parameter that
             is 0 and has no share.
 
+    References:
+        Clopper and Pearson 1934, Biometrika 26, 404-413 (the interval of a share).
+
     Example:
         >>> import zwidth
         >>> wall = zwidth.VirtualWall("17 kN/m", "40 N s/m")
