@@ -70,7 +70,8 @@ def assess(scene: Scene) -> Assessment:
         device, the slowest pole, and the margins of control engineering.
 
     Raises:
-        InputError: the scene's delay model is "fractional_power".
+        InputError: the scene's delay model is "fractional_power", or it has a velocity filter, a hand behind a spring
+            or a coupling.
 
     References:
         Hulin, Preusche, Hirzinger 2006, sections V to VIII.
@@ -85,6 +86,11 @@ def assess(scene: Scene) -> Assessment:
     if scene.timing.delay_model != "held":
         raise InputError(
             f"delay_model: got {scene.timing.delay_model!r}, which has no poles; use 'held' to judge a single wall"
+        )
+    if not scene.is_rigid:
+        raise InputError(
+            "scene: got one with a velocity filter, a hand or a coupling, of which assess knows nothing; ask the scene "
+            "itself: is_stable, margins, is_passive, max_stiffness"
         )
     alpha, beta, delta, d = (float(value) for value in scene.normalized)
     period = scene.timing.period

@@ -74,9 +74,7 @@ class OpenLoop(NamedTuple):
         found = self._roots(turn, until=-1)
         return found[self.at(found).value.real < 0]
 
-    def _roots(
-        self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], until: int | None = None
-    ) -> np.ndarray:
+    def _roots(self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], until: int | None = None) -> np.ndarray:
         w, L = self.w[:until], Jet(*(part[:until] for part in self.L))
         value, slope = read(L)
         dips = self._dips(read, w, value, slope)
@@ -92,7 +90,9 @@ class OpenLoop(NamedTuple):
         """Lowest points between nodes of one sign from which the tangents lead to the other sign."""
         step, sign = np.diff(w), np.sign(value[:-1])
         toward = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
-        lowest = np.minimum(np.abs(value[:-1]) - np.abs(slope[:-1]) * step, np.abs(value[1:]) - np.abs(slope[1:]) * step)
+        lowest = np.minimum(
+            np.abs(value[:-1]) - np.abs(slope[:-1]) * step, np.abs(value[1:]) - np.abs(slope[1:]) * step
+        )
         k = np.flatnonzero(toward & (lowest < 0))
         low, high, sign = w[k], w[k + 1], sign[k]
         for _ in range(40 if k.size else 0):
