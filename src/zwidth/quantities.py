@@ -345,7 +345,7 @@ RADIUS_OUTPUTS = frozenset({"spectral_radius", "margin", "decay_rate", "settling
 MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
 """NaN there means that the wall has no such margin, as `zwidth.margins` says."""
 
-OUTPUTS_WITH_PARTS = ("stable", "stiffness_max", "virtual_damping_at_max")
+OUTPUTS_WITH_PARTS = ("stable", "spectral_radius", "passive", "stiffness_max", "virtual_damping_at_max")
 """What is known of devices with a velocity filter, a hand or a coupling."""
 
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}

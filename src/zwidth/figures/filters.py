@@ -64,6 +64,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
     factor, unit = style.si_unit(float(np.nanmax(table[_STIFFNESS])), "N/m")
     dashes = {"low_pass": style.SOLID, "windowed_difference": style.DOTTED, "backward_difference": ""}
     kinds = [kind for kind in dashes if kind in np.asarray(table["estimate"])]
+    handles: list[Any] = []
     for damping, color in colors.items():
         for kind in kinds:
             rows = select(table, damping_N_s_per_m=damping, estimate=kind)
@@ -77,7 +78,8 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
                 label=f"{kind}, b = {damping:g}",
                 **mark,
             )
-        _mark_best(ax, select(table, damping_N_s_per_m=damping, best=True), color, factor, unit)
+        best = _mark_best(ax, select(table, damping_N_s_per_m=damping, best=True), color, factor, unit)
+        handles.append(style.line(rf"$b = {damping:g}$ N s/m{best}", color=color))
     if np.isfinite(limit):
         ax.axvline(limit * 1e3, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
     _use_logarithmic(ax, "x", "y")
@@ -85,32 +87,23 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
         xlabel=r"noise of the velocity  $\sigma_v$  in mm/s",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
     )
-    handles = [style.line(rf"$b = {damping:g}$ N s/m", color=color) for damping, color in colors.items()]
     handles += [
         style.line(_WORDS[kind], dashes[kind], marker="s" if not dashes[kind] else "", markersize=4.5) for kind in kinds
     ]
-    style.legend(panels, handles, outside=axes is None, ncols=3)
+    style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
 
 
-def _mark_best(ax: Axes, rows: Table, color: Any, factor: float, unit: str) -> None:
-    """The stiffest wall within the limit, and the filter that allows it."""
+def _mark_best(ax: Axes, rows: Table, color: Any, factor: float, unit: str) -> str:
+    """Mark the stiffest wall within the limit; returns the filter that allows it, for the legend."""
+    spelled = ""
     for row in zip(rows["velocity_noise_m_per_s"], rows[_STIFFNESS], rows["cutoff_Hz"], rows["samples"], strict=True):
         noise, stiffness, cutoff, samples = (float(value) for value in row)
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
         ax.plot(noise * 1e3, stiffness * factor, linestyle="", label="best", **look)
-        text = f"${which}$:  {stiffness * factor:.3g} {unit}"
-        plate = {"facecolor": "white", "alpha": 0.85, "linewidth": 0.0, "pad": 1.0}
-        look = {
-            "xytext": (9, -3),
-            "textcoords": "offset points",
-            "va": "top",
-            "fontsize": 8,
-            "bbox": plate,
-            "zorder": 6,
-        }
-        ax.annotate(text, (noise * 1e3, stiffness * factor), **look)
+        spelled = f":  ${which}$,  {stiffness * factor:.3g} {unit}"
+    return spelled
 
 
 def _dots(rows: Table) -> dict[str, Any]:

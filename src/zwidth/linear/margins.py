@@ -122,7 +122,7 @@ class OpenLoop(NamedTuple):
         return float(distances[best]), float(places[best])
 
 
-def answer(loop: LinearLoop, alpha: float, beta: float, at: CirclePoints) -> Jet:
+def answer(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet:
     """L and its derivative in w."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(at)

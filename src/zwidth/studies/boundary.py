@@ -23,7 +23,6 @@ from zwidth.studies.outcome import Outcome, add_si_of_scene, stack
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
 from zwidth.studies.stable_set import tabulate_walls, trace_outlines
-from zwidth.sweep.stiffest import find_stiffest
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 
@@ -162,7 +161,7 @@ def outline_device(device: PhysicalDevice, label: str) -> Outcome:
     table = stack({"curve": "boundary", "delay_model": "held", **one} for one in found)
     if not table:
         return Outcome(notes=("no wall of this device is stable",))
-    walls = tabulate_walls(label, {"stiffest": find_stiffest(scene)})
+    walls = tabulate_walls(label, {"stiffest": scene.max_stiffness()})
     return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
 
 

@@ -1,4 +1,4 @@
-"""The recommendation for a device with a velocity filter, a hand or a coupling: walls, outlines, no response."""
+"""The recommendation for a device with a velocity filter, a hand or a coupling: walls and outlines."""
 
 from __future__ import annotations
 
@@ -9,24 +9,24 @@ from typing import Any
 
 from zwidth import figures
 from zwidth.formatting import with_unit
+from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
 from zwidth.studies.outcome import Outcome, stack
-from zwidth.studies.stable_set import bound_damping, tabulate_walls, trace_outlines
-from zwidth.sweep.stiffest import Stiffest, find_stiffest
+from zwidth.studies.stable_set import bound_damping, name_kind, tabulate_walls, trace_outlines
 
-_NOT_KNOWN = "passivity and the response are not computed for a device with parts"
+_DECAY = math.log(50.0)
 
 
 def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -> Outcome:
-    """The stiffest stable wall with B >= 0 and one at a share of its stiffness, with the stable damping around that."""
-    top = find_stiffest(scene)
+    """The stiffest stable wall and one at a share of its stiffness, with the stable damping around that."""
+    top = scene.max_stiffness()
     wall = top._replace(stiffness=fraction * top.stiffness)
     stable = bool(scene.is_stable(wall.stiffness, wall.virtual_damping))
-    ends = bound_damping(scene, wall.stiffness, wall.virtual_damping) if stable else (math.nan, math.nan)
+    ends = bound_damping(scene, float(wall.stiffness), float(wall.virtual_damping)) if stable else (math.nan, math.nan)
     found = _summarize(scene, top, wall, fraction, stable, ends)
     outlines = stack(trace_outlines(scene, label=label))
     marked = {"stiffest": top, "recommended": wall} if stable else {"stiffest": top}
-    notes = [_NOT_KNOWN]
+    notes = []
     if not stable:
         notes.append(f"no stable wall at {fraction:g} of the largest stiffness with its damping; choose another share")
     return Outcome(
@@ -41,22 +41,31 @@ def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -
 
 
 def _summarize(
-    scene: Scene, top: Stiffest, wall: Stiffest, fraction: float, stable: bool, ends: tuple[float, float]
+    scene: Scene, top: StiffestWall, wall: StiffestWall, fraction: float, stable: bool, ends: tuple[float, float]
 ) -> dict[str, Any]:
     """All numbers of the recommendation, in SI units; what is not known is None."""
+    radius = float(scene.spectral_radius(wall.stiffness, wall.virtual_damping))
     numbers = {name: _known(value) for name, value in scene.parameters().items()}
     device = {name: value for name, value in numbers.items() if name not in ("stiffness", "virtual_damping")}
     return {
         "units": {"stiffness": "N/m", "damping": "N s/m", "virtual_damping": "N s/m", "frequency": "Hz"},
         "device": {**device, "velocity": type(scene.velocity).__name__},
-        "maximum": {name: _known(value) for name, value in top._asdict().items()},
+        "maximum": {
+            "stiffness": _known(float(top.stiffness)),
+            "virtual_damping": _known(float(top.virtual_damping)),
+            "frequency": _known(float(top.frequency)),
+            "kind": name_kind(top),
+        },
         "recommended": {
             "stiffness_fraction": fraction,
-            "stiffness": _known(wall.stiffness),
-            "virtual_damping": _known(wall.virtual_damping),
+            "stiffness": _known(float(wall.stiffness)),
+            "virtual_damping": _known(float(wall.virtual_damping)),
             "virtual_damping_lower": _known(ends[0]),
             "virtual_damping_upper": _known(ends[1]),
             "stable": stable,
+            "spectral_radius": _known(radius),
+            "settling_time": _known(-_DECAY * scene.timing.period / math.log(radius) if 0 < radius < 1 else math.nan),
+            "passive": bool(scene.is_passive(wall.stiffness, wall.virtual_damping)),
         },
     }
 
@@ -82,14 +91,16 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
         "",
         "| | stiffness K | virtual damping B |",
         "|---|---|---|",
-        f"| stiffest stable wall with B >= 0 | {top[0]} | {top[1]} |",
+        f"| stiffest stable wall | {top[0]} | {top[1]} |",
         f"| **recommended, {100 * best['stiffness_fraction']:g} % of it** | **{wall[0]}** | **{wall[1]}** |",
         "",
         "The recommended wall",
         "",
         f"- is {'stable' if best['stable'] else 'NOT stable'};",
         f"- stays stable at this K for B between {lower} and {upper};",
-        f"- {_NOT_KNOWN}.",
+        f"- has the spectral radius {spell(best['spectral_radius'], '')} and settles to 2 % in about "
+        f"{spell(best['settling_time'], 's')};",
+        f"- is passive: {'yes' if best['passive'] else 'no'}.",
         "",
     ]
     return "\n".join(lines)

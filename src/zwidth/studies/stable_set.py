@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from zwidth.figures.table import SI_COLUMNS
+from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
+from zwidth.stability.ridge import RidgeKind
+from zwidth.status import Status
 from zwidth.studies.outcome import Table
-from zwidth.sweep.stiffest import Stiffest
 
 # Places between which a bound is looked for, and how often: to the last digit.
 _PLACES, _ROUNDS = np.arange(1, 32) / 32.0, 11
@@ -34,7 +36,12 @@ def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
         }
 
 
-def tabulate_walls(label: str, walls: Mapping[str, Stiffest]) -> Table:
+def name_kind(wall: StiffestWall) -> str:
+    """The kind of a stiffest wall in words, "none" where there is no such wall."""
+    return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
+
+
+def tabulate_walls(label: str, walls: Mapping[str, StiffestWall]) -> Table:
     """The walls that a figure marks on one device, by what each is."""
     table: Table = {"label": np.array([label] * len(walls)), "wall": np.array(list(walls))}
     table[SI_COLUMNS[0]] = np.array([wall.stiffness for wall in walls.values()])

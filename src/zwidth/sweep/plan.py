@@ -37,7 +37,8 @@ _RATES = {
     **{"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 1e6},
     **{"gain_margin": 2e5, "delay_margin": 2e4, "modulus_margin": 2e4},
 }
-# To lay out the boundary of one device with parts, and to find its edge.
+# Of devices with parts; and the seconds that it takes to lay out the boundary of one.
+_RATES_WITH_PARTS = {"alpha_max": 10.0, "stable": 3e8, "passive": 100.0, "spectral_radius": 5e4}
 _SCENE_SECONDS = 0.1
 _FOLLOWS_FROM = dict.fromkeys(RADIUS_OUTPUTS, "spectral_radius")
 _FOLLOWS_FROM |= {"passivity_margin": "passive", "phase_margin": "gain_margin"}
@@ -172,10 +173,10 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     methods = {name: method for name, (method, _) in chosen.items()}
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
-        slowness = sum(1.0 / _RATES[name] for name in _costly(outputs))
+        rates = _RATES_WITH_PARTS if study.with_parts else _RATES
+        slowness = sum(1.0 / rates[name] for name in _costly(outputs))
         if study.with_parts:
-            walls = grid.size_of(family) // grid.size_of("device")
-            slowness += _SCENE_SECONDS / walls
+            slowness += _SCENE_SECONDS * grid.size_of("device") / grid.size_of(family)
         per_point = _bytes_per_point(outputs)
         size = grid.size_of(family)
         target = min((memory - _LAID_OUT_BYTES) // per_point, _LARGEST_CHUNK, int(_CHUNK_SECONDS / slowness))

@@ -7,12 +7,11 @@ from functools import lru_cache
 import numpy as np
 
 from zwidth.errors import InputError, ZwidthError
-from zwidth.quantities import STATUS_OF, Family
+from zwidth.quantities import OUTPUTS, STATUS_OF, Family
 from zwidth.scene import Scene
 from zwidth.status import Status
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.part_axes import make_scene
-from zwidth.sweep.stiffest import find_stiffest
 from zwidth.sweep.study import SweepStudy
 
 
@@ -28,35 +27,58 @@ def compute_scenes(
     """Every output of a family on a block, and its status; walls in shape (D, A, B), devices in shape (D,)."""
     devices = block.stiffness.shape[0]
     shape = (devices, block.stiffness.shape[1], block.virtual_damping.shape[1]) if family == "wall" else (devices,)
-    found = {name: np.zeros(shape, bool) if name == "stable" else np.full(shape, np.nan) for name in outputs}
+    found = {
+        name: np.zeros(shape, bool) if OUTPUTS[name].dtype == "bool" else np.full(shape, np.nan) for name in outputs
+    }
     status = np.full(shape, Status.OK, np.uint8)
     for k in range(devices):
         values = {name: float(column[k]) for name, column in block.parameters.items()}
         try:
             scene = _keep(make_scene(study, values))
-            one = _compute_walls(scene, block, k) if family == "wall" else _compute_device(scene)
+            walls = block.stiffness[k][:, None], block.virtual_damping[k][None, :]
+            one, told = _compute_walls(scene, outputs, *walls) if family == "wall" else _compute_device(scene)
         except InputError:
             status[k] = Status.INVALID_INPUT
             continue
         except (ZwidthError, ArithmeticError):
             status[k] = Status.NOT_CONVERGED
             continue
+        status[k] = told
         for name in outputs:
             found[name][k] = one[name]
     return {**found, STATUS_OF[family]: status}
 
 
-def _compute_walls(scene: Scene, block: SceneBlock, k: int) -> dict[str, np.ndarray]:
-    """Whether the walls of one device are stable: those within the intervals of their row."""
-    stiffness = block.stiffness[k][:, None]
+def _compute_walls(
+    scene: Scene, outputs: tuple[str, ...], stiffness: np.ndarray, virtual_damping: np.ndarray
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """The outputs of one device's walls, and where one of them is not known."""
+    found: dict[str, np.ndarray] = {}
+    unknown = np.zeros((stiffness.size, virtual_damping.size), bool)
+    if "stable" in outputs:
+        found["stable"] = _label_rows(scene, stiffness, virtual_damping[0])
+    if "spectral_radius" in outputs:
+        found["spectral_radius"] = radius = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
+        unknown |= np.isnan(radius)
+    if "passive" in outputs:
+        margin = np.asarray(scene.passivity_margin(stiffness, virtual_damping))
+        found["passive"] = margin > 0
+        unknown |= np.isnan(margin)
+    return found, np.where(unknown, Status.NOT_CONVERGED, Status.OK)
+
+
+def _label_rows(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> np.ndarray:
+    """Which walls are stable: those within the intervals of their row, one comparison each."""
     # Shape (rows, most intervals of a row, 2).
-    ends = scene.stable_stiffness(block.virtual_damping[k])
+    ends = scene.stable_stiffness(virtual_damping)
     stable = np.zeros((stiffness.size, ends.shape[0]), bool)
     for low, high in np.moveaxis(ends, (1, 2), (0, 1)):
         stable |= (stiffness > low) & (stiffness < high)
-    return {"stable": stable}
+    return stable
 
 
-def _compute_device(scene: Scene) -> dict[str, float]:
-    top = find_stiffest(scene)
-    return {"stiffness_max": top.stiffness, "virtual_damping_at_max": top.virtual_damping}
+def _compute_device(scene: Scene) -> tuple[dict[str, float], int]:
+    top = scene.max_stiffness()
+    return {"stiffness_max": float(top.stiffness), "virtual_damping_at_max": float(top.virtual_damping)}, int(
+        top.status
+    )

@@ -67,7 +67,11 @@ def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
     assert scene.is_stable(stiffness, inside).all()
     beyond = np.array([lower, upper]) + 1e-6 * (upper - lower) * np.array([-1, 1])
     assert not scene.is_stable(stiffness, beyond).any()
-    assert "passivity and the response are not computed" in outcome.notes[0]
+    wall = stiffness, best["virtual_damping"]
+    assert best["passive"] == bool(scene.is_passive(*wall))
+    assert best["spectral_radius"] == pytest.approx(np.abs(scene.poles(*wall)).max(), rel=1e-9)
+    assert best["settling_time"] == pytest.approx(-1e-3 * np.log(50) / np.log(best["spectral_radius"]))
+    assert outcome.notes == ()
     assert len(outcome.figures[""]()) == 1
 
 

@@ -74,6 +74,24 @@ def test_the_stiffest_walls_are_at_the_edge(folder):
             assert np.nanmax(ends) <= stiffness * (1 + 1e-9)
 
 
+def test_radii_and_passivity_are_those_of_the_scenes(tmp_path):
+    walls = {"stiffness": [500.0, 5000.0], "virtual_damping": [0.0, 5.0, 60.0]}
+    outputs = ("stable", "spectral_radius", "passive")
+    config = config_of(study("s", {**DEVICE, "velocity.cutoff": [30, 100], **walls}, outputs, **FILTER))
+    assert zwidth.run(config, out=tmp_path).ok
+    data = open_dataset(tmp_path).load()
+    assert (data.status == Status.OK).all()
+    np.testing.assert_array_equal(data.stable, data.spectral_radius < 1)
+    for damping in DAMPINGS:
+        for cutoff in (30.0, 100.0):
+            one, scene = data.sel(damping=damping, velocity_cutoff=cutoff), scene_of(cutoff, damping)
+            grid = np.meshgrid(*walls.values(), indexing="ij")
+            np.testing.assert_array_equal(one.passive, scene.is_passive(*grid))
+            exact = np.abs(scene.poles(*grid)).max(-1)
+            np.testing.assert_allclose(one.spectral_radius, exact, rtol=1e-9)
+    assert 0 < data.passive.mean() < 1
+
+
 def test_numbers_of_published_filters(folder):
     """From a grid search with polynomial roots: what 10, 30 and 100 Hz leave, in kN/m, to three digits."""
     found = open_dataset(folder / "devices.zarr").stiffness_max.values
