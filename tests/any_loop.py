@@ -266,7 +266,7 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
     own, newer, older = step[:size, :size], rest[:size, size], rest[:size, :size] @ first[:size, size]
     top, bottom = velocity_polynomials(scene)
 
-    def needed(w: np.ndarray) -> np.ndarray:
+    def needed(w: np.ndarray) -> Any:
         """``-1/G - B F``: the stiffness, where it is real."""
         z = np.exp(1j * w)
         push = newer[None, :] + older[None, :] / z[:, None] if fraction else np.broadcast_to(newer, (w.size, size))
@@ -282,5 +282,5 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
         same = np.sign(needed(middle).imag) == sign
         low, high = np.where(same, middle, low), np.where(same, high, middle)
     at_ends = np.array([1e-9, np.pi])
-    found = np.concatenate([needed(0.5 * (low + high)), needed(at_ends)])
+    found: Any = np.concatenate([needed(0.5 * (low + high)), needed(at_ends)])
     return found.real, float(np.median(np.abs(value)))

@@ -2,6 +2,7 @@
 
 from . import devices as devices
 from .assessment import Assessment as Assessment
+from .assessment import SceneAssessment as SceneAssessment
 from .assessment import assess as assess
 from .design.area import stable_area as stable_area
 from .design.damping import DampingChoice as DampingChoice
@@ -25,6 +26,9 @@ from .design.robust import robust_wall as robust_wall
 from .design.stiffness import Sensitivities as Sensitivities
 from .design.stiffness import max_stiffness as max_stiffness
 from .design.stiffness import sensitivities as sensitivities
+from .design.tolerances import Tolerance as Tolerance
+from .design.tolerances import ToleranceEstimate as ToleranceEstimate
+from .design.tolerances import simulate_tolerances as simulate_tolerances
 from .errors import ConfigError as ConfigError
 from .errors import InputError as InputError
 from .errors import PrecisionWarning as PrecisionWarning

@@ -1,4 +1,4 @@
-"""A verdict on one wall of the rigid loop: stable, how far from the boundary, passive, and what is possible."""
+"""A verdict on one wall: stable, how far from the boundary, passive, and what is possible."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.errors import InputError
+from zwidth.linear.columns import stable_dampings
 from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.decay import decay_rate
@@ -17,6 +18,7 @@ from zwidth.stability.margins import margins
 from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.proved import outermost_poles
 from zwidth.stability.ridge import RidgeKind, alpha_max
+from zwidth.status import Status
 
 _POLE_ACCURACY = 1e-9
 
@@ -53,13 +55,37 @@ class Assessment:
 
     def as_dict(self) -> dict[str, Any]:
         """The fields as plain JSON values, None in place of NaN and infinities."""
-        return {
-            name: None if isinstance(value, float) and not math.isfinite(value) else value
-            for name, value in asdict(self).items()
-        }
+        return {name: _plain(value) for name, value in asdict(self).items()}
 
 
-def assess(scene: Scene) -> Assessment:
+@dataclass(frozen=True)
+class SceneAssessment:
+    """What `assess` finds of a scene with a filter, a compliance or a hand; SI units, NaN for what does not exist."""
+
+    stable: bool  # every pole lies strictly inside the unit circle
+    spectral_radius: float  # the largest pole magnitude
+    decay_rate: float  # of the slowest motion, in 1/s; negative for a growing one
+    stable_stiffness: tuple[tuple[float, float], ...]  # every stable interval of K at this B, in N/m
+    stable_damping: tuple[tuple[float, float], ...]  # every stable interval of B at this K, in N s/m
+    stiffness_max: float  # of the stiffest stable wall, in N/m
+    virtual_damping_at_max: float  # in N s/m
+    ridge_kind: str  # "smooth", "corner" or "no_damping"; "none" where no wall is stable
+    ridge_frequency: float  # of the pole pair on the unit circle there, in Hz
+    time_constant: float  # of the slowest pole, in s; negative for a growing one, infinite on the circle
+    frequency: float  # at which the slowest pole oscillates, in Hz; 0 for one that does not
+
+    def as_dict(self) -> dict[str, Any]:
+        """The fields as plain JSON values, None in place of NaN and infinities."""
+        return {name: _plain(value) for name, value in asdict(self).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def assess(scene: Scene) -> Assessment | SceneAssessment:
     """Judge the wall of a scene.
 
     Args:
@@ -67,11 +93,11 @@ def assess(scene: Scene) -> Assessment:
 
     Returns:
         Assessment: stability, distances to the boundary in K and in B, passivity, the stiffest stable wall of the
-        device, the slowest pole, and the margins of control engineering.
+        device, the slowest pole, and the margins of control engineering. For a scene with a filter, a compliance or a
+        hand behind a spring a SceneAssessment, in SI units alone, with every stable interval.
 
     Raises:
-        InputError: the scene's delay model is "fractional_power", or it has a velocity filter, a hand behind a spring
-            or a coupling.
+        InputError: the scene's delay model is "fractional_power".
 
     References:
         Hulin, Preusche, Hirzinger 2006, sections V to VIII.
@@ -87,11 +113,10 @@ def assess(scene: Scene) -> Assessment:
         raise InputError(
             f"delay_model: got {scene.timing.delay_model!r}, which has no poles; use 'held' to judge a single wall"
         )
-    if not scene.is_rigid:
-        raise InputError(
-            "scene: got one with a velocity filter, a hand or a coupling, of which assess knows nothing; ask the scene "
-            "itself: is_stable, margins, is_passive, max_stiffness"
-        )
+    return _assess_rigid(scene) if scene.is_rigid else _assess_parts(scene)
+
+
+def _assess_rigid(scene: Scene) -> Assessment:
     alpha, beta, delta, d = (float(value) for value in scene.normalized)
     period = scene.timing.period
     spring = scene.mass / period**2
@@ -130,6 +155,32 @@ def assess(scene: Scene) -> Assessment:
         gain_crossover=float(stands.gain_crossover) * hertz,
         phase_crossover=float(stands.phase_crossover) * hertz,
     )
+
+
+def _assess_parts(scene: Scene) -> SceneAssessment:
+    stiffness, damping = scene.wall.stiffness, scene.wall.virtual_damping
+    units = scene.units
+    slowest = scene.pole_table(stiffness, damping)
+    best = scene.max_stiffness()
+    column = stable_dampings(scene.traced_boundary, stiffness / units.stiffness) * units.virtual_damping
+    constant = float(slowest.time_constant[0])
+    return SceneAssessment(
+        stable=bool(scene.is_stable(stiffness, damping)),
+        spectral_radius=float(scene.spectral_radius(stiffness, damping)),
+        decay_rate=1.0 / constant if constant else math.inf,
+        stable_stiffness=_as_pairs(scene.stable_stiffness(damping)),
+        stable_damping=_as_pairs(column),
+        stiffness_max=float(best.stiffness),
+        virtual_damping_at_max=float(best.virtual_damping),
+        ridge_kind=RidgeKind(int(best.kind)).name.lower() if best.status == Status.OK else "none",
+        ridge_frequency=float(best.frequency),
+        time_constant=constant,
+        frequency=float(slowest.frequency[0]),
+    )
+
+
+def _as_pairs(intervals: np.ndarray) -> tuple[tuple[float, float], ...]:
+    return tuple((float(low), float(high)) for low, high in intervals)
 
 
 def _slowest_turn(alpha: float, beta: float, delta: float, d: float) -> float:

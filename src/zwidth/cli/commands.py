@@ -10,8 +10,9 @@ import click
 from zwidth import __version__
 from zwidth.cli import runs
 from zwidth.cli.bench import bench
+from zwidth.cli.design import design
 from zwidth.cli.devices import devices
-from zwidth.cli.options import json_option, physical_options
+from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.formatting import plain, with_unit
 
@@ -26,30 +27,43 @@ def cli() -> None:
 
 
 @cli.command()
-@physical_options(wall=True, required=True)
+@scene_options(wall=True, required=True)
+@friction_option
+@resolution_option
 @json_option
-def check(as_json: bool, **given: float) -> None:
-    """Judge one wall: stable, passive, how far from the boundary."""
-    from zwidth.assessment import assess
-    from zwidth.parts.device import Device
-    from zwidth.parts.timing import Timing
-    from zwidth.parts.wall import VirtualWall
-    from zwidth.scene import Scene
+def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
+    """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""
+    from zwidth.assessment import Assessment, assess
+    from zwidth.cli import scene_words
+    from zwidth.design.friction import friction_rule
+    from zwidth.design.limits import limits_of
 
-    wall = VirtualWall(given["stiffness"], given["virtual_damping"])
-    scene = Scene(Device(given["mass"], given["damping"]), Timing(given["period"], given["delay"]), wall)
-    verdict = assess(scene)
+    verdict, limits, notes = assess(scene), limits_of(scene), scene_words.coded_period_notes(scene)
+    rule = None
+    if friction is not None or resolution is not None:
+        device = {"damping": scene.damping, "period": scene.timing.period}
+        rule = friction_rule(**device, friction=friction, resolution=resolution)
     if as_json:
-        click.echo(json.dumps(verdict.as_dict(), indent=2, allow_nan=False))
+        result = verdict.as_dict() | {"limits": [_without_nan(limit._asdict()) for limit in limits], "notes": notes}
+        if rule is not None:
+            result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
+        click.echo(json.dumps(result, indent=2, allow_nan=False))
         return
-    for line in verdict_lines(scene, verdict):
+    rigid = isinstance(verdict, Assessment)
+    lines = verdict_lines(scene, verdict) if rigid else scene_words.scene_verdict_lines(scene, verdict)
+    lines += scene_words.limit_lines(limits) + (scene_words.friction_lines(rule) if rule is not None else [])
+    for line in [*lines, *(row("note", note) for note in notes)]:
         click.echo(line)
+
+
+def _without_nan(entries: dict[str, Any]) -> dict[str, Any]:
+    return {name: None if value != value else value for name, value in entries.items()}
 
 
 @cli.command()
 @click.option("--delta", type=float, help="Normalized physical damping b T/m.")
 @click.option("--d", type=float, help="Delay in periods.")
-@physical_options(wall=False, required=False)
+@scene_options(wall=False, required=False)
 @click.option(
     "--delay-model",
     type=click.Choice(["held", "fractional_power"]),
@@ -61,10 +75,7 @@ def check(as_json: bool, **given: float) -> None:
 def ridge(
     delta: float | None,
     d: float | None,
-    mass: float | None,
-    damping: float,
-    period: float | None,
-    delay: float,
+    scene: Any,
     delay_model: str,
     as_json: bool,
 ) -> None:
@@ -75,16 +86,16 @@ def ridge(
     """
     import numpy as np
 
-    from zwidth.parts.device import Device
-    from zwidth.parts.timing import Timing
-    from zwidth.scene import Scene
     from zwidth.stability.ridge import RidgeKind, alpha_max
     from zwidth.status import Status
 
-    physical = mass is not None and period is not None
-    if physical == (delta is not None) or (delta is None) != (d is None):
+    if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
-    scene = Scene(Device(mass, damping), Timing(period, delay)) if mass is not None and period is not None else None
+    if scene is not None and (not scene.is_rigid or scene.operator is not None):
+        if delay_model != "held":
+            raise click.UsageError("--delay-model fractional_power is for a rigid device without parts")
+        _print_part_ridge(scene, as_json)
+        return
     at_delta, at_d = (scene.delta, scene.d) if scene is not None else (delta, d)
     point = alpha_max(at_delta, at_d, delay=delay_model)  # pyright: ignore[reportArgumentType]  (click checked it)
     if int(point.status) != Status.OK:
@@ -116,6 +127,36 @@ def ridge(
         click.echo(slope.line())
 
 
+def _print_part_ridge(scene: Any, as_json: bool) -> None:
+    """The stiffest wall of a scene with parts."""
+    from zwidth.cli import scene_words
+    from zwidth.stability.ridge import RidgeKind
+    from zwidth.status import Status
+
+    wall = scene.max_stiffness()
+    if int(wall.status) != Status.OK:
+        raise click.UsageError(f"no wall with K > 0 is stable on this device: {Status(int(wall.status)).message}")
+    slopes, kind = scene_words.part_slopes(scene), RidgeKind(int(wall.kind)).name.lower()
+    if as_json:
+        result = {
+            "stiffness_max": float(wall.stiffness),
+            "virtual_damping": float(wall.virtual_damping),
+            "frequency": float(wall.frequency),
+            "kind": kind,
+            "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
+            "notes": scene_words.coded_period_notes(scene),
+        }
+        click.echo(json.dumps(result, indent=2, allow_nan=False))
+        return
+    for line in scene_words.scene_lines(scene):
+        click.echo(line)
+    click.echo(row("K_max", f"{with_unit(float(wall.stiffness), 'N/m')} ({kind.replace('_', ' ')} optimum)"))
+    click.echo(row("B", with_unit(float(wall.virtual_damping), "N s/m")))
+    click.echo(row("frequency", with_unit(float(wall.frequency), "Hz")))
+    for line in [*(slope.line() for slope in slopes), *(row("note", n) for n in scene_words.coded_period_notes(scene))]:
+        click.echo(line)
+
+
 @cli.command()
 def schema() -> None:
     """Print the JSON Schema of configuration files, for editors."""
@@ -124,5 +165,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (*runs.COMMANDS, devices, bench):
+for command in (*runs.COMMANDS, design, devices, bench):
     cli.add_command(command)

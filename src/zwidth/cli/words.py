@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 def row(label: str, text: str) -> str:
-    return f"{label:<22}{text}"
+    return f"{label:<20}  {text}"
 
 
 class Slope(NamedTuple):
@@ -49,11 +49,14 @@ def find_slopes(scene: Scene, delay_model: Any) -> list[Slope]:
     return [Slope(*parts) for parts in zip(device, ("b", "m", "T", "t_d"), values, units, words, strict=True)]
 
 
+def stability_word(stable: bool) -> str:
+    """The verdict, in color."""
+    return click.style("stable", fg="green", bold=True) if stable else click.style("UNSTABLE", fg="red", bold=True)
+
+
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     wall, device, timing = scene.wall, scene.device, scene.timing
-    stable = (
-        click.style("stable", fg="green", bold=True) if verdict.stable else click.style("UNSTABLE", fg="red", bold=True)
-    )
+    stable = stability_word(verdict.stable)
     lines = [
         row("device", f"m = {with_unit(device.mass * 1e3, 'g')}, b = {with_unit(device.damping, 'N s/m')}"),
         row(
@@ -75,7 +78,7 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
             f"at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')} "
             f"(alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)})",
         ),
-        row("slowest pole", _pole_words(verdict)),
+        row("slowest pole", pole_words(verdict.time_constant, verdict.frequency)),
         *_margin_lines(verdict),
     ]
     return lines
@@ -125,9 +128,9 @@ def _passivity_words(verdict: Assessment) -> str:
     return f"no, for want of {with_unit(-verdict.passivity_margin, 'N s/m')} of physical damping"
 
 
-def _pole_words(verdict: Assessment) -> str:
-    swing = f", oscillating at {with_unit(verdict.frequency, 'Hz')}" if verdict.frequency else ""
-    constant = verdict.time_constant
+def pole_words(constant: float, frequency: float) -> str:
+    """How the slowest pole moves: its time constant in s, negative for a growing one, and its frequency in Hz."""
+    swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
     if constant == float("inf"):
         return f"neither decays nor grows{swing}"
     verb = "decays" if constant >= 0 else "grows"

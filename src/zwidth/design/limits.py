@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import NamedTuple
 
+from zwidth.errors import InputError
 from zwidth.linear.stiffest import stiffest_wall
 from zwidth.parts.velocity import BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scene import Scene
 from zwidth.status import Status
 
-# "Ideal" sampling is so many times faster; a window may hold no more samples than these.
-_FASTER, _LONGEST_WINDOW = 64, 1000
+# "Ideal" sampling is so many times faster, or as much less as keeps window and delay within these many periods: the
+# cost of a search grows with their square.
+_FASTER, _MOST_PERIODS = 64, 128
 
 
 class Limit(NamedTuple):
@@ -27,7 +28,8 @@ def limits_of(scene: Scene) -> list[Limit]:
     """Say what limits the stiffest wall of a scene.
 
     Each thing that the scene has is made ideal by itself: the filter (the plain difference of two samples instead),
-    the delay (none), the sampling (64 times faster, filter and delay the same in seconds) and the compliance (rigid,
+    the delay (none), the sampling (64 times faster, or less where window and delay are long; both, and the filter, the
+    same in seconds) and the compliance (rigid,
     with the tip's mass added to the motor's).
 
     Args:
@@ -37,6 +39,9 @@ def limits_of(scene: Scene) -> list[Limit]:
         One record each, the largest gain first. What makes the wall softer is listed as well, with a gain below 1: a
         tip that is loose may help. The sampling of a filter given by its coefficients is left out, for nobody knows
         what it were at another rate. NaN where a K_max cannot be computed; those come last.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII (what damping, mass, rate and delay change of a rigid device).
 
     Example:
         >>> import zwidth
@@ -55,7 +60,11 @@ def limits_of(scene: Scene) -> list[Limit]:
 
 
 def _stiffness(scene: Scene) -> float:
-    wall = stiffest_wall(scene)
+    try:
+        wall = stiffest_wall(scene)
+    except InputError:
+        # Many times faster a long delay may be more periods than the model is computed for.
+        return float("nan")
     return float(wall.stiffness) if wall.status == Status.OK else float("nan")
 
 
@@ -67,8 +76,9 @@ def _ideals(scene: Scene) -> list[tuple[str, str, Scene]]:
         found.append(("velocity", "the velocity unfiltered", scene.replace(velocity=BackwardDifference())))
     if scene.timing.delay > 0:
         found.append(("delay", "no delay", scene.replace(delay=0.0)))
-    if not isinstance(scene.velocity, VelocityFilter):
-        found.append(_sampled_faster(scene))
+    faster = _affordable_rate(scene)
+    if faster > 1:
+        found.append(("period", f"sampled {faster} times faster", _sample_faster(scene, faster)))
     coupling = scene.device.coupling
     if coupling is not None:
         rigid = scene.replace(coupling=None, mass=scene.device.mass + coupling.mass)
@@ -76,12 +86,19 @@ def _ideals(scene: Scene) -> list[tuple[str, str, Scene]]:
     return found
 
 
-def _sampled_faster(scene: Scene) -> tuple[str, str, Scene]:
-    velocity, faster = scene.velocity, _FASTER
-    if isinstance(velocity, WindowedDifference):
-        faster = min(faster, _LONGEST_WINDOW // velocity.samples)
-        velocity = replace(velocity, samples=velocity.samples * faster)
-    if velocity.coded_period is not None:
-        velocity = replace(velocity, coded_period=velocity.coded_period / faster)
-    ideal = scene.replace(velocity=velocity, period=scene.timing.period / faster)
-    return "period", f"sampled {faster} times faster", ideal
+def _affordable_rate(scene: Scene) -> int:
+    """How many times faster the sampling may be, 1 where nobody knows what the filter were then."""
+    if isinstance(scene.velocity, VelocityFilter):
+        return 1
+    window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
+    return _FASTER if scene.is_rigid else min(_FASTER, int(_MOST_PERIODS / (window + scene.d)))
+
+
+def _sample_faster(scene: Scene, faster: int) -> Scene:
+    """The scene at so many times the rate, filter and delay the same in seconds."""
+    changes: dict[str, float] = {"period": scene.timing.period / faster}
+    if isinstance(scene.velocity, WindowedDifference):
+        changes["velocity.samples"] = scene.velocity.samples * faster
+    if not isinstance(scene.velocity, VelocityFilter) and scene.velocity.coded_period is not None:
+        changes["velocity.coded_period"] = scene.velocity.coded_period / faster
+    return scene.replace(**changes)

@@ -150,7 +150,7 @@ def _sensitivities_kernel(
     )
 
 
-def _one_percent(value: float) -> float:
+def one_percent(value: float) -> float:
     """A power of ten near one percent of ``value``, as a step people can picture."""
     return 10.0 ** (math.floor(math.log10(value) + 0.5) - 2)
 
@@ -180,17 +180,17 @@ def sensitivity_lines(
     gain = sensitivities(mass=mass, damping=damping, period=period, delay=delay, delay_model=delay_model)
     if gain.status != Status.OK:
         raise InputError(f"mass, damping, period, delay: {Status(int(gain.status)).message}")
-    step_m, step_t = _one_percent(float(mass)), _one_percent(float(period))
+    step_m, step_t = one_percent(float(mass)), one_percent(float(period))
     grams, seconds = with_unit(step_m * 1e3, "g", 1), with_unit(step_t, "s", 1)
     return [
-        f"one more N s/m of damping {_effect(gain.per_damping)}",
-        f"{grams} more mass {_effect(gain.per_mass * step_m)}",
-        f"a sampling period {seconds} shorter {_effect(-gain.per_period * step_t)} (same delay in seconds)",
-        f"{seconds} more delay {_effect(gain.per_delay * step_t)}",
+        f"one more N s/m of damping {describe_effect(gain.per_damping)}",
+        f"{grams} more mass {describe_effect(gain.per_mass * step_m)}",
+        f"a sampling period {seconds} shorter {describe_effect(-gain.per_period * step_t)} (same delay in seconds)",
+        f"{seconds} more delay {describe_effect(gain.per_delay * step_t)}",
     ]
 
 
-def _effect(change: float) -> str:
+def describe_effect(change: float) -> str:
     """ "buys 0.5 kN/m", "costs 3 N/m"."""
     if change == 0:
         return "changes nothing"

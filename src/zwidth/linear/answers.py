@@ -12,6 +12,7 @@ from zwidth.errors import InputError, check_choice
 from zwidth.linear import state_space
 from zwidth.linear.chain import Chain
 from zwidth.linear.delay_margin import linear_margins
+from zwidth.linear.margins import answer
 from zwidth.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
 from zwidth.linear.poles import all_poles, log_size
 from zwidth.linear.radius import spectral_radius as linear_radius
@@ -73,9 +74,7 @@ def respond(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: Ar
     # Half the sampling rate is half a turn, whatever the rounding of the quotient.
     w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
     inside = (w > 0) & (w <= np.pi)
-    at = circle(np.where(inside, w, 1.0))
-    with np.errstate(all="ignore"):
-        value = -(a + b * loop.estimate.jet(at).value) / loop.needed(at).value
+    value = answer(loop, a, b, circle(np.where(inside, w, 1.0))).value
     return np.where(inside, value, complex(np.nan, np.nan))[()]
 
 

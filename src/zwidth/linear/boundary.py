@@ -1,13 +1,13 @@
 """The boundary curve of any linear loop, cut into arcs on which the damping is monotone; rows of it and their counts.
 
 On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``
-(docs/theory/one-crossover.md tells it for the rigid loop). Between the zeros of ``d beta/dw`` and of Im F beta is
-monotone, so that each row meets an arc once at most. Along a row a pole leaves the circle where
+(docs/theory/scenes.md, V8). Between the zeros of ``d beta/dw`` and of Im F beta is monotone (V12), so that each row
+meets an arc once at most. Along a row a pole leaves the circle where
 ``Im(q' - beta F') > 0``, which at z = 1 and z = -1 holds for the real poles as well. Hence
 
     poles outside(alpha, beta) = base + sum over the row's crossings below alpha of +-2 (pairs) or +-1 (real poles)
 
-with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide.
+with one number ``base`` for the whole plane: far below every crossing the zeros of N1 decide (V13, V14).
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.linear.crossing_lines import CrossingLine, circle_zeros, end_lines, interior_line
 from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths, lag_jet, product_jet
 from zwidth.numerics.roots import false_position
 
@@ -33,10 +34,6 @@ _INSIDE = np.arange(1, 8) / 8.0
 _MOST_STEPS, _ARRIVED = 120, 1e-10
 # How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
 _ROOM = 0.02
-# Of |q|: less of an imaginary part than that where Im F vanishes is none.
-_NONE = 1e-11
-# A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
-_FLAT = 1e-12
 # By what share a row is moved, at most, that rounding keeps from being counted.
 _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
 
@@ -65,28 +62,6 @@ class Arc(NamedTuple):
     def first(self) -> float:
         """Its lowest angle."""
         return float(min(self.w[0], self.w[-1]))
-
-
-class CrossingLine(NamedTuple):
-    """A frequency at which a whole line ``alpha + beta real(F) = q`` puts poles on the circle."""
-
-    w: float
-    q: float
-    f: float
-    q_turn: float  # Im dq/dw
-    f_turn: float
-    poles: int  # 1 at z = 1 and z = -1, else 2
-
-    @property
-    def meeting(self) -> float:
-        """The damping at which the curve meets the line, ``Im q'/Im F'``; NaN where it does not."""
-        return self.q_turn / self.f_turn if abs(self.f_turn) > _FLAT else np.nan
-
-    def leaving(self, beta: np.ndarray) -> np.ndarray:
-        """Poles that leave the circle there as alpha rises; on the row through the meeting, as just above it."""
-        if np.isnan(self.meeting):
-            return np.full(beta.shape, self.poles * np.sign(self.q_turn))
-        return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
 
 
 class Crossings(NamedTuple):
@@ -150,13 +125,13 @@ class Boundary:
         w = np.unique(np.concatenate([w, _dips(loop, w, here)]))
         here = curve_at(loop, w)
         vertical = zeros_of(loop, w, here.fall, "fall")
-        touched = [p for p in _circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
+        touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
         vertical = np.union1d(vertical, touched)
-        lines = tuple(line for p in vertical if (line := _interior_line(loop, p)) is not None)
+        lines = tuple(line for p in vertical if (line := interior_line(loop, p)) is not None)
         poles = np.array([p for p in vertical if all(p != line.w for line in lines)])
         turns = zeros_of(loop, w, here.turn, "turn")
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
-        lines = (*lines, *_end_lines(loop))
+        lines = (*lines, *end_lines(loop))
         limits = {0.0: np.nan, np.pi: np.nan} | {line.w: line.meeting for line in lines}
         return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns, limits)), lines, poles)
 
@@ -186,7 +161,7 @@ class Boundary:
         return [line.w for line in self.lines if line.poles == 2]
 
     def _settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rows whose crossings lead from the count far below to that far above, and which ones do.
+        """Rows whose crossings lead from the count far below to that far above, and which ones do (V15).
 
         A row within rounding of a turn of the curve may miss one of two arcs: a neighbor that does not stands for it.
         """
@@ -246,7 +221,7 @@ class Boundary:
         return total.astype(int), sound
 
     def borders(self, w: np.ndarray) -> np.ndarray:
-        """Whether the stable set lies on one side of the curve at each angle."""
+        """Whether the stable set lies on one side of the curve at each angle (V18)."""
         here = curve_at(self.loop, w)
         own = np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
         # By the arc: next to z = -1 the slope at one angle may be rounding.
@@ -264,7 +239,7 @@ class Boundary:
 
     @cached_property
     def base(self) -> int:
-        """Poles outside far below every crossing (docs/theory/scenes.md, S14)."""
+        """Poles outside far below every crossing (docs/theory/scenes.md, V14)."""
         return self._far_outside(-1.0)
 
     @cached_property
@@ -377,46 +352,6 @@ def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
     return (w[k, None] + step[k, None] * _INSIDE).ravel()
 
 
-def _interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
-    """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
-    at = circle(np.array([w]))
-    q, f = loop.needed(at), loop.estimate.jet(at)
-    if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
-        return None
-    value, turn = float(q.value[0].real), float(q.slope[0].imag)
-    return CrossingLine(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
-
-
-def _circle_zeros(loop: LinearLoop) -> np.ndarray:
-    """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
-    zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
-    angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
-    return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
-
-
-def _end_lines(loop: LinearLoop) -> list[CrossingLine]:
-    """The lines of real poles at z = 1 and z = -1; where the device does not move there is none."""
-    lines = []
-    for w in (0.0, np.pi):
-        at = circle(np.array([w]))
-        with np.errstate(all="ignore"):
-            q, f = loop.needed(at), loop.estimate.jet(at)
-        numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
-        infinite = np.any(np.abs(loop.zeros - (2.0 if w else 0.0)) <= ON_CIRCLE)
-        if np.all(np.isfinite(numbers)) and not infinite:
-            q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
-            lines.append(CrossingLine(w, q_value, f_value, q_turn, f_turn, 1))
-    return lines
-
-
-def _find_tie(line: CrossingLine, arcs: tuple[Arc, ...]) -> float:
-    """The line's sign on the row on which the arc beside it ends, which counts as one that the arc does not meet."""
-    for arc in (arcs[0], arcs[-1]):
-        if line.w in (arc.w[0], arc.w[-1]):
-            return float(np.sign(line.f_turn)) * (1.0 if arc.w[0] == line.w else -1.0)
-    return 0.0
-
-
 def _arcs(
     loop: LinearLoop,
     w: np.ndarray,
@@ -458,7 +393,5 @@ def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limit
     if w in at_pole:
         return side * np.inf
     if w in limits:
-        # The row that ends on the line of a real pole is that line's, see `_find_tie`.
-        inward = np.nextafter(limits[w], -side * np.inf) if w in (0.0, np.pi) else limits[w]
-        return float(inward) if np.isfinite(limits[w]) else side * np.inf
+        return limits[w] if np.isfinite(limits[w]) else side * np.inf
     return float(curve_at(loop, np.array([w])).beta[0])

@@ -7,7 +7,7 @@ on the first. In units of T and of the first body's mass, with ``u`` the force h
 
 so that no small sum of large spring forces is ever formed. Between samples the motion is the matrix exponential. From
 held force to sampled position, with zeta = z - 1, Psi = e^A - 1 = A phi1(A) and Gamma(t) the answer to a force held
-for t (docs/theory/scenes.md):
+for t (docs/theory/scenes.md, V2 to V4):
 
     G(z) = C (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)) / z^(n+1),   d = n + f
 """

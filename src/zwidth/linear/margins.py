@@ -90,9 +90,8 @@ class OpenLoop(NamedTuple):
         """Lowest points between nodes of one sign from which the tangents lead to the other sign."""
         step, sign = np.diff(w), np.sign(value[:-1])
         toward = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
-        lowest = np.minimum(
-            np.abs(value[:-1]) - np.abs(slope[:-1]) * step, np.abs(value[1:]) - np.abs(slope[1:]) * step
-        )
+        size, fall = np.abs(value), np.abs(slope)
+        lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
         k = np.flatnonzero(toward & (lowest < 0))
         low, high, sign = w[k], w[k + 1], sign[k]
         for _ in range(40 if k.size else 0):

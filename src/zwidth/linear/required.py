@@ -54,17 +54,23 @@ def require(
     low, high = _range(parameter, now, within)
 
     def surplus(value: float) -> float:
-        """How K_max compares with the wanted stiffness; hardly any where the value is refused or no wall is stable."""
-        try:
-            wall = stiffest_wall(scene.replace(**{parameter: value}), negative_damping)
-        except InputError:
-            return -_HARDLY_ANY
+        """How K_max compares with the wanted stiffness, in logarithms; NaN where it cannot be computed."""
+        wall = stiffest_wall(scene.replace(**{parameter: value}), negative_damping)
         if wall.status == Status.NO_BOUNDARY:
             return -_HARDLY_ANY
         return math.log(wall.stiffness / stiffness) if wall.status == Status.OK else math.nan
 
-    grid = np.geomspace(low, high, _POINTS)
-    values = [surplus(float(value)) for value in grid]
+    grid, values = [], []
+    for value in np.geomspace(low, high, _POINTS).tolist():
+        try:
+            values.append(surplus(value))
+        except InputError:
+            # The range ends where values are refused, as for a cut-off at half the sampling rate.
+            continue
+        grid.append(value)
+    if not grid:
+        raise InputError(f"within: {parameter} cannot have any value from {low:g} to {high:g}")
+    low, high = grid[0], grid[-1]
     enough = [value >= 0 for value in values if not math.isnan(value)]
     if not enough or not any(enough):
         status = Status.UNREACHABLE if enough and len(enough) == len(values) else Status.NOT_CONVERGED
@@ -72,8 +78,8 @@ def require(
     if len(enough) == len(values) and all(enough):
         return RequiredValue(min(max(now, low), high), "everywhere", (), (low, high), Status.OK)
     found = tuple(
-        _cross(surplus, float(grid[k]), float(grid[k + 1]))
-        for k in range(_POINTS - 1)
+        _cross(surplus, grid[k], grid[k + 1])
+        for k in range(len(grid) - 1)
         if (values[k] >= 0) != (values[k + 1] >= 0) and not math.isnan(values[k] + values[k + 1])
     )
     proved = tuple(crossing for crossing in found if crossing is not None)
@@ -109,9 +115,8 @@ def _cross(surplus: Callable[[float], float], low: float, high: float) -> Crossi
     """The crossing between two values, proved by a value on each side of it; None where it cannot be."""
     from scipy.optimize import brentq
 
-    place = float(
-        np.clip(math.exp(float(brentq(lambda x: surplus(math.exp(x)), math.log(low), math.log(high)))), low, high)
-    )
+    root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
+    place = math.exp(cast("float", root))
     for share in _BESIDE:
         ends = place * (1.0 - share), place * (1.0 + share)
         below, above = (surplus(end) >= 0 for end in ends)

@@ -41,7 +41,7 @@ class Condition(IntEnum):
 
 
 class Ridge(NamedTuple):
-    """The stiffest stable wall and the two conditions that make it so; ``w2`` is pi where the second has no angle."""
+    """The stiffest stable wall and the two conditions that make it so; ``w2`` is w1 where the second has no angle."""
 
     alpha: float
     beta: float
@@ -102,9 +102,9 @@ def _tops(border: Border, least: float) -> list[tuple[float, float, float, bool]
 
 def _describe(border: Border, alpha: float, beta: float, w: float, inner: bool, negative: bool) -> Ridge:
     if not negative and beta == 0.0:
-        return Ridge(alpha, beta, w, np.pi, _condition(w), Condition.NO_DAMPING)
+        return Ridge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
     if inner:
-        return Ridge(alpha, beta, w, np.pi, Condition.PAIR, Condition.STATIONARY)
+        return Ridge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
     return _corner(border, alpha, beta)
 
 

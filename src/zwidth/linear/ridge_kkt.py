@@ -106,9 +106,12 @@ def traced_wall(scene: Any, negative: bool) -> StiffestWall:
 def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
     """The stiffest wall for values of the moving parameters."""
     dtype = values[0].dtype
-    shape = jax.ShapeDtypeStruct((len(_NOWHERE) + 1,), dtype)
-    frozen = [jax.lax.stop_gradient(value) for value in values]
-    told = jax.pure_callback(partial(_search, structure), shape, *frozen, vmap_method="sequential")
+    # As bits: the thread of a callback may have JAX's default precision, which would halve the digits on the way.
+    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(jnp.stack(values)), jnp.int32)
+    shape = jax.ShapeDtypeStruct((len(_NOWHERE) + 1, *bits.shape[1:]), jnp.int32)
+    search_there = partial(_search, structure, np.dtype(dtype))
+    told = jax.pure_callback(search_there, shape, bits, vmap_method="sequential")
+    told = jax.lax.bitcast_convert_type(told, dtype)
     status = told[-1].astype(jnp.int32)
     found = status == Status.OK
     told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
@@ -132,17 +135,18 @@ def _delay(scene: Any) -> tuple[Any, Any]:
     return scene.timing.delay, scene.timing.period
 
 
-def _search(structure: Structure, *values: np.ndarray) -> np.ndarray:
-    """The ridge on the host, and its status behind it."""
-    dtype = np.asarray(values[0]).dtype
+def _search(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
+    """The ridge on the host, and its status behind it; numbers come and go as their bits."""
+    values = np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()
     bad = (math.nan,) * len(_NOWHERE)
-    numbers = {path: float(value) for path, value in zip(structure.paths, values, strict=True)}
     try:
-        found, status = search(replace_parameters(structure.template, numbers), structure.negative)
+        scene = replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
+        found, status = search(scene, structure.negative)
     except InputError:
         found, status = None, Status.INVALID_INPUT
     ridge = bad if found is None else (*found, found.kind)
-    return np.array([*ridge, status], dtype)
+    told = np.array([*ridge, status], dtype)
+    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
 
 
 def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
@@ -186,24 +190,26 @@ def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
         size = jax.lax.stop_gradient(jnp.abs(q))
         return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
 
-    def meet(w: Array, place: int) -> Array:
-        """A pole pair at w, or a real pole where w stays."""
-        r, _ = distance(w)
-        stays = (w - args.start[2 + place]) / args.scales[2 + place]
-        return jnp.stack([r.real, jnp.where(args.codes[place] == Condition.PAIR, r.imag, stays)])
-
-    def stationary() -> Array:
-        (_, f), (slope, _) = jax.jvp(distance, (w1,), (jnp.ones_like(w1),))
+    def both(w: Array) -> tuple[Array, Array]:
+        (r, f), (slope, _) = jax.jvp(distance, (w,), (jnp.ones_like(w),))
         across = (jnp.conj(f) * slope).imag
         size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
-        return jnp.stack([across / jnp.where(size > 0, size, 1.0), unknowns[3] - args.start[3] / args.scales[3]])
+        across = across / jnp.where(size > 0, size, 1.0)
+        # At z = -1 F is real, and may be 0.
+        return r, jnp.where(args.codes[0] == Condition.PAIR, across, slope.imag)
 
-    def undamped() -> Array:
-        return jnp.stack([unknowns[1], unknowns[3] - args.start[3] / args.scales[3]])
-
+    # One text for both angles, so that the compiler reads it once.
+    r, across = jax.vmap(both)(jnp.stack([w1, w2]))
+    stays = unknowns[2:] - args.start[2:] / args.scales[2:]
+    # A pole pair at w, or a real pole where w stays.
+    meet = jnp.stack([r.real, jnp.where(args.codes == Condition.PAIR, r.imag, stays)], -1)
     which = jnp.maximum(args.codes[1] - Condition.PLUS_ONE, 0)
-    second = jax.lax.switch(which, [lambda: meet(w2, 1), stationary, undamped])
-    return jnp.concatenate([meet(w1, 0), second])
+    conditions = (
+        lambda: meet[1],
+        lambda: jnp.stack([across[0], stays[1]]),
+        lambda: jnp.stack([unknowns[1], stays[1]]),
+    )
+    return jnp.concatenate([meet[0], jax.lax.switch(which, conditions)])
 
 
 @partial(jax.jit, static_argnums=0)

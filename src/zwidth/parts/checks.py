@@ -36,7 +36,7 @@ def _read(field: str, value: Any, read: Callable[[Any], Any]) -> Any:
         raise InputError(f"{field}: got an array of shape {np.shape(value)}; a scene holds single numbers")
     if isinstance(value, Real) and not isinstance(value, bool):
         # Also what NumPy holds.
-        value = to_float(value)
+        value = to_float(value)  # pyright: ignore[reportArgumentType]  (anything that float takes)
     try:
         return read(value)
     except UnusableValueError as error:

@@ -68,6 +68,7 @@ class RecommendStudy(ResponseStudy):
         stiffness, damping = si_scales(device)
         wall = VirtualWall(stiffness=alpha * stiffness, virtual_damping=beta * damping)
         verdict = assess(replace(bare, wall=wall))
+        assert isinstance(verdict, Assessment), "scenes with parts are recommended for elsewhere"
         columns, note = self.respond(device, alpha, beta, label=device.label or self.name, physical=True)
         response = stack([columns])
         found = _summary(device, wall, verdict, self.stiffness_fraction, float(columns["settling_time_s"]))

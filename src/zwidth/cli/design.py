@@ -1,0 +1,184 @@
+"""`zwidth design`: what a wanted stiffness asks of a device, and how tolerances change the answer."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from typing import Any
+
+import click
+
+from zwidth.cli.options import flag_of, json_option, scene_options
+from zwidth.cli.words import row
+from zwidth.formatting import plain, with_unit
+
+_FINDS = {
+    "damping": ("damping", "N s/m"),
+    "mass": ("mass", "kg"),
+    "period": ("period", "s"),
+    "rate": ("period", "s"),
+    "delay": ("delay", "s"),
+    "cutoff": ("velocity.cutoff", "Hz"),
+}
+_BOX = ("mass", "damping", "period", "delay")
+
+
+class ToleranceType(click.ParamType):
+    """A parameter and the share by which it may differ: ``mass=10%`` or ``damping=0.2``."""
+
+    name = "NAME=SHARE"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Parse one option."""
+        if isinstance(value, tuple):
+            return value
+        name, _, text = value.partition("=")
+        text = text.strip()
+        try:
+            share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+        except ValueError:
+            self.fail(
+                f"got {value!r}; write the parameter and its share, as mass=10% or velocity.cutoff=0.05", param, ctx
+            )
+        return name.strip(), share
+
+
+@click.command()
+@scene_options(wall=True, required=True)
+@click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose such that K_max reaches the stiffness.")
+@click.option("--tolerance", "tolerances", type=ToleranceType(), multiple=True, help="As mass=10%; may be repeated.")
+@click.option(
+    "--distribution",
+    type=click.Choice(("uniform", "normal")),
+    default="uniform",
+    show_default=True,
+    help="Of the tolerances: a share either way, or a standard deviation.",
+)
+@click.option("--samples", type=int, help="Devices drawn; 10,000, or 200 of a scene with parts.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Of the draws.")
+@json_option
+def design(
+    scene: Any,
+    find: str | None,
+    tolerances: tuple[tuple[str, float], ...],
+    distribution: Any,
+    samples: int | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Say what a wanted stiffness needs, or how many devices within tolerances bear a wall.
+
+    With --find: the value of one property at which the stiffest stable wall reaches --stiffness, the others as given.
+    With --tolerance: the share of devices on which the wall (--stiffness, --virtual-damping) is stable, the stiffness
+    that 99 % of them bear, and, for uniform tolerances of a rigid device, what is proved for every one of them.
+    """
+    if find is None and not tolerances:
+        raise click.UsageError("give --find or --tolerance, or both")
+    found: dict[str, Any] = {}
+    lines: list[str] = []
+    if find is not None:
+        found["required"], words = _require(scene, find)
+        lines += words
+    if tolerances:
+        found["tolerances"], words = _tolerate(scene, dict(tolerances), distribution, samples, seed)
+        lines += words
+        if scene.is_rigid and distribution == "uniform" and all(name in _BOX for name, _ in tolerances):
+            found["every_device"], words = _prove(scene, dict(tolerances))
+            lines += words
+    if as_json:
+        click.echo(json.dumps(found, indent=2, allow_nan=False))
+        return
+    for line in lines:
+        click.echo(line)
+
+
+def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
+    """The value of one property that is enough, and on which side of it there is enough."""
+    path, unit = _FINDS[find]
+    values = scene.parameters()
+    if path not in values:
+        raise click.UsageError(f"--find {find}: this scene has none; give {flag_of(path)} to start from")
+    present = values[path]
+    # From nothing there is no range to search: a range that any device has.
+    within = None if present else {"damping": (1e-6, 1e4), "delay": (1e-3 * scene.timing.period, 1.0)}[path]
+    if path == "velocity.cutoff":
+        # A filter has none from half its sampling rate on.
+        within = present / 30.0, min(30.0 * present, 0.499 / (scene.velocity.coded_period or scene.timing.period))
+    wanted = float(scene.wall.stiffness)
+    needed = scene.required(path, wanted, within=within)
+    result = {"parameter": path, "value": _plain(needed.value), "unit": unit, "enough": needed.enough}
+    result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
+    text = _amount(needed.value, unit)
+    if path == "period":
+        result["rate"] = None if result["value"] is None else 1.0 / needed.value
+        text += f" (a rate of {with_unit(1.0 / needed.value, 'Hz')}; the same delay in seconds)"
+    if needed.enough in ("nowhere", "everywhere"):
+        low, high = (_amount(end, unit) for end in needed.range)
+        reached = "reached nowhere" if needed.enough == "nowhere" else "reached everywhere"
+        text = f"K_max = {with_unit(wanted, 'N/m')} is {reached} from {low} to {high}"
+    else:
+        others = len(needed.crossings) - 1
+        text += f" or {'more' if needed.enough == 'above' else 'less'}" + (
+            f"; {others} more crossing{'s' if others > 1 else ''} in the range, see --json" if others else ""
+        )
+    return result, [row(f"{path} needed", text)]
+
+
+def _tolerate(
+    scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
+) -> tuple[dict[str, Any], list[str]]:
+    from zwidth.design.tolerances import Tolerance, simulate_tolerances
+
+    count = samples if samples is not None else 10_000 if scene.is_rigid else 200
+    named = {name: Tolerance(share, distribution) for name, share in shares.items()}
+    found = simulate_tolerances(scene, named, samples=count, seed=seed)
+    result = {name: _plain(value) for name, value in asdict(found).items() if name not in ("drawn", "labels")}
+    result |= {"seed": seed, "distribution": distribution, "shares": shares}
+    percent = f"{100 * found.reliability:g} %"
+    share = f"{plain(100 * found.stable)} % of {found.samples} devices drawn"
+    known = f"{plain(100 * found.stable_low)} to {plain(100 * found.stable_high)} % of all, with 95 % confidence"
+    wall = scene.wall
+    lines = [
+        row("wall", f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
+        row("stable", f"{share} ({known})"),
+        row(f"borne by {percent}", f"K up to {with_unit(found.stiffness, 'N/m')} at this B"),
+    ]
+    if result["stiffness_max"] is not None:
+        lines.append(row("", f"K up to {with_unit(found.stiffness_max, 'N/m')}, each device with a B of its own"))
+    return result, lines
+
+
+def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
+    """What every device of the box bears."""
+    from zwidth.design.robust import Interval, robust_max_stiffness, robust_wall
+
+    nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)
+    box: dict[str, Any] = dict(zip(_BOX, nominal, strict=True))
+    own = (scene.device.mass, scene.device.damping, 0.0, 0.0)
+    for (name, value), device in zip(list(box.items()), own, strict=True):
+        if name in shares:
+            # A rigid hand adds what has no tolerance.
+            reach = shares[name] * (device or value)
+            box[name] = Interval(value - reach, value + reach)
+    wall, best = robust_wall(**box), robust_max_stiffness(**box)
+    result = {
+        "stiffness": _plain(float(wall.stiffness)),
+        "virtual_damping": _plain(float(wall.virtual_damping)),
+        "stiffness_max": _plain(float(best.stiffness)),
+    }
+    lines = [
+        row(
+            "proved for every one",
+            f"K = {with_unit(float(wall.stiffness), 'N/m')} at B = {with_unit(float(wall.virtual_damping), 'N s/m')}; "
+            f"{with_unit(float(best.stiffness), 'N/m')}, each with a B of its own",
+        )
+    ]
+    return result, lines
+
+
+def _plain(value: Any) -> Any:
+    return None if isinstance(value, float) and value != value else value
+
+
+def _amount(value: float, unit: str) -> str:
+    return with_unit(value * 1e3, "g") if unit == "kg" else with_unit(value, unit)

@@ -1,0 +1,198 @@
+"""`zwidth check`: scenes on the command line, doubts, what limits, friction, and that it stays light."""
+
+import json
+import re
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+
+DEVICE = ["--mass", "100 g", "--damping", "10", "--delay", "1 periods"]
+RATE = ["--rate", "1 kHz"]
+WALL = ["--stiffness", "3 kN/m", "--virtual-damping", "5"]
+PARTS = {
+    "filter": (["--velocity-cutoff", "100 Hz"], {"velocity": zwidth.LowPass(cutoff=100)}),
+    "window": (["--velocity-samples", "5"], {"velocity": zwidth.WindowedDifference(5)}),
+    "butterworth": (
+        ["--velocity-kind", "butterworth", "--velocity-cutoff", "50", "--velocity-order", "4"],
+        {"velocity": zwidth.Butterworth(50, 4)},
+    ),
+    "hand": (["--operator-mass", "500 g", "--operator-stiffness", "100"], {"operator": zwidth.Operator(0.5, 0, 100)}),
+    "soft hand": (
+        ["--operator-mass", "0.5", "--operator-coupling-stiffness", "1 kN/m", "--operator-coupling-damping", "2"],
+        {"operator": zwidth.Operator(0.5, 0, 0, 1000, 2)},
+    ),
+}
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, list(arguments))
+    assert result.exit_code == 0, result.output
+    return result
+
+
+def scene_with(velocity=None, operator=None, coupling=None):
+    parts = {} if velocity is None else {"velocity": velocity}
+    device = zwidth.Device(0.1, 10, coupling)
+    return zwidth.Scene(device, zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(3e3, 5), operator=operator, **parts)
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_options_make_the_scene_that_they_name(name):
+    arguments, parts = PARTS[name]
+    printed = json.loads(run("check", *WALL, *DEVICE, *RATE, *arguments, "--json").stdout)
+    scene = scene_with(**parts)
+    best = scene.max_stiffness()
+    assert printed["stable"] == scene.is_stable(3e3, 5)
+    assert printed["spectral_radius"] == scene.spectral_radius(3e3, 5)
+    assert printed["stiffness_max"] == best.stiffness
+    assert printed["virtual_damping_at_max"] == best.virtual_damping
+    assert [limit["gain"] for limit in printed["limits"]] == [limit.gain for limit in zwidth.limits_of(scene)]
+
+
+def test_a_coupling_and_the_ends_of_its_row_and_column():
+    tip = ["--coupling-mass", "50 g", "--coupling-stiffness", "20 kN/m", "--coupling-damping", "1"]
+    printed = json.loads(run("check", *WALL, *DEVICE, *RATE, *tip, "--coupling-sensor", "tip", "--json").stdout)
+    scene = scene_with(coupling=zwidth.Coupling(0.05, 20e3, 1.0, "tip"))
+    (row,), (column,) = printed["stable_stiffness"], printed["stable_damping"]
+    near = 1e-6
+    for low, high, ask in ((*row, lambda K: scene.is_stable(K, 5)), (*column, lambda B: scene.is_stable(3e3, B))):
+        size = high - low
+        inside = [low + near * size, 0.5 * (low + high), high - near * size]
+        assert [bool(ask(value)) for value in (low - near * size, *inside, high + near * size)] == [0, 1, 1, 1, 0]
+
+
+def test_the_words_of_a_scene_with_parts():
+    out = run("check", *WALL, *DEVICE, *RATE, *PARTS["filter"][0]).stdout.splitlines()
+    labels = [line[:22].strip() for line in out]
+    assert labels[:5] == ["device", "timing", "velocity", "wall", ""]
+    assert labels[5:10] == [
+        "verdict",
+        "to the boundary in K",
+        "to the boundary in B",
+        "stiffest stable wall",
+        "slowest pole",
+    ]
+    assert "cutoff 100.0 Hz" in out[2]
+    assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[8]
+    assert out[10].startswith("what limits it        no delay: K_max")
+
+
+def test_a_rigid_scene_says_what_limits_it_too():
+    out = run("check", *WALL, *DEVICE, *RATE).stdout
+    assert "\npassive               " in out
+    first, second = out.splitlines()[-2:]
+    assert first.startswith("what limits it        no delay: K_max 82.58 kN/m, 4.16 times")
+    assert second.startswith("                      sampled 64 times faster: ")
+
+
+def test_rate_and_period_are_one_thing():
+    one = run("check", *WALL, *DEVICE, "--rate", "4 kHz").stdout
+    assert one == run("check", *WALL, *DEVICE, "--period", "0.25 ms").stdout
+    assert "d = 1.000" in one
+    for both in ([], ["--rate", "1000", "--period", "1e-3"]):
+        assert CliRunner().invoke(cli, ["check", *WALL, *DEVICE, *both]).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "doubt"),
+    [
+        (["--mass", "70", *RATE], "--mass is 70 kg, far from any device; did you mean --mass '70 g'?"),
+        (["--mass", "1", "--period", "4000"], "--period is 4000 s, .* did you mean --rate '4000 Hz'?"),
+        (["--mass", "1", "--period", "1"], "--period is 1 s, .* did you mean --period '1 ms'?"),
+        (["--mass", "1", "--rate", "1"], "--rate is 1 Hz, .* did you mean --rate '1 kHz'?"),
+        (["--mass", "1", *RATE, "--delay", "20"], "--delay is 20 s, .* did you mean --delay '20 ms'?"),
+        (
+            ["--mass", "1", *RATE, "--damping", "2e4"],
+            "--damping is 20000 N s/m, .* did you mean --damping '20000 mN s/m'?",
+        ),
+    ],
+)
+def test_what_no_device_has_gets_a_line_of_doubt(arguments, doubt):
+    result = run("check", "--stiffness", "100", *arguments)
+    assert result.stdout.startswith("device")
+    (line,) = result.stderr.splitlines()
+    assert re.fullmatch(f"zwidth: {doubt.replace('?', '[?]')}", line)
+
+
+def test_a_stiffness_beyond_all_walls_is_doubted_and_usual_values_are_not():
+    assert "--stiffness is 1e+09 N/m" in run("check", "--stiffness", "1e9", *DEVICE, *RATE).stderr
+    assert run("check", *WALL, *DEVICE, *RATE, *PARTS["soft hand"][0]).stderr == ""
+    wheel = ["--stiffness", "2", "--mass", "4.5e-4", "--damping", "0.0013", "--rate", "1 kHz"]
+    assert run("check", *wheel).stderr == ""
+
+
+def test_friction_and_resolution():
+    given = ["--friction", "0.24", "--resolution", "15.7 um"]
+    printed = json.loads(run("check", *WALL, *DEVICE, *RATE, *given, "--json").stdout)["friction_rule"]
+    assert printed["by_damping"] == 2 * 10 / 1e-3
+    assert printed["by_friction"] == pytest.approx(2 * 0.24 / 15.7e-6, rel=1e-15)
+    assert printed["stiffness"] == printed["by_damping"]
+    assert "2 b/T = 20.00 kN/m, 2 f_c/Q = 30.57 kN/m" in run("check", *WALL, *DEVICE, *RATE, *given).stdout
+    assert "both are needed" in run("check", *WALL, *DEVICE, *RATE, "--friction", "1").stdout
+
+
+def test_a_coded_period_that_is_not_the_loop_s_is_pointed_out():
+    other = ["--velocity-cutoff", "100", "--velocity-coded-period", "0.1 ms"]
+    out = run("check", *WALL, *DEVICE, *RATE, *other).stdout
+    assert "velocities come out 10.0 times as large, and the cut-off lies at 10.00 Hz in place of 100.0 Hz" in out
+    same = ["--velocity-cutoff", "100", "--velocity-coded-period", "1 ms"]
+    assert "note" not in run("check", *WALL, *DEVICE, *RATE, *same).stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--velocity-cutoff", "800"], "'--velocity-cutoff': got 800 Hz; it must lie below half the sampling rate"),
+        (["--velocity-cutoff", "10", "--velocity-order", "3"], "'--velocity-order': got 3; a whole number from 1 to 2"),
+        (["--velocity-order", "2"], "--velocity-order does not belong to a velocity estimate of kind"),
+        (["--velocity-kind", "butterworth"], "needs --velocity-cutoff"),
+        (["--coupling-mass", "1"], "a coupling has a mass and a stiffness; give --coupling-stiffness"),
+        (["--operator-coupling-damping", "1"], "'--operator-coupling-damping': got 1.0 without a spring"),
+        (["--operator-mass", "70 gg"], "'--operator-mass': got '70 gg'; the units allowed are kg, g, mg"),
+    ],
+)
+def test_what_is_refused_names_the_option(arguments, message):
+    result = CliRunner().invoke(cli, ["check", *WALL, *DEVICE, *RATE, *arguments])
+    assert result.exit_code == 2
+    assert message in result.stderr
+
+
+@pytest.mark.parametrize("name", [None, *PARTS])
+def test_a_check_needs_no_jax(name):
+    arguments = ["check", *WALL, *DEVICE, *RATE, *(PARTS[name][0] if name else [])]
+    code = (
+        "import sys\nfrom zwidth.cli.commands import cli\n"
+        f"cli.main(args={arguments!r}, standalone_mode=False)\nprint('jax' in sys.modules)"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.splitlines()[-1] == "False"
+
+
+def test_the_ridge_of_a_scene_with_parts():
+    arguments = ["ridge", *DEVICE, *RATE, *PARTS["filter"][0]]
+    printed = json.loads(run(*arguments, "--json").stdout)
+    scene = scene_with(zwidth.LowPass(cutoff=100))
+    best, per = scene.max_stiffness(), scene.sensitivities().per
+    assert printed["stiffness_max"] == best.stiffness
+    assert printed["frequency"] == best.frequency
+    assert printed["kind"] == "smooth"
+    assert {name: entry["value"] for name, entry in printed["sensitivities"].items()} == per
+    assert printed["sensitivities"]["velocity.cutoff"]["unit"] == "N/m per Hz"
+    step = 1e-3
+    there, here = (scene.replace(**{"velocity.cutoff": 100 + s}).max_stiffness().stiffness for s in (step, -step))
+    assert np.isclose(per["velocity.cutoff"], (there - here) / (2 * step), rtol=1e-6)
+    lines = run(*arguments).stdout.splitlines()
+    assert lines[-1].startswith("dK_max/d(velocity.cutoff)  52.53 N/m per Hz: 1 Hz more buys 52.5 N/m")
+
+
+def test_the_ridge_of_a_rigid_hand_counts_the_hand_s_mass():
+    printed = json.loads(run("ridge", *DEVICE, *RATE, "--operator-mass", "100 g", "--json").stdout)
+    assert printed["stiffness_max"] == pytest.approx(
+        zwidth.max_stiffness(mass=0.2, damping=10.0, period=1e-3, delay=1e-3), rel=1e-12
+    )

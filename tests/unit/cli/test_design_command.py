@@ -1,0 +1,95 @@
+"""`zwidth design`: what a stiffness needs, and tolerances."""
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+
+DEVICE = ["--mass", "100 g", "--damping", "10", "--rate", "1 kHz", "--delay", "0.5 ms"]
+
+
+def design(*arguments):
+    result = CliRunner().invoke(cli, ["design", *arguments])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+def needed(*arguments):
+    return json.loads(design(*arguments, "--json"))["required"]
+
+
+def test_what_is_needed_agrees_with_the_closed_form_of_a_rigid_device():
+    find = ["--stiffness", "40 kN/m", *DEVICE, "--find"]
+    plain = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.5e-3}
+
+    def known(name):
+        return {key: value for key, value in plain.items() if key != name}
+
+    assert needed(*find, "damping")["value"] == pytest.approx(
+        zwidth.required_damping(40e3, **known("damping")).value, rel=1e-9
+    )
+    assert needed(*find, "mass")["value"] == pytest.approx(zwidth.required_mass(40e3, **known("mass")).value, rel=1e-9)
+    longest = zwidth.required_period(40e3, **known("period")).value
+    rate = needed(*find, "rate")
+    assert rate["value"] == pytest.approx(longest, rel=1e-9)
+    assert rate["rate"] == 1 / rate["value"]
+    assert needed(*find, "delay")["value"] == pytest.approx(
+        zwidth.allowed_delay(40e3, **known("delay")).value, rel=1e-9
+    )
+
+
+def test_a_cutoff_is_enough_and_a_lower_one_is_not():
+    filtered = ["--stiffness", "15 kN/m", *DEVICE, "--velocity-cutoff", "100", "--find", "cutoff"]
+    found = needed(*filtered)
+    assert (found["parameter"], found["unit"], found["enough"]) == ("velocity.cutoff", "Hz", "above")
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 0.5e-3), velocity=zwidth.LowPass(cutoff=100))
+    reach = [
+        scene.replace(**{"velocity.cutoff": found["value"] * factor}).max_stiffness().stiffness
+        for factor in (1 - 1e-6, 1 + 1e-6)
+    ]
+    assert reach[0] < 15e3 < reach[1]
+    assert design(*filtered).startswith("velocity.cutoff needed  ")
+
+
+def test_from_no_damping_and_no_delay_a_range_is_searched():
+    bare = ["--mass", "0.1", "--rate", "1000", "--stiffness", "100 kN/m"]
+    assert needed(*bare, "--find", "damping")["value"] == pytest.approx(
+        zwidth.required_damping(100e3, mass=0.1, period=1e-3).value, rel=1e-9
+    )
+    assert "reached nowhere" in design(*bare, "--find", "delay")
+
+
+def test_tolerances_are_drawn_and_proved():
+    wall = ["--stiffness", "17 kN/m", "--virtual-damping", "35", "--mass", "0.1", "--damping", "10", "--rate", "1 kHz"]
+    shares = ["--delay", "1 ms", "--tolerance", "mass=20%", "--tolerance", "damping=0.3"]
+    found = json.loads(design(*wall, *shares, "--json"))
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(17e3, 35))
+    same = zwidth.simulate_tolerances(scene, {"mass": 0.2, "damping": 0.3})
+    assert found["tolerances"]["stable"] == same.stable
+    assert found["tolerances"]["stiffness"] == same.stiffness
+    box = {"mass": zwidth.Interval(0.08, 0.12), "damping": zwidth.Interval(7, 13), "period": 1e-3, "delay": 1e-3}
+    assert found["every_device"]["stiffness"] == pytest.approx(zwidth.robust_wall(**box).stiffness, rel=1e-6)
+    assert found["every_device"]["stiffness"] < found["tolerances"]["stiffness"]
+    text = design(*wall, *shares)
+    assert "% of 10000 devices drawn" in text
+    assert "proved for every one" in text
+    normal = design(*wall, *shares[:2], "--tolerance", "mass=5%", "--distribution", "normal", "--samples", "500")
+    assert "of 500 devices drawn" in normal
+    assert "proved" not in normal
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "give --find or --tolerance, or both"),
+        (["--find", "cutoff"], "--find cutoff: this scene has none; give --velocity-cutoff to start from"),
+        (["--tolerance", "mass=ten"], "write the parameter and its share, as mass=10%"),
+    ],
+)
+def test_what_is_refused(arguments, message):
+    result = CliRunner().invoke(cli, ["design", "--stiffness", "20 kN/m", *DEVICE, *arguments])
+    assert result.exit_code == 2
+    assert message in result.stderr
