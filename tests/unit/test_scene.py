@@ -168,17 +168,6 @@ def test_a_mask_is_not_ignored():
         zwidth.normalize(mass=np.ma.masked_array([0.1, 0.2], mask=[True, False]), period=1e-3)
 
 
-@pytest.mark.parametrize(
-    "parts",
-    [{"velocity": zwidth.LowPass(cutoff=100)}, {"operator": zwidth.Operator(stiffness=10)}],
-    ids=["velocity", "operator"],
-)
-def test_assess_refuses_what_it_knows_nothing_of(parts):
-    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(1e3), **parts)
-    with pytest.raises(InputError, match="a velocity filter, a hand or a coupling, of which assess knows nothing"):
-        zwidth.assess(scene)
-
-
 def test_assess_counts_a_hand_held_rigidly_as_mass():
     timing, wall = zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(10e3, 40)
     held = zwidth.assess(zwidth.Scene(zwidth.Device(0.1, 10), timing, wall, operator=zwidth.Operator(mass=0.4)))

@@ -46,10 +46,16 @@ def _reader(name: str) -> Callable[[Any], Axis]:
     """A validator for an axis of a parameter in SI units."""
     parameter, allowed = PARAMETERS[name], PARAMETERS[name].allowed
     if parameter.whole:
-        return _whole_axis(make_axis_reader(make_entry_reader(name), make_entry_reader(name)))
+        entry = _accept_whole_floats(make_entry_reader(name))
+        return _whole_axis(make_axis_reader(entry, entry))
     low = max(allowed.low, 0.0)
     positive = Range(low, allowed.high, low_open=low == 0.0)
     return make_axis_reader(make_entry_reader(name), quantity(find_dimension(parameter.unit), positive))
+
+
+def _accept_whole_floats(entry: Entry) -> Entry:
+    """A validator that takes 5.0 for 5, as a store spells the ends of equal steps."""
+    return lambda raw: entry(int(raw) if isinstance(raw, float) and raw.is_integer() else raw)
 
 
 def _whole_axis(read: Callable[[Any], Axis]) -> Callable[[Any], Axis]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, Field, ValidationInfo, WrapValidator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WrapValidator
 
 from zwidth._types import DelayModel
 from zwidth.config.faults import LocatedProblem, listing, problem
@@ -200,6 +200,18 @@ class PhysicalDevice(_PhysicalPlant):
 
     label: str | None = None
     """Name of the device in legends."""
+
+
+class LabeledDevice(_PhysicalPlant):
+    """A device in SI units among others that a figure names."""
+
+    # The scene may supply all the rest.
+    model_config = ConfigDict(json_schema_extra={"required": ["label"]})
+
+    what: ClassVar[str] = "a device"
+
+    label: str
+    """Name of the device in the legend, each one its own."""
 
 
 class NormalizedDevice(_NormalizedPlant):

@@ -12,7 +12,7 @@ from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members
 from zwidth.config.parts import list_parts
-from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, stack
 from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
@@ -30,7 +30,7 @@ class CompareStudy(ComputedStudy):
 
     kind: Literal["compare"]
 
-    devices: Annotated[tuple[PhysicalDevice, ...], WrapValidator(members("devices"))]
+    devices: Annotated[tuple[LabeledDevice, ...], WrapValidator(members("devices"))]
     """Devices in SI units, each with a label; what one of them leaves out is the scene's."""
 
     @classmethod
@@ -44,9 +44,7 @@ class CompareStudy(ComputedStudy):
         yield from super().limits()
         labels = [device.label for device in self.devices]
         for index, label in enumerate(labels):
-            if label is None:
-                yield ("devices", index), problem("label missing", "the figure names each device", "add 'label: NAME'")
-            elif label in labels[:index]:
+            if label in labels[:index]:
                 yield ("devices", index, "label"), problem(f"got {label!r} twice", "each label once", "rename one")
 
     @property
@@ -65,7 +63,7 @@ class CompareStudy(ComputedStudy):
         """The outlines of every device, and a table of the stiffest walls."""
         rows, outlines, walls = [], [], []
         for device in self.devices:
-            label, loop = str(device.label), device.to_scene()
+            label, loop = device.label, device.to_scene()
             top = loop.max_stiffness()
             pieces = list(trace_outlines(loop, label=label))
             islands = sum(piece["piece"] == "island" for piece in pieces)

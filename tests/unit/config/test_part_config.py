@@ -146,11 +146,11 @@ def test_a_kind_that_takes_nothing_of_the_scene_is_not_refused(load):
         ),
         ("kind: sweep, name: s, axes: {alpha: 1}", "studies[0]", "its parts are in SI units"),
         (
-            "kind: sweep, name: s, axes: {stiffness: 1}, outputs: [passive]",
+            "kind: sweep, name: s, axes: {stiffness: 1}, outputs: [margin]",
             "studies[0].outputs[0]",
             "there are 'stable'",
         ),
-        ("kind: compare, name: c, devices: [{mass: 1}]", "studies[0].devices[0]", "label missing"),
+        ("kind: compare, name: c, devices: [{mass: 1}]", "studies[0].devices[0].label", "missing"),
         ("kind: compare, name: c, devices: [{label: a}, {label: a, mass: 1}]", "studies[0].devices[1].label", "twice"),
         ("kind: filters, name: f", "studies[0]", "cutoff and samples are missing"),
         ("kind: filters, name: f, cutoff: [600]", "studies[0].cutoff", "below half the sampling rate"),
