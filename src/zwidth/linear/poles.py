@@ -25,7 +25,7 @@ _STEPS, _ARRIVED = 60, 4e-16
 _NUMBERS = 1 << 20
 
 
-class Value(NamedTuple):
+class PolynomialValue(NamedTuple):
     """P, its derivative, and the size of what it is the sum of."""
 
     value: Array
@@ -80,7 +80,7 @@ def log_size(zeta: Array) -> Array:
         return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -1.0))
 
 
-def evaluate(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> Value:
+def evaluate(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
     """The factored polynomial; arrays that broadcast with zeta."""
     f = loop.estimate
     turns = f.window + f.lag
@@ -94,7 +94,7 @@ def evaluate(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> Value:
     wall = alpha * bottom[0] + beta * top[0], alpha * bottom[1] + beta * top[1]
     own, pushed = _times(device, bottom), _times(answer, wall)
     largest = np.abs(own[0]) + np.abs(answer[0]) * (np.abs(alpha * bottom[0]) + np.abs(beta * top[0]))
-    return Value(own[0] + pushed[0], own[1] + pushed[1], largest)
+    return PolynomialValue(own[0] + pushed[0], own[1] + pushed[1], largest)
 
 
 def _start(loop: LinearLoop, alpha: Array, beta: Array) -> Array:

@@ -40,7 +40,7 @@ class Condition(IntEnum):
     NO_DAMPING = 4
 
 
-class Ridge(NamedTuple):
+class BoundRidge(NamedTuple):
     """The stiffest stable wall and the two conditions that make it so; ``w2`` is w1 where the second has no angle."""
 
     alpha: float
@@ -64,7 +64,7 @@ class Ridge(NamedTuple):
         return RidgeKind.SMOOTH if smooth else RidgeKind.CORNER
 
 
-def find_ridge(border: Border, negative_damping: bool) -> Ridge | None:
+def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     """The stiffest stable wall with alpha > 0, None where no such wall is stable.
 
     Raises:
@@ -100,11 +100,11 @@ def _tops(border: Border, least: float) -> list[tuple[float, float, float, bool]
     return sorted(found, key=lambda top: -top[0])
 
 
-def _describe(border: Border, alpha: float, beta: float, w: float, inner: bool, negative: bool) -> Ridge:
+def _describe(border: Border, alpha: float, beta: float, w: float, inner: bool, negative: bool) -> BoundRidge:
     if not negative and beta == 0.0:
-        return Ridge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
+        return BoundRidge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
     if inner:
-        return Ridge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
+        return BoundRidge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
     return _corner(border, alpha, beta)
 
 
@@ -125,7 +125,7 @@ def _end_of_row(boundary: Boundary, beta: float) -> list[tuple[float, float, flo
     return [(top, beta, float(found.w[0, int(np.nanargmin(np.abs(found.alpha[0] - top)))]))]
 
 
-def _corner(border: Border, alpha: float, beta: float) -> Ridge:
+def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     """The two conditions that meet at a corner, and the corner to the last place."""
     found = border.boundary.crossings(np.array([beta]))
     away = np.abs(found.alpha[0] - alpha)
@@ -133,7 +133,7 @@ def _corner(border: Border, alpha: float, beta: float) -> Ridge:
     angles = sorted(float(found.w[0, k]) for k in near)
     met = len(near) == 2 and away[near[1]] <= 1e-4 * abs(alpha)
     if met and angles[1] - angles[0] > 1e-6:
-        start = Ridge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
+        start = BoundRidge(alpha, beta, angles[0], angles[1], _condition(angles[0]), _condition(angles[1]))
         held = _polish(border.boundary.loop, start)
         if held is not None:
             return held
@@ -141,10 +141,10 @@ def _corner(border: Border, alpha: float, beta: float) -> Ridge:
     top, damping = border.at_end(np.pi)
     if not abs(top - alpha) <= _NEAR * abs(alpha):
         raise ArithmeticError(f"no two conditions meet at alpha = {alpha!r}, beta = {beta!r}")
-    return Ridge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
+    return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
 
 
-def _polish(loop: LinearLoop, start: Ridge) -> Ridge | None:
+def _polish(loop: LinearLoop, start: BoundRidge) -> BoundRidge | None:
     """Newton's method on a corner of two different angles; None where it does not hold near the start."""
     x = np.array([start.alpha, start.beta, start.w1, start.w2])
     moves = np.array([start.first == Condition.PAIR, start.second == Condition.PAIR])
@@ -190,7 +190,7 @@ def _reach(border: Border, beta: float, least: float) -> float:
     return _highest(border, np.maximum(beta + size * _BESIDE, least))
 
 
-def _refuse_stiffer(border: Border, found: Ridge, least: float) -> None:
+def _refuse_stiffer(border: Border, found: BoundRidge, least: float) -> None:
     """Refuse a ridge above which rows anywhere hold a stable wall."""
     betas = _dampings(border, least)
     # Between the ends: a row through a corner is no witness.

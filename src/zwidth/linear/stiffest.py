@@ -9,7 +9,7 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.errors import InputError, ZwidthError
-from zwidth.linear.ridge import Ridge, find_ridge
+from zwidth.linear.ridge import BoundRidge, find_ridge
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.ridge import RidgeKind, alpha_max
@@ -67,7 +67,7 @@ def refuse_fractional_power(scene: Any) -> None:
         )
 
 
-def search(scene: Any, negative: bool) -> tuple[Ridge | None, Status]:
+def search(scene: Any, negative: bool) -> tuple[BoundRidge | None, Status]:
     """The ridge of a scene of plain numbers, or why there is none."""
     border = scene.border
     try:

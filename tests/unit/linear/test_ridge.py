@@ -10,7 +10,7 @@ import pytest
 import zwidth
 from zwidth import Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
 from zwidth.errors import InputError, TracedDelayError
-from zwidth.linear.ridge import Condition, Ridge, find_ridge
+from zwidth.linear.ridge import BoundRidge, Condition, find_ridge
 from zwidth.linear.ridge_kkt import moving_paths
 from zwidth.stability.ridge import RidgeKind
 
@@ -30,7 +30,7 @@ PAPER = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
 WINDOW = PAPER.replace(velocity=WindowedDifference(15))
 
 
-def wanted(scene: Scene, negative: bool) -> Ridge:
+def wanted(scene: Scene, negative: bool) -> BoundRidge:
     found = find_ridge(scene.border, negative)
     assert found is not None
     return found
