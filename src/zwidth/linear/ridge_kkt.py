@@ -17,15 +17,16 @@ import numpy as np
 import optimistix
 
 from zwidth._types import Array
-from zwidth.batching import compute_concretely, traced_columns
+from zwidth.batching import traced_columns
 from zwidth.domain import poison
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.linear.chain import Chain, chain_of, needed, respond
 from zwidth.linear.ridge import Condition
+from zwidth.linear.slopes import moving_paths
 from zwidth.linear.stiffest import StiffestWall, search
 from zwidth.linear_loop import circle
 from zwidth.normalization import in_periods
-from zwidth.parts.paths import list_parameters, replace_parameters
+from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
 from zwidth.stability.ridge import RidgeKind
 from zwidth.status import Status
@@ -59,16 +60,6 @@ class _Arguments(NamedTuple):
     start: Array
     codes: Array
     scales: Array
-
-
-def moving_paths(scene: Any) -> tuple[str, ...]:
-    """The parameters of a scene, without the wall's, that K_max can be differentiated in."""
-    bare = replace_parameters(scene, {"wall": VirtualWall(0.0)})
-    paths = [path for path, value in list_parameters(bare).items() if not isinstance(value, int | np.integer)]
-    without = {"stiffness", "virtual_damping"}
-    if scene.operator is not None and scene.operator.rigid:
-        without.add("operator.coupling_damping")
-    return tuple(path for path in paths if path not in without)
 
 
 def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
@@ -210,23 +201,3 @@ def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
         lambda: jnp.stack([unknowns[1], stays[1]]),
     )
     return jnp.concatenate([meet[0], jax.lax.switch(which, conditions)])
-
-
-@partial(jax.jit, static_argnums=0)
-def _slopes(structure: Structure, values: tuple[Array, ...]) -> tuple[StiffestWall, tuple[Array, ...]]:
-    def stiffness(values: tuple[Array, ...]) -> tuple[Array, StiffestWall]:
-        wall = compiled_wall(structure, *values)
-        return wall.stiffness, wall
-
-    (_, wall), slopes = jax.value_and_grad(stiffness, has_aux=True)(values)
-    return wall, slopes
-
-
-def slopes_at(scene: Any, paths: tuple[str, ...], negative: bool) -> tuple[StiffestWall, dict[str, float]]:
-    """The stiffest wall of a scene of plain numbers and its derivatives in some parameters, in float64."""
-    structure = structure_of(scene, paths, negative)
-    values = scene.parameters()
-    with compute_concretely():
-        wall, slopes = _slopes(structure, tuple(jnp.asarray(values[path], float) for path in paths))
-        wall = StiffestWall(*(np.asarray(part)[()] for part in wall))
-        return wall, {path: float(slope) for path, slope in zip(paths, slopes, strict=True)}
