@@ -111,7 +111,7 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
 
 
 def _state(scene: Any, found: BoundRidge) -> np.ndarray:
-    """The stiffness of alpha = 1, and what the conditions say of the wall found before: 0 on the scene it belongs to."""
+    """The stiffness of alpha = 1, and what the conditions say of the wall found before; 0 on its own scene."""
     rest, slope, _ = _residual(scene, found)
     return np.array([scene.units.stiffness, rest[0].real, rest[0].imag, rest[1].real, rest[1].imag, slope[0].imag])
 
@@ -125,7 +125,7 @@ def _residual(scene: Any, found: BoundRidge) -> tuple[np.ndarray, np.ndarray, Je
 
 
 def _conditions(scene: Any, found: BoundRidge) -> tuple[np.ndarray, list[int]]:
-    """The derivatives of the binding conditions in alpha and what moves with it, and which rows of `_state` they are.
+    """The derivatives of the binding conditions in alpha and what moves with it; their rows of `_state`.
 
     At a smooth optimum the angle may stay where it is: to first order it does not matter.
     """
