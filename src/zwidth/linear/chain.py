@@ -3,9 +3,9 @@
 Bodies stand in a row, each with a damper and a spring to ground, linked by springs and dampers; the wall's force acts
 on the first. In units of T and of the first body's mass, with ``u`` the force held over a period,
 
-    x' = A x + B u,   x = (x1, e2, e3, v1, e2', e3'),   e the extensions of the links
+    x' = A x + B u,   x = (y, e2, e3, y', e2', e3'),   y the sensed body's position, e the extensions of the links
 
-so that no small sum of large spring forces is ever formed. Between samples the motion is the matrix exponential. From
+so that no small difference of large positions is ever formed. Between samples the motion is the matrix exponential. From
 held force to sampled position, with zeta = z - 1, Psi = e^A - 1 = A phi1(A) and Gamma(t) the answer to a force held
 for t (docs/theory/scenes.md, V2 to V4):
 
@@ -106,9 +106,9 @@ def rates(chain: Chain) -> tuple[Any, Any]:
     accelerations = []
     for k, body in enumerate(chain.bodies):
         force = row()
-        for j in range(k + 1):
-            force[j] = force[j] - body.stiffness
-            force[count + j] = force[count + j] - body.damping
+        for j, side in _position(k, chain.sensor):
+            force[j] = force[j] - side * body.stiffness
+            force[count + j] = force[count + j] - side * body.damping
         if k:
             link = chain.links[k - 1]
             force[k], force[count + k] = force[k] - link.stiffness, force[count + k] - link.damping
@@ -122,11 +122,18 @@ def rates(chain: Chain) -> tuple[Any, Any]:
         speed[count + k] = zero + 1.0
         rows.append(speed)
     for k in range(count):
-        before = accelerations[k - 1] if k else row()
-        rows.append([a - b for a, b in zip(accelerations[k], before, strict=True)])
+        above, below = (accelerations[k], accelerations[k - 1]) if k else (accelerations[chain.sensor], row())
+        rows.append([a - b for a, b in zip(above, below, strict=True)])
     first = 1.0 / chain.bodies[0].mass + zero
-    pushed = [zero] * count + [first] + ([-first] + [zero] * (count - 2) if count > 1 else [])
+    # A body beyond a link feels the push through the link alone.
+    pushed = [zero] * count + [zero if chain.sensor else first] + [-first, zero][: count - 1]
     return xp.stack([xp.stack([xp.asarray(v) for v in r]) for r in rows]), xp.stack([xp.asarray(v) for v in pushed])
+
+
+def _position(body: int, sensor: int) -> list[tuple[int, float]]:
+    """The position of a body as a sum of the sensed one and of extensions: which, and their signs."""
+    between = [(j, 1.0) for j in range(sensor + 1, body + 1)] + [(j, -1.0) for j in range(body + 1, sensor + 1)]
+    return [(0, 1.0), *between]
 
 
 def _flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
@@ -145,12 +152,11 @@ def _flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
 
 
 class Sampled(NamedTuple):
-    """The chain between two samples; the sensor's row is C."""
+    """The chain between two samples; what the sensor sees is the first number of the state."""
 
     psi: Any
     full: Any
     late: Any | None  # Gamma(1 - f), None for whole delays
-    sensor: Any
 
 
 def respond(chain: Chain) -> Sampled | Plant:
@@ -161,13 +167,10 @@ def respond(chain: Chain) -> Sampled | Plant:
 def sampled(chain: Chain) -> Sampled:
     """Discretize exactly."""
     rate, push = rates(chain)
-    xp = namespace(rate)
     psi, full = _flow(rate, push, 1.0)
     fraction = chain.d - chain.whole
     late = None if _is_zero(fraction) else _flow(rate, push, 1.0 - fraction)[1]
-    count = len(chain.bodies)
-    sensor = xp.asarray([1.0] * (chain.sensor + 1) + [0.0] * (2 * count - chain.sensor - 1))
-    return Sampled(psi, full, late, sensor)
+    return Sampled(psi, full, late)
 
 
 def needed(chain: Chain, w: Any, parts: Sampled | Plant | None = None) -> Any:
@@ -182,7 +185,7 @@ def needed(chain: Chain, w: Any, parts: Sampled | Plant | None = None) -> Any:
     force = parts.full + 0j if parts.late is None else at.before * parts.late + parts.full
     turns = chain.whole if parts.late is None else chain.whole + 1
     moved = xp.linalg.solve(at.before * xp.eye(parts.psi.shape[0]) - parts.psi, force)
-    return -lag_jet(at, turns).value / (parts.sensor @ moved)
+    return -lag_jet(at, turns).value / moved[0]
 
 
 def _rigid_plant(chain: Chain) -> Plant:
@@ -247,7 +250,7 @@ def _numerator(parts: Sampled, push: np.ndarray, den: np.ndarray) -> np.ndarray:
     """The numerator in zeta of ``C (zeta - Psi)^-1 push``, by its Markov parameters."""
     markov, state = [], push
     for _ in range(den.size - 1):
-        markov.append(parts.sensor @ state)
+        markov.append(state[0])
         state = parts.psi @ state
     return np.convolve(den, markov)[: den.size - 1]
 
