@@ -21,7 +21,7 @@ import numpy as np
 from zwidth.linear.arcs import Arc, cut_arcs
 from zwidth.linear.crossing_lines import CrossingLine, circle_zeros, end_lines, interior_line
 from zwidth.linear.curve import curve_at, find_dips, nodes_of, zeros_of
-from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths, lag_jet, product_jet
+from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths
 
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
 _MOST_STEPS, _ARRIVED = 120, 1e-10
@@ -184,9 +184,7 @@ class Boundary:
         loop = self.loop
         depth = depths(loop.zeros)
         on = np.abs(depth) <= ON_CIRCLE
-        at = circle(np.abs(np.angle(1.0 - loop.zeros[on])))
-        answer = product_jet(at, loop.zeros, loop.gain).over(product_jet(at, loop.poles, 1.0))
-        answer = answer.times(lag_jet(at, -loop.lag))
+        answer = loop.answer(circle(np.abs(np.angle(1.0 - loop.zeros[on]))))
         # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
         leaving = int(np.sum(side * answer.slope.imag < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving

@@ -126,7 +126,7 @@ def answer(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet
     """L and its derivative in w."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(at)
-        found = Jet(-(alpha + beta * f.value), -beta * f.slope).over(loop.needed(at))
+        found = Jet(alpha + beta * f.value, beta * f.slope).times(loop.answer(at))
         # At pi it is real.
         real = at.w >= np.pi
         return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)
