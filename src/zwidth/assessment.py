@@ -139,6 +139,9 @@ def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str,
         ``message`` ("OK" and nothing, or "INVALID_INPUT" and why); every parameter by its dotted path; and what
         `assess` finds, None where a scene has no such number. ``csv.DictWriter`` writes them as they are.
 
+    References:
+        Hulin, Preusche, Hirzinger 2006, sections V to VIII.
+
     Example:
         >>> import zwidth
         >>> device, timing, wall = zwidth.Device(0.1, 10), zwidth.Timing(1e-3), zwidth.VirtualWall(25e3, 40)
@@ -147,7 +150,7 @@ def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str,
         >>> [(row["scene"], row["status"], row["stable"]) for row in zwidth.assess_many(scenes)]
         [('slow', 'OK', False), ('fast', 'OK', True), ('refused', 'INVALID_INPUT', None)]
     """
-    named = scenes.items() if isinstance(scenes, Mapping) else enumerate(scenes)
+    named: Any = scenes.items() if isinstance(scenes, Mapping) else enumerate(scenes)
     records = [_record(name, scene) for name, scene in named]
     answers = [field.name for kind in (Assessment, SceneAssessment) for field in fields(kind)]
     given = [name for record in records for name in record if name not in answers]
