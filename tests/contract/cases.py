@@ -181,6 +181,7 @@ CASES = [
 # Public functions that take no arrays point by point, or that compile for long: who holds their contract instead.
 OTHERS = {
     "assess": "one scene: tests/unit/test_report.py, tests/properties/test_consistency.py",
+    "assess_many": "scenes by name: tests/unit/test_assessment.py",
     "fastest_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
     "fastest_wall": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
     "limits_of": "one scene: tests/unit/design/test_limits.py",

@@ -15,6 +15,7 @@ held for t (docs/theory/scenes.md, V2 to V4):
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,15 +143,27 @@ def _flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
     """``e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
     xp = namespace(rate, time)
     size = rate.shape[0]
-    if xp is np:
-        from scipy.linalg import expm
-    else:
-        from jax.scipy.linalg import expm
     # Of [[A, 1], [0, 0]] the exponential holds phi1(A), and e^A - 1 = A phi1(A) keeps the digits of slow motions.
     top = xp.concatenate([rate * time, xp.eye(size)], axis=1)
     block = xp.concatenate([top, xp.zeros((size, 2 * size))], axis=0)
-    phi1 = expm(block)[:size, size:]
+    phi1 = _exponential(block, xp)[:size, size:]
     return rate * time @ phi1, time * (phi1 @ push)
+
+
+def _exponential(block: Any, xp: Any) -> Any:
+    if xp is np:
+        return _known_exponential(block.tobytes(), len(block))
+    from jax.scipy.linalg import expm
+
+    return expm(block)
+
+
+@lru_cache(maxsize=64)
+def _known_exponential(block: bytes, size: int) -> np.ndarray:
+    """Kept, for the same chain is asked at many delays and its motion over a whole period hangs on none of them."""
+    from scipy.linalg import expm
+
+    return expm(np.frombuffer(block).reshape(size, size))
 
 
 class Sampled(NamedTuple):
