@@ -7,6 +7,7 @@ which conditions those are has no derivative and needs none: as a parameter move
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,9 +30,11 @@ from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.wall import VirtualWall
 from zwidth.stability.ridge import RidgeKind
 from zwidth.status import Status
-from zwidth.xp import is_traced
+from zwidth.xp import is_traced, namespace
 
 _MAX_STEPS = 16
+# Newton's steps from what the search found, which doubles its digits at each.
+_STEPS = 2
 # A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
 
@@ -115,9 +118,8 @@ def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
     status = told[-1].astype(jnp.int32)
     found = status == Status.OK
     told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
-    scene = replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
-    d = float(structure.whole) if structure.held else in_periods(*map(jnp.asarray, _delay(scene)))
-    alpha, beta, w1, w2, close = _solve(chain_of(scene, (d, structure.whole)), told[:4], told[4:6].astype(jnp.int32))
+    scene = _fill(structure, values)
+    alpha, beta, w1, w2, close = _solve(_chain(structure, scene), told[:4], told[4:6].astype(jnp.int32))
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
     spoiled = poison(status == Status.OK, *values)
     omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
@@ -136,36 +138,35 @@ def _delay(scene: Any) -> tuple[Any, Any]:
 
 
 def _search(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
-    """The ridge on the host, and its status behind it; numbers come and go as their bits."""
-    values = np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()
-    bad = (math.nan,) * len(_NOWHERE)
+    """`_find` for a callback: numbers come and go as their bits."""
+    told = np.array(_find(structure, np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()), dtype)
+    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
+
+
+def _find(structure: Structure, values: list[float]) -> tuple[float, ...]:
+    """The ridge on the host, and its status behind it."""
     try:
-        scene = replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
-        found, status = search(scene, structure.negative)
+        found, status = search(_fill(structure, values), structure.negative)
     except InputError:
         found, status = None, Status.INVALID_INPUT
-    ridge = bad if found is None else (*found, found.kind)
-    told = np.array([*ridge, status], dtype)
-    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
+    return *((math.nan,) * len(_NOWHERE) if found is None else (*found, found.kind)), status
+
+
+def _fill(structure: Structure, values: Iterable[Any]) -> Any:
+    """The scene with these values in place of the placeholders."""
+    return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
+
+
+def _chain(structure: Structure, scene: Any) -> Chain:
+    d = float(structure.whole) if structure.held else in_periods(*map(jnp.asarray, _delay(scene)))
+    return chain_of(scene, (d, structure.whole))
 
 
 def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
-    estimate = chain.estimate
-    complexes = jnp.result_type(start.dtype, jnp.complex64)
-    scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
-    scales = jnp.where(scales > 0, scales, 1.0)
-    args = _Arguments(
-        jax.tree.map(jnp.asarray, respond(chain)),
-        jnp.asarray(estimate.gain, start.dtype),
-        jnp.asarray(estimate.zeros, complexes),
-        jnp.asarray(estimate.poles, complexes),
-        start,
-        codes,
-        scales,
-    )
-    tolerance = 16 * float(jnp.finfo(start.dtype).eps)
-    begin = start / scales
+    args = _prepare(chain, start, codes)
+    begin = start / args.scales
+    tolerance = _tolerance(start.dtype)
     solution = optimistix.root_find(
         partial(_residual, chain),
         optimistix.Newton(rtol=tolerance, atol=tolerance),
@@ -174,9 +175,39 @@ def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Arra
         max_steps=_MAX_STEPS,
         throw=False,
     )
-    # What counts is that Newton stayed where the search had put it; a double root is met to half of the digits.
-    close = jnp.all(jnp.abs(solution.value - begin) <= 64 * tolerance**0.5)
-    return *(solution.value * scales), close
+    close = jnp.all(jnp.abs(solution.value - begin) <= _reach(start.dtype))
+    return *(solution.value * args.scales), close
+
+
+def _tolerance(dtype: Any) -> float:
+    return 16 * float(jnp.finfo(dtype).eps)
+
+
+def _reach(dtype: Any) -> float:
+    """How far Newton may go: it must stay where the search put it; a double root is met to half of the digits."""
+    return 64 * _tolerance(dtype) ** 0.5
+
+
+def _prepare(chain: Chain, start: Array, codes: Array) -> _Arguments:
+    """What `_residual` needs beside the unknowns."""
+    estimate = chain.estimate
+    complexes = jnp.result_type(start.dtype, jnp.complex64)
+    return _Arguments(
+        jax.tree.map(jnp.asarray, respond(chain)),
+        jnp.asarray(estimate.gain, start.dtype),
+        jnp.asarray(estimate.zeros, complexes),
+        jnp.asarray(estimate.poles, complexes),
+        start,
+        codes,
+        _scales(start),
+    )
+
+
+def _scales(start: Array) -> Array:
+    """The size of the unknowns."""
+    xp = namespace(start)
+    scales = xp.stack([start[0], xp.abs(start[0]) + xp.abs(start[1]), start[2], start[3]])
+    return xp.where(scales > 0, scales, 1.0)
 
 
 def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
@@ -204,29 +235,59 @@ def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
     # A pole pair at w, or a real pole where w stays.
     meet = jnp.stack([r.real, jnp.where(args.codes == Condition.PAIR, r.imag, stays)], -1)
     which = jnp.maximum(args.codes[1] - Condition.PLUS_ONE, 0)
-    conditions = (
-        lambda: meet[1],
-        lambda: jnp.stack([across[0], stays[1]]),
-        lambda: jnp.stack([unknowns[1], stays[1]]),
-    )
-    return jnp.concatenate([meet[0], jax.lax.switch(which, conditions)])
+    second = jnp.stack(
+        [meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])],
+    )[which]
+    return jnp.concatenate([meet[0], second])
 
 
 @partial(jax.jit, static_argnums=0)
-def _slopes(structure: Structure, values: tuple[Array, ...]) -> tuple[StiffestWall, tuple[Array, ...]]:
-    def stiffness(values: tuple[Array, ...]) -> tuple[Array, StiffestWall]:
-        wall = compiled_wall(structure, *values)
-        return wall.stiffness, wall
+def _linearize(
+    structure: Structure, start: Array, codes: Array, unknowns: Array, values: Array
+) -> tuple[Array, Array, Array]:
+    """The four equations with K in N/m behind them, and their derivatives in the unknowns and in the values."""
 
-    (_, wall), slopes = jax.value_and_grad(stiffness, has_aux=True)(values)
-    return wall, slopes
+    def equations(unknowns: Array, values: Array) -> tuple[Array, Array]:
+        scene = _fill(structure, values)
+        chain = _chain(structure, scene)
+        args = _prepare(chain, start, codes)
+        stiffness = unknowns[0] * args.scales[0] * scene.units.stiffness
+        left = jnp.append(_residual(chain, unknowns, args), stiffness)
+        return left, left
+
+    (by_unknowns, by_values), left = jax.jacfwd(equations, argnums=(0, 1), has_aux=True)(unknowns, values)
+    return left, by_unknowns, by_values
 
 
-def slopes_at(scene: Any, paths: tuple[str, ...], negative: bool) -> tuple[StiffestWall, dict[str, float]]:
-    """The stiffest wall of a scene of plain numbers and its derivatives in some parameters, in float64."""
+def slopes_at(scene: Any, paths: tuple[str, ...], negative: bool) -> tuple[Array, dict[str, float], Status]:
+    """K_max in N/m of a scene of plain numbers, its derivatives in some parameters, and the status, in float64.
+
+    The search and Newton's steps are the host's: what is compiled holds no callback, so that it can be kept on disk.
+    """
     structure = structure_of(scene, paths, negative)
-    values = scene.parameters()
-    with compute_concretely():
-        wall, slopes = _slopes(structure, tuple(jnp.asarray(values[path], float) for path in paths))
-        wall = StiffestWall(*(np.asarray(part)[()] for part in wall))
-        return wall, {path: float(slope) for path, slope in zip(paths, slopes, strict=True)}
+    values = np.array([scene.parameters()[path] for path in paths], float)
+    told = np.array(_find(structure, values.tolist()))
+    status, spoiled = Status(int(told[-1])), (np.float64(math.nan), dict.fromkeys(paths, math.nan))
+    if status != Status.OK:
+        return *spoiled, status
+    start, codes = told[:4], told[4:6].astype(np.int32)
+    # The equations do not depend on which walls count.
+    structure = structure._replace(negative=False)
+
+    def linearize(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Newton's next unknowns; K and its derivatives at these."""
+        left, by_unknowns, by_values = map(np.asarray, _linearize(structure, start, codes, unknowns, values))
+        solved = np.linalg.solve(by_unknowns[:4], np.column_stack([left[:4], by_values[:4]]))
+        return unknowns - solved[:, 0], left[4], by_values[4] - by_unknowns[4] @ solved[:, 1:]
+
+    begin = unknowns = start / _scales(start)
+    try:
+        with compute_concretely():
+            for _ in range(_STEPS):
+                unknowns, _, _ = linearize(unknowns)
+            unknowns, stiffness, slopes = linearize(unknowns)
+    except np.linalg.LinAlgError:
+        return *spoiled, Status.NOT_CONVERGED
+    if not np.all(np.abs(unknowns - begin) <= _reach(start.dtype)):
+        return *spoiled, Status.NOT_CONVERGED
+    return stiffness, dict(zip(paths, slopes.tolist(), strict=True)), status

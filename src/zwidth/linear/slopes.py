@@ -34,8 +34,7 @@ def differentiate(scene: Any, negative_damping: bool | None = None) -> SceneSens
     refuse_fractional_power(scene)
     from zwidth.linear.ridge_kkt import moving_paths, slopes_at
 
-    wall, per = slopes_at(scene, moving_paths(scene), negative)
-    return SceneSensitivities(wall.stiffness, per, wall.status)
+    return SceneSensitivities(*slopes_at(scene, moving_paths(scene), negative))
 
 
 def _by_closed_form(scene: Any, negative: bool) -> SceneSensitivities | None:
