@@ -213,6 +213,7 @@ def _solve_rows(
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
     found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
+    at_ends = [(first == 0, below.copy()), (last == 0, above.copy())]
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
@@ -229,6 +230,9 @@ def _solve_rows(
         if not on.any():
             break
         here, x = here[on], new[on]
+    # A row through an end of its arc meets the line there in one point, with nothing between them.
+    for exact, end in at_ends:
+        found = np.where(exact, end, found)
     return found, _residual(loop, fixed, beta, found)[2]
 
 
