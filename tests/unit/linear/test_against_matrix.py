@@ -12,7 +12,7 @@ import zwidth
 from zwidth.linear.boundary import curve_at
 from zwidth.linear.polynomial import closed_loop_poles
 
-SCENES = 12
+SCENES = 6
 # Two eigenvalue codes on matrices of up to 40 rows; poles next to each other share their digits (see below).
 POLE = 1e-9
 # The end of an interval against a bisected scan: what is left of 16 digits after alpha is a difference.
