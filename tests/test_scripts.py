@@ -13,7 +13,7 @@ ROOT = Path(__file__).resolve().parent.parent
 QUICK = ROOT / "tests" / "quick.txt"
 ON_EVERY_CORE = ["--numprocesses", "auto", "--dist", "loadfile"]
 # What the quick tests must hold something of; the scene is described by a module, the others by folders.
-ROOMS = (
+ROOMS = ("test_scene.py", "test_loop.py", *"parts linear stability design sweep studies config cli figures".split())
     "test_scene.py",
     "test_loop.py",
     "parts",
