@@ -34,8 +34,6 @@ from zwidth.status import Status
 from zwidth.xp import is_traced, namespace
 
 _MAX_STEPS = 16
-# Newton's steps from what the search found, which doubles its digits at each.
-_STEPS = 2
 # A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
 
