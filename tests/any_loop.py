@@ -215,7 +215,8 @@ def proved_poles(
         for zeta in found.tolist():
             z = 1 + flint.acb(zeta.real, zeta.imag)
             values = [term(z) for term in terms]
-            missed.append(float((abs(sum(values)) / sum(abs(value) for value in values)).mid()))
+            size = abs(values[0]) + abs(values[1]) + abs(values[2])
+            missed.append(float((abs(values[0] + values[1] + values[2]) / size).mid()))
         return np.array([_number(root - 1) for root in roots]), np.array(missed)
     finally:
         flint.ctx.dps = before
