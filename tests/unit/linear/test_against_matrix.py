@@ -10,7 +10,7 @@ from scipy.optimize import linear_sum_assignment
 
 import any_loop
 import zwidth
-from zwidth.linear.boundary import curve_at
+from zwidth.linear.curve import curve_at
 from zwidth.linear.poles import poles_less_one
 
 SCENES = 12
