@@ -44,6 +44,7 @@ class CirclePoints(NamedTuple):
     w: Array
     z: Array
     before: Array
+    after: Array  # z + 1
 
 
 def circle(w: Array) -> CirclePoints:
@@ -52,7 +53,7 @@ def circle(w: Array) -> CirclePoints:
     half = 0.5 * w
     s, c = xp.sin(half), _exactly_at_pi(w, 0.0, xp.cos(half), xp)
     before = -2.0 * s * s + 2j * s * c
-    return CirclePoints(w, 1.0 + before, before)
+    return CirclePoints(w, 1.0 + before, before, 2.0 * c * (c + 1j * s))
 
 
 def depths(offsets: np.ndarray) -> np.ndarray:
@@ -82,7 +83,9 @@ def product_jet(at: CirclePoints, offsets: Any, factor: Any) -> Jet:
     slope = 0.0 * at.z
     turn = 1j * at.z
     for offset in offsets:
-        one = at.before + offset
+        # Next to z = -1 the sum around z = 1 has lost its phase.
+        left = isinstance(offset, np.number) and offset.real > 1.0
+        one = at.after + (offset - 2.0) if left else at.before + offset
         value, slope = value * one, slope * one + value * turn
     return Jet(value, slope)
 

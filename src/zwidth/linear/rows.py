@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.linear.boundary import Boundary
+from zwidth.linear.poles import log_size, poles_less_one
 
 # Rows whose crossings are laid out at one time.
 _ROWS = 1 << 12
@@ -54,7 +55,8 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
     """Whether each wall is stable; arrays that broadcast. Dampings that repeat are solved once."""
     shape = np.broadcast_shapes(alpha.shape, beta.shape)
     rows, place = np.unique(beta, return_inverse=True)
-    if rows.size * _FEW_WALLS > np.prod(shape):
+    sound = boundary.outside(np.zeros(rows.size), np.where(np.isfinite(rows), rows, 0.0)) >= 0
+    if rows.size * _FEW_WALLS > np.prod(shape) or not sound.all():
         return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
     ends = stable_intervals(boundary, rows)
     place = place.reshape(beta.shape)
@@ -76,7 +78,12 @@ def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
     for start in range(0, good.size, _ROWS):
         part = slice(start, start + _ROWS)
         alpha, beta = (np.where(good[part], column[part], 0.0) for column in columns)
-        stable[part] = good[part] & (boundary.outside(alpha, beta) == 0)
+        outside = boundary.outside(alpha, beta)
+        # A row whose crossings contradict each other says nothing: all poles of its walls do.
+        left = np.flatnonzero(outside < 0)
+        if left.size:
+            outside[left] = (log_size(poles_less_one(boundary.loop, alpha[left], beta[left])) >= 0).sum(1)
+        stable[part] = good[part] & (outside == 0)
     return stable.reshape(shape)
 
 

@@ -52,6 +52,14 @@ SCENES = {
     "low cut-off": scene(device(0.1), 1, zwidth.LowPass(cutoff=0.01)),
     "high cut-off": scene(device(0.1), 0.4, zwidth.Butterworth(cutoff=499.999, order=4)),
     "order 8": scene(device(0.0), 0.4, zwidth.Butterworth(cutoff=20.0, order=8)),
+    "window 200": scene(device(0.1, tied(0.05, 0.01, "tip", 0.5)), 2, WINDOW(200)),
+    "zero of G beside the filter's at -1": scene(
+        device(0.0, tied(0.013, 0.0, "motor", 3.0)),
+        5,
+        zwidth.Butterworth(cutoff=20.0, order=4),
+        zwidth.Operator(2.4, 6e-5, 1.3e-6 / T**2, coupling_stiffness=7e-5 / T**2, coupling_damping=1.3e-4 / T),
+    ),
+    "soft link to a sensor at the tip": scene(device(0.01, tied(1e-6, 0.0, "tip", 30.0)), 1),
     "filter's pole on the device's": scene(device(0.1), 1, zwidth.LowPass(time_constant=T / 0.1, order=2)),
     "filter of another period": scene(device(0.1), 1, zwidth.LowPass(cutoff=20.0, coded_period=T / 10)),
 }
@@ -93,3 +101,19 @@ def test_a_device_without_any_damping_is_not_stable_behind_a_spring_alone():
     for d in (0.0, 0.3, 1.0, 2.0):
         for velocity in (WINDOW(3), zwidth.LowPass(cutoff=50.0)):
             assert not scene(device(0.0), d, velocity).is_stable([1e2, 1e4, 1e5], 0.0).any()
+
+
+@pytest.mark.parametrize("sensor", ["motor", "tip"])
+def test_without_any_damping_no_stiffness_is_stable_however_small(sensor):
+    # The row through the end of an arc at z = 1: between the arc and the line there are no walls.
+    for d in (0.0, 0.3):
+        assert not scene(device(0.0, tied(0.2, 0.01, sensor)), d).stable_stiffness(0.0).size
+
+
+def test_walls_of_a_row_that_contradicts_itself_are_told_by_their_poles(monkeypatch):
+    loop = scene(device(0.1), 1.3, WINDOW(5))
+    stiffness, damping = np.linspace(1e3, 3e5, 12), np.array([[0.0], [50.0], [300.0]])
+    expected = loop.is_stable(stiffness, damping)
+    assert 0 < expected.sum() < expected.size
+    monkeypatch.setattr(type(loop.traced_boundary), "_settle", lambda self, beta: (beta, np.zeros(beta.shape, bool)))
+    np.testing.assert_array_equal(loop.is_stable(stiffness, damping), expected)
