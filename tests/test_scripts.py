@@ -13,19 +13,8 @@ ROOT = Path(__file__).resolve().parent.parent
 QUICK = ROOT / "tests" / "quick.txt"
 ON_EVERY_CORE = ["--numprocesses", "auto", "--dist", "loadfile"]
 # What the quick tests must hold something of; the scene is described by a module, the others by folders.
-ROOMS = ("test_scene.py", "test_loop.py", *"parts linear stability design sweep studies config cli figures".split())
-    "test_scene.py",
-    "test_loop.py",
-    "parts",
-    "linear",
-    "stability",
-    "design",
-    "sweep",
-    "studies",
-    "config",
-    "cli",
-    "figures",
-)
+FOLDERS = ("parts", "linear", "stability", "design", "sweep", "studies", "config", "cli", "figures")
+ROOMS = ("test_scene.py", "test_loop.py", *FOLDERS)
 
 # Every call becomes a line in the file "calls"; uv makes an environment whose pytest does the same.
 NOTE = """#!/usr/bin/env bash

@@ -4,6 +4,7 @@ from . import devices as devices
 from .assessment import Assessment as Assessment
 from .assessment import SceneAssessment as SceneAssessment
 from .assessment import assess as assess
+from .assessment import assess_many as assess_many
 from .design.area import stable_area as stable_area
 from .design.damping import DampingChoice as DampingChoice
 from .design.damping import FastestWall as FastestWall

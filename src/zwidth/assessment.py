@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
 from zwidth.errors import InputError
 from zwidth.linear.columns import stable_dampings
+from zwidth.linear.poles import is_marginal
 from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.decay import decay_rate
@@ -32,6 +34,7 @@ class Assessment:
     delta: float
     d: float
     stable: bool  # every pole lies strictly inside the unit circle; everything else agrees with it
+    marginal: bool  # not stable for one pole at z = 1 alone: without stiffness nothing pulls back
     spectral_radius: float  # the largest pole magnitude, 1 to rounding where the decay is very slow
     decay_rate: float  # of the slowest motion, in 1/s, with relative accuracy; negative for a growing one
     stiffness_limit: float  # the stiffest stable K at this B, in N/m
@@ -63,6 +66,7 @@ class SceneAssessment:
     """What `assess` finds of a scene with a filter, a compliance or a hand; SI units, NaN for what does not exist."""
 
     stable: bool  # every pole lies strictly inside the unit circle
+    marginal: bool  # not stable for one pole at z = 1 alone: without stiffness nothing pulls back
     spectral_radius: float  # the largest pole magnitude
     decay_rate: float  # of the slowest motion, in 1/s; negative for a growing one
     stable_stiffness: tuple[tuple[float, float], ...]  # every stable interval of K at this B, in N/m
@@ -73,6 +77,14 @@ class SceneAssessment:
     ridge_frequency: float  # of the pole pair on the unit circle there, in Hz
     time_constant: float  # of the slowest pole, in s; negative for a growing one, infinite on the circle
     frequency: float  # at which the slowest pole oscillates, in Hz; 0 for one that does not
+    passive: bool | None  # whatever the hand; with a coupling True is proved and False is not, None with its tip sensed
+    passivity_margin: float  # the device's damping in excess of what a passive wall needs, in N s/m
+    gain_margin: float  # the margins are those of `zwidth.Scene.margins`
+    phase_margin: float  # in degrees
+    delay_margin: float  # in s; NaN where it could not be confirmed
+    modulus_margin: float
+    gain_crossover: float  # in Hz
+    phase_crossover: float
 
     def as_dict(self) -> dict[str, Any]:
         """The fields as plain JSON values, None in place of NaN and infinities."""
@@ -116,6 +128,48 @@ def assess(scene: Scene) -> Assessment | SceneAssessment:
     return _assess_rigid(scene) if scene.is_rigid else _assess_parts(scene)
 
 
+def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str, Any]]:
+    """Judge the walls of many scenes, one record each; a scene that has no answer leaves the others alone.
+
+    Args:
+        scenes: scenes of any kind, or a mapping of names to scenes.
+
+    Returns:
+        A list of dicts with the same keys, a row of a table each: ``scene``, its name or number; ``status`` and
+        ``message`` ("OK" and nothing, or "INVALID_INPUT" and why); every parameter by its dotted path; and what
+        `assess` finds, None where a scene has no such number. ``csv.DictWriter`` writes them as they are.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, sections V to VIII.
+
+    Example:
+        >>> import zwidth
+        >>> device, timing, wall = zwidth.Device(0.1, 10), zwidth.Timing(1e-3), zwidth.VirtualWall(25e3, 40)
+        >>> scenes = {name: zwidth.Scene(device, timing, wall, zwidth.LowPass(cutoff=c)) for name, c in
+        ...           {"slow": 20, "fast": 200, "refused": 900}.items()}
+        >>> [(row["scene"], row["status"], row["stable"]) for row in zwidth.assess_many(scenes)]
+        [('slow', 'OK', False), ('fast', 'OK', True), ('refused', 'INVALID_INPUT', None)]
+    """
+    named: Any = scenes.items() if isinstance(scenes, Mapping) else enumerate(scenes)
+    records = [_record(name, scene) for name, scene in named]
+    answers = [field.name for kind in (Assessment, SceneAssessment) for field in fields(kind)]
+    given = [name for record in records for name in record if name not in answers]
+    names = list(dict.fromkeys([*given, *answers]))
+    return [{name: record.get(name) for name in names} for record in records]
+
+
+def _record(name: str | int, scene: Scene) -> dict[str, Any]:
+    head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
+    try:
+        if not isinstance(scene, Scene):
+            raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
+        verdict = assess(scene).as_dict()
+    except InputError as error:
+        verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
+    own = scene.parameters() if isinstance(scene, Scene) else {}
+    return head | own | verdict
+
+
 def _assess_rigid(scene: Scene) -> Assessment:
     alpha, beta, delta, d = (float(value) for value in scene.normalized)
     period = scene.timing.period
@@ -134,6 +188,8 @@ def _assess_rigid(scene: Scene) -> Assessment:
         delta=delta,
         d=d,
         stable=bool(is_stable(alpha, beta, delta, d)),
+        # The row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
+        marginal=alpha == 0 and float(row.alpha) > 0,
         spectral_radius=math.exp(-rate),
         decay_rate=rate / period,
         stiffness_limit=float(row.alpha) * spring,
@@ -163,10 +219,14 @@ def _assess_parts(scene: Scene) -> SceneAssessment:
     slowest = scene.pole_table(stiffness, damping)
     best = scene.max_stiffness()
     column = stable_dampings(scene.traced_boundary, stiffness / units.stiffness) * units.virtual_damping
-    constant = float(slowest.time_constant[0])
+    marginal = is_marginal(scene.loop, stiffness / units.stiffness, damping / units.virtual_damping)
+    constant = math.inf if marginal else float(slowest.time_constant[0])
+    stands = scene.margins(stiffness, damping)
+    known = scene.device.coupling is None or scene.device.coupling.sensor == "motor"
     return SceneAssessment(
         stable=bool(scene.is_stable(stiffness, damping)),
-        spectral_radius=float(scene.spectral_radius(stiffness, damping)),
+        marginal=marginal,
+        spectral_radius=1.0 if marginal else float(scene.spectral_radius(stiffness, damping)),
         decay_rate=1.0 / constant if constant else math.inf,
         stable_stiffness=_as_pairs(scene.stable_stiffness(damping)),
         stable_damping=_as_pairs(column),
@@ -175,7 +235,15 @@ def _assess_parts(scene: Scene) -> SceneAssessment:
         ridge_kind=RidgeKind(int(best.kind)).name.lower() if best.status == Status.OK else "none",
         ridge_frequency=float(best.frequency),
         time_constant=constant,
-        frequency=float(slowest.frequency[0]),
+        frequency=0.0 if marginal else float(slowest.frequency[0]),
+        passive=bool(scene.is_passive(stiffness, damping)) if known else None,
+        passivity_margin=float(scene.passivity_margin(stiffness, damping)) if known else math.nan,
+        gain_margin=float(stands.gain_margin),
+        phase_margin=float(stands.phase_margin),
+        delay_margin=float(stands.delay_margin),
+        modulus_margin=float(stands.modulus_margin),
+        gain_crossover=float(stands.gain_crossover),
+        phase_crossover=float(stands.phase_crossover),
     )
 
 

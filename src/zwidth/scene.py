@@ -13,8 +13,9 @@ from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.linear.answers import SceneAnswers
 from zwidth.linear.border import Border, Outline, outlines
-from zwidth.linear.boundary import Boundary, curve_at
+from zwidth.linear.boundary import Boundary
 from zwidth.linear.chain import Chain, chain_of, linear_loop
+from zwidth.linear.curve import curve_at
 from zwidth.linear.required import RequiredValue, require
 from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear.slopes import SceneSensitivities, differentiate
@@ -72,9 +73,7 @@ class Scene(SceneAnswers):
 
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
-            # Without a wall the velocity estimate is the third part.
-            object.__setattr__(self, "velocity", self.wall)
-            object.__setattr__(self, "wall", VirtualWall(stiffness=0.0))
+            self._move_up()
         kinds = {
             "device": Device,
             "timing": Timing,
@@ -86,6 +85,17 @@ class Scene(SceneAnswers):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {_EXAMPLES[name]}")
+
+    def _move_up(self) -> None:
+        """Without a wall the velocity estimate is the third part, and the hand the fourth."""
+        estimate, fourth, hand = self.wall, self.velocity, self.operator
+        if isinstance(fourth, Operator) and hand is None:
+            hand = fourth
+        elif fourth != BackwardDifference():
+            raise InputError(f"wall: got {estimate!r}, and {fourth!r} as the velocity as well; name parts that follow")
+        moved = {"wall": VirtualWall(stiffness=0.0), "velocity": estimate, "operator": hand}
+        for name, part in moved.items():
+            object.__setattr__(self, name, part)
 
     @property
     def is_rigid(self) -> bool:

@@ -181,16 +181,20 @@ CASES = [
 # Public functions that take no arrays point by point, or that compile for long: who holds their contract instead.
 OTHERS = {
     "assess": "one scene: tests/unit/test_report.py, tests/properties/test_consistency.py",
+    "assess_many": "scenes by name: tests/unit/test_assessment.py",
     "fastest_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
     "fastest_wall": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
+    "limits_of": "one scene: tests/unit/design/test_limits.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
     "most_robust_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
     "robust_max_stiffness": "boxes of devices: tests/unit/design/test_robust.py",
     "robust_wall": "boxes of devices: tests/unit/design/test_robust.py",
     "run": "a configuration: tests/unit/runs/test_run.py",
+    "simulate_tolerances": "one scene: tests/unit/design/test_tolerances.py",
     "stable_region": "one device: tests/unit/stability/test_region.py",
     "stability_of": "the former name of `decide_stability`",
     "step_response": "one wall: tests/unit/test_response.py",
+    "to_control": "one scene: tests/unit/linear/test_answers.py",
     "use_compilation_cache": "a setting: tests/unit/test_kernel_cache.py",
 }

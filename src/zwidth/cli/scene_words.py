@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, isfinite
 from typing import TYPE_CHECKING, Any
 
-from zwidth.cli.words import Slope, pole_words, row, stability_word
+from zwidth.cli.words import Slope, margin_lines, passivity_words, pole_words, row, stability_word
 from zwidth.formatting import plain, short, with_unit
 
 if TYPE_CHECKING:
@@ -57,7 +57,8 @@ def _amount(key: str, value: Any) -> str:
 def scene_verdict_lines(scene: Scene, verdict: SceneAssessment) -> list[str]:
     """The verdict on a scene with parts."""
     wall = scene.wall
-    word = stability_word(verdict.stable)
+    word = stability_word(verdict.stable, verdict.marginal)
+    coupled = scene.device.coupling is not None
     best = "none: no stiffness is stable at any damping"
     if isfinite(verdict.stiffness_max):
         best = (
@@ -72,8 +73,10 @@ def scene_verdict_lines(scene: Scene, verdict: SceneAssessment) -> list[str]:
         row("verdict", f"{word}, spectral radius {verdict.spectral_radius:.6f}"),
         row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B")),
         row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K")),
+        row("passive", passivity_words(wall.stiffness, verdict, sufficient=coupled)),
         row("stiffest stable wall", best),
         row("slowest pole", pole_words(verdict.time_constant, verdict.frequency)),
+        *margin_lines(wall.stiffness, verdict),
     ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import isfinite, isinf, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
@@ -10,7 +10,7 @@ import click
 from zwidth.formatting import plain, with_unit
 
 if TYPE_CHECKING:
-    from zwidth.assessment import Assessment
+    from zwidth.assessment import Assessment, SceneAssessment
     from zwidth.scene import Scene
 
 
@@ -49,14 +49,17 @@ def find_slopes(scene: Scene, delay_model: Any) -> list[Slope]:
     return [Slope(*parts) for parts in zip(device, ("b", "m", "T", "t_d"), values, units, words, strict=True)]
 
 
-def stability_word(stable: bool) -> str:
+def stability_word(stable: bool, marginal: bool = False) -> str:
     """The verdict, in color."""
+    if marginal:
+        word = click.style("marginal", fg="yellow", bold=True)
+        return f"{word} (a pole at z = 1: without stiffness nothing pulls back)"
     return click.style("stable", fg="green", bold=True) if stable else click.style("UNSTABLE", fg="red", bold=True)
 
 
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     wall, device, timing = scene.wall, scene.device, scene.timing
-    stable = stability_word(verdict.stable)
+    stable = stability_word(verdict.stable, verdict.marginal)
     lines = [
         row("device", f"m = {with_unit(device.mass * 1e3, 'g')}, b = {with_unit(device.damping, 'N s/m')}"),
         row(
@@ -71,7 +74,7 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         "",
         row("verdict", f"{stable}, spectral radius {verdict.spectral_radius:.6f}"),
         *_distance_lines(wall.stiffness, wall.virtual_damping, verdict),
-        row("passive", _passivity_words(verdict)),
+        row("passive", passivity_words(wall.stiffness, verdict)),
         row(
             "stiffest stable wall",
             f"K_max = {with_unit(verdict.stiffness_max, 'N/m')} "
@@ -79,7 +82,7 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
             f"(alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)})",
         ),
         row("slowest pole", pole_words(verdict.time_constant, verdict.frequency)),
-        *_margin_lines(verdict),
+        *margin_lines(wall.stiffness, verdict),
     ]
     return lines
 
@@ -108,30 +111,38 @@ def _distance_lines(stiffness: float, virtual_damping: float, verdict: Assessmen
     return [row("to the boundary in K", in_k), row("to the boundary in B", in_b)]
 
 
-def _margin_lines(verdict: Assessment) -> list[str]:
-    """The margins of control engineering, where the wall has a stiffness."""
-    if verdict.alpha <= 0:
+def margin_lines(stiffness: float, verdict: Assessment | SceneAssessment) -> list[str]:
+    """The margins of control engineering, where the wall has a stiffness or stands without one."""
+    if stiffness <= 0 and not verdict.stable:
         return []
     parts = [f"gain {plain(verdict.gain_margin)}"]
     if isfinite(verdict.phase_margin):
         at = with_unit(verdict.gain_crossover, "Hz", 3)
         parts.append(f"phase {plain(verdict.phase_margin)} degrees at {at}")
-    parts += [f"delay {with_unit(verdict.delay_margin, 's')}", f"modulus {plain(verdict.modulus_margin)}"]
+    delay = "not known" if isnan(verdict.delay_margin) else with_unit(verdict.delay_margin, "s")
+    parts += [f"delay {delay}", f"modulus {plain(verdict.modulus_margin)}"]
     return [row("margins", ", ".join(parts))]
 
 
-def _passivity_words(verdict: Assessment) -> str:
-    if verdict.alpha < 0:
+def passivity_words(stiffness: float, verdict: Assessment | SceneAssessment, *, sufficient: bool = False) -> str:
+    """Whether a wall is passive; where the condition is only sufficient, a wall that misses it may still be."""
+    if verdict.passive is None:
+        return "not known: the sensor is not where the force acts"
+    if stiffness < 0:
         return "no, and no damping makes a negative stiffness passive"
+    margin = verdict.passivity_margin
     if verdict.passive:
-        return f"yes, with {with_unit(verdict.passivity_margin, 'N s/m')} of physical damping to spare"
-    return f"no, for want of {with_unit(-verdict.passivity_margin, 'N s/m')} of physical damping"
+        return f"yes, with {with_unit(margin, 'N s/m')} of physical damping to spare"
+    if margin == 0:
+        return "only just, without any physical damping to spare"
+    verb = "not proved" if sufficient else "no"
+    return f"{verb}, for want of {with_unit(-margin, 'N s/m')} of physical damping"
 
 
 def pole_words(constant: float, frequency: float) -> str:
     """How the slowest pole moves: its time constant in s, negative for a growing one, and its frequency in Hz."""
     swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
-    if constant == float("inf"):
+    if isinf(constant):
         return f"neither decays nor grows{swing}"
     verb = "decays" if constant >= 0 else "grows"
     return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"

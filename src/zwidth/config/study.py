@@ -18,7 +18,7 @@ from zwidth.formatting import describe
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
 
-KINDS_WITH_PARTS = ("boundary", "recommend", "compare", "filters", "sweep")
+KINDS_WITH_PARTS = ("boundary", "recommend", "compare", "filters", "design", "sweep")
 """The kinds that answer for devices with parts, for messages."""
 
 

@@ -8,6 +8,7 @@ from .filters import draw_filters as draw_filters
 from .passivity_cost import draw_passivity_cost as draw_passivity_cost
 from .plane import draw_plane as draw_plane
 from .recommendation import draw_recommendation as draw_recommendation
+from .requirement import draw_requirement as draw_requirement
 from .ridge import draw_ridge as draw_ridge
 from .slope import draw_slope as draw_slope
 from .stability_map import draw_map as draw_map

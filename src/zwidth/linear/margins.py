@@ -17,7 +17,9 @@ from zwidth.linear_loop import CirclePoints, Jet, LinearLoop, circle
 
 # Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
 _HALVINGS, _SHARE = 40, 0.25
-_STEPS, _ARRIVED = 100, 4e-16
+_STEPS, _CLOSED = 100, 4e-16
+# A Newton step so small, of the angle, leaves an error of its own square.
+_ARRIVED = 1e-10
 
 
 class OpenLoop(NamedTuple):
@@ -126,7 +128,7 @@ def answer(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet
     """L and its derivative in w."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(at)
-        found = Jet(-(alpha + beta * f.value), -beta * f.slope).over(loop.needed(at))
+        found = Jet(alpha + beta * f.value, beta * f.slope).times(loop.answer(at))
         # At pi it is real.
         real = at.w >= np.pi
         return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)
@@ -145,7 +147,7 @@ def polish_roots(
             new = x - value / slope
         good = (new >= low) & (new <= high) & (step % 4 != 3)
         new = np.where(good, new, 0.5 * (low + high))
-        done = (np.abs(new - x) <= _ARRIVED * x) & good | (high - low <= _ARRIVED * x) | (value == 0)
+        done = (np.abs(new - x) <= _ARRIVED * x) & good | (high - low <= _CLOSED * x) | (value == 0)
         x = np.where(value == 0, x, new)
         if done.all():
             break

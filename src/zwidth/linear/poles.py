@@ -164,3 +164,13 @@ def all_poles(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
     """`poles_less_one` of arrays of one shape, along a new last axis."""
     found = poles_less_one(loop, alpha.reshape(-1), beta.reshape(-1))
     return found.reshape(*alpha.shape, found.shape[-1])
+
+
+def is_marginal(loop: LinearLoop, alpha: float, beta: float) -> bool:
+    """Whether a wall has one pole exactly at z = 1 and all others strictly inside: it neither pulls back nor grows."""
+    wall = np.array([alpha]), np.array([beta])
+    at = evaluate(loop, *wall, np.zeros(1, complex))
+    if at.value[0] != 0 or at.slope[0] == 0:
+        return False
+    found = all_poles(loop, *wall)[0]
+    return bool(np.all(log_size(np.delete(found, np.argmin(np.abs(found)))) < 0))

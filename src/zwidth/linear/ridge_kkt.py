@@ -18,15 +18,16 @@ import numpy as np
 import optimistix
 
 from zwidth._types import Array
-from zwidth.batching import compute_concretely, traced_columns
+from zwidth.batching import traced_columns
 from zwidth.domain import poison
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.linear.chain import Chain, chain_of, needed, respond
 from zwidth.linear.ridge import Condition
+from zwidth.linear.slopes import moving_paths
 from zwidth.linear.stiffest import StiffestWall, search
 from zwidth.linear_loop import circle
 from zwidth.normalization import in_periods
-from zwidth.parts.paths import list_parameters, replace_parameters
+from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
 from zwidth.stability.ridge import RidgeKind
 from zwidth.status import Status
@@ -62,16 +63,6 @@ class _Arguments(NamedTuple):
     start: Array
     codes: Array
     scales: Array
-
-
-def moving_paths(scene: Any) -> tuple[str, ...]:
-    """The parameters of a scene, without the wall's, that K_max can be differentiated in."""
-    bare = replace_parameters(scene, {"wall": VirtualWall(0.0)})
-    paths = [path for path, value in list_parameters(bare).items() if not isinstance(value, int | np.integer)]
-    without = {"stiffness", "virtual_damping"}
-    if scene.operator is not None and scene.operator.rigid:
-        without.add("operator.coupling_damping")
-    return tuple(path for path in paths if path not in without)
 
 
 def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
@@ -239,55 +230,3 @@ def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
         [meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])],
     )[which]
     return jnp.concatenate([meet[0], second])
-
-
-@partial(jax.jit, static_argnums=0)
-def _linearize(
-    structure: Structure, start: Array, codes: Array, unknowns: Array, values: Array
-) -> tuple[Array, Array, Array]:
-    """The four equations with K in N/m behind them, and their derivatives in the unknowns and in the values."""
-
-    def equations(unknowns: Array, values: Array) -> tuple[Array, Array]:
-        scene = _fill(structure, values)
-        chain = _chain(structure, scene)
-        args = _prepare(chain, start, codes)
-        stiffness = unknowns[0] * args.scales[0] * scene.units.stiffness
-        left = jnp.append(_residual(chain, unknowns, args), stiffness)
-        return left, left
-
-    (by_unknowns, by_values), left = jax.jacfwd(equations, argnums=(0, 1), has_aux=True)(unknowns, values)
-    return left, by_unknowns, by_values
-
-
-def slopes_at(scene: Any, paths: tuple[str, ...], negative: bool) -> tuple[Array, dict[str, float], Status]:
-    """K_max in N/m of a scene of plain numbers, its derivatives in some parameters, and the status, in float64.
-
-    The search and Newton's steps are the host's: what is compiled holds no callback, so that it can be kept on disk.
-    """
-    structure = structure_of(scene, paths, negative)
-    values = np.array([scene.parameters()[path] for path in paths], float)
-    told = np.array(_find(structure, values.tolist()))
-    status, spoiled = Status(int(told[-1])), (np.float64(math.nan), dict.fromkeys(paths, math.nan))
-    if status != Status.OK:
-        return *spoiled, status
-    start, codes = told[:4], told[4:6].astype(np.int32)
-    # The equations do not depend on which walls count.
-    structure = structure._replace(negative=False)
-
-    def linearize(unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Newton's next unknowns; K and its derivatives at these."""
-        left, by_unknowns, by_values = map(np.asarray, _linearize(structure, start, codes, unknowns, values))
-        solved = np.linalg.solve(by_unknowns[:4], np.column_stack([left[:4], by_values[:4]]))
-        return unknowns - solved[:, 0], left[4], by_values[4] - by_unknowns[4] @ solved[:, 1:]
-
-    begin = unknowns = start / _scales(start)
-    try:
-        with compute_concretely():
-            for _ in range(_STEPS):
-                unknowns, _, _ = linearize(unknowns)
-            unknowns, stiffness, slopes = linearize(unknowns)
-    except np.linalg.LinAlgError:
-        return *spoiled, Status.NOT_CONVERGED
-    if not np.all(np.abs(unknowns - begin) <= _reach(start.dtype)):
-        return *spoiled, Status.NOT_CONVERGED
-    return stiffness, dict(zip(paths, slopes.tolist(), strict=True)), status

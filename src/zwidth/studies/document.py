@@ -27,6 +27,7 @@ from zwidth.config.study import Study
 from zwidth.formatting import describe, suggestion
 from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.compare import CompareStudy
+from zwidth.studies.design import DesignStudy
 from zwidth.studies.filters import FiltersStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
@@ -64,6 +65,7 @@ for _model in (
     RecommendStudy,
     CompareStudy,
     FiltersStudy,
+    DesignStudy,
     SweepStudy,
 ):
     register(_model)

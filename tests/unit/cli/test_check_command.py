@@ -71,16 +71,18 @@ def test_the_words_of_a_scene_with_parts():
     out = run("check", *WALL, *DEVICE, *RATE, *PARTS["filter"][0]).stdout.splitlines()
     labels = [line[:22].strip() for line in out]
     assert labels[:5] == ["device", "timing", "velocity", "wall", ""]
-    assert labels[5:10] == [
+    assert labels[5:12] == [
         "verdict",
         "to the boundary in K",
         "to the boundary in B",
+        "passive",
         "stiffest stable wall",
         "slowest pole",
+        "margins",
     ]
     assert "cutoff 100.0 Hz" in out[2]
-    assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[8]
-    assert out[10].startswith("what limits it        no delay: K_max")
+    assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[9]
+    assert out[12].startswith("what limits it        no delay: K_max")
 
 
 def test_a_rigid_scene_says_what_limits_it_too():
@@ -196,3 +198,32 @@ def test_the_ridge_of_a_rigid_hand_counts_the_hand_s_mass():
     assert printed["stiffness_max"] == pytest.approx(
         zwidth.max_stiffness(mass=0.2, damping=10.0, period=1e-3, delay=1e-3), rel=1e-12
     )
+
+
+@pytest.mark.parametrize("parts", [[], ["--velocity-cutoff", "100 Hz"]], ids=["rigid", "filter"])
+@pytest.mark.parametrize("damping, word", [("0", "UNSTABLE"), ("5", "marginal (a pole at z = 1")])
+def test_a_wall_without_stiffness(parts, damping, word):
+    said = run("check", "--stiffness", "0", "--virtual-damping", damping, "--mass", "100 g", *RATE, *parts).stdout
+    assert word in said
+    assert "-0 N s/m" not in said
+    assert "neither decays nor grows" in said
+
+
+@pytest.mark.parametrize(
+    "parts, words",
+    [
+        (["--velocity-cutoff", "100 Hz"], "yes, with 8.479 N s/m of physical damping to spare"),
+        (["--coupling-mass", "50 g", "--coupling-stiffness", "20 kN/m"], "not proved, for want of"),
+        (
+            ["--coupling-mass", "50 g", "--coupling-stiffness", "20 kN/m", "--coupling-sensor", "tip"],
+            "not known: the sensor is not where the force acts",
+        ),
+    ],
+)
+def test_passivity_and_margins_of_parts_are_printed(parts, words):
+    wall = ["--stiffness", "0 N/m" if "--velocity-cutoff" in parts else "40 kN/m", "--virtual-damping", "5"]
+    said = run("check", *wall, "--mass", "100 g", "--damping", "10", *RATE, *parts).stdout
+    assert re.search(rf"^passive +{re.escape(words)}", said, re.MULTILINE)
+    if "--velocity-cutoff" not in parts:
+        margins = r"^margins +gain [0-9.]+, phase -?[0-9.]+ degrees at .*, delay .*s, modulus"
+        assert re.search(margins, said, re.MULTILINE)

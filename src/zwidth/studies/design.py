@@ -1,0 +1,257 @@
+"""The design study: the value of one parameter that a wanted stiffness needs, and the share of devices that bear it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
+
+from zwidth import figures
+from zwidth.config.axes import read_entries
+from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.fields import Fraction
+from zwidth.config.numbers import number, whole_number
+from zwidth.config.parameters import StiffnessAxis
+from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.units import make_entry_reader
+from zwidth.design.tolerances import Tolerance, simulate_tolerances
+from zwidth.errors import InputError
+from zwidth.figures.table import SI_COLUMNS
+from zwidth.formatting import describe, short, suggestion
+from zwidth.linear.required import RequiredValue
+from zwidth.parts.wall import VirtualWall
+from zwidth.quantities import PARAMETERS, PHYSICAL, Range
+from zwidth.scene import Scene
+from zwidth.status import Status
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
+
+FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
+# Scenes that the search for one value asks about.
+_TRIALS = 60
+_OTHER_SIDE = {"above": "below", "below": "above"}
+
+
+def _read_parameter(raw: Any) -> str:
+    if raw not in FINDS:
+        raise problem(f"got {describe(raw)}", f"a parameter of the scene by its path: {listing(FINDS)}",
+                      suggestion(raw, FINDS, "write one of these"))  # fmt: skip
+    return raw
+
+
+def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
+    name = info.data.get("find")
+    if not isinstance(raw, list | tuple) or len(raw) != 2:
+        raise problem(f"got {describe(raw)}", "a range is a list of its two ends", "write [low, high]")
+    ends = read_entries(raw, make_entry_reader(name) if name else float)
+    if not 0 < ends[0] < ends[1]:
+        raise problem(f"got {short(ends[0])} and {short(ends[1])}", "0 < low < high", "write the lower end first")
+    return ends
+
+
+Parameter = Annotated[str, BeforeValidator(_read_parameter), WithJsonSchema({"type": "string", "enum": list(FINDS)})]
+Ends = Annotated[
+    tuple[float, ...],
+    BeforeValidator(_read_range),
+    WithJsonSchema({"type": "array", "items": {"type": ["number", "string"]}, "minItems": 2, "maxItems": 2}),
+]
+Count = Annotated[int, BeforeValidator(whole_number(Range(2, 100_000)))]
+Reserve = Annotated[float, BeforeValidator(number(Range(1.0, 100.0)))]
+
+
+class DesignStudy(ComputedStudy):
+    """The value of one parameter at which the stiffest wall reaches a wanted stiffness, and what tolerances leave."""
+
+    what: ClassVar[str] = "a design study"
+    from_scene: ClassVar[tuple[str, ...]] = ("device", "stiffness")
+    takes_parts: ClassVar[bool] = True
+
+    kind: Literal["design"]
+
+    device: PhysicalDevice
+    """Device in SI units; the scene's where left out. A delay stays as it is in seconds."""
+
+    find: Parameter
+    """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
+
+    stiffness: StiffnessAxis
+    """Wanted stiffness K in N/m or with a unit, one or several; the scene's where left out."""
+
+    reserve: Reserve = 1.0
+    """How many times the wanted stiffness the stiffest stable wall is to reach, 1 or more."""
+
+    within: Ends | None = None
+    """The two ends of the range that is searched; a thirtieth to 30 times the present value where left out."""
+
+    num: Count = 61
+    """Points of the curve in the figure."""
+
+    tolerances: dict[str, Fraction] | None = None
+    """Shares by which parameters of a device may differ from their values, by path: the share that bears the wall."""
+
+    distribution: Literal["uniform", "normal"] = "uniform"
+    """Of the tolerances: anywhere within the share, or with the share as standard deviation."""
+
+    samples: Count | None = None
+    """Devices drawn for each wanted stiffness; 10000, or 200 of a device with parts, where left out."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        if not isinstance(scene, PhysicalScene):
+            return raw
+        wanted = {} if not scene.stiffness else {"stiffness": scene.stiffness}
+        return {"device": scene.device, **wanted, **raw}
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        if name == "device":
+            return "a stiffness in N/m needs a device in SI units", "give the scene mass and period"
+        if name == "stiffness":
+            return "a design begins with the stiffness that is wanted", "add 'stiffness: [20 kN/m, 40 kN/m]'"
+        return super().missing(name)
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        if not self.stiffness.values().min() > 0:
+            what = problem(f"got {short(float(self.stiffness.values().min()))} N/m", "it must be greater than 0")
+            yield ("stiffness",), what
+        known = self._list_parameters()
+        if self.find not in known:
+            has = f"this device has {listing(known)}"
+            yield ("find",), problem(f"got {self.find!r}", has, "add the part to the scene, or write one of these")
+        elif not known[self.find] > 0 and self.within is None:
+            what = f"{self.find} is 0 now"
+            yield ("within",), problem(what, "a search from nothing needs a range", "add 'within: [0.1, 100]'")
+        yield from self._check_tolerances(known)
+
+    def _check_tolerances(self, known: dict[str, float]) -> Iterable[LocatedProblem]:
+        most = 1 / 3 if self.distribution == "normal" else 1.0
+        for name, share in (self.tolerances or {}).items():
+            if name not in known or name == "rate":
+                yield ("tolerances", name), problem("unknown parameter", f"this device has {listing(known)}")
+            elif share >= most:
+                yield ("tolerances", name), problem(f"got {short(share)}", f"it must be less than {most:.3g}")
+            elif known[name] == 0 and name != self.find:
+                what = problem(f"{name} is 0, and so is any share of it", "a value greater than 0", "leave it out")
+                yield ("tolerances", name), what
+
+    def _list_parameters(self) -> dict[str, float]:
+        found = self.device.to_scene().parameters()
+        known = {name: float(value) for name, value in found.items() if name in FINDS and isinstance(value, float)}
+        return known | {"rate": 1.0 / known["period"]}
+
+    @property
+    def extent(self) -> str:
+        return f"stiffnesses = {self.stiffness.size}"
+
+    @property
+    def draws(self) -> int:
+        """Devices drawn for each stiffness."""
+        if self.tolerances is None:
+            return 0
+        return self.samples or (10_000 if self.device.is_rigid else 200)
+
+    @property
+    def points(self) -> int:
+        return self.stiffness.size * (_TRIALS + self.draws) + self.num
+
+    @property
+    def nbytes(self) -> int:
+        return self.points * 80
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """The value that each stiffness needs, K_max over the parameter, and a figure of both."""
+        nominal = self.device.to_scene()
+        rows, notes, ranges = [], [], []
+        for stiffness in self.stiffness.values().tolist():
+            needed = self._require(nominal, self.reserve * stiffness)
+            ranges.append(needed.range)
+            rows.append(self._describe(nominal, stiffness, needed))
+            notes += self._note(stiffness, needed)
+        low, high = min(ends[0] for ends in ranges), max(ends[1] for ends in ranges)
+        curve = self._trace(nominal, low, high)
+        table = stack(rows)
+        return Outcome(
+            table=table,
+            figures={"": partial(figures.draw_requirement, curve, table)},
+            documents={f"{self.name}_curve.csv": csv_text(curve)},
+            notes=tuple(notes),
+        )
+
+    def _require(self, nominal: Scene, stiffness: float) -> RequiredValue:
+        """The value that is enough; a rate by its period."""
+        within = None if self.within is None else (self.within[0], self.within[1])
+        if self.find != "rate":
+            return nominal.required(self.find, stiffness, within=within)
+        periods = None if within is None else (1.0 / within[1], 1.0 / within[0])
+        found = nominal.required("period", stiffness, within=periods)
+        low, high = found.range
+        crossings = tuple(
+            crossing._replace(value=1.0 / crossing.value, enough=_OTHER_SIDE[crossing.enough])
+            for crossing in reversed(found.crossings)
+        )
+        enough: Any = _OTHER_SIDE.get(found.enough, found.enough)
+        return RequiredValue(1.0 / found.value, enough, crossings, (1.0 / high, 1.0 / low), found.status)
+
+    def _describe(self, nominal: Scene, stiffness: float, needed: RequiredValue) -> dict[str, Any]:
+        """A row of the table: what is needed, the wall there, and what tolerances leave of it."""
+        others = [c for c in needed.crossings if c.value != needed.value]
+        row: dict[str, Any] = {
+            SI_COLUMNS[0]: stiffness,
+            "reserve": self.reserve,
+            "parameter": self.find,
+            "unit": PARAMETERS[self.find].unit,
+            "present": self._list_parameters()[self.find],
+            "value": needed.value,
+            "enough": needed.enough,
+            "other_crossings": "; ".join(f"{c.value!r} {c.enough}" for c in others),
+            "range_low": needed.range[0],
+            "range_high": needed.range[1],
+            "status": Status(needed.status).name,
+            "stiffness_max_N_per_m": math.nan,
+            SI_COLUMNS[1]: math.nan,
+        }
+        found = None
+        if needed.status == Status.OK:
+            found = nominal.replace(**{self.find: needed.value})
+            top = found.max_stiffness()
+            row |= {"stiffness_max_N_per_m": float(top.stiffness), SI_COLUMNS[1]: float(top.virtual_damping)}
+        return row | (self._tolerate(found, stiffness, row[SI_COLUMNS[1]]) if self.tolerances is not None else {})
+
+    def _tolerate(self, found: Scene | None, stiffness: float, virtual_damping: float) -> dict[str, float]:
+        """The share of devices on which the wanted stiffness is stable at the damping that suits the nominal one."""
+        names = ("stable_share", "stable_share_low", "stable_share_high", "borne_by_99_percent_N_per_m")
+        if found is None:
+            return dict.fromkeys(names, math.nan)
+        scene = found.replace(wall=VirtualWall(stiffness, virtual_damping))
+        shares = {name: Tolerance(share, self.distribution) for name, share in (self.tolerances or {}).items()}
+        drawn = simulate_tolerances(scene, shares, samples=self.draws)
+        return dict(zip(names, (drawn.stable, drawn.stable_low, drawn.stable_high, drawn.stiffness), strict=True))
+
+    def _note(self, stiffness: float, needed: RequiredValue) -> Iterable[str]:
+        wanted = f"{self.reserve * stiffness:g} N/m"
+        low, high = needed.range
+        if needed.status != Status.OK:
+            yield f"{wanted}: {self.find} from {low:g} to {high:g}: {Status(needed.status).message}"
+        elif needed.enough == "everywhere":
+            yield f"{wanted}: any {self.find} from {low:g} to {high:g} is enough"
+        elif len(needed.crossings) > 1:
+            yield f"{wanted}: K_max passes it at {len(needed.crossings)} values of {self.find}; the nearest is given"
+
+    def _trace(self, nominal: Scene, low: float, high: float) -> Table:
+        """K_max over the parameter; NaN where a value is refused or no wall is stable."""
+        rows = []
+        for value in np.geomspace(low, high, self.num).tolist():
+            wall = (math.nan, math.nan)
+            try:
+                top = nominal.replace(**{self.find: value}).max_stiffness()
+            except InputError:
+                pass
+            else:
+                if top.status == Status.OK:
+                    wall = float(top.stiffness), float(top.virtual_damping)
+            rows.append({"parameter": self.find, "value": value, **dict(zip(SI_COLUMNS, wall, strict=True))})
+        return stack(rows)

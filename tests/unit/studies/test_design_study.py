@@ -1,0 +1,134 @@
+"""The design study: against the closed search of the rigid loop, K_max on both sides, tolerances and refusals."""
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth import figures
+from zwidth.errors import ConfigError
+from zwidth.figures.table import SI_COLUMNS
+from zwidth.studies.design import DesignStudy
+from zwidth.studies.document import load_config
+
+DEVICE = {"mass": 0.1, "damping": 10.0, "rate": 1000, "delay": 1e-3}
+FILTERED = {**DEVICE, "velocity": {"kind": "low_pass", "cutoff": 100}}
+
+
+def design(find, stiffness, device=DEVICE, **more):
+    raw = {"kind": "design", "name": "d", "device": device, "find": find, "stiffness": stiffness, **more}
+    return DesignStudy.model_validate(raw)
+
+
+def test_damping_rate_and_delay_are_those_of_the_closed_search():
+    rigid = {"mass": 0.1, "period": 1e-3, "delay": 1e-3}
+    expected = {
+        "damping": float(zwidth.required_damping(30e3, **rigid).value),
+        "rate": 1.0 / float(zwidth.required_period(30e3, mass=0.1, damping=10.0, delay=1e-3).value),
+        "delay": float(zwidth.allowed_delay(30e3, mass=0.1, damping=10.0, period=1e-3).value),
+    }
+    for find, value in expected.items():
+        table = design(find, "30 kN/m", num=3).compute(None, True).table
+        assert table["value"][0] == pytest.approx(value, rel=1e-9)
+        assert table["enough"][0] == ("below" if find == "delay" else "above")
+        assert table["stiffness_max_N_per_m"][0] >= 30e3
+
+
+@pytest.mark.parametrize("find, stiffness", [("velocity.cutoff", 15e3), ("mass", 10e3)])
+def test_the_value_is_enough_and_its_other_side_is_not(find, stiffness):
+    study = design(find, stiffness, FILTERED, num=3)
+    table = study.compute(None, True).table
+    (value,), (enough,) = table["value"], table["enough"]
+    nominal = study.device.to_scene()
+    side = {"above": 1, "below": -1}[enough]
+    more, less = (nominal.replace(**{find: value * (1 + k * side * 1e-3)}).max_stiffness().stiffness for k in (1, -1))
+    assert less < stiffness < more
+
+
+def test_a_rate_is_searched_within_its_own_range():
+    table = design("rate", [25e3, 90e3], within=["200 Hz", "20 kHz"], num=3).compute(None, True).table
+    assert table["range_low"] == pytest.approx([200, 200])
+    assert table["range_high"] == pytest.approx([20e3, 20e3])
+    assert table["present"].tolist() == pytest.approx([1000, 1000])
+    # The delay of 1 ms in seconds stays, which no rate makes up for.
+    assert table["status"].tolist() == ["OK", "UNREACHABLE"]
+    assert np.isnan(table["value"][1])
+    assert table["enough"][1] == "nowhere"
+
+
+def test_what_is_out_of_reach_or_always_enough_is_said():
+    outcome = design("damping", [1e3, 30e3, 1e9], within=[1, 100], num=3).compute(None, True)
+    assert outcome.table["enough"].tolist() == ["everywhere", "above", "nowhere"]
+    assert len(outcome.notes) == 2
+    assert len(outcome.figures[""]()) == 1
+
+
+def test_tolerances_judge_the_wanted_wall_on_the_device_that_was_found():
+    shares = {"mass": 0.05, "damping": 0.2}
+    table = design("damping", 30e3, reserve=1.1, tolerances=shares, samples=2000, num=3).compute(None, True).table
+    device = zwidth.Device(0.1, float(table["value"][0]))
+    scene = zwidth.Scene(device, zwidth.Timing(1e-3, 1e-3))
+    top = scene.max_stiffness()
+    assert top.stiffness == pytest.approx(33e3, rel=1e-9)
+    wall = zwidth.VirtualWall(30e3, float(top.virtual_damping))
+    drawn = zwidth.simulate_tolerances(scene.replace(wall=wall), shares, samples=2000)
+    assert table["stable_share"][0] == drawn.stable
+    assert table["borne_by_99_percent_N_per_m"][0] == drawn.stiffness
+    assert 0.5 < drawn.stable < 1
+
+
+def test_the_figure_marks_what_is_needed_on_the_curve():
+    outcome = design("damping", [20e3, 30e3], reserve=1.1, within=[1, 100], num=41).compute(None, True)
+    (ax,) = outcome.figures[""]()
+    drawn = {}
+    for line in ax.lines:
+        drawn.setdefault(line.get_label(), []).append(line)
+    found = outcome.table["value"].tolist()
+    assert [float(line.get_xdata()[0]) for line in drawn["required"]] == found
+    assert [float(line.get_ydata()[0]) for line in drawn["required"]] == pytest.approx([22.0, 33.0])
+    assert float(drawn["present"][0].get_xdata()[0]) == 10.0
+    for line, value in zip(drawn["enough"], found, strict=True):
+        x, y = np.asarray(line.get_xdata()), np.asarray(line.get_ydata())
+        assert x[np.isfinite(y)].min() == value
+    # Written with three digits, on the side that is enough.
+    for text, value in zip(ax.texts, found, strict=True):
+        written = float(text.get_text().split(" ")[0])
+        assert value <= written < 1.01 * value
+    curve = {"parameter": np.array(["damping"] * 2), "value": np.array([1.0, 50.0])}
+    curve[SI_COLUMNS[0]] = np.array([15e3, 45e3])
+    assert list(figures.draw_requirement(curve, outcome.table, ax)) == [ax]
+
+
+REFUSED = {
+    "find: dampin": "did you mean 'damping'",
+    "find: velocity.cutoff": "this device has",
+    "find: velocity.samples": "a parameter of the scene by its path",
+    "find: delay": "add 'within: [0.1, 100]'",
+    "find: damping, within: [2, 1]": "write the lower end first",
+    "find: damping, within: [1 kg, 2 kg]": "kg",
+    "find: damping, tolerances: {mas: 0.1}": "this device has",
+    "find: damping, tolerances: {mass: 1.1}": "write 75 % as 0.75",
+    "find: damping, tolerances: {mass: 0.5}, distribution: normal": "it must be less than 0.333",
+    "find: damping, stiffness: 0": "it must be greater than 0",
+}
+
+
+@pytest.mark.parametrize("fields", REFUSED)
+def test_refusals(fields, tmp_path):
+    wall = "" if "stiffness" in fields else ", stiffness: 20 kN/m"
+    text = "{version: 1, name: a, scene: {mass: 0.1, damping: 1, rate: 1000}, studies: [{kind: design, name: d, %s%s}]}"
+    file = tmp_path / "a.yaml"
+    file.write_text(text % (fields, wall))
+    with pytest.raises(ConfigError) as refusal:
+        load_config(file)
+    assert REFUSED[fields] in str(refusal.value)
+
+
+def test_the_scene_supplies_device_and_stiffness(tmp_path):
+    file = tmp_path / "a.yaml"
+    scene = "{mass: 0.1, damping: 1, rate: 1000, stiffness: 5 kN/m, velocity: {kind: low_pass, cutoff: 50}}"
+    file.write_text(f"{{version: 1, name: a, scene: {scene}, studies: [{{kind: design, name: d, find: damping}}]}}")
+    (study,) = load_config(file).studies
+    assert isinstance(study, DesignStudy)
+    assert study.stiffness.values().tolist() == [5e3]
+    assert study.device.velocity is not None
+    assert study.draws == 0
