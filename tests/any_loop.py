@@ -198,6 +198,43 @@ def count_outside(scene: Any, stiffness: float, virtual_damping: float, digits: 
         flint.ctx.dps = before
 
 
+def proved_poles(
+    scene: Any, stiffness: float, virtual_damping: float, found: np.ndarray, digits: int = 90
+) -> tuple[np.ndarray, np.ndarray]:
+    """Poles less 1 from balls, and how much each found one misses ``P = 0``, in units of the sizes of its terms.
+
+    The second is the backward error: a loop whose D, K and B are moved by that share of themselves has this pole.
+    """
+    before = flint.ctx.dps
+    try:
+        flint.ctx.dps = digits
+        device, spring, damper = ball_parts(scene)
+        terms = device, spring * _ball(stiffness), damper * _ball(virtual_damping)
+        roots = nonzero(terms[0] + terms[1] + terms[2]).roots(tol=10.0 ** (-digits // 2))
+        missed = []
+        for zeta in found.tolist():
+            z = 1 + flint.acb(zeta.real, zeta.imag)
+            values = [term(z) for term in terms]
+            missed.append(float((abs(sum(values)) / sum(abs(value) for value in values)).mid()))
+        return np.array([_number(root - 1) for root in roots]), np.array(missed)
+    finally:
+        flint.ctx.dps = before
+
+
+def proved_zeros(scene: Any, digits: int = 90) -> np.ndarray:
+    """Zeros less 1 of the device's answer, behind the backward difference."""
+    before = flint.ctx.dps
+    try:
+        flint.ctx.dps = digits
+        return np.array([_number(root - 1) for root in nonzero(ball_parts(scene)[1]).roots(tol=10.0 ** (-digits // 2))])
+    finally:
+        flint.ctx.dps = before
+
+
+def _number(ball: flint.acb) -> complex:
+    return complex(float(ball.real.mid()), float(ball.imag.mid()))
+
+
 def nonzero(polynomial: flint.acb_poly) -> flint.acb_poly:
     """Without its roots at 0, which lie inside: exact ones, and those of modes gone within a sample."""
     parts = polynomial.coeffs()

@@ -142,6 +142,11 @@ class LinearLoop:
         over = product_jet(at, self.poles, -1.0).over(product_jet(at, self.zeros, self.gain))
         return over.times(lag_jet(at, self.lag))
 
+    def answer(self, at: CirclePoints) -> Jet:
+        """G: the sampled position that the wall's force leads to."""
+        over = product_jet(at, self.zeros, self.gain).over(product_jet(at, self.poles, 1.0))
+        return over.times(lag_jet(at, -self.lag))
+
     @property
     def order(self) -> int:
         """How many poles the closed loop has."""

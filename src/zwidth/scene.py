@@ -13,8 +13,9 @@ from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.linear.answers import SceneAnswers
 from zwidth.linear.border import Border, Outline, outlines
-from zwidth.linear.boundary import Boundary, curve_at
+from zwidth.linear.boundary import Boundary
 from zwidth.linear.chain import Chain, chain_of, linear_loop
+from zwidth.linear.curve import curve_at
 from zwidth.linear.required import RequiredValue, require
 from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear.slopes import SceneSensitivities, differentiate

@@ -64,7 +64,8 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
 
 def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[float, str]]:
     """What each dashed line stands for: the wanted stiffness, its reserve, and the share of devices that bear it."""
-    shares = required["stable_share"] if "stable_share" in required else np.full(len(required["value"]), np.nan)
+    borne = "stable_share" in required
+    shares = required["stable_share"] if borne else np.full(len(required["value"]), np.nan)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.3g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
         yield wanted * reserve, words + (f", borne by {100 * share:.3g} %" if np.isfinite(share) else "")

@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.linear.boundary import Boundary, curve_at, zeros_of
+from zwidth.linear.boundary import Boundary
 from zwidth.linear.crossing_lines import CrossingLine
+from zwidth.linear.curve import curve_at, zeros_of
 from zwidth.linear_loop import circle
 from zwidth.numerics.roots import false_position
 

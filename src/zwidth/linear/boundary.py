@@ -14,54 +14,19 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.linear.arcs import Arc, cut_arcs
 from zwidth.linear.crossing_lines import CrossingLine, circle_zeros, end_lines, interior_line
-from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths, lag_jet, product_jet
-from zwidth.numerics.roots import false_position
+from zwidth.linear.curve import curve_at, find_dips, nodes_of, zeros_of
+from zwidth.linear_loop import ON_CIRCLE, LinearLoop, circle, depths
 
-# How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
-_STEP = 0.08
-_ROUNDS = 60
-# How near to z = -1 the last node is, for a loop without roots there.
-_LAST = 1e-4
-# Shares of a step at which a dip of the slope between two nodes is looked for.
-_INSIDE = np.arange(1, 8) / 8.0
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
 _MOST_STEPS, _ARRIVED = 120, 1e-10
-# How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
-_ROOM = 0.02
 # By what share a row is moved, at most, that rounding keeps from being counted.
 _SHIFTS = (1e-15, -1e-15, 1e-13, -1e-13, 1e-11, -1e-11)
-
-
-class CurvePoints(NamedTuple):
-    """Points of the boundary curve, and what decides their order."""
-
-    alpha: np.ndarray
-    beta: np.ndarray
-    alpha_slope: np.ndarray  # d alpha/dw
-    turn: np.ndarray  # Im q' Im F - Im q Im F', of the sign of d beta/dw
-    fall: np.ndarray  # Im F
-    size: np.ndarray  # |q| + |beta F|, of which alpha is a difference
-
-
-class Arc(NamedTuple):
-    """A part of the curve on which beta is monotone, by its nodes in ascending beta."""
-
-    w: np.ndarray
-    beta: np.ndarray
-    alpha: np.ndarray
-    size: np.ndarray
-    leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
-
-    @property
-    def first(self) -> float:
-        """Its lowest angle."""
-        return float(min(self.w[0], self.w[-1]))
 
 
 class Crossings(NamedTuple):
@@ -71,40 +36,6 @@ class Crossings(NamedTuple):
     w: np.ndarray
     leaving: np.ndarray  # poles that leave the circle as alpha rises past the crossing; negative for entering ones
     sound: np.ndarray  # of each row: whether its crossings lead from the count far below to that far above
-
-
-def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
-    """The boundary curve at angles in (0, pi)."""
-    at = circle(w)
-    with np.errstate(all="ignore"):
-        q, f = loop.needed(at), loop.estimate.jet(at)
-        beta = q.value.imag / f.value.imag
-        alpha = q.value.real - beta * f.value.real
-        turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag
-        beta_slope = turn / f.value.imag**2
-        alpha_slope = q.slope.real - beta_slope * f.value.real - beta * f.slope.real
-        size = np.abs(q.value) + np.abs(beta * f.value)
-        return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag, size)
-
-
-def nodes_of(loop: LinearLoop) -> np.ndarray:
-    """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
-    roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
-    sizes, far = np.abs(roots), np.abs(roots - 2.0)
-    turn = 1.0 / (abs(loop.lag) + loop.estimate.window + 1.0)
-    first = 1e-3 * min([turn, *sizes[sizes > 1e-13]])
-    # Next to z = -1 imaginary parts x = pi - w have lost eps/x of themselves, and beta varies by (x/far)^2: closer than
-    # this its slope is rounding.
-    last = _LAST * min([turn, *far[far > 1e-13]]) ** (2.0 / 3.0)
-    w = np.concatenate([np.geomspace(first, 0.1, 64), np.linspace(0.1, np.pi - last, 32)[1:]])
-    for _ in range(_ROUNDS):
-        half = 0.5 * np.diff(w)
-        wide = 2.0 * half * loop.turning(w[:-1] + half, half) > _STEP * 16.0
-        wide |= 2.0 * half * loop.turning(w[:-1] + half, 0.0 * half) > _STEP
-        if not wide.any():
-            break
-        w = np.sort(np.concatenate([w, w[:-1][wide] + half[wide]]))
-    return w
 
 
 @dataclass(frozen=True)
@@ -122,7 +53,7 @@ class Boundary:
         """Lay out the curve."""
         w = nodes_of(loop)
         here = curve_at(loop, w)
-        w = np.unique(np.concatenate([w, _dips(loop, w, here)]))
+        w = np.unique(np.concatenate([w, find_dips(loop, w, here)]))
         here = curve_at(loop, w)
         vertical = zeros_of(loop, w, here.fall, "fall")
         touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
@@ -133,7 +64,7 @@ class Boundary:
         turns = np.array([t for t in turns if all(abs(t - line.w) > 1e-6 for line in lines)])
         lines = (*lines, *end_lines(loop))
         limits = {0.0: np.nan, np.pi: np.nan} | {line.w: line.meeting for line in lines}
-        return cls(loop, w, tuple(_arcs(loop, w, here, poles, turns, limits)), lines, poles)
+        return cls(loop, w, tuple(cut_arcs(loop, w, here, poles, turns, limits)), lines, poles)
 
     def crossings(self, beta: np.ndarray) -> Crossings:
         """Where the rows of these dampings, shape (rows,), cross the boundary."""
@@ -204,9 +135,10 @@ class Boundary:
         for place, arc in enumerate(self.arcs):
             row, k = _cells(arc, beta)
             with np.errstate(all="ignore"):
-                ends = np.stack([arc.alpha[k - 1], arc.alpha[k]])
-                room = np.abs(ends[1] - ends[0]) + _ROOM * np.maximum(arc.size[k - 1], arc.size[k])
-                above, below = alpha[row] > ends.max(0) + room, alpha[row] < ends.min(0) - room
+                share = (beta[row] - arc.beta[k - 1]) / (arc.beta[k] - arc.beta[k - 1])
+                share = np.where(arc.straight[k - 1], share, 0.5)
+                away = alpha[row] - (arc.alpha[k - 1] + share * (arc.alpha[k] - arc.alpha[k - 1]))
+                above, below = away > arc.room[k - 1], away < -arc.room[k - 1]
             counted = but[row] != place
             total[row[above & counted]] += arc.leaving
             left = ~(above | below) & counted
@@ -252,9 +184,7 @@ class Boundary:
         loop = self.loop
         depth = depths(loop.zeros)
         on = np.abs(depth) <= ON_CIRCLE
-        at = circle(np.abs(np.angle(1.0 - loop.zeros[on])))
-        answer = product_jet(at, loop.zeros, loop.gain).over(product_jet(at, loop.poles, 1.0))
-        answer = answer.times(lag_jet(at, -loop.lag))
+        answer = loop.answer(circle(np.abs(np.angle(1.0 - loop.zeros[on]))))
         # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
         leaving = int(np.sum(side * answer.slope.imag < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
@@ -283,6 +213,7 @@ def _solve_rows(
         share = first / (first - last)
     share = np.where((share > 0) & (share < 1), share, np.where(share >= 1, 1.0 - 1e-9, 1e-9))
     found = below + np.where(np.isfinite(first) & np.isfinite(last), share, 0.5) * (above - below)
+    at_ends = [(first == 0, below.copy()), (last == 0, above.copy())]
     here = np.arange(beta.size)
     x = found.copy()
     for step in range(_MOST_STEPS):
@@ -299,6 +230,9 @@ def _solve_rows(
         if not on.any():
             break
         here, x = here[on], new[on]
+    # A row through an end of its arc meets the line there in one point, with nothing between them.
+    for exact, end in at_ends:
+        found = np.where(exact, end, found)
     return found, _residual(loop, fixed, beta, found)[2]
 
 
@@ -317,81 +251,3 @@ def _residual(loop: LinearLoop, fixed: list[float], beta: np.ndarray, w: np.ndar
         safe = np.where(end, 1.0, whole)
         ratio = np.where(end, slope.imag / turn, value.imag / safe)
         return ratio, (slope.imag - ratio * turn) / safe, value.real
-
-
-def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
-    """Zeros of a field of the curve between nodes where its sign changes."""
-    k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
-    low, high, sign = w[k], w[k + 1], np.sign(values[k])
-    if not k.size:
-        return low
-    with np.errstate(all="ignore"):
-        scale = sign / (np.abs(values[k]) + np.abs(values[k + 1]))
-        ends = values[k] * scale, values[k + 1] * scale
-        return false_position(
-            lambda at: getattr(curve_at(loop, at), field) * scale, low, high, *ends, _MOST_STEPS, 2e-16 * high
-        )
-
-
-def _dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
-    """Nodes to add where d beta/dw keeps its sign from one node to the next but may not do so between them.
-
-    The curve changes so little over a step that the slope is nearly a parabola there; where an end's tangent leads
-    below a tenth of it, the step is looked at in eighths.
-    """
-    values = here.turn
-    same = (values[:-1] > 0) == (values[1:] > 0)
-    step = np.diff(w)
-    # Slopes at the nodes by differences of the three around them.
-    inner = np.gradient(values, w)
-    first = np.abs(values[:-1]) + np.sign(values[:-1]) * inner[:-1] * step / 2
-    last = np.abs(values[1:]) - np.sign(values[1:]) * inner[1:] * step / 2
-    lowest = np.minimum(first, last)
-    near = same & (lowest < 0.25 * np.minimum(np.abs(values[:-1]), np.abs(values[1:])))
-    k = np.flatnonzero(near)
-    return (w[k, None] + step[k, None] * _INSIDE).ravel()
-
-
-def _arcs(
-    loop: LinearLoop,
-    w: np.ndarray,
-    here: CurvePoints,
-    poles: np.ndarray,
-    turns: np.ndarray,
-    limits: dict[float, float],
-) -> list[Arc]:
-    """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
-    ends = np.unique(np.concatenate([list(limits), poles, turns]))
-    at_pole = {float(p) for p in poles}
-    arcs = []
-    for a, b in pairwise(ends.tolist()):
-        inner = (w > a) & (w < b)
-        nodes, curve = w[inner], CurvePoints(*(values[inner] for values in here))
-        if not nodes.size:
-            nodes = np.array([0.5 * (a + b)])
-            curve = curve_at(loop, nodes)
-        rising = np.sum(np.sign(curve.turn)) > 0
-        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
-        leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
-        first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
-        last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
-        # What the ends' alpha is no one asks: next to them every wall is compared with the crossing itself.
-        nodes, beta = np.concatenate([[a], nodes, [b]]), np.concatenate([[first], curve.beta, [last]])
-        alpha, size = (np.concatenate([[np.nan], part, [np.nan]]) for part in (curve.alpha, curve.size))
-        if not rising:
-            nodes, beta, alpha, size = nodes[::-1], beta[::-1], alpha[::-1], size[::-1]
-        # Next to a limit or an extreme rounding may leave a node out of order; without it nothing is lost.
-        good = np.maximum.accumulate(beta) == beta
-        good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
-        good[[0, -1]] = True
-        if beta[0] <= beta[-1]:
-            arcs.append(Arc(nodes[good], beta[good], alpha[good], size[good], leaving))
-    return arcs
-
-
-def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
-    if w in at_pole:
-        return side * np.inf
-    if w in limits:
-        return limits[w] if np.isfinite(limits[w]) else side * np.inf
-    return float(curve_at(loop, np.array([w])).beta[0])

@@ -162,13 +162,12 @@ def _device(chain: Chain) -> tuple[flint.arb_poly, flint.arb_poly]:
         )
 
     step, full = flow(flint.arb(1))
-    sensor = flint.arb_mat([[1] * (chain.sensor + 1) + [0] * (size - chain.sensor - 1)])
     device = step.charpoly()
 
     def numerator(state: flint.arb_mat) -> flint.arb_poly:
         markov = []
         for _ in range(size):
-            markov.append((sensor * state)[0, 0])
+            markov.append(state[0, 0])
             state = step * state
         product = (flint.arb_poly(device.coeffs()[::-1]) * flint.arb_poly(markov)).coeffs()[:size]
         return flint.arb_poly(product[::-1])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.linear.boundary import Boundary, curve_at, zeros_of
+from zwidth.linear.boundary import Boundary
+from zwidth.linear.curve import curve_at, zeros_of
 
 # Halvings of a step between two nodes: to the last digit of its angle.
 _HALVINGS = 60

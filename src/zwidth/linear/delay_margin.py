@@ -15,8 +15,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.linear.boundary import Boundary, nodes_of
+from zwidth.linear.boundary import Boundary
 from zwidth.linear.chain import Chain, linear_loop
+from zwidth.linear.curve import nodes_of
 from zwidth.linear.margins import OpenLoop, margins_of
 from zwidth.linear.radius import log_radius
 from zwidth.linear.rows import label_walls

@@ -128,11 +128,10 @@ def answer(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet
     """L and its derivative in w."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(at)
-        q = loop.needed(at)
-        found = Jet(-(alpha + beta * f.value), -beta * f.slope).over(q)
-        # At pi it is real, and 0 where an undamped device answers nothing.
-        real = np.where(np.isfinite(q.value), found.value.real, 0.0) + 0j
-        return Jet(np.where(at.w >= np.pi, real, found.value), found.slope)
+        found = Jet(alpha + beta * f.value, beta * f.slope).times(loop.answer(at))
+        # At pi it is real.
+        real = at.w >= np.pi
+        return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)
 
 
 def polish_roots(

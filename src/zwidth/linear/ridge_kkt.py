@@ -7,6 +7,7 @@ which conditions those are has no derivative and needs none: as a parameter move
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -17,21 +18,24 @@ import numpy as np
 import optimistix
 
 from zwidth._types import Array
-from zwidth.batching import compute_concretely, traced_columns
+from zwidth.batching import traced_columns
 from zwidth.domain import poison
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.linear.chain import Chain, chain_of, needed, respond
 from zwidth.linear.ridge import Condition
+from zwidth.linear.slopes import moving_paths
 from zwidth.linear.stiffest import StiffestWall, search
 from zwidth.linear_loop import circle
 from zwidth.normalization import in_periods
-from zwidth.parts.paths import list_parameters, replace_parameters
+from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
 from zwidth.stability.ridge import RidgeKind
 from zwidth.status import Status
-from zwidth.xp import is_traced
+from zwidth.xp import is_traced, namespace
 
 _MAX_STEPS = 16
+# Newton's steps from what the search found, which doubles its digits at each.
+_STEPS = 2
 # A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
 
@@ -59,16 +63,6 @@ class _Arguments(NamedTuple):
     start: Array
     codes: Array
     scales: Array
-
-
-def moving_paths(scene: Any) -> tuple[str, ...]:
-    """The parameters of a scene, without the wall's, that K_max can be differentiated in."""
-    bare = replace_parameters(scene, {"wall": VirtualWall(0.0)})
-    paths = [path for path, value in list_parameters(bare).items() if not isinstance(value, int | np.integer)]
-    without = {"stiffness", "virtual_damping"}
-    if scene.operator is not None and scene.operator.rigid:
-        without.add("operator.coupling_damping")
-    return tuple(path for path in paths if path not in without)
 
 
 def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
@@ -115,9 +109,8 @@ def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
     status = told[-1].astype(jnp.int32)
     found = status == Status.OK
     told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
-    scene = replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
-    d = float(structure.whole) if structure.held else in_periods(*map(jnp.asarray, _delay(scene)))
-    alpha, beta, w1, w2, close = _solve(chain_of(scene, (d, structure.whole)), told[:4], told[4:6].astype(jnp.int32))
+    scene = _fill(structure, values)
+    alpha, beta, w1, w2, close = _solve(_chain(structure, scene), told[:4], told[4:6].astype(jnp.int32))
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
     spoiled = poison(status == Status.OK, *values)
     omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
@@ -136,36 +129,35 @@ def _delay(scene: Any) -> tuple[Any, Any]:
 
 
 def _search(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
-    """The ridge on the host, and its status behind it; numbers come and go as their bits."""
-    values = np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()
-    bad = (math.nan,) * len(_NOWHERE)
+    """`_find` for a callback: numbers come and go as their bits."""
+    told = np.array(_find(structure, np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()), dtype)
+    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
+
+
+def _find(structure: Structure, values: list[float]) -> tuple[float, ...]:
+    """The ridge on the host, and its status behind it."""
     try:
-        scene = replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
-        found, status = search(scene, structure.negative)
+        found, status = search(_fill(structure, values), structure.negative)
     except InputError:
         found, status = None, Status.INVALID_INPUT
-    ridge = bad if found is None else (*found, found.kind)
-    told = np.array([*ridge, status], dtype)
-    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
+    return *((math.nan,) * len(_NOWHERE) if found is None else (*found, found.kind)), status
+
+
+def _fill(structure: Structure, values: Iterable[Any]) -> Any:
+    """The scene with these values in place of the placeholders."""
+    return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
+
+
+def _chain(structure: Structure, scene: Any) -> Chain:
+    d = float(structure.whole) if structure.held else in_periods(*map(jnp.asarray, _delay(scene)))
+    return chain_of(scene, (d, structure.whole))
 
 
 def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
-    estimate = chain.estimate
-    complexes = jnp.result_type(start.dtype, jnp.complex64)
-    scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
-    scales = jnp.where(scales > 0, scales, 1.0)
-    args = _Arguments(
-        jax.tree.map(jnp.asarray, respond(chain)),
-        jnp.asarray(estimate.gain, start.dtype),
-        jnp.asarray(estimate.zeros, complexes),
-        jnp.asarray(estimate.poles, complexes),
-        start,
-        codes,
-        scales,
-    )
-    tolerance = 16 * float(jnp.finfo(start.dtype).eps)
-    begin = start / scales
+    args = _prepare(chain, start, codes)
+    begin = start / args.scales
+    tolerance = _tolerance(start.dtype)
     solution = optimistix.root_find(
         partial(_residual, chain),
         optimistix.Newton(rtol=tolerance, atol=tolerance),
@@ -174,9 +166,39 @@ def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Arra
         max_steps=_MAX_STEPS,
         throw=False,
     )
-    # What counts is that Newton stayed where the search had put it; a double root is met to half of the digits.
-    close = jnp.all(jnp.abs(solution.value - begin) <= 64 * tolerance**0.5)
-    return *(solution.value * scales), close
+    close = jnp.all(jnp.abs(solution.value - begin) <= _reach(start.dtype))
+    return *(solution.value * args.scales), close
+
+
+def _tolerance(dtype: Any) -> float:
+    return 16 * float(jnp.finfo(dtype).eps)
+
+
+def _reach(dtype: Any) -> float:
+    """How far Newton may go: it must stay where the search put it; a double root is met to half of the digits."""
+    return 64 * _tolerance(dtype) ** 0.5
+
+
+def _prepare(chain: Chain, start: Array, codes: Array) -> _Arguments:
+    """What `_residual` needs beside the unknowns."""
+    estimate = chain.estimate
+    complexes = jnp.result_type(start.dtype, jnp.complex64)
+    return _Arguments(
+        jax.tree.map(jnp.asarray, respond(chain)),
+        jnp.asarray(estimate.gain, start.dtype),
+        jnp.asarray(estimate.zeros, complexes),
+        jnp.asarray(estimate.poles, complexes),
+        start,
+        codes,
+        _scales(start),
+    )
+
+
+def _scales(start: Array) -> Array:
+    """The size of the unknowns."""
+    xp = namespace(start)
+    scales = xp.stack([start[0], xp.abs(start[0]) + xp.abs(start[1]), start[2], start[3]])
+    return xp.where(scales > 0, scales, 1.0)
 
 
 def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
@@ -204,29 +226,7 @@ def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
     # A pole pair at w, or a real pole where w stays.
     meet = jnp.stack([r.real, jnp.where(args.codes == Condition.PAIR, r.imag, stays)], -1)
     which = jnp.maximum(args.codes[1] - Condition.PLUS_ONE, 0)
-    conditions = (
-        lambda: meet[1],
-        lambda: jnp.stack([across[0], stays[1]]),
-        lambda: jnp.stack([unknowns[1], stays[1]]),
-    )
-    return jnp.concatenate([meet[0], jax.lax.switch(which, conditions)])
-
-
-@partial(jax.jit, static_argnums=0)
-def _slopes(structure: Structure, values: tuple[Array, ...]) -> tuple[StiffestWall, tuple[Array, ...]]:
-    def stiffness(values: tuple[Array, ...]) -> tuple[Array, StiffestWall]:
-        wall = compiled_wall(structure, *values)
-        return wall.stiffness, wall
-
-    (_, wall), slopes = jax.value_and_grad(stiffness, has_aux=True)(values)
-    return wall, slopes
-
-
-def slopes_at(scene: Any, paths: tuple[str, ...], negative: bool) -> tuple[StiffestWall, dict[str, float]]:
-    """The stiffest wall of a scene of plain numbers and its derivatives in some parameters, in float64."""
-    structure = structure_of(scene, paths, negative)
-    values = scene.parameters()
-    with compute_concretely():
-        wall, slopes = _slopes(structure, tuple(jnp.asarray(values[path], float) for path in paths))
-        wall = StiffestWall(*(np.asarray(part)[()] for part in wall))
-        return wall, {path: float(slope) for path, slope in zip(paths, slopes, strict=True)}
+    second = jnp.stack(
+        [meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])],
+    )[which]
+    return jnp.concatenate([meet[0], second])

@@ -9,7 +9,7 @@ import pytest
 
 import any_loop
 import zwidth
-from zwidth.linear.boundary import curve_at
+from zwidth.linear.curve import curve_at
 
 T = 1e-3
 Draw = Callable[[float, float], float]

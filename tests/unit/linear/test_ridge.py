@@ -63,7 +63,7 @@ def test_an_island_of_negative_damping_counts_when_asked_for():
 
 def test_rigid_scenes_take_the_closed_form_and_any_loop_agrees():
     rng = np.random.default_rng(3)
-    for _ in range(40):
+    for _ in range(20):
         delta = float(rng.choice([0.0, 10 ** rng.uniform(-3, 1.5)]))
         d = float(rng.choice([0, 1, 2, 5, 20, 0.3, 0.999, 1.7]))
         scene = Scene(Device(1.0, delta), Timing(1.0, d))
@@ -81,25 +81,15 @@ BOUND = {
     "smooth": (PAPER.replace(velocity=LowPass(cutoff=100), delay=1.3e-3), False, "PAIR STATIONARY"),
     "row": (WINDOW.replace(delay=0.7e-3), False, "PAIR NO_DAMPING"),
     "island": (WINDOW.replace(delay=0.7e-3), True, "PAIR PAIR"),
-    "tip": (
+    "parts": (
         Scene(
-            Device(0.1, 4.0, Coupling(0.05, 2e4, 3.0, "tip")),
-            Timing(1e-3, 0.3e-3),
-            velocity=Butterworth(80.0),
-            operator=Operator(0.1, 3.0, 100.0),
-        ),
-        False,
-        "PAIR STATIONARY",
-    ),
-    "hand": (
-        Scene(
-            Device(0.1, 1.0, Coupling(0.05, 3e4, 1.0)),
+            Device(0.1, 1.0, Coupling(0.05, 3e4, 1.0, "tip")),
             Timing(1e-3, 0.3e-3),
             velocity=LowPass(time_constant=1e-3, order=2, coded_period=2e-3),
             operator=Operator(0.5, 6.0, 135.0, 800.0, 4.0),
         ),
         False,
-        None,
+        "PAIR STATIONARY",
     ),
     "double pole": (
         Scene(Device(1.0, 19.0), Timing(1.0, 0.1), velocity=WindowedDifference(4)),
@@ -119,9 +109,8 @@ BOUND = {
 def test_derivatives_are_those_of_the_search(name):
     """Central differences of the search in NumPy, extrapolated, in every parameter of every part."""
     scene, negative, conditions = BOUND[name]
-    if conditions is not None:
-        found = wanted(scene, negative)
-        assert f"{found.first.name} {found.second.name}" == conditions
+    found = wanted(scene, negative)
+    assert f"{found.first.name} {found.second.name}" == conditions
     wall = scene.max_stiffness(negative_damping=negative)
     got = scene.sensitivities(negative_damping=negative)
     assert got.status == Status.OK
@@ -134,7 +123,7 @@ def test_derivatives_are_those_of_the_search(name):
 
 
 def _difference(scene: Scene, path: str, negative: bool) -> float:
-    """dK/d(log of the parameter), by three central differences."""
+    """dK/d(log of the parameter), by two central differences."""
     value = scene.parameters()[path]
 
     def central(step: float) -> float:
@@ -144,9 +133,8 @@ def _difference(scene: Scene, path: str, negative: bool) -> float:
         )
         return float(high - low) / (2.0 * step)
 
-    first, second, third = (central(step) for step in (2e-3, 1e-3, 5e-4))
-    better = (4.0 * second - first) / 3.0, (4.0 * third - second) / 3.0
-    return (16.0 * better[1] - better[0]) / 15.0
+    first, second = central(1e-3), central(5e-4)
+    return (4.0 * second - first) / 3.0
 
 
 def test_derivatives_of_a_rigid_scene_are_the_closed_ones():
@@ -168,9 +156,6 @@ def filtered(cutoff):
 
 
 def test_inside_transformations(x64):
-    slope = jax.grad(filtered)(100.0)
-    expected = PAPER.replace(velocity=LowPass(cutoff=100.0)).sensitivities().per["velocity.cutoff"]
-    assert float(slope) == pytest.approx(expected, rel=1e-10)
     assert float(jax.jit(filtered)(30.0)) == pytest.approx(filtered(30.0), rel=1e-12)
     # The third lane has no filter, and spoils no other.
     many = jax.vmap(jax.value_and_grad(filtered))(np.array([30.0, 10.0, -1.0, 100.0]))
@@ -178,7 +163,8 @@ def test_inside_transformations(x64):
     assert np.isnan(many[1][2])
     good = np.array([0, 1, 3])
     np.testing.assert_allclose(many[0][good], [filtered(f) for f in (30.0, 10.0, 100.0)], rtol=1e-12)
-    assert float(many[1][3]) == pytest.approx(expected, rel=1e-10)
+    slope = _difference(PAPER.replace(velocity=LowPass(cutoff=100.0)), "velocity.cutoff", False) / 100.0
+    assert float(many[1][3]) == pytest.approx(slope, rel=1e-8)
     # B = 0 binds at 10 Hz: the filter does not count.
     assert abs(float(many[1][1])) < 1e-8
 
@@ -207,7 +193,7 @@ def test_a_traced_delay_is_refused():
 def test_without_a_delay_the_period_may_be_traced(x64):
     scene = PAPER.replace(velocity=LowPass(cutoff=100.0), delay=0.0)
     slope = jax.grad(lambda period: scene.replace(period=period).max_stiffness().stiffness)(1e-3)
-    assert float(slope) == pytest.approx(scene.sensitivities().per["period"], rel=1e-9)
+    assert float(slope) == pytest.approx(_difference(scene, "period", False) / 1e-3, rel=1e-8)
 
 
 def test_no_stable_wall_is_no_number():
