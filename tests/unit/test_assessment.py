@@ -1,6 +1,7 @@
 """Verdicts on walls: passivity and margins of scenes with parts, walls that are marginal, and tables of many scenes."""
 
 import csv
+import dataclasses
 import io
 import math
 
@@ -70,6 +71,15 @@ def test_other_walls_are_not(name, wall):
     verdict = zwidth.assess(free_scene(name, *wall))
     assert not verdict.marginal
     assert verdict.stable == (wall[0] > 0)
+
+
+@pytest.mark.parametrize("delay", [0.0, 1e-3, 1.4e-3])
+def test_an_undamped_device_has_no_stable_spring(delay):
+    scene = dataclasses.replace(free_scene("filter", 0.0, 0.0), timing=zwidth.Timing(1e-3, delay))
+    verdict = zwidth.assess(scene)
+    assert isinstance(verdict, zwidth.SceneAssessment)
+    assert verdict.stable_stiffness == ()
+    assert verdict.stable_damping == ()
 
 
 def test_many_scenes_make_a_table_and_a_bad_one_spoils_no_other():

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.domain import WALL_RANGE
 from zwidth.linear.boundary import Boundary
 from zwidth.linear.poles import log_size, poles_less_one
 
@@ -42,7 +43,9 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> Intervals:
     least, most = np.full((beta.size, 1), -np.inf), np.full((beta.size, 1), np.inf)
     ends = np.concatenate([least, np.where(np.isnan(alpha), np.inf, alpha), most], 1)
     outside = boundary.base + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
-    stable = (np.round(outside) == 0) & (ends[:, 1:] > ends[:, :-1]) & (np.isfinite(beta) & found.sound)[:, None]
+    # Closer than any alpha in range two crossings are one: the rounding of 0 on an undamped device's own row.
+    wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
+    stable = (np.round(outside) == 0) & wide & (np.isfinite(beta) & found.sound)[:, None]
     # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
     place = np.cumsum(stable, 1) - 1
     low, high = (np.full((beta.size, int(stable.sum(1).max(initial=0))), np.nan) for _ in range(2))

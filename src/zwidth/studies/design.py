@@ -56,7 +56,9 @@ Parameter = Annotated[str, BeforeValidator(_read_parameter), WithJsonSchema({"ty
 Ends = Annotated[
     tuple[float, ...],
     BeforeValidator(_read_range),
-    WithJsonSchema({"type": "array", "items": {"type": ["number", "string"]}, "minItems": 2, "maxItems": 2}),
+    WithJsonSchema(
+        {"type": "array", "items": {"anyOf": [{"type": "number"}, {"type": "string"}]}, "minItems": 2, "maxItems": 2}
+    ),
 ]
 Count = Annotated[int, BeforeValidator(whole_number(Range(2, 100_000)))]
 Reserve = Annotated[float, BeforeValidator(number(Range(1.0, 100.0)))]

@@ -88,6 +88,13 @@ def test_python_control_agrees():
     np.testing.assert_allclose(got, expected, rtol=1e-4)
 
 
+def test_an_undamped_device_answers_nothing_at_half_the_rate():
+    scene = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=100))
+    response = scene.frequency_response(1e3, 5.0, [499.9, 500.0])
+    assert response[1] == 0
+    assert abs(response[0]) < 1e-3
+
+
 def test_an_unstable_wall():
     found = FILTERED.margins(60e3, 4.0)
     assert found.gain_margin < 1
