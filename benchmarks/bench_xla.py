@@ -21,7 +21,6 @@ import numpy as np
 
 from zwidth import batching, xla
 from zwidth.stability import (
-    boundary_solve,
     certified_filter,
     circle,
     crossover,
@@ -112,9 +111,6 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     def point(a: Any, b: Any) -> Any:
         return jax.vmap(lambda x, y: ridge_kkt.kkt_kernel(x, y, "held"))(a, b)
 
-    def solved(a: Any, b: Any) -> Any:
-        return jax.vmap(lambda x, y: boundary_solve._point_kernel(x, y, 0.0, 0.1, 1.0, 0.0, 2.0, "held"))(a, b)
-
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, "held", ANY)
 
@@ -124,18 +120,16 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
     yield "STRIP, verdict", lambda: strips(stable), compiled(stable, wide), columns
     few = (delta[:8192], d[:8192])
-    yield "UNFUSED, ridge kkt", compiled(point, xla.UNFUSED), compiled(point), few
     yield (
         "store_once, ridge kkt",
-        compiled(point, xla.UNFUSED),
-        compiled(point, xla.UNFUSED, kkt__store_once=same, newton__store_once=same),
+        compiled(point),
+        compiled(point, kkt__store_once=same, newton__store_once=same),
         few,
     )
     yield "store_once, ridge", compiled(top), compiled(top, newton__store_once=same), (delta, d)
     yield "angle, alone", compiled(xla.angle), compiled(their_angle), (alpha - 1.0, beta)
     other = {"circle__angle": their_angle, "circle__find_turn": their_turn, "radius__angle": their_angle}
     yield "angle and find_turn, radius", compiled(quick, wide), compiled(quick, wide, **other), columns
-    yield "UNFUSED, boundary point", compiled(solved, xla.UNFUSED), compiled(solved), few
     by_rule, alone = slopes()
     yield "custom_jvp, gradient of ridge", lambda: by_rule, lambda: alone, (delta, d)
     million = tuple(np.tile(np.asarray(column), 16) for column in (delta, d))

@@ -22,7 +22,7 @@ import numpy as np
 
 from zwidth._types import ArrayLike
 from zwidth.errors import InputError, PrecisionWarning, TracedDelayError
-from zwidth.xla import STRIP, UNFUSED, WIDE
+from zwidth.xla import STRIP, WIDE
 from zwidth.xp import is_jax, is_traced
 
 # Large batches run in pieces of one size: one compilation, bounded memory, and a point's value does not depend
@@ -270,11 +270,10 @@ def map_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: i
 
 
 @cache
-def _compile_pointwise(kernel: Callable[..., Any], static: tuple[Any, ...], fused: bool) -> Callable[..., Any]:
+def _compile_pointwise(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
     import jax
 
-    options = None if fused else UNFUSED
-    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)), compiler_options=options)
+    return jax.jit(jax.vmap(lambda *point: kernel(*point, *static)))
 
 
 def _padded_size(count: int, chunk: int, least: int) -> int:
@@ -300,7 +299,6 @@ def map_flat(
     columns: list[np.ndarray],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    fused: bool = True,
     least: int = 1,
     threads: int | None = None,
 ) -> Any:
@@ -310,7 +308,7 @@ def map_flat(
     never shorter than ``least``: the compiler treats very short ones differently, to the last place.
     """
     size = _padded_size(columns[0].size, chunk, least)
-    return _map_pieces(_compile_pointwise(kernel, static, fused), columns, size, threads)
+    return _map_pieces(_compile_pointwise(kernel, static), columns, size, threads)
 
 
 def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None) -> Any:
@@ -351,7 +349,6 @@ def pointwise(
     values: tuple[ArrayLike, ...],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    fused: bool = True,
     least: int = 1,
 ) -> Any:
     """Broadcast ``values``, apply the one-point JAX ``kernel`` to each point, and restore the common shape."""
@@ -359,7 +356,7 @@ def pointwise(
         return _map_traced(kernel, values, static)
     arrays = broadcast(names, values)
     shape = arrays[0].shape
-    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, fused, least)
+    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, least)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 

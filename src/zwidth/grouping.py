@@ -56,7 +56,6 @@ def map_by_degree(
     static: tuple[Any, ...] = (),
     lead: bool = False,
     chunk: Callable[[Degree], int] = lambda degree: batching.CHUNK,
-    fused: bool = True,
     least: int = 1,
     threads: int | None = None,
     few: Callable[[Degree], int] | None = None,
@@ -66,7 +65,7 @@ def map_by_degree(
     Other arguments may take the place of these if ``names`` says so; the last one is the delay. Results that are
     vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN
     behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any shape, and takes up to
-    so many points of a degree without JAX. ``fused``, ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
+    so many points of a degree without JAX. ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
     """
     if is_traced(*values):
         return _map_traced(kernel, names, values, static, lead)
@@ -79,7 +78,7 @@ def map_by_degree(
             with np.errstate(all="ignore"):
                 parts.append(kernel(*picked, degree, *static))
         else:
-            parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), fused, least, threads))
+            parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), least, threads))
         places.append(index)
     if not parts:
         parts, places = [_of_nothing(kernel, columns, static, few)], [np.arange(0)]

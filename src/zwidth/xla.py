@@ -20,11 +20,6 @@ Values = TypeVar("Values")
 # times as fast for radii and 1.04 times for verdicts.
 WIDE = {"xla_cpu_prefer_vector_width": 512}
 
-# Without fusion, for kernels that iterate over long formulas: fused, XLA computes shared parts of the formula again for
-# each of their uses. The general boundary point compiles 1.85 times as fast and runs at half the speed, which pays for
-# few points; the general ridge compiles in the same time (0.95 to 1.2) and runs at 0.6 to 0.7 of the speed.
-UNFUSED = {"xla_disable_hlo_passes": "fusion"}
-
 # A kernel over a block of points goes through it in pieces of so many, whose intermediates stay next to the processor.
 # Runs 1.05 times as fast for verdicts.
 STRIP = 1 << 12
@@ -35,8 +30,7 @@ def store_once(values: Values, witness: Array) -> Values:
 
     XLA repeats a chain of cheap operations in every loop it makes out of the operations behind it, but never a
     division. The divisor here is 1, or NaN where ``witness`` (anything known at run time) is, so that the compiler
-    cannot see it. The rigid loop's ridge compiles 1.3 and runs 1.3 to 1.5 times as fast; the general one compiles 1.4
-    and runs 1.1 times as fast where it is fused, as inside `jit`, and no faster where it is not.
+    cannot see it. The rigid loop's ridge compiles 1.3 and runs 1.3 to 1.5 times as fast.
     """
     if not is_jax(witness):
         return values

@@ -36,7 +36,7 @@ def solved_point(names: tuple[str, ...], values: tuple[ArrayLike, ...], line: st
     elif line != "ray":
         numbers, names = [numbers[0], 0.0, 0.0, 1.0], ("alpha", "beta0", "dalpha", "dbeta")
     everything = (delta, d, *numbers, _CODES[line])
-    return pointwise(_point_kernel, ("delta", "d", *names, "line"), everything, (delay_model,), fused=False)
+    return pointwise(_point_kernel, ("delta", "d", *names, "line"), everything, (delay_model,))
 
 
 class _Line(NamedTuple):

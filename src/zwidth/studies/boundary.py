@@ -176,7 +176,7 @@ def outline(delta: float, d: float, delay: DelayModel) -> tuple[dict[str, Any], 
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
     """The virtual damping that is stable for alpha -> 0, over delta, as columns for every delay."""
     columns = [np.tile(deltas, delays.size), np.repeat(delays, deltas.size)]
-    upper = map_flat(_upper_kernel, columns, (delay,), _BATCH, fused=False)
+    upper = map_flat(_upper_kernel, columns, (delay,), _BATCH)
     rows = np.asarray(upper).reshape(delays.size, deltas.size)
     shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
     return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in zip(delays, rows, strict=True)]
