@@ -17,6 +17,7 @@ TARGET = ROOT / "docs" / "figures"
 SHOWN = {
     "paper": ("fig5", "fig10", "fig11", "passivity_cost"),
     "phantom": ("recommend",),
+    "velocity_filter": ("stiffest",),
 }
 # The figure of configs/dense.yaml that is shown.
 STORED = "region_stable.svg"
