@@ -350,7 +350,7 @@ class Scene(SceneAnswers):
             >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
             >>> needed = scene.required("damping", 25e3)
             >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
-            19.62 N s/m or above
+            18.62 N s/m or above
         """
         return require(self, parameter, stiffness, within, negative_damping)
 

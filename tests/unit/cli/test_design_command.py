@@ -92,4 +92,4 @@ def test_tolerances_are_drawn_and_proved():
 def test_what_is_refused(arguments, message):
     result = CliRunner().invoke(cli, ["design", "--stiffness", "20 kN/m", *DEVICE, *arguments])
     assert result.exit_code == 2
-    assert message in result.stderr
+    assert message in result.output

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import flint
 import numpy as np
 import pytest
 
@@ -81,6 +82,8 @@ def test_counts_are_those_of_proved_poles(name):
         expected = any_loop.count_outside(loop, *wall)
         decided += expected is not None
         assert expected is None or outside == expected, (a, b)
+    if not decided and flint.__version__ < "0.9":
+        pytest.skip("this version of python-flint parts no roots of a polynomial of so high a degree")
     assert decided > 0.8 * alpha.size
 
 
