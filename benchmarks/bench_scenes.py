@@ -117,8 +117,8 @@ def report() -> str:
         scene.is_stable(1.0, 1.0)
         poles, first, wall, mapped, eigen, wrong, top = measure(scene)
         lines.append(
-            f"| {name} | {poles} | {first * 1e3:.2g} ms | {wall * 1e6:.2g} us | {mapped * 1e9:.2g} ns "
-            f"| {eigen / mapped:,.0f} | {wrong} | {top * 1e3:.2g} ms |"
+            f"| {name} | {poles} | {_spell(first * 1e3)} ms | {_spell(wall * 1e6)} us | {_spell(mapped * 1e9)} ns "
+            f"| {eigen / mapped:,.0f} | {wrong} | {_spell(top * 1e3)} ms |"
         )
         if direct is None:
             direct = _rigid_ratio(scene)
@@ -128,6 +128,11 @@ def report() -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _spell(value: float) -> str:
+    """Two digits, without an exponent."""
+    return f"{value:.0f}" if value >= 10 else f"{value:.2g}"
 
 
 def _rigid_ratio(scene: zwidth.Scene) -> float:
