@@ -11,6 +11,7 @@ import numpy as np
 
 from zwidth.errors import InputError
 from zwidth.linear.columns import stable_dampings
+from zwidth.linear.passivity import has_condition
 from zwidth.linear.poles import is_marginal
 from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
@@ -222,7 +223,7 @@ def _assess_parts(scene: Scene) -> SceneAssessment:
     marginal = is_marginal(scene.loop, stiffness / units.stiffness, damping / units.virtual_damping)
     constant = math.inf if marginal else float(slowest.time_constant[0])
     stands = scene.margins(stiffness, damping)
-    known = scene.device.coupling is None or scene.device.coupling.sensor == "motor"
+    known = has_condition(scene.device)
     return SceneAssessment(
         stable=bool(scene.is_stable(stiffness, damping)),
         marginal=marginal,

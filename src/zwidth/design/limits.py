@@ -29,8 +29,7 @@ def limits_of(scene: Scene) -> list[Limit]:
 
     Each thing that the scene has is made ideal by itself: the filter (the plain difference of two samples instead),
     the delay (none), the sampling (64 times faster, or less where window and delay are long; both, and the filter, the
-    same in seconds) and the compliance (rigid,
-    with the tip's mass added to the motor's).
+    same in seconds) and the compliance (rigid, with the tip's mass added to the motor's).
 
     Args:
         scene: a scene of plain numbers.

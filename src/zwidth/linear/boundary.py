@@ -91,6 +91,10 @@ class Boundary:
         """The angles besides 0 and pi at which ``Im(q - beta F)`` vanishes on every row."""
         return [line.w for line in self.lines if line.poles == 2]
 
+    def is_sound(self, beta: np.ndarray) -> np.ndarray:
+        """Whether the crossings of each row agree with the counts far below and far above."""
+        return self._settle(beta)[1]
+
     def _settle(self, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows whose crossings lead from the count far below to that far above, and which ones do (V15).
 

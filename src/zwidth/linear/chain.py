@@ -105,7 +105,7 @@ def rates(chain: Chain) -> tuple[Any, Any]:
     zero = 0.0 * (chain.bodies[0].mass + chain.bodies[-1].damping)
     size = 2 * count
 
-    def row(**_: Any) -> list[Any]:
+    def row() -> list[Any]:
         return [zero] * size
 
     accelerations = []
@@ -169,7 +169,8 @@ def _traced_phi1(rate: Any) -> Any:
     """The series for A over a power of 2, then ``phi1(2 A) = phi1(A) (1 + A phi1(A)/2)``.
 
     In two loops, because a program that is differentiated costs by its length: with JAX's own exponential, which holds
-    an approximant for each of five sizes, `zwidth.Scene.sensitivities` compiles 1.2 to 1.7 times as long.
+    an approximant for each of five sizes, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to
+    compile.
     """
     import jax
     import jax.numpy as jnp

@@ -6,6 +6,7 @@ import numpy as np
 
 from zwidth.linear.boundary import Boundary
 from zwidth.linear.curve import curve_at, zeros_of
+from zwidth.linear.rows import label_walls
 
 # Halvings of a step between two nodes: to the last digit of its angle.
 _HALVINGS = 60
@@ -17,7 +18,7 @@ def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     """Where a column is stable: array (intervals, 2) of beta, ascending.
 
     Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
-    nodes once its extremes are among them; the walls between two such dampings share the count of one of them.
+    nodes once its extremes are among them; the walls between two such dampings share the label of one of them.
     """
     met = np.unique(np.concatenate([_on_curve(boundary, alpha), _on_lines(boundary, alpha)]))
     met = met[np.isfinite(met)]
@@ -26,7 +27,7 @@ def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     reach = np.ptp(met) + np.abs(met).max() + 1.0
     ends = np.concatenate([[-np.inf], met, [np.inf]])
     between = 0.5 * (np.concatenate([[met[0] - reach], met]) + np.concatenate([met, [met[-1] + reach]]))
-    stable = boundary.outside(np.full(between.size, alpha), between) == 0
+    stable = label_walls(boundary, np.full(between.size, alpha), between)
     return np.stack([ends[:-1][stable], ends[1:][stable]], -1)
 
 

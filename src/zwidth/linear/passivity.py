@@ -28,10 +28,14 @@ _NODES, _ROUNDS, _MOST = 129, 80, 1 << 18
 _PROVED = 1e-13
 
 
+def has_condition(device: Any) -> bool:
+    """Whether force and sensed motion are those of one point, which the condition is about."""
+    return device.coupling is None or device.coupling.sensor == "motor"
+
+
 def check_has_condition(device: Any) -> None:
     """Refuse a device for which the condition does not hold."""
-    coupling = device.coupling
-    if coupling is not None and coupling.sensor == "tip":
+    if not has_condition(device):
         raise InputError(
             "coupling.sensor: 'tip' has no passivity condition of this kind: force and sensed motion are not those of "
             "one point, so that no damping of the motor bounds the energy; ask is_stable with the hand as operator"

@@ -58,7 +58,7 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
     """Whether each wall is stable; arrays that broadcast. Dampings that repeat are solved once."""
     shape = np.broadcast_shapes(alpha.shape, beta.shape)
     rows, place = np.unique(beta, return_inverse=True)
-    sound = boundary.outside(np.zeros(rows.size), np.where(np.isfinite(rows), rows, 0.0)) >= 0
+    sound = boundary.is_sound(np.where(np.isfinite(rows), rows, 0.0))
     if rows.size * _FEW_WALLS > np.prod(shape) or not sound.all():
         return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
     ends = stable_intervals(boundary, rows)

@@ -9,12 +9,14 @@ from typing import Any
 
 from zwidth import figures
 from zwidth.formatting import with_unit
+from zwidth.linear.passivity import has_condition
 from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
 from zwidth.studies.outcome import Outcome, stack
 from zwidth.studies.stable_set import bound_damping, name_kind, tabulate_walls, trace_outlines
 
 _DECAY = math.log(50.0)
+_PASSIVE = {True: "yes", False: "no", None: "not known, the sensor is not where the force acts"}
 
 
 def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -> Outcome:
@@ -45,6 +47,8 @@ def _summarize(
 ) -> dict[str, Any]:
     """All numbers of the recommendation, in SI units; what is not known is None."""
     radius = float(scene.spectral_radius(wall.stiffness, wall.virtual_damping))
+    known = has_condition(scene.device)
+    passive = bool(scene.is_passive(wall.stiffness, wall.virtual_damping)) if known else None
     numbers = {name: _known(value) for name, value in scene.parameters().items()}
     device = {name: value for name, value in numbers.items() if name not in ("stiffness", "virtual_damping")}
     return {
@@ -65,7 +69,7 @@ def _summarize(
             "stable": stable,
             "spectral_radius": _known(radius),
             "settling_time": _known(-_DECAY * scene.timing.period / math.log(radius) if 0 < radius < 1 else math.nan),
-            "passive": bool(scene.is_passive(wall.stiffness, wall.virtual_damping)),
+            "passive": passive,
         },
     }
 
@@ -100,7 +104,7 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
         f"- stays stable at this K for B between {lower} and {upper};",
         f"- has the spectral radius {spell(best['spectral_radius'], '')} and settles to 2 % in about "
         f"{spell(best['settling_time'], 's')};",
-        f"- is passive: {'yes' if best['passive'] else 'no'}.",
+        f"- is passive: {_PASSIVE[best['passive']]}.",
         "",
     ]
     return "\n".join(lines)

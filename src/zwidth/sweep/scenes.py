@@ -56,7 +56,8 @@ def _compute_walls(
     found: dict[str, np.ndarray] = {}
     unknown = np.zeros((stiffness.size, virtual_damping.size), bool)
     if "stable" in outputs:
-        found["stable"] = _label_rows(scene, stiffness, virtual_damping[0])
+        # With a row a damping its intervals serve all of its walls.
+        found["stable"] = np.asarray(scene.is_stable(stiffness.T, virtual_damping.T)).T
     if "spectral_radius" in outputs:
         found["spectral_radius"] = radius = np.asarray(scene.spectral_radius(stiffness, virtual_damping))
         unknown |= np.isnan(radius)
@@ -65,16 +66,6 @@ def _compute_walls(
         found["passive"] = margin > 0
         unknown |= np.isnan(margin)
     return found, np.where(unknown, Status.NOT_CONVERGED, Status.OK)
-
-
-def _label_rows(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> np.ndarray:
-    """Which walls are stable: those within the intervals of their row, one comparison each."""
-    # Shape (rows, most intervals of a row, 2).
-    ends = scene.stable_stiffness(virtual_damping)
-    stable = np.zeros((stiffness.size, ends.shape[0]), bool)
-    for low, high in np.moveaxis(ends, (1, 2), (0, 1)):
-        stable |= (stiffness > low) & (stiffness < high)
-    return stable
 
 
 def _compute_device(scene: Scene) -> tuple[dict[str, float], int]:

@@ -296,6 +296,9 @@ class SweepStudy(Study):
             if name not in OUTPUTS_WITH_PARTS:
                 allowed = f"with a velocity filter, a hand or a coupling there are {listing(OUTPUTS_WITH_PARTS)}"
                 yield ("outputs", index), problem(f"got {name!r}", allowed, "choose from these")
+            elif name == "passive" and self.coupling is not None and self.coupling.sensor == "tip":
+                allowed = "it is known where the force acts on the body whose position is sensed"
+                yield ("outputs", index), problem("got 'passive' with the sensor at the tip", allowed, "remove it")
         if not {"mass"} <= set(given) or not {"period", "rate"} & set(given):
             return
         yield from find_faults(self)

@@ -102,6 +102,16 @@ def test_a_normalized_scene_has_no_parts(load):
     assert [fault.field for fault in caught.value.faults] == ["scene.velocity"]
 
 
+def test_a_sweep_of_passivity_needs_the_sensor_where_the_force_acts(load):
+    walls = "axes: {stiffness: [1 kN/m, 5 kN/m], virtual_damping: [0, 10]}"
+    sweep = f"studies: [{{kind: sweep, name: s, {walls}, outputs: [stable, passive]}}]\n"
+    coupling = "coupling: {mass: 50 g, stiffness: 20 kN/m, sensor: SENSOR}"
+    assert load(part(coupling.replace("SENSOR", "motor"), sweep)).studies
+    with pytest.raises(ConfigFileError, match="got 'passive' with the sensor at the tip") as caught:
+        load(part(coupling.replace("SENSOR", "tip"), sweep))
+    assert [fault.field for fault in caught.value.faults] == ["studies[0].outputs[1]"]
+
+
 OTHERS = {
     "ridge": "",
     "passivity": "",

@@ -54,6 +54,17 @@ def test_islands_are_told_apart_and_drawn():
     assert [line.get_label() for line in ax.lines[:3]] == ["outline 1", "island 2", "stiffest"]
 
 
+def test_a_recommendation_with_the_sensor_at_the_tip_leaves_passivity_open():
+    device = {"mass": 0.1, "damping": 10, "period": 1e-3, "delay": 1e-3}
+    tip = {"mass": 0.05, "stiffness": 20e3, "damping": 1.0, "sensor": "tip"}
+    study = RecommendStudy.model_validate({"kind": "recommend", "name": "r", "device": device | {"coupling": tip}})
+    outcome = study.compute(None, alone=True)
+    best = json.loads(outcome.documents["recommendation.json"])["recommended"]
+    assert best["stable"] is True
+    assert best["passive"] is None
+    assert "is passive: not known, the sensor is not where the force acts." in outcome.documents["recommendation.md"]
+
+
 def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
     study = RecommendStudy.model_validate({"kind": "recommend", "name": "r", "device": HELD})
     outcome = study.compute(None, True)
