@@ -45,6 +45,7 @@ from .parts.coupling import Coupling as Coupling
 from .parts.device import Device as Device
 from .parts.operator import Operator as Operator
 from .parts.timing import Timing as Timing
+from .parts.velocity import FOAW as FOAW
 from .parts.velocity import BackwardDifference as BackwardDifference
 from .parts.velocity import Butterworth as Butterworth
 from .parts.velocity import LowPass as LowPass
@@ -55,6 +56,9 @@ from .response import StepResponse as StepResponse
 from .response import step_response as step_response
 from .runs import run as run
 from .scene import Scene as Scene
+from .simulation.result import Motion as Motion
+from .simulation.result import Outcome as Outcome
+from .simulation.simulate import simulate as simulate
 from .stability.boundary import BoundaryPoint as BoundaryPoint
 from .stability.boundary import boundary as boundary
 from .stability.boundary import boundary_point as boundary_point

@@ -28,6 +28,8 @@ from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import VirtualWall
+from zwidth.simulation.result import Motion
+from zwidth.simulation.simulate import simulate
 from zwidth.stability.labels import StabilityMethod, is_stable
 
 _EXAMPLES = {
@@ -353,6 +355,25 @@ class Scene(SceneAnswers):
             18.62 N s/m or above
         """
         return require(self, parameter, stiffness, within, negative_damping)
+
+    def simulate(
+        self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None, **options: Any
+    ) -> Motion:
+        """Simulate this device on a wall in time, with contact, friction, an encoder and a motor as wanted.
+
+        Args:
+            stiffness: K in N/m; the scene's own wall where left out.
+            virtual_damping: B in N s/m, likewise.
+            **options: those of `zwidth.simulate`, which this calls.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> held = scene.simulate(25e3, 40, start_position=1e-4, coulomb=1.0, periods=500)
+            >>> zwidth.Outcome(held.outcome).name
+            'REST'
+        """
+        return simulate(self, stiffness, virtual_damping, **options)
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.

@@ -18,7 +18,7 @@ from zwidth.linear_loop import Estimate
 from zwidth.parts.checks import check_number, check_whole
 from zwidth.xp import is_jax, namespace
 
-_LONGEST_WINDOW, _HIGHEST_ORDER = 1000, 8
+_LONGEST_WINDOW, _HIGHEST_ORDER, _LONGEST_ADAPTIVE = 1000, 8, 64
 
 
 def _check_period(owner: Any) -> None:
@@ -212,7 +212,37 @@ class VelocityFilter:
         return Estimate(0, self.numerator[0] / self.denominator[0] * period, lag, zeros, poles)
 
 
-Velocity: TypeAlias = BackwardDifference | WindowedDifference | LowPass | Butterworth | VelocityFilter
+@dataclass(frozen=True)
+class FOAW:
+    """First-order adaptive windowing, for simulations: it has no linear form and no answer to questions of stability.
+
+    The slope over the longest window, up to ``samples`` periods, whose straight line from its oldest to its newest
+    position misses none between by more than ``noise``.
+
+    Args:
+        noise: the largest error of a measured position in m, > 0: one count of an encoder.
+        samples: the longest window in periods, 1 to 64.
+
+    References:
+        Janabi-Sharifi, Hayward, Chen 2000, IEEE Trans. Control Systems Technology 8(6):1003-1009 (end-fit).
+    """
+
+    noise: Any
+    samples: int = 15
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "noise", check_number("velocity.noise", self.noise, "m", low_open=True))
+        object.__setattr__(self, "samples", check_whole("velocity.samples", self.samples, 1, _LONGEST_ADAPTIVE))
+
+    def estimate(self, period: Any) -> Estimate:
+        """Refused: what it answers hangs on the motion."""
+        raise InputError(
+            "velocity: FOAW has no linear form, so that a wall with it has no poles and no boundary; simulate it, or "
+            "ask with a linear estimate such as zwidth.WindowedDifference"
+        )
+
+
+Velocity: TypeAlias = BackwardDifference | WindowedDifference | LowPass | Butterworth | VelocityFilter | FOAW
 
 
 def check_cutoff(cutoff: Any, period: Any) -> None:

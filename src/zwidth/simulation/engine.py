@@ -1,0 +1,196 @@
+"""All periods of all lanes: compiled once for every shape, run in blocks of periods (docs/theory/simulation.md).
+
+A block has a fixed number of periods, so that a longer simulation compiles nothing new.
+"""
+
+from __future__ import annotations
+
+from functools import cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth._types import Array
+from zwidth.simulation.batch import Given, Task
+from zwidth.simulation.lanes import Lanes, Options
+from zwidth.simulation.motion import Body, dot
+from zwidth.simulation.period import Program, Reading, Work, control, forces_of, move
+
+BLOCK = 128
+
+
+class Extent(NamedTuple):
+    """How far the first body went within a stretch of time."""
+
+    low: Array
+    high: Array
+
+
+class Summary(NamedTuple):
+    """What is kept of a motion that is not recorded."""
+
+    deepest: Array  # largest position at a sample
+    widest: Array  # largest distance from 0
+    exits: Array  # times the wall was left
+    impact: Array  # velocity at the first sample in contact
+    given: Array  # the most energy that the wall has given so far
+    halves: Extent  # of the tail, (2, lanes)
+    turns: Array  # how often the velocity turned positive in the tail
+    first_turn: Array
+    last_turn: Array
+
+
+class State(NamedTuple):
+    """All that goes from one sample to the next."""
+
+    body: Body
+    program: Program
+    work: Work
+    summary: Summary
+
+
+class Frame(NamedTuple):
+    """What is recorded at an instant."""
+
+    positions: Array  # (bodies, lanes)
+    velocity: Array
+    force: Array
+    slip: Array
+    work: Work
+    energy: Array
+
+
+class Inputs(NamedTuple):
+    """What a period is given from outside."""
+
+    k: Array
+    noise: Array
+    push: Array
+    durations: Array  # (substeps, pieces, lanes) with jitter
+
+
+def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) -> State:
+    """The state before the first sample: coming on a line, and no command on its way (T2)."""
+    count = lanes.place.shape[1]
+    body = np.zeros((count, x.size))
+    # All bodies together: nothing is stretched.
+    body[0], body[count // 2] = x, v
+    back = np.mod(-np.arange(rings[0]), rings[0])
+    positions = x - back[:, None] * v
+    zero, far = np.zeros(x.size), np.full(x.size, np.inf)
+    program = Program(positions, _settle(lanes, x, v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
+    halves = Extent(np.stack([far, far]), np.stack([-far, -far]))
+    summary = Summary(zero, zero, zero, zero + np.nan, zero, halves, zero, zero, zero)
+    return State(Body(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
+
+
+def _settle(lanes: Lanes, x: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """The state of the velocity filter behind a long past on the line: of a difference constant, else growing."""
+    A, B, window = (np.asarray(part) for part in (lanes.estimator.A, lanes.estimator.B, lanes.estimator.window))
+    level, slope = np.where(window > 0, v, x), np.where(window > 0, 0.0, v)
+    left = np.moveaxis(np.eye(len(B))[..., None] - A, -1, 0)
+    columns = np.moveaxis(B, -1, 0)[..., None]
+    grows = np.linalg.solve(left, columns * slope[:, None, None])
+    return np.moveaxis(np.linalg.solve(left, columns * level[:, None, None] - grows)[..., 0], 0, -1)
+
+
+def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
+    """One period; ``ends`` the periods at which the tail begins, its second half, and the end."""
+    sensed = state.body.x[0] + given.noise
+    program, reading = control(lanes, options, state.program, given.k, sensed)
+    forces = forces_of(lanes, options, program.commands, given.k)
+    durations = given.durations if options.jitter else lanes.durations
+    motion = jnp.roll(lanes.place[0], state.body.x.shape[0] // 2, 0)
+
+    def substep(carry: tuple[Body, Work], j: Array) -> tuple[tuple[Body, Work], Frame | None]:
+        body, work = carry
+        frame = None
+        if options.record:
+            # Of pieces that take no time the force is never felt.
+            acting = forces[-1]
+            for piece in reversed(range(options.pieces - 1)):
+                acting = jnp.where(durations[j, piece] > 0, forces[piece], acting)
+            positions = jnp.stack([dot(row, body.x) for row in lanes.place])
+            energy = dot(body.x, jnp.stack([dot(row, body.x) for row in lanes.energy]))
+            frame = Frame(positions, dot(motion, body.x), acting, body.slip, work, energy)
+        for piece, force in enumerate(forces):
+            body, work = move(lanes, options, body, work, force, given.push, (j, piece), durations[j, piece])
+        return (body, work), frame
+
+    (body, work), frames = jax.lax.scan(substep, (state.body, state.work), np.arange(options.substeps))
+    summary = _summarize(lanes, state, reading, body, work, given.k, ends, motion)
+    after = State(body, program, work, summary)
+    # A block goes on behind the last period.
+    going = given.k < ends[2]
+    after = jax.tree.map(partial(jnp.where, going), after, state)
+    return after, (reading, frames) if options.record else None
+
+
+def _summarize(
+    lanes: Lanes, state: State, reading: Reading, body: Body, work: Work, k: Array, ends: Array, motion: Array
+) -> Summary:
+    known = state.summary
+    x, v, next_v = dot(lanes.place[0], state.body.x), dot(motion, state.body.x), dot(motion, body.x)
+    first = reading.touching & ~state.program.touching & (k > 0) & jnp.isnan(known.impact)
+    turning = (v <= 0) & (next_v > 0) & (k >= ends[0])
+    moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
+    within = jnp.stack([k >= ends[0], k >= ends[1]]) & jnp.stack([k < ends[1], k < ends[2]])
+    within = within[:, None]
+    return Summary(
+        jnp.fmax(known.deepest, x),
+        jnp.fmax(known.widest, jnp.abs(x)),
+        known.exits + (state.program.touching & ~reading.touching),
+        jnp.where(first, v, known.impact),
+        jnp.fmax(known.given, work.wall),
+        Extent(
+            jnp.where(within, jnp.fmin(known.halves.low, x), known.halves.low),
+            jnp.where(within, jnp.fmax(known.halves.high, x), known.halves.high),
+        ),
+        known.turns + turning,
+        jnp.where(turning & (known.turns == 0), moment, known.first_turn),
+        jnp.where(turning, moment, known.last_turn),
+    )
+
+
+@cache
+def compile_block(options: Options) -> Any:
+    """A block of periods, compiled."""
+
+    def block(lanes: Lanes, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
+        return jax.lax.scan(partial(_period, lanes, options, ends), state, given)
+
+    return jax.jit(block, donate_argnums=2)
+
+
+def run_lanes(
+    lanes: Lanes, options: Options, task: Task, given: Given, rings: tuple[int, int]
+) -> tuple[State, Reading | None, Frame | None]:
+    """The last state, and what is recorded along a first axis of periods (and a second of substeps)."""
+    halves = task.periods - task.tail, task.periods - task.tail // 2, task.periods
+    state: Any = jax.tree.map(jnp.asarray, begin(lanes, given.position, given.velocity, rings))
+    lanes, ends = jax.tree.map(jnp.asarray, lanes), jnp.asarray(halves)
+    recorded = []
+    for first in range(0, task.periods, BLOCK):
+        inputs = Inputs(
+            np.arange(first, first + BLOCK),
+            _cut(given.noise, first, 0.0, (1,)),
+            lanes.push + _cut(given.history, first, 0.0, (1,)),
+            _cut(given.durations, first, 0.0, (0, 0, 1)),
+        )
+        state, found = compile_block(options)(lanes, ends, state, inputs)
+        recorded.append(jax.tree.map(np.asarray, found))
+    state = jax.tree.map(np.asarray, state)
+    if not options.record:
+        return state, None, None
+    reading, frame = jax.tree.map(lambda *parts: np.concatenate(parts)[: task.periods], *recorded)
+    return state, reading, frame
+
+
+def _cut(values: np.ndarray | None, first: int, rest: float, shape: tuple[int, ...]) -> np.ndarray:
+    """The block of values along time that begins there, filled up; of one lane where there are none."""
+    if values is None:
+        return np.full((BLOCK, *shape), rest)
+    part = values[first : first + BLOCK]
+    return np.pad(part, ((0, BLOCK - len(part)), *((0, 0),) * (part.ndim - 1)), constant_values=rest)

@@ -1,0 +1,144 @@
+"""Many simulations side by side: what each of them needs, as arrays whose last axis are the simulations ("lanes").
+
+Everything is in units of the period and of the mass that the wall's force acts on; a last axis of length 1 serves all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth._types import Array
+from zwidth.errors import InputError
+from zwidth.linear.state_space import estimate_matrices
+from zwidth.linear_loop import Estimate
+from zwidth.parts.velocity import FOAW
+from zwidth.simulation.flow import Flow, Mechanics, digit_flow, flow
+
+# With friction, steps are so short a part of the fastest motion that two events within one are seen (T5), and never so
+# many that a period would take forever.
+_STEP, _MOST_STEPS = 0.25, 256
+
+
+class Options(NamedTuple):
+    """What decides the shape of the program that is compiled."""
+
+    substeps: int
+    pieces: int  # forces that may act one after the other within a substep
+    friction: bool
+    jitter: bool
+    foaw: int  # longest window, 0 where the estimate is linear
+    bilateral: bool
+    pulling: bool
+    record: bool
+
+
+class Motor(NamedTuple):
+    """What the motor and its bearings do; 0 or infinity where they do nothing."""
+
+    max_force: Array
+    max_rate: Array
+    coulomb: Array
+    static: Array
+
+
+class Estimator(NamedTuple):
+    """The velocity estimate as a difference over a window and a filter; and FOAW's bound."""
+
+    A: Array  # (p, p, lanes)
+    B: Array  # (p, lanes)
+    C: Array
+    D: Array  # (lanes,)
+    window: Array
+    bound: Array
+
+
+class Lanes(NamedTuple):
+    """All that a simulation needs to know."""
+
+    alpha: Array
+    beta: Array
+    resolution: Array
+    push: Array
+    late: Array  # whole periods of delay
+    motor: Motor
+    estimator: Estimator
+    rate: Array  # (n, n + 1, lanes)
+    place: Array  # (bodies, n, lanes)
+    energy: Array  # (n, n, lanes)
+    durations: Array  # (substeps, pieces, lanes), without jitter
+    pieces: Flow  # over these, (substeps, pieces, ..., lanes)
+    digits: Flow  # slipping and held, (2, DIGITS, ..., lanes)
+    longest: Array  # step with friction
+
+
+def _lay(parts: np.ndarray, which: np.ndarray) -> np.ndarray:
+    """One array a scene, along the first axis, as one a lane along the last; of length 1 where there is one scene."""
+    last = np.moveaxis(parts, 0, -1)
+    return last[..., which] if parts.shape[0] > 1 else last
+
+
+def lay_flow(found: Flow, which: np.ndarray) -> Flow:
+    """Flows of scenes as flows of lanes."""
+    return Flow(*(_lay(part, which) for part in found))
+
+
+def lay_estimators(estimates: Sequence[Estimate | FOAW], which: np.ndarray) -> Estimator:
+    """The estimators of all scenes, filters filled up to the longest."""
+    # A window's shift register is the history of positions, which every lane has.
+    filters = [estimate_matrices(replace(each, window=0)) if isinstance(each, Estimate) else None for each in estimates]
+    order = max((0 if each is None else each.A.shape[0] for each in filters), default=0)
+    columns = []
+    for each, matrices in zip(estimates, filters, strict=True):
+        A, B, C, D = np.zeros((order, order)), np.zeros(order), np.zeros(order), 0.0
+        if matrices is not None:
+            size = matrices.A.shape[0]
+            A[:size, :size], B[:size], C[:size] = matrices.A, matrices.B[:, 0], matrices.C[0]
+            D = matrices.D[0, 0]
+        window, bound = (each.window, 0.0) if isinstance(each, Estimate) else (each.samples, each.noise)
+        columns.append((A, B, C, D, window, bound))
+    return Estimator(*(_lay(np.array(column), which) for column in zip(*columns, strict=True)))
+
+
+def cut_period(fractions: np.ndarray, substeps: int, pieces: int) -> np.ndarray:
+    """How long the parts of a period are in which the force is constant, ``(scenes, substeps, pieces)``."""
+    begin = np.arange(substeps) / substeps
+    cut = np.clip(fractions[:, None] - begin, 0.0, 1.0 / substeps)
+    parts = [cut, 1.0 / substeps - cut] if pieces == 2 else [np.full_like(cut, 1.0 / substeps)]
+    return np.stack(parts, -1)
+
+
+def find_longest_steps(machine: Mechanics) -> np.ndarray:
+    """The longest steps with friction: powers of 2, 2 where the velocity is monotone under a constant force."""
+    fastest = np.abs(np.linalg.eigvals(machine.rate[:, :, :-1])).max(-1)
+    steps = 0.5 ** np.maximum(0, np.ceil(np.log2(np.maximum(fastest, 1e-9) / _STEP)))
+    if machine.place.shape[0] == 1:
+        steps = np.where(machine.rate[:, 1, 0] == 0, 2.0, steps)
+    if np.min(steps) * _MOST_STEPS < 1.0:
+        raise InputError(
+            f"coupling.stiffness: a link whose motion turns by {fastest.max():.3g} radians a period takes "
+            f"{1 / np.min(steps):.0f} steps a period to follow with friction; leave the link or the friction out"
+        )
+    return steps
+
+
+def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
+    """What of `Lanes` hangs on the bodies."""
+    ways = (machine.rate, machine.held) if options.friction else (machine.rate,)
+    digits = Flow(*(np.zeros((1, 1, 1, 1, 1)) for _ in Flow._fields))
+    if options.friction or options.jitter:
+        found = [lay_flow(digit_flow(way, machine.drain), which) for way in ways]
+        digits = Flow(*(np.stack(column) for column in zip(*found, strict=True)))
+    longest = find_longest_steps(machine) if options.friction else np.array([2.0])
+    return {
+        "rate": _lay(machine.rate, which),
+        "place": machine.place[..., None],
+        "energy": _lay(machine.energy, which),
+        "durations": _lay(durations, which),
+        "pieces": lay_flow(flow(machine.rate, machine.drain, durations), which),
+        "digits": digits,
+        "longest": _lay(longest, which),
+    }

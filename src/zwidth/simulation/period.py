@@ -1,0 +1,123 @@
+"""One sampling period of every lane: measure, estimate, command, and the motion until the next sample.
+
+Pure functions of JAX arrays whose last axis are the lanes; a state is a tuple of such arrays
+(docs/theory/simulation.md, T2, T3).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from zwidth._types import Array
+from zwidth.simulation.lanes import Lanes, Options
+from zwidth.simulation.motion import Body, advance, dot, slide, times
+
+
+class Program(NamedTuple):
+    """What the program keeps from one sample to the next."""
+
+    positions: Array  # ring of measured positions, (length, lanes)
+    filtered: Array  # state of the velocity filter
+    commands: Array  # ring of commands, (length, lanes)
+    touching: Array
+
+
+class Reading(NamedTuple):
+    """What the program made of one sample."""
+
+    measured: Array
+    velocity: Array
+    command: Array
+    touching: Array
+
+
+class Work(NamedTuple):
+    """Energy since the start."""
+
+    wall: Array  # given by the wall
+    push: Array  # given by the hand's push
+    damping: Array  # taken by dampers
+    friction: Array  # taken by friction
+
+
+def look_back(ring: Array, k: Array, back: Array) -> Array:
+    """The entry of ``back`` samples ago in every lane."""
+    place = jnp.mod(k - back, ring.shape[0])
+    if back.shape[-1] == 1:
+        return ring[place[0]]
+    return jnp.take_along_axis(ring, place[None], 0)[0]
+
+
+def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: Array) -> tuple[Program, Reading]:
+    """Measure, estimate the velocity and command a force (T2)."""
+    quantum = lanes.resolution
+    steps = jnp.floor(sensed / jnp.where(quantum > 0, quantum, 1.0) + 0.5)
+    measured = jnp.where(quantum > 0, quantum * steps, sensed)
+    positions = program.positions.at[k % program.positions.shape[0]].set(measured)
+    estimator = lanes.estimator
+    if options.foaw:
+        velocity, filtered = _adapt_window(positions, k, measured, estimator.bound, options.foaw), program.filtered
+    else:
+        window = estimator.window
+        wide = jnp.maximum(window, 1)
+        entering = jnp.where(window > 0, (measured - look_back(positions, k, window)) / wide, measured)
+        velocity, filtered = estimator.D * entering, program.filtered
+        if len(filtered):
+            velocity = velocity + dot(estimator.C, filtered)
+            filtered = times(estimator.A, filtered) + estimator.B * entering
+    touching = jnp.isfinite(measured) | True if options.bilateral else measured > 0
+    wanted = jnp.where(touching, -(lanes.alpha * measured + lanes.beta * velocity), 0.0)
+    if not options.pulling:
+        wanted = jnp.minimum(wanted, 0.0)
+    motor, last = lanes.motor, program.commands[(k - 1) % program.commands.shape[0]]
+    wanted = jnp.clip(wanted, -motor.max_force, motor.max_force)
+    command = jnp.clip(wanted, last - motor.max_rate, last + motor.max_rate)
+    commands = program.commands.at[k % program.commands.shape[0]].set(command)
+    return Program(positions, filtered, commands, touching), Reading(measured, velocity, command, touching)
+
+
+def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, most: int) -> Array:
+    """FOAW with the line through both ends of its window: the longest before the first that fails."""
+    past = ring[jnp.mod(k - np.arange(most + 1), ring.shape[0])]
+    back = np.arange(1, most + 1)[:, None]
+    slopes = (newest - past[1:]) / back
+    missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # (window, sample, lanes)
+    within = jnp.all((missed <= bound) | (back > back[:, None]), axis=1)
+    length = jnp.sum(jnp.cumprod(within, 0), 0)
+    return jnp.take_along_axis(slopes, jnp.maximum(length - 1, 0)[None], 0)[0]
+
+
+def forces_of(lanes: Lanes, options: Options, commands: Array, k: Array) -> list[Array]:
+    """The commands that act one after the other until the next sample."""
+    ages = {1: (0,), 2: (1, 0), 4: (2, 1, 0, -1)}[options.pieces]
+    return [look_back(commands, k, lanes.late + age) for age in ages]
+
+
+def move(
+    lanes: Lanes,
+    options: Options,
+    body: Body,
+    work: Work,
+    force: Array,
+    push: Array,
+    place: tuple[Array, int],
+    time: Array,
+) -> tuple[Body, Work]:
+    """The motion over one piece of a period, ``place`` its substep and its number, and what it costs."""
+    total = force + push + 0.0 * body.x[0]
+    if options.friction:
+        after, lost, rubbed = slide(lanes, body, total, time)
+    elif options.jitter:
+        x, _, lost = advance(lanes.digits, np.zeros((), bool), body.x, total, time + 0.0 * total)
+        after, rubbed = Body(x, body.slip), 0.0
+    else:
+        z = jnp.concatenate([body.x, total[None]])
+        x = body.x + times(lanes.pieces.change[place], z)
+        after, rubbed = Body(x, body.slip), 0.0
+        lost = dot(z, times(lanes.pieces.loss[place], z))
+    way = dot(lanes.place[0], after.x - body.x)
+    moved = Work(work.wall + force * way, work.push + push * way, work.damping + lost, work.friction + rubbed)
+    return after, moved

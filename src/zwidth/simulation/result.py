@@ -1,0 +1,190 @@
+"""What a simulation returns: the motion in SI units, and what is said of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from zwidth.status import Status
+
+if TYPE_CHECKING:
+    import xarray
+
+
+class Outcome(IntEnum):
+    """How a motion ends, by the two halves of its tail."""
+
+    REST = 0
+    DECAYING = 1
+    STEADY = 2
+    GROWING = 3
+    DIVERGED = 4
+
+
+# A tail this small beside the widest motion is at rest; halves this much alike are steady.
+_AT_REST, _ALIKE, _BEYOND = 1e-9, 0.02, 1e100
+
+OF_MOTION = {
+    "position": ("position of the device, into the wall", "m"),
+    "velocity": ("velocity of the device", "m/s"),
+    "wall_force": ("force of the wall that acts", "N"),
+    "sticking": ("whether friction holds the device", "1"),
+    "tip_position": ("position of the mass beyond the coupling", "m"),
+    "hand_position": ("position of the hand behind its grasp", "m"),
+    "measured": ("position that the program reads", "m"),
+    "estimated_velocity": ("velocity that the program estimates", "m/s"),
+    "command": ("force that the program commands at the sample", "N"),
+    "contact": ("whether the program sees contact at the sample", "1"),
+    "wall_work": ("energy that the wall has given since the start", "J"),
+    "push_work": ("energy that the pushing hand has given", "J"),
+    "damping_loss": ("energy that dampers have taken", "J"),
+    "friction_loss": ("energy that friction has taken", "J"),
+    "energy": ("kinetic and elastic energy of all bodies", "J"),
+}
+OF_WHOLE = {
+    "amplitude": ("half of the peak-to-peak position in the tail", "m"),
+    "frequency": ("frequency of the motion in the tail", "Hz"),
+    "penetration": ("largest position at a sample", "m"),
+    "bounces": ("times the wall was left again", "1"),
+    "impact_velocity": ("velocity at the first sample in contact", "m/s"),
+    "energy_given": ("most energy that the wall has given beyond what it took", "J"),
+    "outcome": ("how the motion ends", "1"),
+    "status": ("why a simulation has its values", "1"),
+}
+
+
+@dataclass(frozen=True)
+class Motion:
+    """One motion or many: arrays of the batch's shape, those over time with one more axis at the end.
+
+    Attributes:
+        time: instants in s, ``substeps`` a period, the first 0; of one axis where all share a period.
+        position, velocity: of the device, the body that the forces act on, in m and m/s; positive into the wall.
+        tip_position, hand_position: of the bodies behind a coupling and behind a grasp; None without.
+        wall_force: that acts from the instant on, in N.
+        sticking: whether friction holds the device.
+        measured, estimated_velocity, command, contact: what the program made of the last sample.
+        wall_work, push_work: energy given by the wall and by the hand's push since the start, in J.
+        damping_loss, friction_loss: energy taken by dampers and by friction.
+        energy: kinetic and elastic energy of all bodies; grows by the work done and falls by what is lost.
+        amplitude: half of the peak-to-peak position in the tail, in m, at the samples.
+        frequency: of the motion in the tail, in Hz; NaN where the velocity does not turn twice there.
+        penetration: the largest position at a sample, in m, at least 0.
+        bounces: how often the wall was left again.
+        impact_velocity: at the first sample in contact, in m/s; NaN where there is none or the motion starts there.
+        energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
+        outcome: a code of `zwidth.Outcome`: REST, the tail's motion is below 1e-9 of the widest; STEADY, its two halves
+            differ by at most 2 % in width; DECAYING, GROWING; DIVERGED, beyond 1e100.
+        status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
+            within a period than are followed.
+    """
+
+    time: np.ndarray | None
+    position: np.ndarray | None
+    velocity: np.ndarray | None
+    wall_force: np.ndarray | None
+    sticking: np.ndarray | None
+    tip_position: np.ndarray | None
+    hand_position: np.ndarray | None
+    measured: np.ndarray | None
+    estimated_velocity: np.ndarray | None
+    command: np.ndarray | None
+    contact: np.ndarray | None
+    wall_work: np.ndarray | None
+    push_work: np.ndarray | None
+    damping_loss: np.ndarray | None
+    friction_loss: np.ndarray | None
+    energy: np.ndarray | None
+    amplitude: Any
+    frequency: Any
+    penetration: Any
+    bounces: Any
+    impact_velocity: Any
+    energy_given: Any
+    outcome: Any
+    status: Any
+
+    def to_dataset(self, *dims: str) -> xarray.Dataset:
+        """The same as an xarray Dataset (extra ``store``), each variable with its long name and unit.
+
+        Args:
+            *dims: names of the batch's axes; ``batch_0``, ``batch_1``, ... where left out.
+        """
+        import xarray
+
+        shape = np.shape(self.amplitude)
+        names = dims or tuple(f"batch_{k}" for k in range(len(shape)))
+        variables: dict[str, Any] = {}
+        for name, (long_name, units) in (OF_MOTION | OF_WHOLE).items():
+            value = getattr(self, name)
+            if value is not None:
+                over = (*names, "time") if name in OF_MOTION else names
+                variables[name] = (over, value, {"long_name": long_name, "units": units})
+        data = xarray.Dataset(variables)
+        if self.time is not None:
+            over = "time" if self.time.ndim == 1 else (*names, "time")
+            name = "time" if self.time.ndim == 1 else "instant"
+            data = data.assign_coords({name: (over, self.time, {"long_name": "time", "units": "s"})})
+        return data
+
+
+def classify(widest: np.ndarray, first: np.ndarray, second: np.ndarray, finite: np.ndarray) -> np.ndarray:
+    """The outcome by the widths of the tail's halves."""
+    with np.errstate(invalid="ignore"):
+        alike = np.abs(first - second) <= _ALIKE * np.maximum(first, second)
+    changing = np.where(second < first, Outcome.DECAYING, Outcome.GROWING)
+    outcome = np.where(second <= _AT_REST * widest, Outcome.REST, np.where(alike, Outcome.STEADY, changing))
+    return np.where(finite & (widest < _BEYOND), outcome, Outcome.DIVERGED)
+
+
+def to_si(
+    found: Any, instants: np.ndarray | None, period: np.ndarray, mass: np.ndarray, bodies: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Columns of one row a simulation, by the names of `Motion`; ``bodies`` names the positions of all bodies."""
+    state, reading, frame = found
+    known, force = state.summary, mass / period**2
+    widths = 0.5 * (known.halves.high - known.halves.low)
+    finite = np.isfinite(state.body.x).all(0)
+    with np.errstate(all="ignore"):
+        frequency = (known.turns - 1) / ((known.last_turn - known.first_turn) * period)
+    # A motion that is lost before it is large was not followed.
+    lost = ~finite & (known.widest < _BEYOND)
+    columns = {
+        "amplitude": widths.max(0),
+        "frequency": np.where(known.turns > 1, frequency, np.nan),
+        "penetration": known.deepest,
+        "bounces": known.exits.astype(int),
+        "impact_velocity": known.impact / period,
+        "energy_given": known.given * force,
+        "outcome": classify(known.widest, widths[0], widths[1], finite),
+        "status": np.where(lost, Status.NOT_CONVERGED, Status.OK),
+    }
+    if frame is None:
+        return columns
+
+    def unroll(part: np.ndarray) -> np.ndarray:
+        """(periods, substeps, lanes) as (lanes, samples)."""
+        return part.reshape(-1, part.shape[-1]).T
+
+    columns |= {name: unroll(part) for name, part in zip(bodies, np.moveaxis(frame.positions, 2, 0), strict=True)}
+    columns |= {
+        "velocity": unroll(frame.velocity) / period[:, None],
+        "wall_force": unroll(frame.force) * force[:, None],
+        "sticking": unroll(frame.slip) == 0,
+        "measured": reading.measured.T,
+        "estimated_velocity": reading.velocity.T / period[:, None],
+        "command": reading.command.T * force[:, None],
+        "contact": reading.touching.T,
+        "energy": unroll(frame.energy) * force[:, None],
+    }
+    for name, part in zip(("wall_work", "push_work", "damping_loss", "friction_loss"), frame.work, strict=True):
+        columns[name] = unroll(part) * force[:, None]
+    if instants is not None:
+        substeps = frame.force.shape[1]
+        shares = np.arange(substeps)[:, None] / substeps
+        time = instants[:-1, None] + shares * np.diff(instants, axis=0)[:, None]
+        columns["time"] = unroll(time) * period[:, None]
+    return columns

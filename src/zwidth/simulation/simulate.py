@@ -1,0 +1,266 @@
+"""Simulations in SI units: arguments to lanes, lanes to results."""
+
+from __future__ import annotations
+
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from zwidth._types import ArrayLike
+from zwidth.batching import as_float64
+from zwidth.errors import InputError, ResourceError, check_choice
+from zwidth.parts.checks import check_whole
+from zwidth.simulation.batch import Numbers, Task, run_batch, structure
+from zwidth.simulation.result import OF_MOTION, Motion
+from zwidth.status import Status
+
+Contact = Literal["bilateral", "unilateral", "push_only"]
+CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")
+
+# Numbers that are kept of every instant, and how much memory they may take.
+_BYTES, _MOST_BYTES = 14 * 8, 4 << 30
+
+
+class _Argument(NamedTuple):
+    unit: str
+    low: float
+    infinite: bool = False
+
+
+_ARGUMENTS = {
+    "stiffness": _Argument("N/m", -np.inf),
+    "virtual_damping": _Argument("N s/m", -np.inf),
+    "start_position": _Argument("m", -np.inf),
+    "start_velocity": _Argument("m/s", -np.inf),
+    "push": _Argument("N", -np.inf),
+    "resolution": _Argument("m", 0.0),
+    "noise": _Argument("m", 0.0),
+    "coulomb": _Argument("N", 0.0),
+    "static": _Argument("N", 0.0),
+    "max_force": _Argument("N", 0.0, infinite=True),
+    "max_rate": _Argument("N/s", 0.0, infinite=True),
+    "jitter": _Argument("s", 0.0),
+}
+
+
+def simulate(
+    scenes: Any,
+    stiffness: ArrayLike | None = None,
+    virtual_damping: ArrayLike | None = None,
+    *,
+    periods: int = 1000,
+    substeps: int = 1,
+    start_position: ArrayLike = 0.0,
+    start_velocity: ArrayLike = 0.0,
+    push: ArrayLike = 0.0,
+    push_history: ArrayLike | None = None,
+    contact: Contact = "bilateral",
+    resolution: ArrayLike = 0.0,
+    noise: ArrayLike = 0.0,
+    coulomb: ArrayLike = 0.0,
+    static: ArrayLike | None = None,
+    max_force: ArrayLike = np.inf,
+    max_rate: ArrayLike = np.inf,
+    jitter: ArrayLike = 0.0,
+    seed: Any = 0,
+    tail: int | None = None,
+    record: bool = True,
+) -> Motion:
+    """Simulate devices on virtual walls in time, exact between samples, with what the linear theory leaves out.
+
+    The wall's surface is at 0 and the wall is where positions are positive; its force on the device is
+    ``-(K x_k + B v_k)``, of the position that is read and the velocity that is estimated at sample k. Without friction,
+    rounding, limits and contact that is the linear loop whose stability `zwidth.Scene.is_stable` decides; nothing of
+    that decision is used here.
+
+    Args:
+        scenes: a `zwidth.Scene`, or a list or array of them. Its shape and those of the numbers below broadcast, as the
+            shape of the batch.
+        stiffness: K in N/m; the scene's own wall where left out.
+        virtual_damping: B in N s/m, likewise.
+        periods: how many sampling periods, >= 1.
+        substeps: instants recorded in each period, >= 1.
+        start_position: of all bodies, in m.
+        start_velocity: of all bodies, in m/s; the measured past lies on that line.
+        push: constant force of the hand on the device, in N.
+        push_history: force of the hand in N, held over each period, (..., periods); added to ``push``.
+        contact: "bilateral", the wall acts on both sides of its surface; "unilateral", where the measured position is
+            > 0; "push_only", there and never pulling.
+        resolution: of the encoder, in m; positions are rounded to it. 0 for none.
+        noise: standard deviation of the measured position before it is rounded, in m.
+        coulomb: dry friction on the device while it slips, in N.
+        static: dry friction that holds it, in N, at least ``coulomb``, which it is where left out.
+        max_force: the most that the motor gives, in N.
+        max_rate: the fastest that the command changes, in N/s.
+        jitter: samples are late by random times between 0 and this, in s, below one period.
+        seed: whole number, >= 0, one or one for each simulation; equal seeds draw equal noise.
+        tail: how many periods at the end amplitude, frequency and outcome are taken from; a quarter where left out.
+        record: whether to keep the motion over time; what is said of it is there in any case.
+
+    Returns:
+        Motion: arrays over time and figures of the whole, see `zwidth.Motion`.
+
+    Raises:
+        InputError: a number is not usable; friction on a link that rings hundreds of times a period.
+        ResourceError: more is to be recorded than 4 GiB.
+
+    Numerics:
+        Float64. Matrix exponentials over the constant parts of a period; with friction the instants of stopping and
+        starting to the last bit (docs/theory/simulation.md). JAX compiles for about a second for each combination of
+        bodies and nonlinear parts; then a rigid sample takes tens of nanoseconds in a batch, with friction some
+        microseconds.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section II (the loop); Abbott, Okamura 2005, IEEE Trans. Robotics 21(5):952-964
+        (quantization and friction).
+
+    Example:
+        >>> import zwidth
+        >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+        >>> hit = zwidth.simulate(scene, 10e3, 40, start_position=-1e-4, start_velocity=0.1, contact="unilateral")
+        >>> print(f"{hit.penetration * 1e3:.2f} mm, left {hit.bounces} times")
+        0.21 mm, left 1 times
+    """
+    given = {
+        "stiffness": stiffness,
+        "virtual_damping": virtual_damping,
+        "start_position": start_position,
+        "start_velocity": start_velocity,
+        "push": push,
+        "resolution": resolution,
+        "noise": noise,
+        "coulomb": coulomb,
+        "static": static,
+        "max_force": max_force,
+        "max_rate": max_rate,
+        "jitter": jitter,
+    }
+    check_choice("contact", contact, CONTACTS)
+    periods = check_whole("periods", periods, 1, 10**9)
+    substeps = check_whole("substeps", substeps, 1, 10_000)
+    tail = max(periods // 4, 1) if tail is None else check_whole("tail", tail, 1, periods)
+    task = Task(periods, substeps, tail, contact, record)
+    known, which = _list_scenes(scenes)
+    numbers, which, good = _read(known, which, given, seed, push_history, periods)
+    if record and numbers.seed.size * periods * substeps * _BYTES > _MOST_BYTES:
+        raise ResourceError(
+            f"{numbers.seed.size} simulations of {periods * substeps} instants take more than "
+            f"{_MOST_BYTES >> 30} GiB to record; use record=False, or fewer of them at a time"
+        )
+    shape, which = which.shape, which.ravel()
+    found: dict[str, np.ndarray] = {}
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    for place, scene in enumerate(known):
+        groups.setdefault(structure(scene), []).append(place)
+    for places in groups.values():
+        own = np.flatnonzero(np.isin(which, places))
+        if own.size:
+            part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), numbers.take(own), task)
+            for name, column in part.items():
+                if name not in found:
+                    found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
+                found[name][own] = column
+    for column in found.values():
+        # What was put in place of a bad number is no one's motion.
+        column[~good] = _missing(column.dtype)
+    found["status"][~good] = Status.INVALID_INPUT
+    if record and "time" not in found:
+        clock = np.array([float(scene.timing.period) for scene in known])
+        steps = np.arange(periods * substeps) / substeps
+        same = len(set(clock.tolist())) == 1
+        found["time"] = steps * clock[0] if same else steps * clock[which][:, None]
+    shaped = {
+        name: column if name == "time" and column.ndim == 1 else column.reshape((*shape, *column.shape[1:]))[()]
+        for name, column in found.items()
+    }
+    return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
+
+
+def _missing(dtype: np.dtype) -> Any:
+    return np.nan if dtype.kind == "f" else 0
+
+
+def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
+    """The scenes that are different objects, and which of them each place of the batch has."""
+    array = np.empty((), object)
+    if hasattr(scenes, "device"):
+        array[()] = scenes
+    else:
+        listed = list(scenes) if not isinstance(scenes, np.ndarray) else scenes
+        array = np.empty(np.shape(listed) if isinstance(listed, np.ndarray) else len(listed), object)
+        array[...] = listed
+    known: dict[int, int] = {}
+    which = np.empty(array.shape, int)
+    for place, scene in np.ndenumerate(array):
+        if not (hasattr(scene, "device") and hasattr(scene, "timing")):
+            raise InputError(f"scenes: got {scene!r}; a zwidth.Scene or a list of them is needed")
+        which[place] = known.setdefault(id(scene), len(known))
+    if not known:
+        raise InputError("scenes: got an empty list; one zwidth.Scene at least is needed")
+    return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which
+
+
+def _read(
+    known: list[Any], which: np.ndarray, given: dict[str, Any], seed: Any, history: Any, periods: int
+) -> tuple[Numbers, np.ndarray, np.ndarray]:
+    """The numbers of all simulations, the scene of each in the batch's shape, and which have usable numbers."""
+    if given["static"] is None:
+        given = {**given, "static": given["coulomb"]}
+    for name in ("stiffness", "virtual_damping"):
+        if given[name] is None:
+            given[name] = np.array([float(getattr(scene.wall, name)) for scene in known])[which]
+    arrays = {name: as_float64(name, value) for name, value in given.items()}
+    seeds = _read_seeds(seed)
+    outer, pushes = [], None
+    if history is not None:
+        pushes = as_float64("push_history", history)
+        if not pushes.ndim or pushes.shape[-1] != periods:
+            raise InputError(
+                f"push_history: got an array of shape {pushes.shape}; its last axis holds one force for each of "
+                f"{periods} periods"
+            )
+        outer = [pushes.shape[:-1]]
+    try:
+        shape = np.broadcast_shapes(which.shape, seeds.shape, *(array.shape for array in arrays.values()), *outer)
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items() if array.shape)
+        raise InputError(
+            f"shapes do not broadcast: scenes {which.shape}, {shapes}; make each axis equal or 1"
+        ) from error
+    which = np.broadcast_to(which, shape)
+    clock = np.array([float(scene.timing.period) for scene in known])
+    good = np.ones(shape, bool)
+    for name, array in arrays.items():
+        usable, allowed = _check(name, array, arrays, clock[which] if array.ndim else clock.min())
+        if array.ndim == 0 and not np.all(usable):
+            raise InputError(f"{name}: got {float(array):g} {_ARGUMENTS[name].unit}; {allowed}")
+        good &= usable
+    flat = {name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()}
+    steady = None
+    if pushes is not None:
+        steady = np.broadcast_to(pushes, (*shape, periods)).reshape(-1, periods)
+        if not np.all(np.isfinite(steady)):
+            raise InputError("push_history: got a force that is not finite; fill the gaps")
+    numbers = Numbers(**flat, seed=np.broadcast_to(seeds, shape).reshape(-1), history=steady)
+    return numbers, which, good.reshape(-1)
+
+
+def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: Any) -> tuple[Any, str]:
+    """Which values of an argument are usable, and what is allowed."""
+    rule = _ARGUMENTS[name]
+    usable = (array >= rule.low) & (np.isfinite(array) | (rule.infinite & (array > 0)))
+    allowed = (
+        "it must be finite" if rule.low < 0 else "it must be at least 0" + ("" if rule.infinite else " and finite")
+    )
+    if name == "static":
+        return usable & (array >= arrays["coulomb"]), "it must be at least coulomb, the friction while slipping"
+    if name == "jitter":
+        return usable & (array < period), "it must be at least 0 and less than the period"
+    return usable, allowed
+
+
+def _read_seeds(seed: Any) -> np.ndarray:
+    seeds = np.asarray(seed)
+    if seeds.dtype.kind not in "iu" or np.any(seeds < 0):
+        raise InputError(f"seed: got {seed!r}; whole numbers of at least 0 are needed")
+    return seeds
