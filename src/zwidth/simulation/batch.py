@@ -66,8 +66,8 @@ class Numbers:
 
 def structure(scene: Any) -> tuple[Any, ...]:
     """What the scenes of one program share: their bodies, which of them is sensed, and FOAW's longest window."""
-    adaptive = isinstance(scene.velocity, FOAW)
-    return *name_bodies(scene), _chain(scene).sensor, scene.velocity.samples if adaptive else 0
+    sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
+    return *name_bodies(scene), sensor, scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
 
 
 def name_bodies(scene: Any) -> tuple[str, ...]:
@@ -78,7 +78,9 @@ def name_bodies(scene: Any) -> tuple[str, ...]:
 
 
 def _chain(scene: Any) -> Chain:
-    return chain_of(replace(scene, velocity=BackwardDifference()) if isinstance(scene.velocity, FOAW) else scene)
+    d = scene.d
+    linear = replace(scene, velocity=BackwardDifference()) if isinstance(scene.velocity, FOAW) else scene
+    return chain_of(linear, (d, int(np.floor(d))))
 
 
 def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task) -> dict[str, np.ndarray]:
@@ -100,8 +102,8 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
         record=task.record,
     )
     estimates: list[Estimate | FOAW] = [
-        scene.velocity if isinstance(scene.velocity, FOAW) else scene.velocity.estimate(scene.timing.period)
-        for scene in scenes
+        scene.velocity if isinstance(scene.velocity, FOAW) else chain.estimate
+        for scene, chain in zip(scenes, chains, strict=True)
     ]
     late = np.array([chain.whole for chain in chains])
     periods = np.array([float(scene.timing.period) for scene in scenes])

@@ -88,12 +88,16 @@ def lay_flow(found: Flow, which: np.ndarray) -> Flow:
 
 def lay_estimators(estimates: Sequence[Estimate | FOAW], which: np.ndarray) -> Estimator:
     """The estimators of all scenes, filters filled up to the longest."""
-    # A window's shift register is the history of positions, which every lane has.
-    filters = [estimate_matrices(replace(each, window=0)) if isinstance(each, Estimate) else None for each in estimates]
+    # A window's shift register is the history of positions, which every lane has; most have nothing behind it.
+    filters = [
+        estimate_matrices(replace(each, window=0)) if isinstance(each, Estimate) and each.degree > each.window else None
+        for each in estimates
+    ]
     order = max((0 if each is None else each.A.shape[0] for each in filters), default=0)
     columns = []
     for each, matrices in zip(estimates, filters, strict=True):
-        A, B, C, D = np.zeros((order, order)), np.zeros(order), np.zeros(order), 0.0
+        A, B, C = np.zeros((order, order)), np.zeros(order), np.zeros(order)
+        D = each.gain if isinstance(each, Estimate) else 0.0
         if matrices is not None:
             size = matrices.A.shape[0]
             A[:size, :size], B[:size], C[:size] = matrices.A, matrices.B[:, 0], matrices.C[0]

@@ -63,7 +63,9 @@ def advance(
         lost = jnp.where(taken, lost + dot(z, times(pick(digits.loss, k), z)), lost)
         return jnp.where(taken, after, x), jnp.where(taken, longer, time), lost
 
-    return jax.lax.fori_loop(0, DIGITS, step, (x, jnp.zeros_like(limit), jnp.zeros_like(limit)))
+    # No digit longer than all of the time is taken.
+    first = jnp.floor(-jnp.log2(jnp.max(limit))).clip(0, DIGITS - 1).astype(int)
+    return jax.lax.fori_loop(first, DIGITS, step, (x, jnp.zeros_like(limit), jnp.zeros_like(limit)))
 
 
 def slide(lanes: Lanes, body: Body, force: Array, duration: Array) -> tuple[Body, Array, Array]:

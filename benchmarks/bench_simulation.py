@@ -1,0 +1,160 @@
+#!/usr/bin/env python3
+"""Measure simulations in time: samples a second of a batch, beside a loop in NumPy and scipy.signal.dlsim.
+
+    python benchmarks/bench_simulation.py [--write docs/simulation.md]
+
+All in one process, side by side: the best of some runs, after one that compiles. The error beside the time is the
+largest difference of the positions from those of the loop and of dlsim, relative to the largest position.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+import scipy.signal
+
+import zwidth
+
+SCENES, PERIODS, BESIDE = 10_000, 1000, 20
+PUSH = 0.5
+
+
+def random_scenes() -> tuple[list[zwidth.Scene], np.ndarray, np.ndarray]:
+    """Devices of many masses, dampings and delays, each with a wall at half of its largest stiffness."""
+    random = np.random.default_rng(1)
+    scenes = [
+        zwidth.Scene(
+            zwidth.Device(mass=10 ** random.uniform(-1.5, 0), damping=10 ** random.uniform(-1, 1)),
+            zwidth.Timing(period=1e-3, delay=random.choice([0.0, 1e-3, 1.5e-3, 2e-3])),
+        )
+        for _ in range(SCENES)
+    ]
+    delta, d = np.array([(scene.delta, scene.d) for scene in scenes]).T
+    top = zwidth.alpha_max(delta, d)
+    units = np.array([scene.units for scene in scenes])
+    return scenes, 0.5 * top.alpha * units[:, 0], top.beta * units[:, 1]
+
+
+def loop_in_numpy(scene: zwidth.Scene, stiffness: float, virtual_damping: float) -> np.ndarray:
+    """What one writes first: the device's matrices once, then a sample at a time."""
+    period, mass = scene.timing.period, scene.device.mass
+    rate = np.array([[0.0, 1.0, 0.0], [0.0, -scene.device.damping / mass, 1.0 / mass], [0.0, 0.0, 0.0]])
+    fraction = scene.d - scene.whole_delay
+    first, second = scipy.linalg.expm(rate * fraction * period), scipy.linalg.expm(rate * (1 - fraction) * period)
+    commands = deque([0.0] * (scene.whole_delay + 2), maxlen=scene.whole_delay + 2)
+    state, last, positions = np.zeros(2), 0.0, np.empty(PERIODS)
+    for k in range(PERIODS):
+        positions[k] = position = state[0]
+        commands.append(-(stiffness * position + virtual_damping * (position - last) / period))
+        last = position
+        state = first[:2, :2] @ state + first[:2, 2] * (commands[0] + PUSH)
+        state = second[:2, :2] @ state + second[:2, 2] * (commands[1] + PUSH)
+    return positions
+
+
+def dlsim(scene: zwidth.Scene, stiffness: float, virtual_damping: float) -> np.ndarray:
+    """The closed loop of scipy.signal, from its matrices."""
+    system = scene.state_space(stiffness, virtual_damping)
+    return scipy.signal.dlsim((system.A, system.B, system.C, system.D, system.dt), np.full(PERIODS, PUSH))[1][:, 0]
+
+
+def seconds(call: Callable[[], Any], runs: int = 3) -> float:
+    """Of the fastest run."""
+    best = np.inf
+    for _ in range(runs):
+        start = time.perf_counter()
+        call()
+        best = min(best, time.perf_counter() - start)
+    return best
+
+
+def report() -> str:
+    """The tables in Markdown."""
+    scenes, stiffness, damping = random_scenes()
+    walls = list(zip(scenes[:BESIDE], stiffness[:BESIDE].tolist(), damping[:BESIDE].tolist(), strict=True))
+    options: dict[str, Any] = {"periods": PERIODS, "push": PUSH, "record": False}
+    start = time.perf_counter()
+    zwidth.simulate(scenes, stiffness, damping, **options)
+    cold = time.perf_counter() - start
+    each = SCENES * PERIODS
+    own = seconds(lambda: zwidth.simulate(scenes, stiffness, damping, **options)) / each
+    few = zwidth.simulate(scenes[:BESIDE], stiffness[:BESIDE], damping[:BESIDE], periods=PERIODS, push=PUSH)
+    assert few.position is not None, "a recorded motion"
+    lines = [
+        "# What simulations cost",
+        "",
+        f"Written by `benchmarks/bench_simulation.py --write docs/simulation.md`: {SCENES:,} devices of different masses,",
+        f"dampings and delays, each on a wall of its own, pushed by a constant force for {PERIODS:,} periods; time a sample,",
+        "everything included that a call does. The others run a part of the devices, in the same process. Difference:",
+        "of the positions, relative to the largest.",
+        "",
+        "| method | time a sample | over the batch | largest difference |",
+        "|---|--:|--:|--:|",
+        f"| `zwidth.simulate`, one batch | {own * 1e9:.0f} ns | 1 | |",
+    ]
+    for name, method in (("loop in NumPy", loop_in_numpy), ("`scipy.signal.dlsim`", dlsim)):
+        spent = seconds(lambda method=method: [method(*wall) for wall in walls]) / (BESIDE * PERIODS)
+        peers = np.array([method(*wall) for wall in walls])
+        error = np.abs(peers - few.position).max() / np.abs(few.position).max()
+        lines.append(f"| {name} | {spent * 1e9:,.0f} ns | {spent / own:,.0f} | {error:.0e} |")
+    lines += ["", f"The first call, which compiles, took {cold:.1f} s.", "", *report_parts(), ""]
+    return "\n".join(lines)
+
+
+def report_parts() -> list[str]:
+    """What nonlinear parts add: one device, many walls."""
+    timing = zwidth.Timing(period=1e-3, delay=1e-3)
+    device = zwidth.Device(mass=0.1, damping=1.0)
+    bare, coupled = zwidth.Scene(device, timing), zwidth.Device(0.1, 1.0, zwidth.Coupling(0.05, 20e3, 1.0))
+    hit = {"start_position": -1e-4, "start_velocity": 0.1, "contact": "unilateral"}
+    cases: dict[str, tuple[zwidth.Scene, dict[str, Any]]] = {
+        "linear": (bare, {"start_position": 1e-4}),
+        "contact": (bare, hit),
+        "contact, encoder, saturation": (bare, {**hit, "resolution": 2e-5, "max_force": 8.0}),
+        "and friction": (bare, {**hit, "resolution": 2e-5, "max_force": 8.0, "coulomb": 0.1}),
+        "contact and jitter": (bare, {**hit, "jitter": 2e-4}),
+        "FOAW and encoder": (
+            zwidth.Scene(device, timing, velocity=zwidth.FOAW(noise=2e-5)),
+            {**hit, "resolution": 2e-5},
+        ),
+        "coupling, contact": (zwidth.Scene(coupled, timing), hit),
+        "coupling, contact and friction": (zwidth.Scene(coupled, timing), {**hit, "coulomb": 0.1}),
+    }
+    lines = [
+        "Parts beside the linear loop, one device and 1,000 walls, 1,000 periods; a single one of them, recorded.",
+        "",
+        "| scene | first call | time a sample of 1,000 | one motion of 1,000 periods |",
+        "|---|--:|--:|--:|",
+    ]
+    stiffness = np.linspace(100.0, 10e3, 1000)
+    for name, (scene, options) in cases.items():
+        start = time.perf_counter()
+        scene.simulate(stiffness, 10.0, record=False, **options)
+        cold = time.perf_counter() - start
+        scene.simulate(5e3, 10.0, **options)
+        many = seconds(lambda s=scene, o=options: s.simulate(stiffness, 10.0, record=False, **o)) / 1e6
+        one = seconds(lambda s=scene, o=options: s.simulate(5e3, 10.0, **o))
+        lines.append(f"| {name} | {cold:.1f} s | {many * 1e9:,.0f} ns | {one * 1e3:.0f} ms |")
+    return lines
+
+
+def main() -> None:
+    """Measure, and print or write."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--write", type=Path, help="file for the tables, in Markdown")
+    write = parser.parse_args().write
+    text = report()
+    print(text)
+    if write:
+        write.write_text(text)
+
+
+if __name__ == "__main__":
+    main()
