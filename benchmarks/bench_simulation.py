@@ -90,10 +90,11 @@ def report() -> str:
     lines = [
         "# What simulations cost",
         "",
-        f"Written by `benchmarks/bench_simulation.py --write docs/simulation.md`: {SCENES:,} devices of different masses,",
-        f"dampings and delays, each on a wall of its own, pushed by a constant force for {PERIODS:,} periods; time a sample,",
-        "everything included that a call does. The others run a part of the devices, in the same process. Difference:",
-        "of the positions, relative to the largest.",
+        "Written by `benchmarks/bench_simulation.py --write docs/simulation.md`.",
+        "",
+        f"{SCENES:,} devices of different masses, dampings and delays, each on a wall of its own, pushed by a",
+        f"constant force for {PERIODS:,} periods: time a sample, everything included that a call does. The others run",
+        "a part of the devices, in the same process. Difference: of the positions, relative to the largest.",
         "",
         "| method | time a sample | over the batch | largest difference |",
         "|---|--:|--:|--:|",
@@ -147,7 +148,7 @@ def report_parts() -> list[str]:
 
 def main() -> None:
     """Measure, and print or write."""
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--write", type=Path, help="file for the tables, in Markdown")
     write = parser.parse_args().write
     text = report()

@@ -115,8 +115,16 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
             positions = jnp.stack([dot(row, body.x) for row in lanes.place])
             energy = dot(body.x, jnp.stack([dot(row, body.x) for row in lanes.energy]))
             frame = Frame(positions, dot(motion, body.x), acting, body.slip, work, energy)
-        for piece, force in enumerate(forces):
-            body, work = move(lanes, options, body, work, force, given.push, (j, piece), durations[j, piece])
+
+        def one(carry: tuple[Body, Work], piece: Any) -> tuple[tuple[Body, Work], None]:
+            number, force = piece
+            return move(lanes, options, *carry, force, given.push, (j, number), durations[j, number]), None
+
+        if options.friction or options.jitter:
+            # Compiled once, not once a piece.
+            return jax.lax.scan(one, (body, work), (np.arange(options.pieces), jnp.stack(forces)))[0], frame
+        for piece in enumerate(forces):
+            (body, work), _ = one((body, work), piece)
         return (body, work), frame
 
     (body, work), frames = jax.lax.scan(substep, (state.body, state.work), np.arange(options.substeps))

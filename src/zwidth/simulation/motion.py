@@ -55,17 +55,21 @@ def advance(
     def pick(part: Array, k: Array) -> Array:
         return jnp.where(held, part[1, k], part[0, k]) if part.shape[0] > 1 else part[0, k]
 
-    def step(k: Array, state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        x, time, lost = state
+    def remain(state: tuple[Array, ...]) -> Array:
+        k, _, time, _ = state
+        return (k < DIGITS) & jnp.any(time < limit)
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        k, x, time, lost = state
         z = jnp.concatenate([x, force[None]])
         longer, after = time + jnp.exp2(-k.astype(time.dtype)), x + times(pick(digits.change, k), z)
         taken = (longer <= limit) & (True if keep is None else keep(after))
         lost = jnp.where(taken, lost + dot(z, times(pick(digits.loss, k), z)), lost)
-        return jnp.where(taken, after, x), jnp.where(taken, longer, time), lost
+        return k + 1, jnp.where(taken, after, x), jnp.where(taken, longer, time), lost
 
     # No digit longer than all of the time is taken.
     first = jnp.floor(-jnp.log2(jnp.max(limit))).clip(0, DIGITS - 1).astype(int)
-    return jax.lax.fori_loop(first, DIGITS, step, (x, jnp.zeros_like(limit), jnp.zeros_like(limit)))
+    return jax.lax.while_loop(remain, step, (first, x, jnp.zeros_like(limit), jnp.zeros_like(limit)))[1:]
 
 
 def slide(lanes: Lanes, body: Body, force: Array, duration: Array) -> tuple[Body, Array, Array]:
