@@ -22,6 +22,12 @@ class Friction(NamedTuple):
     static: float
 
 
+def _event(value: Any, direction: float, terminal: bool) -> Any:
+    """A function that solve_ivp watches, which asks it for attributes."""
+    value.direction, value.terminal = direction, terminal
+    return value
+
+
 class Bodies:
     """Bodies in a row by solve_ivp."""
 
@@ -98,19 +104,17 @@ class Bodies:
         self._grow(state, push)
         watched = self._watched(force, slip)
 
-        def rise(k: int) -> Callable[[float, np.ndarray], float]:
+        def rise(k: int) -> Any:
             def value(_: float, y: np.ndarray) -> float:
                 return float(watched[k][0] @ y) + watched[k][1]
 
-            value.terminal, value.direction = True, 1.0
-            return value
+            return _event(value, 1.0, terminal=True)
 
-        def top(k: int) -> Callable[[float, np.ndarray], float]:
+        def top(k: int) -> Any:
             def value(_: float, y: np.ndarray) -> float:
                 return float(watched[k][0] @ (matrix @ y + push))
 
-            value.direction = -1.0
-            return value
+            return _event(value, -1.0, terminal=False)
 
         rises = [rise(k) for k in range(len(watched))]
         result = self._solve(state, span, matrix, push, [*rises, *(top(k) for k in range(len(watched)))])

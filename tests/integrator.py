@@ -129,7 +129,7 @@ def integrate(
     max_force: float = math.inf,
     max_rate: float = math.inf,
     jitter_samples: np.ndarray | None = None,
-    rtol: float = 1e-13,
+    rtol: float = 3e-14,
     step: float = 0.25,
     closed_form: bool = False,
 ) -> History:

@@ -31,11 +31,16 @@ class RandomMotion(NamedTuple):
 
 def _wall(scene: Any, inside: bool, rng: np.random.Generator) -> tuple[float, float, bool]:
     """A wall that pushes back: stable if wanted and found, or one whose growth stays within float range."""
-    walls = [pair for pair in zip(*random_walls(scene, rng, 40), strict=True) if pair[0] > 0]
-    radii = [float(np.abs(np.linalg.eigvals(closed_loop_matrix(scene, *wall))).max()) for wall in walls]
-    fitting = [k for k, radius in enumerate(radii) if (radius < 1 if inside else 1 < radius < 1.15)]
-    chosen = fitting[0] if fitting else int(np.argmin(radii))
-    return float(walls[chosen][0]), float(walls[chosen][1]), radii[chosen] < 1
+    mildest = math.inf, 0.0, 0.0
+    for K, B in zip(*random_walls(scene, rng, 40), strict=True):
+        if K <= 0:
+            continue
+        radius = float(np.abs(np.linalg.eigvals(closed_loop_matrix(scene, K, B))).max())
+        mildest = min(mildest, (radius, float(K), float(B)))
+        if radius < 1 if inside else 1 < radius < 1.15:
+            return float(K), float(B), inside
+    radius, K, B = mildest
+    return K, B, radius < 1
 
 
 def random_motion(kind: str, rng: np.random.Generator) -> RandomMotion:

@@ -45,9 +45,8 @@ def test_linear_loop_is_the_power_of_its_matrix(kind):
     rng = np.random.default_rng(sum(map(ord, kind)))
     for _ in range(3 if kind in ("filter", "all") else 1):
         scene = random_scene(kind, rng)
-        for K, B in zip(*random_walls(scene, rng, 50), strict=True):
-            if any_loop.spectral_radius(scene, K, B) < 1.02:
-                break
+        walls = zip(*random_walls(scene, rng, 50), strict=True)
+        K, B = next(wall for wall in walls if any_loop.spectral_radius(scene, *wall) < 1.02)
         matrix = any_loop.closed_loop_matrix(scene, K, B)
         n = integrate(scene, K, B, 1).position.shape[1]
         start, speed = 2e-3, 0.1
@@ -117,10 +116,40 @@ def test_block_on_friction_stops_and_sticks():
     assert got.velocity[got.time > stop].tolist() == [[0.0]] * int((got.time > stop).sum())
 
 
+@pytest.mark.parametrize("push", [0.69, -0.71, 0.71])
+def test_block_at_rest_leaves_beyond_static_friction(push):
+    scene = zwidth.Scene(zwidth.Device(mass=0.3), zwidth.Timing(1e-3))
+    got = integrate(scene, 0.0, 0.0, 50, push=push, coulomb=0.5, static=0.7)
+    rest = abs(push) < 0.7
+    way = 0.0 if rest else np.sign(push) * 0.5 * (abs(push) - 0.5) / 0.3 * 0.05**2
+    assert got.position[-1, 0] == pytest.approx(way, rel=tol.JUDGE.float64)
+    assert got.events == ([] if rest else [(0.0, "slip")])
+
+
+@pytest.mark.parametrize("static", [1.3, 1.5])
+def test_hand_drags_a_device_off_its_friction(static):
+    """The ground's spring of the hand stretches the link to the held device as ``1 - cos``."""
+    hand = zwidth.Operator(0.5, 0.0, 400.0, coupling_stiffness=900.0)
+    scene = zwidth.Scene(zwidth.Device(mass=0.3), zwidth.Timing(1e-3), operator=hand)
+    got = integrate(scene, 0.0, 0.0, 100, position=-3e-3, coulomb=1.2, static=static)
+    stretch, rate = 400.0 * 3e-3 / 1300.0, np.sqrt(1300.0 / 0.5)
+    leaving = np.arccos(1.0 - static / (900.0 * stretch)) / rate
+    assert got.events[0] == (pytest.approx(leaving, rel=tol.JUDGE.float64), "slip")
+    before = got.time < leaving
+    assert np.all(got.position[before, 0] == -3e-3)
+    assert worst(got.position[before, 1] + 3e-3, stretch * (1.0 - np.cos(rate * got.time[before]))) < tol.JUDGE.float64
+    k = int(before.sum())
+    gone = got.time[k] - leaving
+    # Its acceleration starts at (static - Coulomb)/m and grows with the stretch.
+    jerk = 900.0 * stretch * rate * np.sin(rate * leaving) / 0.3
+    expected = (static - 1.2) / 0.3 * gone + 0.5 * jerk * gone**2
+    assert got.velocity[k, 0] == pytest.approx(expected, rel=2.0 * rate * gone)
+
+
 def test_single_bodies_on_friction_as_in_closed_form():
-    rng = np.random.default_rng(20)
+    rng = np.random.default_rng(37)
     kinds, left_out = set(), 0
-    for k in range(30):
+    for k in range(16):
         motion = random_motion(("rigid", "filter")[k % 2], rng)
         got, expected = judge(motion), judge(motion, closed_form=True)
         if nearest_decision(got) < 1e-8 or condition(motion, expected, closed_form=True) > 1e4:
@@ -134,19 +163,43 @@ def test_single_bodies_on_friction_as_in_closed_form():
             assert worst(instants, others) < tol.JUDGE.float64
         kinds |= {kind for _, kind in got.events}
     assert kinds == {"stick", "turn", "slip"}
-    assert left_out <= 3
+    assert left_out <= 2
 
 
 @pytest.mark.parametrize("kind", ["tip", "motor", "hand", "coupled hand", "all"])
 def test_motions_do_not_depend_on_the_steps(kind):
     rng = np.random.default_rng(21)
     left_out = 0
-    for _ in range(4):
+    for _ in range(2):
         motion = random_motion(kind, rng)
-        got, finer = judge(motion), judge(motion, rtol=3e-14, step=0.1)
+        got, other = judge(motion), judge(motion, rtol=1e-13, step=0.1)
         if nearest_decision(got) < 1e-8 or condition(motion, got) > 1e4:
             left_out += 1
             continue
-        assert largest_difference(got, finer) < tol.JUDGE.float64
-        assert [kind for _, kind in got.events] == [kind for _, kind in finer.events]
+        assert largest_difference(got, other) < tol.JUDGE.float64
+        assert [kind for _, kind in got.events] == [kind for _, kind in other.events]
     assert left_out <= 1
+
+
+def test_program_reads_commands_and_acts_when_it_should():
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(1e-3, 1.4e-3))
+    late = 0.9 * np.random.default_rng(22).random(121)
+    late[0] = 0.0
+    limits: Any = {"resolution": 2e-5, "max_force": 0.5, "max_rate": 200.0, "jitter_samples": late}
+    got = integrate(scene, 2e3, 2.0, 120, position=-1e-3, velocity=0.1, contact="push_only", **limits)
+    assert np.allclose(got.time, (np.arange(121) + late) * 1e-3, rtol=1e-15)
+    counts = got.measured / 2e-5
+    assert np.abs(counts - np.rint(counts)).max() < 1e-9
+    assert np.abs(got.measured - got.position[:, 0]).max() <= 1e-5
+    assert got.contact.tolist() == (got.measured > 0).tolist()
+    assert np.allclose(got.estimate[1:], np.diff(got.measured) / 1e-3, rtol=1e-12)
+    assert got.estimate[0] == pytest.approx((got.measured[0] + 1e-3 + 1e-4) / 1e-3, rel=1e-9)
+    wanted = np.where(got.contact, np.clip(-(2e3 * got.measured + 2.0 * got.estimate), -0.5, 0.0), 0.0)
+    before = np.append(0.0, got.command[:-1])
+    assert np.allclose(got.command, np.clip(wanted, before - 0.2, before + 0.2), rtol=0, atol=1e-15)
+    assert (got.command.min(), np.abs(np.diff(got.command)).max()) == (-0.5, pytest.approx(0.2))
+    # Every command sets in 1.4 periods behind its sample.
+    starts = np.cumsum([0.0] + [piece.span for piece in got.pieces[:-1]])
+    acting = np.array([piece.wall for piece in got.pieces])
+    newest = np.searchsorted(got.time + 1.4e-3, starts + 1e-12) - 1
+    assert acting.tolist() == np.where(newest >= 0, got.command[newest], 0.0).tolist()
