@@ -4,13 +4,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.signal
 from scipy.integrate import solve_ivp
 
 import any_loop
 import tolerances as tol
 import zwidth
 from independent_scenes import KINDS, random_scene, random_walls
-from integrator import integrate
+from integrator import integrate, velocity_program
 from random_motions import condition, judge, largest_difference, nearest_decision, random_motion
 
 
@@ -61,6 +62,27 @@ def test_linear_loop_is_the_power_of_its_matrix(kind):
         expected = np.array(expected)
         assert worst(got.position, expected[:, :n]) < tol.JUDGE.float64
         assert worst(got.velocity, expected[:, n : 2 * n]) < tol.JUDGE.float64
+
+
+ESTIMATES = (
+    zwidth.BackwardDifference(coded_period=2e-3),
+    zwidth.WindowedDifference(5),
+    zwidth.LowPass(cutoff=30, coded_period=1.5e-3),
+    zwidth.LowPass(time_constant=5e-3, order=2),
+    zwidth.Butterworth(40, 3),
+    zwidth.VelocityFilter([900, -800, -90], [1, -0.5, 0.2, 0.1]),
+)
+
+
+@pytest.mark.parametrize("velocity", ESTIMATES, ids=lambda velocity: type(velocity).__name__)
+def test_estimates_continue_a_long_ramp(velocity):
+    scene = zwidth.Scene(zwidth.Device(1.0), zwidth.Timing(1e-3), velocity=velocity)
+    measured = 0.3 + np.random.default_rng(23).normal(0.0, 1e-3, 60)
+    program = velocity_program(scene, 0.3, -0.2)
+    past = 0.3 + 0.2 * 1e-3 * np.arange(3000, 0, -1)
+    top, bottom = any_loop.velocity_polynomials(scene)
+    expected = scipy.signal.lfilter(top, bottom, np.concatenate([past, measured]))[past.size :]
+    assert worst([program(x) for x in measured], expected) < tol.JUDGE.float64
 
 
 def newton(wall, slip, push, friction):
