@@ -118,3 +118,7 @@ RIDGE_CURVATURE_FLOOR = rounding_errors(
 )
 RIDGE_ORACLE = Tolerance(1e-11, "Relative: bisection of a slope leaves omega with sqrt(eps) of the curve's curvature.")
 LIMIT_SLOPE = rounding_errors(8, "Relative: the same method as RIDGE, on a plant of three numbers.")
+
+JUDGE = Tolerance(
+    1e-9, "Relative to the largest value. An integration to 1e-12 a step of some hundred, its rounding and its growth."
+)
