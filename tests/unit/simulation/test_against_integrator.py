@@ -1,0 +1,57 @@
+"""Simulations against an independent integrator: scipy's `solve_ivp` with events, in absolute coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import tolerances
+from independent_scenes import KINDS
+from random_motions import PERIODS, RandomMotion, condition, judge, nearest_decision, random_motion
+from zwidth import Motion
+
+# Decided by rounding, or so unstable that the integrator's own error shows (random_motions).
+NEAR, CHAOTIC = 1e-8, 1e4
+
+
+def simulate(motion: RandomMotion, seed: int) -> tuple[Motion, RandomMotion]:
+    """The motion simulated, and the same with the instants that were drawn."""
+    period = motion.scene.timing.period
+    given = dict(motion.arguments)
+    jitter = given.pop("jitter_samples")
+    options: dict[str, Any] = {
+        "start_position": given.pop("position"),
+        "start_velocity": given.pop("velocity"),
+        "jitter": 0.0 if jitter is None else float(np.max(jitter)) * period,
+    }
+    found = motion.scene.simulate(**given, **options, periods=PERIODS, seed=seed)
+    if jitter is None:
+        return found, motion
+    assert found.time is not None, "a recorded motion has instants"
+    late = np.append(found.time / period - np.arange(PERIODS), 0.0)
+    return found, motion._replace(arguments=motion.arguments | {"jitter_samples": late})
+
+
+def deviation(found: Motion, motion: RandomMotion) -> tuple[float, bool]:
+    """The largest difference of position and velocity, relative; and whether the motion can tell."""
+    own = motion.kind in ("rigid", "filter")
+    history = judge(motion, closed_form=own)
+    told = nearest_decision(history) > NEAR and condition(motion, history, closed_form=own) < CHAOTIC
+    body = history.position.reshape(PERIODS + 1, -1)[:PERIODS, 0], history.velocity.reshape(PERIODS + 1, -1)[:PERIODS, 0]
+    assert found.position is not None and found.velocity is not None, "a recorded motion"
+    pairs = (found.position, body[0]), (found.velocity, body[1])
+    return max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs), told
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_motions_are_those_of_an_independent_integrator(kind):
+    rng = np.random.default_rng([12, KINDS.index(kind)])
+    compared = 0
+    for seed in range(4):
+        error, told = deviation(*simulate(random_motion(kind, rng), seed))
+        if told:
+            compared += 1
+            assert error < tolerances.JUDGE.float64
+    assert compared >= 3
