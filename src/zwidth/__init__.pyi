@@ -55,6 +55,8 @@ from .response import StepResponse as StepResponse
 from .response import step_response as step_response
 from .runs import run as run
 from .scene import Scene as Scene
+from .simulation.worst_motion import WorstMotion as WorstMotion
+from .simulation.worst_motion import worst_motion as worst_motion
 from .stability.boundary import BoundaryPoint as BoundaryPoint
 from .stability.boundary import boundary as boundary
 from .stability.boundary import boundary_point as boundary_point

@@ -197,4 +197,5 @@ OTHERS = {
     "step_response": "one wall: tests/unit/test_response.py",
     "to_control": "one scene: tests/unit/linear/test_answers.py",
     "use_compilation_cache": "a setting: tests/unit/test_kernel_cache.py",
+    "worst_motion": "one scene and wall: tests/unit/simulation/test_worst_motion.py",
 }
