@@ -211,6 +211,15 @@ def test_too_short_a_motion_is_not_taken_for_a_proof():
     assert zwidth.worst_motion(scene, *wall, longest=1 << 16).status != Status.OK
 
 
+def test_energy_that_rounding_can_come_to_is_no_proof():
+    # Every frequency lacks the same 1e-15 of the damping.
+    scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3))
+    stiffness = 20e3 * (1 + 1e-15)
+    assert scene.passivity_margin(stiffness) < 0
+    assert zwidth.worst_motion(scene, stiffness).status == Status.NOT_CONVERGED
+    assert zwidth.worst_motion(scene, 20e3 * (1 + 1e-12)).status == Status.OK
+
+
 def test_what_is_refused():
     scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3))
     with pytest.raises(InputError, match="one wall of finite numbers"):
