@@ -59,6 +59,8 @@ from .scene import Scene as Scene
 from .simulation.result import Motion as Motion
 from .simulation.result import Outcome as Outcome
 from .simulation.simulate import simulate as simulate
+from .simulation.worst_motion import WorstMotion as WorstMotion
+from .simulation.worst_motion import worst_motion as worst_motion
 from .stability.boundary import BoundaryPoint as BoundaryPoint
 from .stability.boundary import boundary as boundary
 from .stability.boundary import boundary_point as boundary_point

@@ -53,5 +53,5 @@ _MESSAGES = {
         "An input is beyond the range that is computed; alpha and beta are 0 or 1e-60 to 1e60 in magnitude, delta is "
         "at most 1e12 and d at most 1e5, SI quantities are 0 or 1e-30 to 1e30."
     ),
-    Status.UNREACHABLE: "No value of the quantity asked for reaches the wanted stiffness; change another one.",
+    Status.UNREACHABLE: "Nothing that was free to vary reaches what was asked for; change another quantity.",
 }

@@ -191,10 +191,12 @@ OTHERS = {
     "robust_max_stiffness": "boxes of devices: tests/unit/design/test_robust.py",
     "robust_wall": "boxes of devices: tests/unit/design/test_robust.py",
     "run": "a configuration: tests/unit/runs/test_run.py",
+    "simulate": "whole motions: tests/unit/simulation",
     "simulate_tolerances": "one scene: tests/unit/design/test_tolerances.py",
     "stable_region": "one device: tests/unit/stability/test_region.py",
     "stability_of": "the former name of `decide_stability`",
     "step_response": "one wall: tests/unit/test_response.py",
     "to_control": "one scene: tests/unit/linear/test_answers.py",
     "use_compilation_cache": "a setting: tests/unit/test_kernel_cache.py",
+    "worst_motion": "one scene and wall: tests/unit/simulation/test_worst_motion.py",
 }
