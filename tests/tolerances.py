@@ -121,6 +121,8 @@ LIMIT_SLOPE = rounding_errors(8, "Relative: the same method as RIDGE, on a plant
 
 JUDGE = Tolerance(
     1e-9, "Relative to the largest value. An integration to 1e-12 a step of some hundred, its rounding and its growth."
+)
+
 WORST_ENERGY = Tolerance(
     1e-12,
     "Relative to the sum of the terms' magnitudes: a filter by its coefficients loses what its poles next to 1 cost, "

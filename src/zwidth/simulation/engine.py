@@ -184,10 +184,12 @@ def run_lanes(
         inputs = Inputs(
             np.arange(first, first + BLOCK),
             _cut(given.noise, first, 0.0, (1,)),
-            lanes.push + _cut(given.history, first, 0.0, (1,)),
+            lanes.push[None] + _cut(given.history, first, 0.0, (1,)),
             _cut(given.durations, first, 0.0, (0, 0, 1)),
         )
-        state, found = compile_block(options)(lanes, ends, state, inputs)
+        # Lanes are last axes on purpose, whatever the caller wants of arrays of theirs.
+        with jax.numpy_rank_promotion("allow"):
+            state, found = compile_block(options)(lanes, ends, state, inputs)
         recorded.append(jax.tree.map(np.asarray, found))
     state = jax.tree.map(np.asarray, state)
     if not options.record:

@@ -29,8 +29,7 @@ def simulate(motion: RandomMotion, seed: int) -> tuple[Motion, RandomMotion]:
     found = motion.scene.simulate(**given, **options, periods=PERIODS, seed=seed)
     if jitter is None:
         return found, motion
-    assert found.time is not None, "a recorded motion has instants"
-    late = np.append(found.time / period - np.arange(PERIODS), 0.0)
+    late = np.append(np.asarray(found.time) / period - np.arange(PERIODS), 0.0)
     return found, motion._replace(arguments=motion.arguments | {"jitter_samples": late})
 
 
@@ -39,9 +38,9 @@ def deviation(found: Motion, motion: RandomMotion) -> tuple[float, bool]:
     own = motion.kind in ("rigid", "filter")
     history = judge(motion, closed_form=own)
     told = nearest_decision(history) > NEAR and condition(motion, history, closed_form=own) < CHAOTIC
-    body = history.position.reshape(PERIODS + 1, -1)[:PERIODS, 0], history.velocity.reshape(PERIODS + 1, -1)[:PERIODS, 0]
-    assert found.position is not None and found.velocity is not None, "a recorded motion"
-    pairs = (found.position, body[0]), (found.velocity, body[1])
+    # The first body, at the start of every period.
+    first = (part.reshape(PERIODS + 1, -1)[:PERIODS, 0] for part in (history.position, history.velocity))
+    pairs = zip((np.asarray(found.position), np.asarray(found.velocity)), first, strict=True)
     return max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs), told
 
 
