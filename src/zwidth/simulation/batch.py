@@ -13,7 +13,7 @@ from zwidth.linear.chain import Chain, chain_of
 from zwidth.linear_loop import Estimate
 from zwidth.parts.velocity import FOAW, BackwardDifference
 from zwidth.simulation.flow import Mechanics, mechanics
-from zwidth.simulation.lanes import Lanes, Motor, Options, cut_period, lay_estimators, lay_machines
+from zwidth.simulation.lanes import Lanes, Motor, Options, cut_period, lay_estimators, lay_machines, round_up
 from zwidth.simulation.result import to_si
 
 # Lanes that run together: enough for the vector units, few enough that a state stays next to the processor.
@@ -90,15 +90,13 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
     fractions = np.array([float(chain.d - chain.whole) for chain in chains])
     names = name_bodies(scenes[0])
     first_velocity = scenes[0].velocity
-    jitter = bool(np.any(numbers.jitter > 0))
+    jitter, friction = bool(np.any(numbers.jitter > 0)), bool(np.any(numbers.static > 0))
     options = Options(
         substeps=task.substeps,
-        pieces=4 if jitter else 2 if np.any(fractions > 0) else 1,
-        friction=bool(np.any(numbers.static > 0)),
+        pieces=4 if jitter else 2 if friction or np.any(fractions > 0) else 1,
+        friction=friction,
         jitter=jitter,
         foaw=first_velocity.samples if isinstance(first_velocity, FOAW) else 0,
-        bilateral=task.contact == "bilateral",
-        pulling=task.contact != "push_only",
         record=task.record,
     )
     estimates: list[Estimate | FOAW] = [
@@ -123,6 +121,8 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
             beta=given.virtual_damping * period / mass,
             resolution=given.resolution,
             push=given.push * force,
+            bilateral=np.array([task.contact == "bilateral"]),
+            pulling=np.array([task.contact != "push_only"]),
             late=late[own][lane_of],
             motor=Motor(
                 given.max_force * force,
@@ -142,7 +142,7 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
             instants, durations = None, None
         drawn = draw_noise(given.seed, given.noise, task.periods)
         history = None if given.history is None else (given.history * force[:, None]).T
-        rings = max(windows) + 1, int(late.max()) + 3
+        rings = round_up(max(windows) + 1), round_up(int(late.max()) + 3)
         # What JAX is needed for begins here.
         from zwidth.simulation.engine import run_lanes
 

@@ -31,8 +31,6 @@ class Options(NamedTuple):
     friction: bool
     jitter: bool
     foaw: int  # longest window, 0 where the estimate is linear
-    bilateral: bool
-    pulling: bool
     record: bool
 
 
@@ -63,6 +61,8 @@ class Lanes(NamedTuple):
     beta: Array
     resolution: Array
     push: Array
+    bilateral: Array  # whether the wall acts on both sides of its surface
+    pulling: Array  # whether it may pull
     late: Array  # whole periods of delay
     motor: Motor
     estimator: Estimator
@@ -81,6 +81,11 @@ def _lay(parts: np.ndarray, which: np.ndarray) -> np.ndarray:
     return last[..., which] if parts.shape[0] > 1 else last
 
 
+def round_up(size: int) -> int:
+    """0 or the next power of 2, at least 2: what is filled up so is compiled for a few sizes and not for every one."""
+    return 0 if size == 0 else max(2, 1 << (size - 1).bit_length())
+
+
 def lay_flow(found: Flow, which: np.ndarray) -> Flow:
     """Flows of scenes as flows of lanes."""
     return Flow(*(_lay(part, which) for part in found))
@@ -93,7 +98,7 @@ def lay_estimators(estimates: Sequence[Estimate | FOAW], which: np.ndarray) -> E
         estimate_matrices(replace(each, window=0)) if isinstance(each, Estimate) and each.degree > each.window else None
         for each in estimates
     ]
-    order = max((0 if each is None else each.A.shape[0] for each in filters), default=0)
+    order = round_up(max(0 if each is None else each.A.shape[0] for each in filters))
     columns = []
     for each, matrices in zip(estimates, filters, strict=True):
         A, B, C = np.zeros((order, order)), np.zeros(order), np.zeros(order)

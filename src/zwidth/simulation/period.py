@@ -68,10 +68,9 @@ def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: 
         if len(filtered):
             velocity = velocity + dot(estimator.C, filtered)
             filtered = times(estimator.A, filtered) + estimator.B * entering
-    touching = jnp.isfinite(measured) | True if options.bilateral else measured > 0
+    touching = lanes.bilateral | (measured > 0)
     wanted = jnp.where(touching, -(lanes.alpha * measured + lanes.beta * velocity), 0.0)
-    if not options.pulling:
-        wanted = jnp.minimum(wanted, 0.0)
+    wanted = jnp.where(lanes.pulling, wanted, jnp.minimum(wanted, 0.0))
     motor, last = lanes.motor, program.commands[(k - 1) % program.commands.shape[0]]
     wanted = jnp.clip(wanted, -motor.max_force, motor.max_force)
     command = jnp.clip(wanted, last - motor.max_rate, last + motor.max_rate)

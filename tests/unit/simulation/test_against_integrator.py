@@ -48,9 +48,9 @@ def deviation(found: Motion, motion: RandomMotion) -> tuple[float, bool]:
 def test_motions_are_those_of_an_independent_integrator(kind):
     rng = np.random.default_rng([12, KINDS.index(kind)])
     compared = 0
-    for seed in range(4):
+    for seed in range(3):
         error, told = deviation(*simulate(random_motion(kind, rng), seed))
         if told:
             compared += 1
             assert error < tolerances.JUDGE.float64
-    assert compared >= 3
+    assert compared >= 2
