@@ -57,7 +57,7 @@ from .response import step_response as step_response
 from .runs import run as run
 from .scene import Scene as Scene
 from .simulation.result import Motion as Motion
-from .simulation.result import Outcome as Outcome
+from .simulation.result import MotionKind as MotionKind
 from .simulation.simulate import simulate as simulate
 from .simulation.worst_motion import WorstMotion as WorstMotion
 from .simulation.worst_motion import worst_motion as worst_motion

@@ -370,7 +370,7 @@ class Scene(SceneAnswers):
             >>> import zwidth
             >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
             >>> held = scene.simulate(25e3, 40, start_position=1e-4, coulomb=1.0, periods=500)
-            >>> zwidth.Outcome(held.outcome).name
+            >>> zwidth.MotionKind(held.outcome).name
             'REST'
         """
         return simulate(self, stiffness, virtual_damping, **options)

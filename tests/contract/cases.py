@@ -191,7 +191,7 @@ OTHERS = {
     "robust_max_stiffness": "boxes of devices: tests/unit/design/test_robust.py",
     "robust_wall": "boxes of devices: tests/unit/design/test_robust.py",
     "run": "a configuration: tests/unit/runs/test_run.py",
-    "simulate": "whole motions: tests/unit/simulation",
+    "simulate": "whole motions: tests/unit/simulation/test_against_integrator.py",
     "simulate_tolerances": "one scene: tests/unit/design/test_tolerances.py",
     "stable_region": "one device: tests/unit/stability/test_region.py",
     "stability_of": "the former name of `decide_stability`",

@@ -20,7 +20,7 @@ from zwidth.simulation.result import to_si
 TOGETHER = 1 << 10
 
 
-class Task(NamedTuple):
+class Course(NamedTuple):
     """What the simulations of a batch share."""
 
     periods: int
@@ -83,7 +83,7 @@ def _chain(scene: Any) -> Chain:
     return chain_of(linear, (d, int(np.floor(d))))
 
 
-def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task) -> dict[str, np.ndarray]:
+def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, course: Course) -> dict[str, np.ndarray]:
     """Run simulations of scenes of one structure; ``which`` is the scene of each. Columns of one row a simulation."""
     chains = [_chain(scene) for scene in scenes]
     machine = mechanics(chains)
@@ -92,12 +92,12 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
     first_velocity = scenes[0].velocity
     jitter, friction = bool(np.any(numbers.jitter > 0)), bool(np.any(numbers.static > 0))
     options = Options(
-        substeps=task.substeps,
+        substeps=course.substeps,
         pieces=4 if jitter else 2 if friction or np.any(fractions > 0) else 1,
         friction=friction,
         jitter=jitter,
         foaw=first_velocity.samples if isinstance(first_velocity, FOAW) else 0,
-        record=task.record,
+        record=course.record,
     )
     estimates: list[Estimate | FOAW] = [
         scene.velocity if isinstance(scene.velocity, FOAW) else chain.estimate
@@ -121,8 +121,8 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
             beta=given.virtual_damping * period / mass,
             resolution=given.resolution,
             push=given.push * force,
-            bilateral=np.array([task.contact == "bilateral"]),
-            pulling=np.array([task.contact != "push_only"]),
+            bilateral=np.array([course.contact == "bilateral"]),
+            pulling=np.array([course.contact != "push_only"]),
             late=late[own][lane_of],
             motor=Motor(
                 given.max_force * force,
@@ -136,11 +136,11 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
         if options.jitter:
             late_of, fraction_of = late[own][lane_of], fractions[own][lane_of]
             instants, durations = draw_instants(
-                given.seed, given.jitter / period, late_of, fraction_of, task.periods, options.substeps
+                given.seed, given.jitter / period, late_of, fraction_of, course.periods, options.substeps
             )
         else:
             instants, durations = None, None
-        drawn = draw_noise(given.seed, given.noise, task.periods)
+        drawn = draw_noise(given.seed, given.noise, course.periods)
         history = None if given.history is None else (given.history * force[:, None]).T
         rings = round_up(max(windows) + 1), round_up(int(late.max()) + 3)
         # What JAX is needed for begins here.
@@ -148,7 +148,7 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, task: Task
 
         outside = Given(given.start_position, given.start_velocity * period, drawn, history, durations)
         with compute_concretely():
-            found = run_lanes(lanes, options, task, outside, rings)
+            found = run_lanes(lanes, options, course, outside, rings)
         return to_si(found, instants, period, mass, names)
 
     count = which.size

@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.simulation.batch import Given, Task
+from zwidth.simulation.batch import Course, Given
 from zwidth.simulation.lanes import Lanes, Options
-from zwidth.simulation.motion import Body, dot
+from zwidth.simulation.motion import BodyState, dot
 from zwidth.simulation.period import Program, Reading, Work, control, forces_of, move
 
 BLOCK = 128
@@ -45,7 +45,7 @@ class Summary(NamedTuple):
 class State(NamedTuple):
     """All that goes from one sample to the next."""
 
-    body: Body
+    body: BodyState
     program: Program
     work: Work
     summary: Summary
@@ -83,7 +83,7 @@ def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) ->
     program = Program(positions, _settle(lanes, x, v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
     halves = Extent(np.stack([far, far]), np.stack([-far, -far]))
     summary = Summary(zero, zero, zero, zero + np.nan, zero, halves, zero, zero, zero)
-    return State(Body(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
+    return State(BodyState(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
 
 
 def _settle(lanes: Lanes, x: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -104,7 +104,7 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     durations = given.durations if options.jitter else lanes.durations
     motion = jnp.roll(lanes.place[0], state.body.x.shape[0] // 2, 0)
 
-    def substep(carry: tuple[Body, Work], j: Array) -> tuple[tuple[Body, Work], Frame | None]:
+    def substep(carry: tuple[BodyState, Work], j: Array) -> tuple[tuple[BodyState, Work], Frame | None]:
         body, work = carry
         frame = None
         if options.record:
@@ -116,7 +116,7 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
             energy = dot(body.x, jnp.stack([dot(row, body.x) for row in lanes.energy]))
             frame = Frame(positions, dot(motion, body.x), acting, body.slip, work, energy)
 
-        def one(carry: tuple[Body, Work], piece: Any) -> tuple[tuple[Body, Work], None]:
+        def one(carry: tuple[BodyState, Work], piece: Any) -> tuple[tuple[BodyState, Work], None]:
             number, force = piece
             return move(lanes, options, *carry, force, given.push, (j, number), durations[j, number]), None
 
@@ -137,7 +137,7 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
 
 
 def _summarize(
-    lanes: Lanes, state: State, reading: Reading, body: Body, work: Work, k: Array, ends: Array, motion: Array
+    lanes: Lanes, state: State, reading: Reading, body: BodyState, work: Work, k: Array, ends: Array, motion: Array
 ) -> Summary:
     known = state.summary
     x, v, next_v = dot(lanes.place[0], state.body.x), dot(motion, state.body.x), dot(motion, body.x)
@@ -173,14 +173,14 @@ def compile_block(options: Options) -> Any:
 
 
 def run_lanes(
-    lanes: Lanes, options: Options, task: Task, given: Given, rings: tuple[int, int]
+    lanes: Lanes, options: Options, course: Course, given: Given, rings: tuple[int, int]
 ) -> tuple[State, Reading | None, Frame | None]:
     """The last state, and what is recorded along a first axis of periods (and a second of substeps)."""
-    halves = task.periods - task.tail, task.periods - task.tail // 2, task.periods
+    halves = course.periods - course.tail, course.periods - course.tail // 2, course.periods
     state: Any = jax.tree.map(jnp.asarray, begin(lanes, given.position, given.velocity, rings))
     lanes, ends = jax.tree.map(jnp.asarray, lanes), jnp.asarray(halves)
     recorded = []
-    for first in range(0, task.periods, BLOCK):
+    for first in range(0, course.periods, BLOCK):
         inputs = Inputs(
             np.arange(first, first + BLOCK),
             _cut(given.noise, first, 0.0, (1,)),
@@ -194,7 +194,7 @@ def run_lanes(
     state = jax.tree.map(np.asarray, state)
     if not options.record:
         return state, None, None
-    reading, frame = jax.tree.map(lambda *parts: np.concatenate(parts)[: task.periods], *recorded)
+    reading, frame = jax.tree.map(lambda *parts: np.concatenate(parts)[: course.periods], *recorded)
     return state, reading, frame
 
 

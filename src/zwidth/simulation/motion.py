@@ -22,7 +22,7 @@ _MOST_EVENTS = 512
 _LAST_DIGIT = 0.5 ** (DIGITS - 1)
 
 
-class Body(NamedTuple):
+class BodyState(NamedTuple):
     """The bodies' state, and how friction acts on the first: -1 or 1 slipping that way, 0 held."""
 
     x: Array  # (n, lanes)
@@ -30,7 +30,7 @@ class Body(NamedTuple):
 
 
 class _Slide(NamedTuple):
-    body: Body
+    body: BodyState
     left: Array  # of the duration
     lost: Array
     rubbed: Array
@@ -72,7 +72,7 @@ def advance(
     return jax.lax.while_loop(remain, step, (first, x, jnp.zeros_like(limit), jnp.zeros_like(limit)))[1:]
 
 
-def slide(lanes: Lanes, body: Body, force: Array, duration: Array) -> tuple[Body, Array, Array]:
+def slide(lanes: Lanes, body: BodyState, force: Array, duration: Array) -> tuple[BodyState, Array, Array]:
     """The motion under a constant force and friction; what dampers and friction have taken."""
     motion = jnp.roll(lanes.place[0], lanes.place.shape[1] // 2, 0)
     pull = [dot(motion, column) for column in jnp.moveaxis(lanes.rate, 1, 0)]
@@ -85,12 +85,12 @@ def slide(lanes: Lanes, body: Body, force: Array, duration: Array) -> tuple[Body
     def speed(x: Array) -> Array:
         return dot(motion, x)
 
-    def decide(x: Array, slip: Array, stopped: Array) -> Body:
+    def decide(x: Array, slip: Array, stopped: Array) -> BodyState:
         """Hold or let go a body that has no velocity."""
         push = pressed(x)
         # What is left of the velocity goes as an impulse would, into the first body.
         x = jnp.where(stopped, x - lanes.rate[:, -1] * speed(x), x)
-        return Body(x, jnp.where(stopped, jnp.where(jnp.abs(push) > static, jnp.sign(push), 0.0), slip))
+        return BodyState(x, jnp.where(stopped, jnp.where(jnp.abs(push) > static, jnp.sign(push), 0.0), slip))
 
     def step(state: _Slide) -> _Slide:
         x, slip = state.body
@@ -118,23 +118,23 @@ def slide(lanes: Lanes, body: Body, force: Array, duration: Array) -> tuple[Body
         low, when = jax.lax.cond(jnp.any(dips), find_lowest, lambda _: (far, time), None)
         over = (remains(low) < 0) & (state.left > 0)
 
-        def find_event(_: Any) -> tuple[Body, Array, Array]:
+        def find_event(_: Any) -> tuple[BodyState, Array, Array]:
             at, moment, taken = advance(lanes.digits, held, x, driven, when, lambda after: remains(after) >= 0)
             after = decide(at, slip, over)
             # What friction can bear no longer is let go, whatever rounding says of the force.
             towards = jnp.where(held, side, after.slip)
             return (
-                Body(jnp.where(over, after.x, far), jnp.where(over, towards, slip)),
+                BodyState(jnp.where(over, after.x, far), jnp.where(over, towards, slip)),
                 jnp.where(over, moment, time),
                 jnp.where(over, taken, lost),
             )
 
-        after, time, lost = jax.lax.cond(jnp.any(over), find_event, lambda _: (Body(far, slip), time, lost), None)
+        after, time, lost = jax.lax.cond(jnp.any(over), find_event, lambda _: (BodyState(far, slip), time, lost), None)
         moving = state.left > 0
         left = jnp.where(over, state.left - time, state.left - limit)
         way = dot(lanes.place[0], after.x - x)
         return _Slide(
-            Body(jnp.where(moving, after.x, x), jnp.where(moving, after.slip, slip)),
+            BodyState(jnp.where(moving, after.x, x), jnp.where(moving, after.slip, slip)),
             jnp.where(moving, jnp.where(left > _LAST_DIGIT, left, 0.0), 0.0),
             state.lost + jnp.where(moving, lost, 0.0),
             state.rubbed + jnp.where(moving, slip * coulomb * way, 0.0),
@@ -147,4 +147,4 @@ def slide(lanes: Lanes, body: Body, force: Array, duration: Array) -> tuple[Body
     state = _Slide(start, duration + none, none, none, jnp.zeros_like(none, int))
     state = jax.lax.while_loop(lambda state: jnp.any((state.left > 0) & (state.events < _MOST_EVENTS)), step, state)
     known = state.left <= 0
-    return Body(jnp.where(known, state.body.x, jnp.nan), state.body.slip), state.lost, state.rubbed
+    return BodyState(jnp.where(known, state.body.x, jnp.nan), state.body.slip), state.lost, state.rubbed

@@ -13,7 +13,7 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.simulation.lanes import Lanes, Options
-from zwidth.simulation.motion import Body, advance, dot, slide, times
+from zwidth.simulation.motion import BodyState, advance, dot, slide, times
 
 
 class Program(NamedTuple):
@@ -98,24 +98,24 @@ def forces_of(lanes: Lanes, options: Options, commands: Array, k: Array) -> list
 def move(
     lanes: Lanes,
     options: Options,
-    body: Body,
+    body: BodyState,
     work: Work,
     force: Array,
     push: Array,
     place: tuple[Array, int],
     time: Array,
-) -> tuple[Body, Work]:
+) -> tuple[BodyState, Work]:
     """The motion over one piece of a period, ``place`` its substep and its number, and what it costs."""
     total = force + push + 0.0 * body.x[0]
     if options.friction:
         after, lost, rubbed = slide(lanes, body, total, time)
     elif options.jitter:
         x, _, lost = advance(lanes.digits, np.zeros((), bool), body.x, total, time + 0.0 * total)
-        after, rubbed = Body(x, body.slip), 0.0
+        after, rubbed = BodyState(x, body.slip), 0.0
     else:
         z = jnp.concatenate([body.x, total[None]])
         x = body.x + times(lanes.pieces.change[place], z)
-        after, rubbed = Body(x, body.slip), 0.0
+        after, rubbed = BodyState(x, body.slip), 0.0
         lost = dot(z, times(lanes.pieces.loss[place], z))
     way = dot(lanes.place[0], after.x - body.x)
     moved = Work(work.wall + force * way, work.push + push * way, work.damping + lost, work.friction + rubbed)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     import xarray
 
 
-class Outcome(IntEnum):
+class MotionKind(IntEnum):
     """How a motion ends, by the two halves of its tail."""
 
     REST = 0
@@ -76,7 +76,7 @@ class Motion:
         bounces: how often the wall was left again.
         impact_velocity: at the first sample in contact, in m/s; NaN where there is none or the motion starts there.
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
-        outcome: a code of `zwidth.Outcome`: REST, the tail's motion is below 1e-9 of the widest; STEADY, its two halves
+        outcome: a code of `zwidth.MotionKind`: REST, the tail's motion is below 1e-9 of the widest; STEADY, its two halves
             differ by at most 2 % in width; DECAYING, GROWING; DIVERGED, beyond 1e100.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed.
@@ -135,9 +135,9 @@ def classify(widest: np.ndarray, first: np.ndarray, second: np.ndarray, finite: 
     """The outcome by the widths of the tail's halves."""
     with np.errstate(invalid="ignore"):
         alike = np.abs(first - second) <= _ALIKE * np.maximum(first, second)
-    changing = np.where(second < first, Outcome.DECAYING, Outcome.GROWING)
-    outcome = np.where(second <= _AT_REST * widest, Outcome.REST, np.where(alike, Outcome.STEADY, changing))
-    return np.where(finite & (widest < _BEYOND), outcome, Outcome.DIVERGED)
+    changing = np.where(second < first, MotionKind.DECAYING, MotionKind.GROWING)
+    outcome = np.where(second <= _AT_REST * widest, MotionKind.REST, np.where(alike, MotionKind.STEADY, changing))
+    return np.where(finite & (widest < _BEYOND), outcome, MotionKind.DIVERGED)
 
 
 def to_si(

@@ -10,7 +10,7 @@ from zwidth._types import ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError, ResourceError, check_choice
 from zwidth.parts.checks import check_whole
-from zwidth.simulation.batch import Numbers, Task, run_batch, structure
+from zwidth.simulation.batch import Course, Numbers, run_batch, structure
 from zwidth.simulation.result import OF_MOTION, Motion
 from zwidth.status import Status
 
@@ -111,8 +111,8 @@ def simulate(
         microseconds.
 
     References:
-        Hulin, Preusche, Hirzinger 2006, section II (the loop); Abbott, Okamura 2005, IEEE Trans. Robotics 21(5):952-964
-        (quantization and friction).
+        Hulin, Preusche, Hirzinger 2006, section II (the loop).
+        Abbott, Okamura 2005, IEEE Trans. Robotics 21(5):952-964 (encoder and friction).
 
     Example:
         >>> import zwidth
@@ -139,7 +139,7 @@ def simulate(
     periods = check_whole("periods", periods, 1, 10**9)
     substeps = check_whole("substeps", substeps, 1, 10_000)
     tail = max(periods // 4, 1) if tail is None else check_whole("tail", tail, 1, periods)
-    task = Task(periods, substeps, tail, contact, record)
+    course = Course(periods, substeps, tail, contact, record)
     known, which = _list_scenes(scenes)
     numbers, which, good = _read(known, which, given, seed, push_history, periods)
     if record and numbers.seed.size * periods * substeps * _BYTES > _MOST_BYTES:
@@ -155,7 +155,7 @@ def simulate(
     for places in groups.values():
         own = np.flatnonzero(np.isin(which, places))
         if own.size:
-            part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), numbers.take(own), task)
+            part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), numbers.take(own), course)
             for name, column in part.items():
                 if name not in found:
                     found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
