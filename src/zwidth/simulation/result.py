@@ -76,8 +76,8 @@ class Motion:
         bounces: how often the wall was left again.
         impact_velocity: at the first sample in contact, in m/s; NaN where there is none or the motion starts there.
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
-        outcome: a code of `zwidth.MotionKind`: REST, the tail's motion is below 1e-9 of the widest; STEADY, its two halves
-            differ by at most 2 % in width; DECAYING, GROWING; DIVERGED, beyond 1e100.
+        outcome: a code of `zwidth.MotionKind`: REST, the tail's motion is below 1e-9 of the widest; STEADY, its two
+            halves differ by at most 2 % in width; DECAYING, GROWING; DIVERGED, beyond 1e100.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed.
     """
