@@ -1,6 +1,7 @@
 """Every public name, once: what loads it on first use, and what type checkers read."""
 
 from . import devices as devices
+from . import plot as plot
 from .assessment import Assessment as Assessment
 from .assessment import SceneAssessment as SceneAssessment
 from .assessment import assess as assess

@@ -82,22 +82,22 @@ class Motion:
             within a period than are followed.
     """
 
-    time: np.ndarray | None
-    position: np.ndarray | None
-    velocity: np.ndarray | None
-    wall_force: np.ndarray | None
-    sticking: np.ndarray | None
-    tip_position: np.ndarray | None
-    hand_position: np.ndarray | None
-    measured: np.ndarray | None
-    estimated_velocity: np.ndarray | None
-    command: np.ndarray | None
-    contact: np.ndarray | None
-    wall_work: np.ndarray | None
-    push_work: np.ndarray | None
-    damping_loss: np.ndarray | None
-    friction_loss: np.ndarray | None
-    energy: np.ndarray | None
+    time: Any
+    position: Any
+    velocity: Any
+    wall_force: Any
+    sticking: Any
+    tip_position: Any
+    hand_position: Any
+    measured: Any
+    estimated_velocity: Any
+    command: Any
+    contact: Any
+    wall_work: Any
+    push_work: Any
+    damping_loss: Any
+    friction_loss: Any
+    energy: Any
     amplitude: Any
     frequency: Any
     penetration: Any

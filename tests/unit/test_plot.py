@@ -1,0 +1,100 @@
+"""Pictures of scenes show what the scenes answer."""
+
+from __future__ import annotations
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import zwidth
+from zwidth import plot
+
+TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
+RIGID = zwidth.Scene(zwidth.Device(0.1, 10), TIMING)
+FILTERED = RIGID.replace(velocity=zwidth.LowPass(cutoff=100))
+WALL = 10e3, 20.0
+
+
+def line(ax, label):
+    """The data of the line with that label."""
+    (found,) = [each for each in ax.lines if each.get_label() == label]
+    return np.asarray(found.get_xdata(), float), np.asarray(found.get_ydata(), float)
+
+
+@pytest.mark.parametrize("scene", [RIGID, FILTERED])
+@pytest.mark.parametrize("normalized", [False, True])
+def test_the_edge_parts_stable_from_unstable_walls(scene, normalized):
+    ax = plot.region(scene, normalized=normalized)
+    x, y = line(ax, "edge of what is stable")
+    units = tuple(scene.units) if normalized else (1e3, 1.0)
+    K, B = x * units[0], y * units[1]
+    inside = 1e-3 * K.max() < K
+    middle = K[inside].mean(), B[inside].mean()
+    shrunk, grown = (
+        [m + share * (v[inside] - m) for m, v in zip(middle, (K, B), strict=True)] for share in (0.99, 1.01)
+    )
+    assert np.all(scene.is_stable(*shrunk))
+    assert not np.any(scene.is_stable(*grown))
+    top = line(ax, "stiffest stable wall")
+    assert float(top[0][0]) * units[0] == pytest.approx(float(scene.max_stiffness().stiffness))
+
+
+def test_the_passive_edge_parts_passive_walls():
+    ax = plot.region(RIGID, passive=True)
+    (edge,) = [each for each in ax.lines if each.get_linestyle() not in ("-", "None")]
+    K, B = np.asarray(edge.get_xdata(), float) * 1e3, np.asarray(edge.get_ydata(), float)
+    assert np.all(RIGID.is_passive(0.999 * K, 0.999 * B))
+    assert not np.any(RIGID.is_passive(1.001 * K, 1.001 * B))
+
+
+def test_several_scenes_have_their_labels():
+    ax = plot.region({"difference": RIGID, "low-pass": FILTERED})
+    assert {"difference", "low-pass"} <= {text.get_text() for text in ax.get_legend().get_texts()}
+
+
+def test_a_ridge_is_the_stiffest_wall_at_every_value():
+    ax = plot.ridge(RIGID, "damping", [0.0, 5.0, 10.0])
+    x, y = line(ax, "stiffest stable wall")
+    expected = [float(RIGID.replace(damping=b).max_stiffness().stiffness) / 1e3 for b in x]
+    np.testing.assert_allclose(y, expected)
+    assert ax.get_xlabel() == "physical damping  $b$  in N s/m"
+
+
+def test_a_step_is_the_simulated_one():
+    ax = plot.step(FILTERED, *WALL, periods=60)
+    y = np.asarray(ax.lines[0].get_ydata(), float) * 1e-6
+    np.testing.assert_allclose(y, FILTERED.simulate(*WALL, push=1.0, periods=60).position, atol=1e-14)
+
+
+def test_the_gain_crossover_is_on_the_unit_circle_at_its_margin():
+    ax = plot.nyquist(RIGID, *WALL)
+    x, y = line(ax, "gain crossover")
+    at = RIGID.frequency_response(*WALL, RIGID.margins(*WALL).gain_crossover)
+    assert complex(x[0], y[0]) == pytest.approx(complex(at), abs=1e-4)
+
+
+def test_poles_outside_look_different():
+    ax = plot.poles(RIGID, 25e3, 40.0)
+    outside = np.hypot(*line(ax, "poles not inside"))
+    assert outside.min() > 1.0
+    assert outside.size + line(ax, "poles inside")[0].size == RIGID.poles(25e3, 40.0).size
+
+
+def test_motions_over_time():
+    found = RIGID.simulate([5e3, 10e3], 20.0, push=1.0, periods=50)
+    ax = plot.motion(found, labels=["soft", "stiff"])
+    np.testing.assert_allclose(line(ax, "stiff")[1] * 1e-6, np.asarray(found.position)[1])
+    with pytest.raises(zwidth.InputError, match="got 1 for 2 motions"):
+        plot.motion(found, labels=["one"])
+    with pytest.raises(zwidth.InputError, match="record=True"):
+        plot.motion(RIGID.simulate(5e3, 20.0, periods=5, record=False))
+
+
+def test_an_axes_of_ones_own_is_drawn_into_and_no_setting_changes():
+    before = dict(matplotlib.rcParams)
+    ax = Figure().subplots()
+    assert plot.region(RIGID, ax) is ax
+    assert dict(matplotlib.rcParams) == before
+    with pytest.raises(zwidth.InputError, match="values: got shape"):
+        plot.ridge(RIGID, "damping", 3.0)
