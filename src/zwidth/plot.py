@@ -220,7 +220,7 @@ def poles(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Axes
         virtual_damping: B in N s/m.
         ax: an Axes of yours.
     """
-    found = np.asarray(scene.poles(stiffness, virtual_damping)).ravel()
+    found: Any = np.asarray(scene.poles(stiffness, virtual_damping)).ravel()
     outside = np.abs(found) >= 1.0
     ax = _axes(ax, 4.4, 4.2)
     ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.8))

@@ -50,7 +50,9 @@ def test_the_passive_edge_parts_passive_walls():
 
 def test_several_scenes_have_their_labels():
     ax = plot.region({"difference": RIGID, "low-pass": FILTERED})
-    assert {"difference", "low-pass"} <= {text.get_text() for text in ax.get_legend().get_texts()}
+    legend = ax.get_legend()
+    assert legend is not None
+    assert {"difference", "low-pass"} <= {text.get_text() for text in legend.get_texts()}
 
 
 def test_a_ridge_is_the_stiffest_wall_at_every_value():
