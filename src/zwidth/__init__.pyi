@@ -37,6 +37,7 @@ from .errors import PrecisionWarning as PrecisionWarning
 from .errors import StoreExistsError as StoreExistsError
 from .errors import TracedDelayError as TracedDelayError
 from .errors import ZwidthError as ZwidthError
+from .html_report.page import write_report as write_report
 from .kernel_cache import use_compilation_cache as use_compilation_cache
 from .linear.answers import to_control as to_control
 from .loop import char_poly as char_poly
