@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 import zwidth
 from any_loop import closed_loop_matrix
 from independent_scenes import KINDS, random_scene
@@ -17,7 +18,7 @@ def draw_edges(kind, rng, count):
         scene = random_scene(kind, rng)
         damping = float(rng.uniform(-0.05, 0.3) * scene.units.virtual_damping)
         intervals = scene.stable_stiffness(damping)
-        if intervals.size and 0 < intervals[-1, 1] and intervals[-1, 0] < 0.98 * intervals[-1, 1] < np.inf:
+        if intervals.size and intervals[-1, 1] > 0 and intervals[-1, 0] < 0.98 * intervals[-1, 1] < np.inf:
             found.append((scene, damping, intervals[-1, 1]))
     return found
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 import zwidth
 from independent_scenes import KINDS, random_scene
 from tolerances import ENERGY_KEPT, FRICTION_TRUTH
