@@ -131,3 +131,22 @@ WORST_ENERGY = Tolerance(
 WORST_NEED = Tolerance(
     1e-9, "Relative: a generalized eigenvalue of forms with condition (periods)^2, and the condition's own 1e-13."
 )
+
+GROWTH_SIMULATED = Tolerance(
+    1e-6,
+    "Relative, of a growth per period: what other poles leave of a motion, 1e-10 of it, over the angle by which the "
+    "slowest pole turns between samples. Measured below 3e-8 over 28,000 walls.",
+)
+SIMULATED_LINEAR = Tolerance(
+    1e-11,
+    "Relative to the widest motion: 60 periods by two different matrix exponentials, of rates up to 100 a period.",
+)
+ENERGY_KEPT = Tolerance(
+    1e-12, "Relative to the largest flow of energy: hundreds of periods of rounding each; measured below 4e-14."
+)
+FRICTION_TRUTH = Tolerance(
+    1e-13, "Relative: a stop is found to the last binary digit of its instant, of some tens of periods."
+)
+SIMULATED_AGAIN = Tolerance(
+    1e-12, "Relative to the widest motion: the same simulation in a batch, where sums are rounded in another order."
+)
