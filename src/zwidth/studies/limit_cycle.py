@@ -64,7 +64,7 @@ _OWN: Any = {
 _Own: Any = create_model("_Own", __base__=Strict, **_OWN)
 
 
-class Condition(_Own):
+class CycleCondition(_Own):
     """What one panel of a limit_cycle study has of its own."""
 
     what: ClassVar[str] = "a condition"
@@ -121,7 +121,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     axes: CycleAxes
     """The walls, and encoder and friction where they vary."""
 
-    conditions: Annotated[tuple[Condition, ...], WrapValidator(members("conditions"))]
+    conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(members("conditions"))]
     """What each panel has of its own, beside what the study sets for all; one panel where left out."""
 
     silence: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)] = 1e-6
