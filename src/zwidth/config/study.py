@@ -90,17 +90,21 @@ class Study(Strict):
         return {**{name: supplied[name] for name in cls.from_scene}, **raw}
 
     @classmethod
+    def _list_taken(cls, raw: dict[str, Any]) -> list[str]:
+        """What of the device the study takes from the scene."""
+        return [name for name in cls.from_scene if name not in raw and not name.startswith("delay_model")]
+
+    @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         """Refuse a scene with parts of which the study would take numbers and forget the rest."""
-        taken = [name for name in cls.from_scene if name not in raw and not name.startswith("delay_model")]
+        taken = cls._list_taken(raw)
         if taken and not cls.takes_parts and is_with_parts(scene):
             raise refuse_parts(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
 
     @classmethod
     def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         """Refuse a scene whose velocity estimate has no linear form, where something is taken of it."""
-        taken = cls.takes_parts or any(name not in raw for name in cls.from_scene)
-        if taken and not cls.simulates and is_adaptive(scene):
+        if (cls.takes_parts or cls._list_taken(raw)) and not cls.simulates and is_adaptive(scene):
             raise problem("got scene.velocity of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
 
     @classmethod
