@@ -69,10 +69,7 @@ def draw_limit_cycles(
             ax.plot(*ends, color=style.VERMILION, linewidth=1.2, label=f"linear, {one.number}", zorder=3)
         if len(labels) > 1:
             ax.set_title(label)
-        for which, values in zip("xy", (x, y), strict=True):
-            if logarithmic(values):
-                getattr(ax, f"set_{which}scale")("log")
-            getattr(ax, f"set_{which}lim")(values.min(), values.max())
+        _scale_axes(ax, x, y)
     names = [f"{_AXES[name][0]}  ${_AXES[name][1]}$  in {scales[name][1]}" for name in (across, along)]
     style.label_axes(panels, *names, once=axes is None)
     figure = style.figure_of(panels)
@@ -95,16 +92,18 @@ def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) 
 @style.house_style()
 def draw_limit_cycle_curves(
     arrays: Mapping[str, np.ndarray],
+    edges: Table,
     bounds: tuple[float, float],
     family: str = "",
     axes: style.AnyAxes | None = None,
 ) -> np.ndarray:
     """Draw amplitude (above) and frequency (below) of the buzz over one parameter, a column per condition.
 
-    A gap: silent, or wider than any buzz.
+    A gap: silent, or wider than any buzz; a vertical line: boundary of the linear theory.
 
     Args:
         arrays: what the npz file of a limit_cycle study holds.
+        edges: columns condition, number and the parameter; nothing where there is no linear boundary.
         bounds: amplitudes between which a motion counts as a buzz, in m.
         family: the name of the parameter that has a curve for each of its values; "" where there is none.
         axes: Axes of yours, those of the amplitudes first.
@@ -127,7 +126,9 @@ def draw_limit_cycle_curves(
             for curve, buzz, look in zip(cycles[name][column], buzzes[column], looks, strict=True):
                 shown = np.where(buzz, curve, np.nan) * times
                 ax.plot(arrays[over] * scale, shown, marker=".", markersize=2.5, linewidth=1.0, **look)
-            _scale_over(ax, arrays[over] * scale)
+            _scale_axes(ax, arrays[over] * scale)
+            for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
+                ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
                 ax.set_yscale("log")
                 ax.yaxis.set_major_formatter(_PLAIN)
@@ -137,7 +138,8 @@ def draw_limit_cycle_curves(
             if column == 0:
                 ax.set_ylabel(words)
     handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]
-    style.legend(panels, handles if family else [], outside=axes is None, ncols=4)
+    boundary = [style.line("boundary of the linear theory", width=1.0, color=style.VERMILION)] if edges else []
+    style.legend(panels, handles if family else boundary, outside=axes is None, ncols=4)
     return panels
 
 
@@ -156,9 +158,10 @@ def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarra
     ]
 
 
-def _scale_over(ax: Axes, values: np.ndarray) -> None:
-    """The range and the spacing of the axis of a parameter."""
-    if logarithmic(values):
-        ax.set_xscale("log")
-        ax.xaxis.set_major_formatter(_PLAIN)
-    ax.set_xlim(float(values.min()), float(values.max()))
+def _scale_axes(ax: Axes, *values: np.ndarray) -> None:
+    """The range and the spacing of the axes of parameters."""
+    for axis, own in zip("xy", values, strict=False):
+        if logarithmic(own):
+            getattr(ax, f"set_{axis}scale")("log")
+            getattr(ax, f"{axis}axis").set_major_formatter(_PLAIN)
+        getattr(ax, f"set_{axis}lim")(float(own.min()), float(own.max()))

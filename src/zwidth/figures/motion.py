@@ -36,26 +36,24 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     motions = _read_motions(table)
     panels = style.panels(axes, 2, 6.4, 4.8, height_ratios=(1.6, 1.0), sharex=True)
     clock, second = style.si_unit(max(float(each.time_s[-1]) for each in motions), "s")
-    quantities = zip(panels, (("position", "m"), ("wall_force", "N")), ("position  $x$", "wall force"), strict=False)
-    for ax, (name, unit), words in quantities:
-        values = [getattr(each, f"{name}_{unit}") for each in motions]
-        factor, unit = _limit(ax, "y", values, unit)
-        for each, mine in zip(motions, values, strict=True):
+    behind = [name for name in ("tip_position_m", "hand_position_m") if hasattr(motions[0], name)]
+    quantities = (("position_m", "position  $x$", behind), ("wall_force_N", "wall force", []))
+    for ax, (name, words, others) in zip(panels, quantities, strict=False):
+        factor, unit = _limit(ax, "y", [getattr(each, one) for each in motions for one in (name, *others)], name[-1])
+        for each in motions:
             # Steps of a force are too short for dashes: lightness has to do.
-            look = each.look if name == "position" else {"color": each.look["color"], "linewidth": 1.1}
-            ax.plot(each.time_s * clock, mine * factor, label=each.label, zorder=3, **look)
-            others = ("tip_position_m", "hand_position_m") if name == "position" else ()
-            for other in (other for other in others if hasattr(each, other)):
-                ax.plot(
-                    each.time_s * clock, getattr(each, other) * factor, label=f"{other}, {each.label}", zorder=2.5,
-                    color=each.look["color"], linewidth=0.7,
-                )  # fmt: skip
+            look = each.look if name == "position_m" else {"color": each.look["color"], "linewidth": 1.1}
+            ax.plot(each.time_s * clock, getattr(each, name) * factor, label=each.label, zorder=3, **look)
+            for other in others:
+                look = {"color": each.look["color"], "linewidth": 0.6}
+                ax.plot(each.time_s * clock, getattr(each, other) * factor, label=f"{other}, {each.label}", **look)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
         ax.set_ylabel(f"{words}  in {unit}")
         ax.set_xlim(0.0, max(float(each.time_s[-1]) for each in motions) * clock)
-    _shade_wall(panels[0], "y")
+    _mark_wall(panels[0], "y", motions)
     panels[-1].set_xlabel(f"time  $t$  in {second}")
-    style.legend(panels, _explain(motions), outside=axes is None, ncols=3)
+    handles = [*_explain(motions), *([style.line("bodies behind links", width=0.6)] if behind else [])]
+    style.legend(panels, handles, outside=axes is None, ncols=_count_columns(motions))
     return panels
 
 
@@ -78,10 +76,10 @@ def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndar
         start = each.position_m[0] * x, each.velocity_m_per_s[0] * y
         ax.plot(*start, linestyle="", marker="o", markersize=4.0, color=style.BLACK, label="start", zorder=4)
     ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
-    _shade_wall(ax, "x")
+    _mark_wall(ax, "x", motions)
     ax.set(xlabel=f"position  $x$  in {meter}", ylabel=f"velocity  $v$  in {speed}")
     start = style.line("start", "", color=style.BLACK, marker="o", markersize=4.0)
-    style.legend(panels, [*_explain(motions), start], outside=axes is None, ncols=4)
+    style.legend(panels, [*_explain(motions), start], outside=axes is None, ncols=_count_columns(motions))
     return panels
 
 
@@ -108,7 +106,8 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
             ax.plot(each.time_s * clock, values, color=color, linestyle=dash, linewidth=1.2, label=words)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=1)
         ax.set_xlim(0.0, float(each.time_s[-1]) * clock)
-        ax.set(title=_in_math(each.label), xlabel=f"time  $t$  in {second}", ylabel=f"energy  in {joule}")
+        title = _in_math(each.label).replace(", ", "\n" if columns > 1 else ", ")
+        ax.set(title=title, xlabel=f"time  $t$  in {second}", ylabel=f"energy  in {joule}")
     handles = [style.line(words, dash, 1.2, color) for words, color, dash in (_ENERGIES[name] for name in shown)]
     style.legend(panels, handles, outside=axes is None, ncols=min(len(handles), 2 + columns))
     return panels
@@ -136,18 +135,26 @@ def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[f
     return factor, unit
 
 
-def _shade_wall(ax: Axes, which: str) -> None:
-    """Mark where the wall is: positions > 0."""
-    far = max(getattr(ax, f"get_{which}lim")())
-    shade, line = (ax.axhspan, ax.axhline) if which == "y" else (ax.axvspan, ax.axvline)
-    shade(0.0, far, color=style.GRAY, alpha=0.10, linewidth=0.0, zorder=0.5)
+def _mark_wall(ax: Axes, which: str, motions: list[Any]) -> None:
+    """Mark the wall's surface, and where the wall is unless it acts on both sides."""
+    line = ax.axhline if which == "y" else ax.axvline
     line(0.0, color=style.GRAY, linewidth=1.0, zorder=2)
+    if all(np.all(each.contact) for each in motions):
+        return
+    far = max(getattr(ax, f"get_{which}lim")())
+    shade = ax.axhspan if which == "y" else ax.axvspan
+    shade(0.0, far, color=style.GRAY, alpha=0.10, linewidth=0.0, zorder=0.5)
     place = {"y": (0.99, 0.97, "right", "top"), "x": (0.99, 0.03, "right", "bottom")}[which]
     ax.text(*place[:2], "wall", transform=ax.transAxes, ha=place[2], va=place[3], color=style.GRAY, fontsize=8)
 
 
 def _in_math(label: str) -> str:
     return label.replace("K_max", r"$K_{\max}$")
+
+
+def _count_columns(motions: list[Any]) -> int:
+    """How many names of motions a legend has side by side."""
+    return 2 if max(len(each.label) for each in motions) > 20 else 4
 
 
 def _explain(motions: Iterable[Any]) -> list[Any]:

@@ -204,7 +204,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         draw = (
             partial(figures.draw_limit_cycles, arrays, table, bounds)
             if family is None
-            else partial(figures.draw_limit_cycle_curves, arrays, bounds, family)
+            else partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
         )
         low, high = (with_unit(bound, "m", 3) for bound in bounds)
         notes.append(f"buzzing: an amplitude from {low} to {high} in the last quarter of {self.duration}")
@@ -227,7 +227,7 @@ def choose_curves(varied: dict[str, Axis]) -> str | None:
 def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[str, np.ndarray]) -> list[dict[str, Any]]:
     """The linear boundary in the plane of two axes, as columns: outlines, or lines where one of the walls' is fixed."""
     walls = [name for name in ("stiffness", "virtual_damping") if name in varied]
-    if not walls or len(varied) < 2:
+    if not walls:
         return []
     lines = []
     for outline in scene.stable_region():
@@ -238,12 +238,12 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
             lines.append(ends)
             continue
         (along,), (fixed,) = walls, {"stiffness", "virtual_damping"} - set(walls)
-        (across,) = set(varied) - {along}
         x, y, level = ends[along], ends[fixed], float(axes[fixed])
         k = np.flatnonzero((y[:-1] < level) != (y[1:] < level))
         crossed = x[k] + (level - y[k]) / (y[k + 1] - y[k]) * (x[k + 1] - x[k])
-        far = varied[across].values()
-        lines += [{along: np.full(2, value), across: np.array([far.min(), far.max()])} for value in crossed]
+        others = {name: varied[name].values() for name in varied if name != along}
+        far = {name: np.array([values.min(), values.max()]) for name, values in others.items()}
+        lines += [{along: np.full(2, value), **far} for value in crossed]
     return [
         {"condition": label, "number": number, **{_COLUMNS[name]: part for name, part in line.items()}}
         for number, line in enumerate(lines, start=1)

@@ -225,24 +225,25 @@ def describe_end(motion: Motion, k: int, period: float) -> str:
     if motion.status[k]:
         return "not followed to its end"
     end = End(int(motion.outcome[k]))
-    assert motion.contact is not None, "it is recorded"
-    assert motion.velocity is not None, "it is recorded"
-    contact, tail = motion.contact[k], max(motion.contact[k].size // 4, 1)
     if end in (End.REST, End.DIVERGED):
         return _WORDS[end]
+    arrays = (motion.position, motion.velocity, motion.contact)
+    position, velocity, contact = (part[k] for part in arrays if part is not None)
+    tail = max(contact.size // 4, 1)
     if not contact[-tail:].any():
         return "gone from the wall"
     amplitude, frequency = float(motion.amplitude[k]), float(motion.frequency[k])
-    swings = frequency * period * tail
-    if not contact[-tail:].all() and not swings >= _FEW_SWINGS:
-        # Halves of the tail with a swing or two each tell nothing: impacts do.
+    # Halves of the tail with a swing or two each tell nothing: impacts do, and where the motion is widest.
+    if not frequency * period * tail >= _FEW_SWINGS:
         hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
-        speeds = motion.velocity[k].reshape(contact.size, -1)[hits, 0]
-        if speeds.size < 2:
-            return "bouncing, too few times to tell how it goes on"
-        first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
-        change = "growing" if speeds[-1] > speeds[0] else "decaying"
-        return f"bounces {change}, the first of {speeds.size} impacts at {first} and the last at {last}"
+        if hits.size > 1:
+            speeds = velocity.reshape(contact.size, -1)[hits, 0]
+            first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
+            change = "growing" if speeds[-1] > speeds[0] else "decaying"
+            return f"bounces {change}, the first of {hits.size} impacts at {first} and the last at {last}"
+        widest_last = np.argmax(np.abs(position)) >= position.size - tail * position.size // contact.size
+        if end is End.STEADY or (end is End.GROWING) != widest_last:
+            return "too few swings at the end to tell how it goes on"
     if end is not End.STEADY:
         return _WORDS[end]
     rate = f" at {with_unit(frequency, 'Hz', 3)}" if np.isfinite(frequency) else ""
