@@ -48,6 +48,7 @@ STIFFNESS = Dimension({"N/m": 0, "mN/m": -3, "kN/m": 3, "MN/m": 6, "N/mm": 3, "k
 FORCE = Dimension({"N": 0, "mN": -3, "kN": 3}, "0.2 N")
 LENGTH = Dimension({"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "nm": -9}, "10 um")
 SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
+FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
 _OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, LENGTH, SPEED)}
 
 PERIOD_WORDS = ("periods", "period")

@@ -20,6 +20,7 @@ from zwidth.formatting import describe, suggestion
 from zwidth.parts.coupling import Coupling
 from zwidth.parts.operator import Operator
 from zwidth.parts.velocity import (
+    FOAW,
     BackwardDifference,
     Butterworth,
     LowPass,
@@ -27,10 +28,13 @@ from zwidth.parts.velocity import (
     VelocityFilter,
     WindowedDifference,
 )
-from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE
-from zwidth.units import MASS, RATE, STIFFNESS, TIME
+from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.units import LENGTH, MASS, RATE, STIFFNESS, TIME
 
 PARTS = ("velocity", "operator", "coupling")
+
+NO_LINEAR_FORM = "FOAW chooses its window by the motion and has no linear form"
+SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such as 'windowed_difference'"
 
 
 def locate_refusal(error: InputError) -> LocatedProblem:
@@ -157,36 +161,60 @@ class FilterSection(PartSection):
     """Coefficients of the denominator, highest power of z first; its roots lie inside the unit circle."""
 
 
-AnyVelocity: TypeAlias = (
+class FOAWSection(PartSection):
+    """First-order adaptive windowing, for simulations."""
+
+    what: ClassVar[str] = "a velocity estimate of kind foaw"
+    part: ClassVar[Any] = FOAW
+
+    kind: Literal["foaw"]
+
+    noise: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)]
+    """The largest error of a measured position in m or with a unit, > 0: one count of an encoder."""
+
+    samples: Annotated[int, BeforeValidator(whole_number(Range(1, 64)))] = 15
+    """The longest window in periods, 1 to 64."""
+
+
+LinearVelocity: TypeAlias = (
     BackwardDifferenceSection | WindowedDifferenceSection | LowPassSection | ButterworthSection | FilterSection
 )
-_ESTIMATES: dict[str, type[PartSection]] = {
+_LINEAR: dict[str, type[PartSection]] = {
     "backward_difference": BackwardDifferenceSection,
     "windowed_difference": WindowedDifferenceSection,
     "low_pass": LowPassSection,
     "butterworth": ButterworthSection,
     "filter": FilterSection,
 }
+_ESTIMATES = {**_LINEAR, "foaw": FOAWSection}
 
 
-def read_velocity(raw: Any) -> Any:
+def read_velocity(raw: Any, known: dict[str, type[PartSection]] = _LINEAR) -> Any:
     """A velocity estimate, read as what its kind names."""
-    if isinstance(raw, PartSection):
+    if isinstance(raw, tuple(known.values())):
         return raw
-    kinds = f"a velocity estimate is a mapping with one of the kinds {listing(_ESTIMATES)}"
+    if isinstance(raw, FOAWSection):
+        raise problem("got a velocity estimate of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
+    kinds = f"a velocity estimate is a mapping with one of the kinds {listing(known)}"
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", kinds, "write {kind: low_pass, cutoff: 100 Hz}")
     if "kind" not in raw:
         raise validation_error("velocity", [(("kind",), problem("missing", kinds, "add 'kind: low_pass'"))])
     kind = raw["kind"]
-    if not isinstance(kind, str) or kind not in _ESTIMATES:
-        allowed, remedy = f"the kinds are {listing(_ESTIMATES)}", suggestion(kind, _ESTIMATES, "write one of these")
+    if not isinstance(kind, str) or kind not in known:
+        allowed, remedy = f"the kinds are {listing(known)}", suggestion(kind, known, "write one of these")
+        if kind == "foaw":
+            allowed, remedy = NO_LINEAR_FORM, SIMULATED
         raise validation_error("velocity", [(("kind",), problem(f"got {describe(kind)}", allowed, remedy))])
-    return _ESTIMATES[kind].model_validate(raw)
+    return known[kind].model_validate(raw)
 
 
 VelocityField = Annotated[
-    Annotated[AnyVelocity, Field(discriminator="kind")], WrapValidator(lambda raw, _: read_velocity(raw))
+    Annotated[LinearVelocity, Field(discriminator="kind")], WrapValidator(lambda raw, _: read_velocity(raw))
+]
+SimulatedVelocityField = Annotated[
+    Annotated[LinearVelocity | FOAWSection, Field(discriminator="kind")],
+    WrapValidator(lambda raw, _: read_velocity(raw, _ESTIMATES)),
 ]
 
 

@@ -26,7 +26,9 @@ from zwidth.config.numbers import number
 from zwidth.config.parts import (
     PARTS,
     CouplingSection,
+    FOAWSection,
     OperatorSection,
+    SimulatedVelocityField,
     VelocityField,
     build_velocity,
     list_parts,
@@ -136,7 +138,7 @@ class _PhysicalPlant(_OneKind):
         try:
             scene = self.to_scene()
             # Where it is not rigid: what the parts refuse only together, such as a cut-off beyond half the rate.
-            _ = scene.is_rigid or scene.loop
+            _ = scene.is_rigid or isinstance(self.velocity, FOAWSection) or scene.loop
         except InputError as error:
             yield locate_refusal(error)
             return
@@ -202,6 +204,13 @@ class PhysicalDevice(_PhysicalPlant):
     """Name of the device in legends."""
 
 
+class SimulatedDevice(PhysicalDevice):
+    """A device in SI units whose velocity estimate need not be linear."""
+
+    velocity: SimulatedVelocityField | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """How the velocity is estimated; the difference of two samples where left out."""
+
+
 class LabeledDevice(_PhysicalPlant):
     """A device in SI units among others that a figure names."""
 
@@ -234,6 +243,9 @@ class PhysicalScene(_PhysicalPlant):
     virtual_damping: VirtualDamping | None = None
     """Damping B of the wall in N s/m."""
 
+    velocity: SimulatedVelocityField | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    """How the velocity is estimated; the difference of two samples where left out."""
+
     delay_model: DelayModel = "held"
     """How a delay that is not whole is modeled."""
 
@@ -246,9 +258,18 @@ class PhysicalScene(_PhysicalPlant):
 
     @property
     def device(self) -> PhysicalDevice:
+        """The scene without its wall, for studies that need a linear velocity estimate."""
+        return PhysicalDevice(**self._device_keys)
+
+    @property
+    def simulated_device(self) -> SimulatedDevice:
         """The scene without its wall."""
-        parts = list_parts(self)
-        return PhysicalDevice(mass=self.mass, damping=self.damping, period=self.period, delay=self.delay, **parts)
+        return SimulatedDevice(**self._device_keys)
+
+    @property
+    def _device_keys(self) -> dict[str, Any]:
+        own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay")}
+        return {**own, **list_parts(self)}
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -315,6 +336,11 @@ class NormalizedWall(_OneKind):
 
     beta: Number = 0.0
     """Normalized damping B T/m."""
+
+
+def is_adaptive(owner: AnyScene | AnyDevice) -> bool:
+    """Whether the velocity estimate of a scene or a device has no linear form."""
+    return isinstance(getattr(owner, "velocity", None), FOAWSection)
 
 
 def is_with_parts(owner: AnyScene | AnyDevice) -> bool:

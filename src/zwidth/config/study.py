@@ -11,14 +11,14 @@ from pydantic_core import PydanticCustomError
 from zwidth._types import DELAY_MODELS, DelayModel
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Name, Strict, members
-from zwidth.config.parts import list_parts
-from zwidth.config.scenes import AnyScene, is_with_parts
+from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
+from zwidth.config.scenes import AnyScene, is_adaptive, is_with_parts
 from zwidth.formatting import describe
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
 
-KINDS_WITH_PARTS = ("boundary", "recommend", "compare", "filters", "design", "sweep")
+KINDS_WITH_PARTS = ("boundary", "recommend", "compare", "filters", "design", "simulate", "limit_cycle", "sweep")
 """The kinds that answer for devices with parts, for messages."""
 
 
@@ -64,6 +64,9 @@ class Study(Strict):
     takes_parts: ClassVar[bool] = False
     """Whether it answers for a device with a velocity filter, a hand or a coupling; it then has the field device."""
 
+    simulates: ClassVar[bool] = False
+    """Whether it answers for a velocity estimate without a linear form."""
+
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
 
     name: Name
@@ -87,11 +90,22 @@ class Study(Strict):
         return {**{name: supplied[name] for name in cls.from_scene}, **raw}
 
     @classmethod
+    def _list_taken(cls, raw: dict[str, Any]) -> list[str]:
+        """What of the device the study takes from the scene."""
+        return [name for name in cls.from_scene if name not in raw and not name.startswith("delay_model")]
+
+    @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         """Refuse a scene with parts of which the study would take numbers and forget the rest."""
-        taken = [name for name in cls.from_scene if name not in raw and not name.startswith("delay_model")]
+        taken = cls._list_taken(raw)
         if taken and not cls.takes_parts and is_with_parts(scene):
             raise refuse_parts(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
+
+    @classmethod
+    def check_estimate(cls, raw: dict[str, Any], scene: AnyScene) -> None:
+        """Refuse a scene whose velocity estimate has no linear form, where something is taken of it."""
+        if (cls.takes_parts or cls._list_taken(raw)) and not cls.simulates and is_adaptive(scene):
+            raise problem("got scene.velocity of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:

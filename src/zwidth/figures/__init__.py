@@ -16,6 +16,11 @@ JSON file, too):
     draw_stable_set       outlines of devices with a velocity filter, a hand or a coupling
     draw_filters          maximum stiffness over the cut-off of a velocity filter and over its window
     draw_filter_noise     the same over the noise that the filter lets through
+    draw_motion           simulated positions and wall forces over time
+    draw_phase_plane      simulated velocity over position
+    draw_energy           what wall and hand have given, and what damping and friction have taken
+    draw_limit_cycles     amplitude of the buzz over two parameters (from arrays)
+    draw_limit_cycle_curves  amplitude and frequency of the buzz over one parameter (from arrays)
 
 From the dataset of a sweep, as `zwidth.open_dataset` gives it, or a part of one:
 

@@ -5,6 +5,11 @@ from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines
 from .filters import draw_filter_noise as draw_filter_noise
 from .filters import draw_filters as draw_filters
+from .limit_cycle import draw_limit_cycle_curves as draw_limit_cycle_curves
+from .limit_cycle import draw_limit_cycles as draw_limit_cycles
+from .motion import draw_energy as draw_energy
+from .motion import draw_motion as draw_motion
+from .motion import draw_phase_plane as draw_phase_plane
 from .passivity_cost import draw_passivity_cost as draw_passivity_cost
 from .plane import draw_plane as draw_plane
 from .recommendation import draw_recommendation as draw_recommendation

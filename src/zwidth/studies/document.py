@@ -29,10 +29,12 @@ from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.compare import CompareStudy
 from zwidth.studies.design import DesignStudy
 from zwidth.studies.filters import FiltersStudy
+from zwidth.studies.limit_cycle import LimitCycleStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
 from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy
+from zwidth.studies.simulate import SimulateStudy
 from zwidth.studies.step import StepStudy
 from zwidth.sweep.study import SweepStudy
 from zwidth.units import looks_like_number
@@ -66,6 +68,8 @@ for _model in (
     CompareStudy,
     FiltersStudy,
     DesignStudy,
+    SimulateStudy,
+    LimitCycleStudy,
     SweepStudy,
 ):
     register(_model)
@@ -203,6 +207,7 @@ def _fill_study(study: Any, scene: AnyScene) -> Any:
     if model is None:
         return study
     try:
+        model.check_estimate(study, scene)
         model.check_parts(study, scene)
     except PydanticCustomError as refusal:
         # Raised where the study is read, at its place in the file.

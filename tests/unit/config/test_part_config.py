@@ -23,11 +23,12 @@ def part(text, studies=BOUNDARY):
         ("{kind: low_pass, cutoff: 0.1 kHz, order: 2}", zwidth.LowPass(cutoff=100, order=2)),
         ("{kind: low_pass, time_constant: 50 ms}", zwidth.LowPass(time_constant=0.05)),
         ("{kind: butterworth, cutoff: 25, order: 4}", zwidth.Butterworth(25, 4)),
+        ("{kind: foaw, noise: 20 um}", zwidth.FOAW(2e-5, 15)),
         ("{kind: filter, numerator: [1000, -1000], denominator: [1, 0]}", zwidth.VelocityFilter([1e3, -1e3], [1, 0])),
     ],
 )
 def test_every_velocity_estimate(load, text, expected):
-    config = load(part(f"velocity: {text}"))
+    config = load(part(f"velocity: {text}", "studies: [{kind: simulate, name: s, walls: [{stiffness: 1000}]}]\n"))
     assert config.scene.to_scene().velocity == expected
     # What a run keeps of a configuration says the same.
     assert Config.model_validate(config.model_dump(mode="json", exclude_none=True)) == config

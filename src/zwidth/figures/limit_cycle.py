@@ -1,0 +1,167 @@
+"""The buzz of walls: its amplitude over a plane of two parameters, and amplitude and frequency over one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+from matplotlib.patches import Patch
+from matplotlib.ticker import FuncFormatter
+
+from zwidth.figures import style
+from zwidth.figures.grid import logarithmic
+from zwidth.figures.table import SI_COLUMNS, Table, curves
+from zwidth.formatting import with_unit
+
+_AXES = {
+    SI_COLUMNS[0]: ("stiffness", "K", "N/m"),
+    SI_COLUMNS[1]: ("virtual damping", "B", "N s/m"),
+    "resolution_m": ("resolution of the encoder", r"\Delta", "m"),
+    "coulomb_N": ("dry friction", "F_c", "N"),
+}
+_DIVERGED = 4
+_CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
+_BEYOND: dict[str, Any] = {"facecolor": "#D9D9D9", "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
+_PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
+_STYLES = (style.SOLID, style.DASHED, style.DASH_DOTTED, style.DOTTED)
+
+
+@style.house_style()
+def draw_limit_cycles(
+    arrays: Mapping[str, np.ndarray], edges: Table, bounds: tuple[float, float], axes: style.AnyAxes | None = None
+) -> np.ndarray:
+    """Draw the amplitude of the buzz over two parameters, a panel per condition.
+
+    White: silent; hatched: wider than any buzz; line: boundary of the linear theory.
+
+    Args:
+        arrays: what the npz file of a limit_cycle study holds.
+        edges: columns condition, number and those of the two parameters; nothing where there is no linear boundary.
+        bounds: amplitudes between which a motion counts as a buzz, in m.
+        axes: Axes of yours, one for each condition.
+    """
+    labels = arrays["condition"].tolist()
+    across, along = (name for name in _AXES if name in arrays)
+    columns = len(labels) if len(labels) <= 3 else 2
+    rows = -(-len(labels) // columns)
+    size = (max(1.3 + 2.5 * columns, 5.6), 1.3 + 2.4 * rows) if len(labels) > 1 else (5.8, 4.3)
+    panels = style.panels(axes, len(labels), *size, columns, sharex=True, sharey=True)
+    scales = {name: style.si_unit(float(np.abs(arrays[name]).max()), _AXES[name][2]) for name in (across, along)}
+    beyond = _find_beyond(arrays, bounds)
+    factor, meter = style.si_unit(float(np.sqrt(bounds[0] * bounds[1])), "m")
+    norm = LogNorm(bounds[0] * factor, bounds[1] * factor)
+    colors = matplotlib.colormaps["viridis_r"].with_extremes(under="white", bad=(0, 0, 0, 0))
+    image: Any = None
+    for k, (ax, label) in enumerate(zip(panels, labels, strict=False)):
+        x, y = arrays[across] * scales[across][0], arrays[along] * scales[along][0]
+        if beyond[k].any():
+            # Seen where the values above it are left out.
+            ax.fill_between([x.min(), x.max()], y.min(), y.max(), **_BEYOND, zorder=0.5)
+        shown = np.where(beyond[k], np.nan, np.maximum(arrays["amplitude_m"][k], 1e-300)) * factor
+        look: dict[str, Any] = {"shading": "nearest", "rasterized": True, "zorder": 1}
+        image = ax.pcolormesh(x, y, shown.T, cmap=colors, norm=norm, **look)
+        for one in curves(edges, "number", condition=label) if edges else ():
+            ends = (getattr(one, name) * scales[name][0] for name in (across, along))
+            ax.plot(*ends, color=style.VERMILION, linewidth=1.2, label=f"linear, {one.number}", zorder=3)
+        if len(labels) > 1:
+            ax.set_title(label)
+        _scale_axes(ax, x, y)
+    names = [f"{_AXES[name][0]}  ${_AXES[name][1]}$  in {scales[name][1]}" for name in (across, along)]
+    style.label_axes(panels, *names, once=axes is None)
+    figure = style.figure_of(panels)
+    label = f"amplitude of the buzz  in {meter}"
+    figure.colorbar(image, ax=list(panels), label=label, shrink=0.9, format=_PLAIN)
+    edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.6}
+    handles: list[Any] = [
+        Patch(facecolor="white", label="silent", **edge),
+        Patch(**_BEYOND, label=f"beyond {with_unit(bounds[1], 'm', 1)}"),
+    ]
+    handles += [style.line("boundary of the linear theory", width=1.2, color=style.VERMILION)] if edges else []
+    style.legend(panels, handles, outside=axes is None, ncols=3)
+    return panels
+
+
+def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) -> np.ndarray:
+    return (arrays["outcome"] == _DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
+
+
+@style.house_style()
+def draw_limit_cycle_curves(
+    arrays: Mapping[str, np.ndarray],
+    edges: Table,
+    bounds: tuple[float, float],
+    family: str = "",
+    axes: style.AnyAxes | None = None,
+) -> np.ndarray:
+    """Draw amplitude (above) and frequency (below) of the buzz over one parameter, a column per condition.
+
+    A gap: silent, or wider than any buzz; a vertical line: boundary of the linear theory.
+
+    Args:
+        arrays: what the npz file of a limit_cycle study holds.
+        edges: columns condition, number and the parameter; nothing where there is no linear boundary.
+        bounds: amplitudes between which a motion counts as a buzz, in m.
+        family: the name of the parameter that has a curve for each of its values; "" where there is none.
+        axes: Axes of yours, those of the amplitudes first.
+    """
+    labels = arrays["condition"].tolist()
+    (over,) = (name for name in _AXES if name in arrays and name != family)
+    size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)
+    panels = style.panels(axes, 2 * len(labels), *size, len(labels), sharex=True, sharey="row")
+    scale, unit = style.si_unit(float(np.abs(arrays[over]).max()), _AXES[over][2])
+    # The curves along the axis before the last one.
+    turn = 1 if family and [name for name in _AXES if name in arrays].index(family) else 0
+    cycles = {name: arrays[name] if arrays[name].ndim == 3 else arrays[name][:, None] for name in _CYCLES}
+    cycles = {name: values.swapaxes(1, 2) if turn else values for name, values in cycles.items()}
+    buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
+    factor, meter = style.si_unit(float(np.max(cycles["amplitude_m"], where=buzzes, initial=0.0)), "m")
+    quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
+    looks = _list_looks(arrays, family, cycles["linearly_stable"])
+    for row, (name, times, words) in enumerate(quantities):
+        for column, ax in enumerate(panels[row * len(labels) : (row + 1) * len(labels)]):
+            for curve, buzz, look in zip(cycles[name][column], buzzes[column], looks, strict=True):
+                shown = np.where(buzz, curve, np.nan) * times
+                ax.plot(arrays[over] * scale, shown, marker=".", markersize=2.5, linewidth=1.0, **look)
+            _scale_axes(ax, arrays[over] * scale)
+            for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
+                ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
+            if row == 0:
+                ax.set_yscale("log")
+                ax.yaxis.set_major_formatter(_PLAIN)
+                ax.set_title(labels[column] if len(labels) > 1 else "")
+            else:
+                ax.set_xlabel(f"{_AXES[over][0]}  ${_AXES[over][1]}$  in {unit}")
+            if column == 0:
+                ax.set_ylabel(words)
+    handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]
+    boundary = [style.line("boundary of the linear theory", width=1.0, color=style.VERMILION)] if edges else []
+    style.legend(panels, handles if family else boundary, outside=axes is None, ncols=4)
+    return panels
+
+
+def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
+    """The look of every curve, and its label: which value it belongs to, and where no wall of it is linearly stable."""
+    if not family:
+        return [{"color": style.DISTINCT[0], "linestyle": style.SOLID, "label": "buzz"}]
+    values, (_, symbol, unit) = arrays[family], _AXES[family]
+    times, unit = style.si_unit(float(np.abs(values).max()), unit)
+    colors = style.ordered_colors(values.size)
+    unstable = [not np.any(stable[:, k]) for k in range(values.size)]
+    texts = [f"${symbol} = {value * times:.4g}$ {unit}" for value in values]
+    return [
+        {"color": color, "linestyle": _STYLES[k % len(_STYLES)], "label": text + (", unstable" if lost else "")}
+        for k, (color, text, lost) in enumerate(zip(colors, texts, unstable, strict=True))
+    ]
+
+
+def _scale_axes(ax: Axes, *values: np.ndarray) -> None:
+    """The range and the spacing of the axes of parameters."""
+    for axis, own in zip("xy", values, strict=False):
+        if logarithmic(own):
+            getattr(ax, f"set_{axis}scale")("log")
+            getattr(ax, f"{axis}axis").set_major_formatter(_PLAIN)
+        getattr(ax, f"set_{axis}lim")(float(own.min()), float(own.max()))

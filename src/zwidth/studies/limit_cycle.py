@@ -1,0 +1,266 @@
+"""The limit_cycle study: where a wall buzzes, and how wide, over one or two parameters and under several conditions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, get_type_hints
+
+import numpy as np
+from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema, WrapValidator, create_model
+
+from zwidth import figures
+from zwidth.config.axes import SPELLED, Axis, axis_schema, make_axis_reader
+from zwidth.config.circumstances import Circumstances
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import Strict, members, unit_schema
+from zwidth.config.parameters import StiffnessAxis, VirtualDampingAxis
+from zwidth.config.scenes import AnyScene
+from zwidth.config.units import quantity
+from zwidth.figures.table import SI_COLUMNS
+from zwidth.formatting import with_unit
+from zwidth.parts.velocity import FOAW
+from zwidth.quantities import NOT_NEGATIVE, POSITIVE
+from zwidth.scene import Scene
+from zwidth.simulation.result import OF_WHOLE
+from zwidth.simulation.result import Outcome as End
+from zwidth.status import Status
+from zwidth.studies.outcome import Outcome, csv_text, stack
+from zwidth.studies.simulate import SimulatedStudy, check_circumstances, name_column
+from zwidth.units import FORCE, LENGTH, Dimension
+
+# The axes that there may be, with their columns.
+_COLUMNS = {
+    "stiffness": SI_COLUMNS[0],
+    "virtual_damping": SI_COLUMNS[1],
+    "resolution": "resolution_m",
+    "coulomb": "coulomb_N",
+}
+_OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
+# So many values of a list are curves, and more are a plane.
+_MOST_CURVES = 6
+
+
+def _reader(dimension: Dimension) -> Any:
+    return PlainValidator(make_axis_reader(quantity(dimension, NOT_NEGATIVE), quantity(dimension, POSITIVE)))
+
+
+def _schema(dimension: Dimension) -> WithJsonSchema:
+    entry = unit_schema(dimension).json_schema
+    assert entry is not None, "a schema for validation is given"
+    return axis_schema(entry, entry)
+
+
+LengthAxis = Annotated[Axis, _reader(LENGTH), SPELLED, _schema(LENGTH)]
+FrictionAxis = Annotated[Axis, _reader(FORCE), SPELLED, _schema(FORCE)]
+
+# All that the study sets for every condition may be set for one; what is not is None.
+_OWN: Any = {
+    name: (hint | None, Field(default=None, description=Circumstances.model_fields[name].description))
+    for name, hint in get_type_hints(Circumstances, include_extras=True).items()
+    if name in Circumstances.model_fields
+}
+_Own: Any = create_model("_Own", __base__=Strict, **_OWN)
+
+
+class CycleCondition(_Own):
+    """What one panel of a limit_cycle study has of its own."""
+
+    what: ClassVar[str] = "a condition"
+
+    label: str
+    """Name of the condition, each one its own."""
+
+
+class CycleAxes(Strict):
+    """Parameters of a limit_cycle study, one or two of them with several values."""
+
+    what: ClassVar[str] = "the axes of a limit_cycle study"
+
+    stiffness: StiffnessAxis
+    """Stiffness K of the wall, in N/m or with a unit."""
+
+    virtual_damping: VirtualDampingAxis
+    """Damping B of the wall, in N s/m or with a unit."""
+
+    resolution: LengthAxis | None = None
+    """One count of the encoder, in m or with a unit."""
+
+    coulomb: FrictionAxis | None = None
+    """Dry friction, in N or with a unit."""
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        if not 1 <= len(self.varied) <= 2:
+            what = f"got {len(self.varied)} axes of several values"
+            yield (), problem(what, "one or two of them are drawn", "write the others as numbers")
+
+    @property
+    def given(self) -> dict[str, Axis]:
+        """The axes that there are."""
+        return {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
+
+    @property
+    def varied(self) -> dict[str, Axis]:
+        """Those with several values."""
+        return {name: axis for name, axis in self.given.items() if axis.size > 1}
+
+    def lay_out(self) -> dict[str, np.ndarray]:
+        """The values of every axis, so that they broadcast to the grid."""
+        grid = np.meshgrid(*(axis.values() for axis in self.varied.values()), indexing="ij", sparse=True)
+        return {name: axis.values()[0] for name, axis in self.given.items()} | dict(zip(self.varied, grid, strict=True))
+
+
+class LimitCycleStudy(SimulatedStudy, Circumstances):
+    """Amplitude of the buzz over one or two parameters, under one or several conditions."""
+
+    what: ClassVar[str] = "a limit_cycle study"
+
+    kind: Literal["limit_cycle"]
+
+    axes: CycleAxes
+    """The walls, and encoder and friction where they vary."""
+
+    conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(members("conditions"))]
+    """What each panel has of its own, beside what the study sets for all; one panel where left out."""
+
+    silence: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)] = 1e-6
+    """Amplitude below which a motion counts as silent, in m or with a unit."""
+
+    widest: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)] = 1e-3
+    """Amplitude beyond which it counts as no buzz any more, in m or with a unit."""
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        return {"conditions": [{"label": raw.get("name", "")}], **raw}
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        labels = [each.label for each in self.conditions]
+        for index, condition in enumerate(self.conditions):
+            if condition.label in labels[:index]:
+                what = f"got {condition.label!r} twice"
+                yield ("conditions", index, "label"), problem(what, "each label once", "rename one")
+            for name in self.axes.given:
+                if getattr(condition, name, None) is not None:
+                    what = "given twice, here and as an axis"
+                    yield ("conditions", index, name), problem(what, "each parameter once", "remove one")
+        if self.widest <= self.silence:
+            what = f"got {with_unit(self.widest, 'm')}, silence is {with_unit(self.silence, 'm')}"
+            yield ("widest",), problem(what, "a buzz lies between silence and widest", "raise it")
+        scene = self.device.to_scene()
+        found = [list(check_circumstances(each, scene)) for each in self.list_circumstances()]
+        for index, (condition, faults) in enumerate(zip(self.conditions, found, strict=True)):
+            for path, what in faults:
+                own = getattr(condition, str(path[0])) is not None
+                # What the study sets for all is told once.
+                if own or index == 0:
+                    yield (("conditions", index, *path) if own else path), what
+
+    def list_circumstances(self) -> list[Circumstances]:
+        """The circumstances of every condition."""
+        common = {name: getattr(self, name) for name in Circumstances.model_fields}
+        owns = [{name: getattr(each, name) for name in common} for each in self.conditions]
+        return [
+            Circumstances.model_construct(**common | {name: value for name, value in own.items() if value is not None})
+            for own in owns
+        ]
+
+    @property
+    def extent(self) -> str:
+        sizes = " x ".join(f"{axis.size} {name}" for name, axis in self.axes.varied.items())
+        return f"conditions x walls = {len(self.conditions)} x {sizes}"
+
+    @property
+    def points(self) -> int:
+        return len(self.conditions) * math.prod(axis.size for axis in self.axes.varied.values())
+
+    @property
+    def nbytes(self) -> int:
+        return self.points * 8 * (1 + len(_OUTPUTS))
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """What becomes of every wall, as arrays with a first axis of conditions, and how much of them stays silent."""
+        axes, varied = self.axes.lay_out(), self.axes.varied
+        labels = [each.label for each in self.conditions]
+        found: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}
+        edges, notes = [], []
+        for label, given in zip(labels, self.list_circumstances(), strict=True):
+            placed = given.place(self.device.to_scene())
+            motion = placed.simulate(**given.options(self.device.period) | axes, record=False)
+            for name in _OUTPUTS:
+                found[name].append(getattr(motion, name))
+            stable = np.full(motion.outcome.shape, -1, np.int8)
+            if not isinstance(placed.velocity, FOAW):
+                stable[...] = placed.is_stable(axes["stiffness"], axes["virtual_damping"])
+                edges += trace_edges(placed, label, varied, axes)
+            found["linearly_stable"].append(stable)
+            notes.append(f"{label}: {describe_shares(motion, stable, self.silence, self.widest)}")
+        units = {name: unit for name, (_, unit) in OF_WHOLE.items()}
+        arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
+        arrays |= {name_column(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
+        table, bounds = stack(edges), (self.silence, self.widest)
+        family = choose_curves(varied)
+        draw = (
+            partial(figures.draw_limit_cycles, arrays, table, bounds)
+            if family is None
+            else partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
+        )
+        low, high = (with_unit(bound, "m", 3) for bound in bounds)
+        notes.append(f"buzzing: an amplitude from {low} to {high} in the last quarter of {self.duration}")
+        return Outcome(
+            arrays=arrays,
+            figures={"": draw},
+            documents={f"{self.name}_boundary.csv": csv_text(table)} if table else {},
+            notes=tuple(notes),
+        )
+
+
+def choose_curves(varied: dict[str, Axis]) -> str | None:
+    """The column of the axis whose values are a curve each, "" for a single curve; None where a plane is drawn."""
+    if len(varied) == 1:
+        return ""
+    short = [name for name, axis in varied.items() if axis.form == "list" and axis.size <= _MOST_CURVES]
+    return _COLUMNS[short[0]] if short else None
+
+
+def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    """The linear boundary in the plane of two axes, as columns: outlines, or lines where one of the walls' is fixed."""
+    walls = [name for name in ("stiffness", "virtual_damping") if name in varied]
+    if not walls:
+        return []
+    lines = []
+    for outline in scene.stable_region():
+        # Closed: the first point comes again at the end.
+        stiffness, damping = (np.append(part, part[0]) for part in outline[:2])
+        ends: dict[str, np.ndarray] = {"stiffness": stiffness, "virtual_damping": damping}
+        if len(walls) == 2:
+            lines.append(ends)
+            continue
+        (along,), (fixed,) = walls, {"stiffness", "virtual_damping"} - set(walls)
+        x, y, level = ends[along], ends[fixed], float(axes[fixed])
+        k = np.flatnonzero((y[:-1] < level) != (y[1:] < level))
+        crossed = x[k] + (level - y[k]) / (y[k + 1] - y[k]) * (x[k + 1] - x[k])
+        others = {name: varied[name].values() for name in varied if name != along}
+        far = {name: np.array([values.min(), values.max()]) for name, values in others.items()}
+        lines += [{along: np.full(2, value), **far} for value in crossed]
+    return [
+        {"condition": label, "number": number, **{_COLUMNS[name]: part for name, part in line.items()}}
+        for number, line in enumerate(lines, start=1)
+    ]
+
+
+def describe_shares(motion: Any, stable: np.ndarray, silence: float, widest: float) -> str:
+    """How much of the linearly stable and unstable walls is silent, buzzes, or goes beyond."""
+    beyond = (motion.outcome == End.DIVERGED) | (motion.amplitude > widest)
+    silent = ~beyond & (motion.amplitude < silence)
+    known = motion.status == Status.OK
+    ends = {"silent": silent, "buzzing": ~silent & ~beyond, "beyond": beyond}
+    words = []
+    for name, kind in {"linearly stable ": 1, "linearly unstable ": 0, "": -1}.items():
+        those = known & (stable == kind)
+        if those.any():
+            shares = ", ".join(f"{np.mean(end[those]):.1%} {word}" for word, end in ends.items())
+            words.append(f"of {those.sum()} {name}walls {shares}")
+    lost = int(np.count_nonzero(~known))
+    return "; ".join(words) + (f"; {lost} not followed to the end" if lost else "")

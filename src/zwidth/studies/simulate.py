@@ -1,0 +1,250 @@
+"""The simulate study: motions of a device on virtual walls over time."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BeforeValidator, PlainValidator, WrapValidator
+
+from zwidth import figures
+from zwidth.config.axes import SPELLED, Axis, axis, axis_schema
+from zwidth.config.circumstances import Circumstances
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import members
+from zwidth.config.numbers import whole_number
+from zwidth.config.parts import NO_LINEAR_FORM, locate_refusal
+from zwidth.config.scenes import (
+    AnyScene,
+    AnyWall,
+    PhysicalDevice,
+    PhysicalScene,
+    PhysicalWall,
+    SimulatedDevice,
+    WallField,
+)
+from zwidth.config.study import HeldOnly
+from zwidth.errors import InputError
+from zwidth.figures.table import SI_COLUMNS
+from zwidth.formatting import with_unit
+from zwidth.parts.velocity import FOAW
+from zwidth.quantities import POSITIVE, Range
+from zwidth.scene import Scene
+from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion
+from zwidth.simulation.result import Outcome as End
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, si_scales, stack
+
+_POSITIVE = {"type": "number", "exclusiveMinimum": 0}
+Fractions = Annotated[Axis, PlainValidator(axis(POSITIVE)), SPELLED, axis_schema(_POSITIVE, _POSITIVE)]
+
+# What the program makes of a sample stays until the next one.
+_OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
+# In a tail of fewer swings its halves are not compared.
+_FEW_SWINGS = 4.0
+_WORDS = {
+    End.REST: "at rest",
+    End.DECAYING: "decaying",
+    End.GROWING: "growing",
+    End.DIVERGED: "growing without end",
+}
+
+
+class SimulatedStudy(ComputedStudy):
+    """What the studies that simulate share."""
+
+    from_scene: ClassVar[tuple[str, ...]] = ("device", "delay_model")
+    takes_parts: ClassVar[bool] = True
+    simulates: ClassVar[bool] = True
+
+    device: SimulatedDevice
+    """Device in SI units; the scene's where left out."""
+
+    delay_model: HeldOnly = "held"
+    """How a delay that is not whole is modeled; a motion exists in the model 'held' only."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        filled = {"delay_model": scene.delay_model, **raw}
+        if isinstance(scene, PhysicalScene):
+            filled.setdefault("device", scene.simulated_device)
+        return filled
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        if name == "device":
+            return "a motion in m and N needs a device in SI units", "give the scene mass and period"
+        return super().missing(name)
+
+
+def check_circumstances(given: Circumstances, scene: Scene) -> Iterable[LocatedProblem]:
+    """What of the circumstances does not go together, or not with the device."""
+    yield from given.find_clashes(scene.timing.period)
+    if given.velocity is not None and not isinstance(placed := given.place(scene).velocity, FOAW):
+        try:
+            placed.estimate(scene.timing.period)
+        except InputError as error:
+            yield locate_refusal(error)
+
+
+class SimulateStudy(SimulatedStudy, Circumstances):
+    """Motions of a device on one or several walls over time."""
+
+    what: ClassVar[str] = "a simulate study"
+    remedy_if_too_large: ClassVar[str] = "shorten the duration, lower substeps, or use fewer walls"
+
+    kind: Literal["simulate"]
+
+    substeps: Annotated[int, BeforeValidator(whole_number(Range(1, 10_000)))] = 1
+    """Points recorded per period."""
+
+    stiffness_fraction: Fractions | None = None
+    """Stiffness as a share of the maximum, with the virtual damping of that wall; give this or walls."""
+
+    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
+    """Walls; the scene's where left out."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        filled = super().fill(raw, scene)
+        if scene.wall is not None and not {"walls", "stiffness_fraction", "device"} & set(raw):
+            filled["walls"] = [scene.wall]
+        return filled
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        given = [key for key in raw if key in ("stiffness_fraction", "walls")]
+        if len(given) == 2:
+            allowed = "walls are shares of the maximum stiffness or given outright"
+            what = "stiffness_fraction and walls are both given"
+            yield (given[1],), problem(what, allowed, "remove one", on_key=True)
+        elif not given:
+            allowed = "the study needs a wall to meet"
+            yield (), problem("stiffness_fraction or walls is missing", allowed, "add 'stiffness_fraction: 0.75'")
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        scene = self.device.to_scene()
+        yield from check_circumstances(self, scene)
+        if self.stiffness_fraction is not None and isinstance(self.place(scene).velocity, FOAW):
+            what = "got a share of the maximum stiffness"
+            yield ("stiffness_fraction",), problem(what, f"{NO_LINEAR_FORM} and no such maximum", "write walls")
+
+    @property
+    def count(self) -> int:
+        """How many motions there are."""
+        return self.stiffness_fraction.size if self.stiffness_fraction is not None else len(self.walls or ())
+
+    @property
+    def extent(self) -> str:
+        count = self.count
+        return f"{count} motion{'' if count == 1 else 's'} of {self.duration} with {self.substeps} points a period"
+
+    @property
+    def points(self) -> int:
+        return int(self.count * min(self.duration.periods(self.device.period), 1e15) * self.substeps)
+
+    @property
+    def nbytes(self) -> int:
+        return self.points * 8 * len(OF_MOTION)
+
+    def list_walls(self, scene: Scene) -> list[tuple[str, float, float]]:
+        """Each wall by its name, stiffness and virtual damping."""
+        if self.stiffness_fraction is not None:
+            top = scene.max_stiffness()
+            stiffness, damping = float(top.stiffness), float(top.virtual_damping)
+            if not np.isfinite(stiffness):
+                raise InputError("stiffness_fraction: no wall of this device is stable; write walls")
+            shares = self.stiffness_fraction.values().tolist()
+            return [(f"{share:g} of K_max", share * stiffness, damping) for share in shares]
+        walls = [wall_in_si(self.device, wall) for wall in self.walls or ()]
+        return [(name_wall(*wall), *wall) for wall in walls]
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """The motions, as tables and figures, and in words how each ends."""
+        placed = self.place(self.device.to_scene())
+        walls = self.list_walls(placed)
+        stiffness, damping = np.array([wall[1:] for wall in walls]).T
+        motion = placed.simulate(stiffness, damping, substeps=self.substeps, **self.options(self.device.period))
+        linear = None if isinstance(placed.velocity, FOAW) else placed.is_stable(stiffness, damping)
+        parts, rows, notes = [], [], []
+        for k, (label, *wall) in enumerate(walls):
+            named = {"label": label, **dict(zip(SI_COLUMNS, wall, strict=True))}
+            parts.append({**named, **tabulate_motion(motion, k, self.substeps)})
+            words = describe_end(motion, k, self.device.period)
+            judged = {} if linear is None else {"linearly_stable": bool(linear[k])}
+            whole = {name_column(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
+            if motion.outcome[k] == End.REST:
+                whole["frequency_Hz"] = np.nan
+            rows.append({**named, **judged, **whole, "outcome": words})
+            verdict = "" if linear is None else f" (linearly {'stable' if linear[k] else 'unstable'})"
+            notes.append(f"{label}{verdict}: {words}")
+        table = stack(parts)
+        drawn = {"": figures.draw_motion, "_phase": figures.draw_phase_plane, "_energy": figures.draw_energy}
+        return Outcome(
+            table=table,
+            figures={addition: partial(draw, table) for addition, draw in drawn.items()},
+            documents={f"{self.name}_summary.csv": csv_text(stack(rows))},
+            notes=tuple(notes),
+        )
+
+
+def wall_in_si(device: PhysicalDevice, wall: AnyWall) -> tuple[float, float]:
+    """Stiffness in N/m and virtual damping in N s/m of a wall on a device."""
+    if isinstance(wall, PhysicalWall):
+        return wall.stiffness, wall.virtual_damping
+    stiffness, damping = si_scales(device)
+    return wall.alpha * stiffness, wall.beta * damping
+
+
+def name_wall(stiffness: float, virtual_damping: float) -> str:
+    """A wall in words."""
+    return f"K = {with_unit(stiffness, 'N/m')}, B = {with_unit(virtual_damping, 'N s/m')}"
+
+
+def name_column(name: str, unit: str) -> str:
+    """The name of a quantity with its unit, as in velocity_m_per_s."""
+    return name if unit == "1" else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
+
+
+def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarray]:
+    """One motion of several over time, as columns."""
+    assert motion.time is not None, "it is recorded"
+    columns = {"time_s": motion.time if motion.time.ndim == 1 else motion.time[k]}
+    for name, (_, unit) in OF_MOTION.items():
+        values = getattr(motion, name)
+        if values is not None:
+            own = np.repeat(values[k], substeps) if name in _OF_SAMPLES else values[k]
+            columns[name_column(name, unit)] = own.astype(int) if own.dtype == bool else own
+    return columns
+
+
+def describe_end(motion: Motion, k: int, period: float) -> str:
+    """How a recorded motion of several ends, in words."""
+    if motion.status[k]:
+        return "not followed to its end"
+    end = End(int(motion.outcome[k]))
+    if end in (End.REST, End.DIVERGED):
+        return _WORDS[end]
+    arrays = (motion.position, motion.velocity, motion.contact)
+    position, velocity, contact = (part[k] for part in arrays if part is not None)
+    tail = max(contact.size // 4, 1)
+    if not contact[-tail:].any():
+        return "gone from the wall"
+    amplitude, frequency = float(motion.amplitude[k]), float(motion.frequency[k])
+    # Halves of the tail with a swing or two each tell nothing: impacts do, and where the motion is widest.
+    if not frequency * period * tail >= _FEW_SWINGS:
+        hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
+        if hits.size > 1:
+            speeds = velocity.reshape(contact.size, -1)[hits, 0]
+            first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
+            change = "growing" if speeds[-1] > speeds[0] else "decaying"
+            return f"bounces {change}, the first of {hits.size} impacts at {first} and the last at {last}"
+        widest_last = np.argmax(np.abs(position)) >= position.size - tail * position.size // contact.size
+        if end is End.STEADY or (end is End.GROWING) != widest_last:
+            return "too few swings at the end to tell how it goes on"
+    if end is not End.STEADY:
+        return _WORDS[end]
+    rate = f" at {with_unit(frequency, 'Hz', 3)}" if np.isfinite(frequency) else ""
+    return f"buzzing{rate}, amplitude {with_unit(amplitude, 'm', 3)}"

@@ -1,0 +1,184 @@
+"""The limit_cycle study: its arrays against single simulations, its words against counts, and what figures draw."""
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+import zwidth
+from zwidth.config.faults import problems_of
+from zwidth.studies.limit_cycle import LimitCycleStudy
+
+DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
+SCENE = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3))
+PLANE = {
+    "stiffness": {"linear": {"start": "1 kN/m", "stop": "25 kN/m", "num": 9}},
+    "virtual_damping": {"linear": {"start": -5, "stop": 100, "num": 8}},
+}
+CONDITIONS = [{"label": "linear"}, {"label": "encoder", "resolution": "20 um"}]
+
+
+def study_of(axes=PLANE, **keys):
+    return LimitCycleStudy.model_validate({"kind": "limit_cycle", "name": "c", "device": DEVICE, "axes": axes, **keys})
+
+
+@pytest.fixture(scope="module")
+def plane():
+    return study_of(conditions=CONDITIONS, start_position="0.1 mm", duration="400 periods").compute(None, True)
+
+
+@pytest.fixture(scope="module")
+def curves():
+    axes = {
+        "stiffness": ["5 kN/m", "16 kN/m"],
+        "virtual_damping": 42.5,
+        "resolution": {"log": {"start": "1 um", "stop": "100 um", "num": 5}},
+    }
+    keys = {"start_position": "0.1 mm", "max_force": "8.5 N", "duration": "400 periods", "silence": "0.1 um"}
+    return study_of(axes, **keys).compute(None, True)
+
+
+def test_the_arrays_are_those_of_the_simulation(plane):
+    arrays = plane.arrays
+    assert arrays["condition"].tolist() == ["linear", "encoder"]
+    K, B = arrays["stiffness_N_per_m"][:, None], arrays["virtual_damping_N_s_per_m"]
+    assert (K[0, 0], K[-1, 0], B[0], B[-1]) == (1e3, 25e3, -5.0, 100.0)
+    for k, resolution in enumerate((0.0, 2e-5)):
+        expected = zwidth.simulate(SCENE, K, B, start_position=1e-4, periods=400, record=False, resolution=resolution)
+        names = {"amplitude": "_m", "frequency": "_Hz", "energy_given": "_J", "outcome": "", "status": ""}
+        for name, unit in names.items():
+            np.testing.assert_array_equal(arrays[name + unit][k], getattr(expected, name))
+        np.testing.assert_array_equal(arrays["linearly_stable"][k], SCENE.is_stable(K, B))
+
+
+def test_the_words_count_what_the_arrays_hold(plane):
+    arrays = plane.arrays
+    assert len(plane.notes) == 3
+    for k, note in enumerate(plane.notes[:2]):
+        amplitude, stable = arrays["amplitude_m"][k], arrays["linearly_stable"][k] == 1
+        silent, beyond = amplitude < 1e-6, (amplitude > 1e-3) | (arrays["outcome"][k] == zwidth.Outcome.DIVERGED)
+        for those, name in ((stable, "stable"), (~stable, "unstable")):
+            shares = [np.mean(end[those]) for end in (silent, ~silent & ~beyond, beyond)]
+            told = ", ".join(f"{a:.1%} {b}" for a, b in zip(shares, ("silent", "buzzing", "beyond"), strict=True))
+            assert f"of {those.sum()} linearly {name} walls {told}" in note
+    # The encoder makes stable walls buzz that are silent without.
+    stable = arrays["linearly_stable"][0] == 1
+    assert np.mean(arrays["amplitude_m"][0][stable] < 1e-6) > 0.7
+    assert np.mean(arrays["amplitude_m"][1][stable] < 1e-6) < 0.3
+
+
+def test_a_plane_is_drawn_with_the_linear_boundary(plane):
+    panels = plane.figures[""]()
+    assert [ax.get_title("left") for ax in panels] == ["linear", "encoder"]
+    (outline,) = SCENE.stable_region()
+    for k, ax in enumerate(panels):
+        (line,) = [line for line in ax.lines if line.get_label() == "linear, 1"]
+        np.testing.assert_allclose(line.get_xdata()[:-1], outline.stiffness / 1e3)
+        np.testing.assert_allclose(line.get_ydata()[:-1], outline.virtual_damping)
+        (mesh,) = [each for each in ax.collections if hasattr(each, "get_coordinates")]
+        drawn, amplitude = mesh.get_array(), plane.arrays["amplitude_m"][k].T
+        beyond = (amplitude > 1e-3) | (plane.arrays["outcome"][k].T == zwidth.Outcome.DIVERGED)
+        np.testing.assert_array_equal(np.ma.getmaskarray(drawn), beyond)
+        np.testing.assert_allclose(drawn[~beyond], np.maximum(amplitude[~beyond], 1e-300) * 1e6)
+        # What is silent lies below the colors.
+        assert mesh.norm.vmin == pytest.approx(1.0)
+
+
+def test_curves_are_drawn_over_the_other_axis(curves):
+    arrays = curves.arrays
+    assert arrays["amplitude_m"].shape == (1, 2, 5)
+    above, below = curves.figures[""]()
+    for k, label in enumerate(("$K = 5$ kN/m", "$K = 16$ kN/m, unstable")):
+        (line,) = [line for line in above.lines if line.get_label() == label]
+        np.testing.assert_allclose(line.get_xdata(), arrays["resolution_m"] * 1e6)
+        np.testing.assert_allclose(line.get_ydata(), arrays["amplitude_m"][0, k] * 1e6)
+        (line,) = [line for line in below.lines if line.get_label() == label]
+        np.testing.assert_allclose(line.get_ydata(), arrays["frequency_Hz"][0, k])
+
+
+def test_a_limited_motor_swings_as_the_describing_function_says(curves):
+    """Harmonic balance: where the loop's phase is 180 degrees, the gain left of the limit is one over the loop's."""
+    stiffness, damping = 16e3, 42.5
+    omega = 2 * np.pi * np.linspace(60, 110, 200_001)
+    z = np.exp(1j * omega * 1e-3)
+    # x = -G(K + B (1 - 1/z)/T) x: the frequency at which the loop is real.
+    wall = stiffness + damping * (1 - 1 / z) / 1e-3
+    zoh = (1 - np.exp(-1j * omega * 1e-3)) / (1j * omega * 1e-3)
+    loop = wall * zoh / z / (-0.1 * omega**2 + 0.1j * omega)
+    k = np.flatnonzero(np.diff(np.sign(loop.imag)) != 0)[0]
+    found = curves.arrays["frequency_Hz"][0, 1, 0]
+    assert found == pytest.approx(omega[k] / 2 / np.pi, rel=0.02)
+    # Saturation of amplitude ratio r has the gain N(r); the first harmonic of the command before it is |wall| A.
+    ratios = np.linspace(1e-3, 1, 100_001)
+    gains = 2 / np.pi * (np.arcsin(ratios) + ratios * np.sqrt(1 - ratios**2))
+    ratio = np.interp(-1 / loop[k].real, gains, ratios)
+    assert curves.arrays["amplitude_m"][0, 1, 0] == pytest.approx(8.5 / ratio / abs(wall[k]), rel=0.05)
+
+
+def test_the_boundary_over_one_stiffness_axis_is_a_line():
+    axes = {
+        "stiffness": {"linear": {"start": "5 kN/m", "stop": "25 kN/m", "num": 3}},
+        "virtual_damping": 40,
+        "coulomb": {"linear": {"start": 0, "stop": "1 N", "num": 2}},
+    }
+    outcome = study_of(axes, start_position="0.1 mm", duration="50 periods").compute(None, True)
+    (ax,) = outcome.figures[""]()
+    lines = [line.get_xdata()[0] for line in ax.lines if line.get_label().startswith("linear")]
+    expected = SCENE.stable_stiffness(40.0).ravel() / 1e3
+    # A polygon of some hundreds of points.
+    np.testing.assert_allclose(sorted(lines), expected, rtol=1e-3, atol=1e-3)
+
+
+def test_an_adaptive_window_has_no_linear_boundary():
+    foaw = {"kind": "foaw", "noise": "20 um", "samples": 4}
+    axes = {"stiffness": {"linear": {"start": "1 kN/m", "stop": "9 kN/m", "num": 3}}, "virtual_damping": [5, 20]}
+    conditions = [{"label": "difference"}, {"label": "adaptive", "velocity": foaw}]
+    keys = {"conditions": conditions, "resolution": "20 um", "start_position": "0.1 mm", "duration": "50 periods"}
+    outcome = study_of(axes, **keys).compute(None, True)
+    assert (outcome.arrays["linearly_stable"][0] >= 0).all()
+    assert (outcome.arrays["linearly_stable"][1] == -1).all()
+    assert outcome.notes[1].startswith("adaptive: of 6 walls ")
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"axes": {"stiffness": 1e3, "virtual_damping": 5}}, "got 0 axes of several values"),
+        ({"axes": {"stiffness": [1, 2], "virtual_damping": [1, 2], "coulomb": [1, 2]}}, "got 3 axes"),
+        ({"axes": {"stiffness": [1, 2]}}, "virtual_damping"),
+        ({"conditions": [{"label": "a"}, {"label": "a"}]}, "got 'a' twice"),
+        ({"conditions": []}, "one of the conditions at least is needed"),
+        ({"conditions": [{"resolution": "20 um"}]}, "label"),
+        ({"axes": {**PLANE, "coulomb": 0.1}, "conditions": [{"label": "a", "coulomb": 0.2}]}, "here and as an axis"),
+        ({"silence": "2 mm"}, "a buzz lies between silence and widest"),
+        ({"conditions": [{"label": "a", "coulomb": 0.2, "static": 0.1}]}, "below coulomb, 0.2 N"),
+    ],
+)
+def test_bad_input_is_told(keys, said):
+    with pytest.raises(ValueError, match=said):
+        study_of(**keys)
+
+
+def test_a_fault_of_all_conditions_is_told_once_and_one_of_a_condition_at_its_place():
+    def faults(**keys):
+        with pytest.raises(ValidationError) as caught:
+            study_of(**keys)
+        return [path for path, _ in problems_of(caught.value)]
+
+    assert faults(jitter="2 ms", conditions=CONDITIONS) == [("jitter",)]
+    assert faults(conditions=[{"label": "a"}, {"label": "b", "jitter": "2 ms"}]) == [("conditions", 1, "jitter")]
+
+
+def test_a_run_writes_everything(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text(
+        "version: 1\nname: a\nscene: {mass: 0.1 kg, period: 1 ms, delay: 1 periods}\nstudies:\n"
+        "  - kind: limit_cycle\n    name: c\n    start_position: 10 um\n    duration: 50 periods\n"
+        "    axes: {stiffness: {linear: {start: 1, stop: 20 kN/m, num: 3}}, virtual_damping: [0, 50]}\n"
+        "    conditions: [{label: linear}, {label: friction, coulomb: 0.1 N}]\n",
+        encoding="utf-8",
+    )
+    result = zwidth.run(file, out=tmp_path / "out")
+    assert result.ok
+    assert all((tmp_path / "out" / name).stat().st_size for name in ("c.npz", "c_boundary.csv", "c.png", "c.svg"))
+    with np.load(tmp_path / "out" / "c.npz") as stored:
+        assert stored["amplitude_m"].shape == (2, 3, 2)

@@ -1,0 +1,212 @@
+"""The simulate study: the motions that it writes, what it says of them, and what its figures draw."""
+
+import csv
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth import figures
+from zwidth.config.scenes import PhysicalWall
+from zwidth.figures.table import select
+from zwidth.studies.simulate import SimulateStudy
+
+DEVICE = {"mass": 0.1, "damping": 0.1, "period": 1e-3, "delay": "1 periods"}
+IMPACT = {"start_position": -1e-3, "start_velocity": 0.1, "push": 0.5, "contact": "unilateral"}
+
+
+def study_of(**keys):
+    return SimulateStudy.model_validate({"kind": "simulate", "name": "s", "device": DEVICE, **keys})
+
+
+@pytest.fixture(scope="module")
+def impact():
+    study = study_of(**IMPACT, stiffness_fraction=[0.6, 0.95, 1.05], duration="0.3 s", substeps=2)
+    return study.compute(None, True)
+
+
+@pytest.fixture(scope="module")
+def motion():
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3))
+    top = scene.max_stiffness()
+    walls = np.array([0.6, 0.95, 1.05]) * top.stiffness
+    return zwidth.simulate(scene, walls, top.virtual_damping, periods=300, substeps=2, **IMPACT)
+
+
+def summary_of(outcome):
+    return list(csv.DictReader(outcome.documents["s_summary.csv"].splitlines()))
+
+
+def test_the_table_is_the_motion(impact, motion):
+    table = impact.table
+    assert table["label"][:: 2 * 300].tolist() == ["0.6 of K_max", "0.95 of K_max", "1.05 of K_max"]
+    names = {"position_m": "position", "wall_force_N": "wall_force", "wall_work_J": "wall_work", "energy_J": "energy"}
+    for column, name in {**names, "velocity_m_per_s": "velocity"}.items():
+        np.testing.assert_array_equal(table[column], getattr(motion, name).ravel())
+    np.testing.assert_array_equal(table["time_s"], np.tile(motion.time, 3))
+    # What the program makes of a sample is there at both instants of its period.
+    np.testing.assert_array_equal(table["command_N"], np.repeat(motion.command.ravel(), 2))
+
+
+def test_the_summary_has_what_is_said_of_each_motion(impact, motion):
+    rows = summary_of(impact)
+    for name, column in {
+        "penetration": "penetration_m",
+        "energy_given": "energy_given_J",
+        "bounces": "bounces",
+    }.items():
+        np.testing.assert_array_equal([float(row[column]) for row in rows], getattr(motion, name))
+    assert [row["linearly_stable"] for row in rows] == ["True", "True", "False"]
+    # At rest nothing has a frequency.
+    assert rows[0]["frequency_Hz"] == "nan"
+    assert float(rows[1]["frequency_Hz"]) == motion.frequency[1]
+
+
+def test_words_tell_how_motions_end(impact):
+    assert impact.notes[:2] == (
+        "0.6 of K_max (linearly stable): at rest",
+        "0.95 of K_max (linearly stable): decaying",
+    )
+    # Each half of the tail has less than one bounce: impacts tell what it cannot.
+    assert impact.notes[2].startswith(
+        "1.05 of K_max (linearly unstable): bounces growing, the first of 4 impacts at 144"
+    )
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({"start_position": 1e-4, "walls": [{"stiffness": 30e3}]}, "unstable): growing"),
+        (
+            {"start_position": 1e-4, "duration": "180 periods", "walls": [{"stiffness": 1e7}]},
+            "unstable): growing without end",
+        ),
+        (
+            {"start_position": -1e-4, "start_velocity": 0.1, "contact": "unilateral", "walls": [{"stiffness": 1e3}]},
+            "unstable): gone from the wall",
+        ),
+        (
+            {"start_position": 1e-4, "max_force": 8.5, "walls": [{"stiffness": 16e3, "virtual_damping": 42.5}]},
+            "unstable): buzzing at 81.",
+        ),
+    ],
+    ids=["growing", "diverged", "gone", "buzzing"],
+)
+def test_words_of_other_ends(keys, said):
+    (note,) = study_of(**keys).compute(None, True).notes
+    assert said in note
+
+
+def test_walls_have_names_and_may_be_normalized():
+    walls = [{"stiffness": 2e3, "virtual_damping": 5}, {"alpha": 0.05, "beta": 0.1}]
+    outcome = study_of(walls=walls, start_position=1e-4, duration="50 periods").compute(None, True)
+    assert [row["label"] for row in summary_of(outcome)] == [
+        "K = 2.000 kN/m, B = 5.000 N s/m",
+        "K = 5.000 kN/m, B = 10.00 N s/m",
+    ]
+    # With T = 1 ms and m = 0.1 kg, alpha = 1 is 100 kN/m and beta = 1 is 100 N s/m.
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3))
+    expected = zwidth.simulate(scene, [2e3, 5e3], [5.0, 10.0], start_position=1e-4, periods=50)
+    assert expected.position is not None, "it is recorded"
+    np.testing.assert_allclose(outcome.table["position_m"], expected.position.ravel(), rtol=1e-12)
+
+
+def test_an_adaptive_window_is_simulated_and_has_no_share():
+    keys = {"velocity": {"kind": "foaw", "noise": "20 um", "samples": 8}, "resolution": "20 um"}
+    outcome = study_of(**keys, walls=[{"stiffness": 5e3, "virtual_damping": 20}], start_position=1e-3).compute(
+        None, True
+    )
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.1), zwidth.Timing(period=1e-3, delay=1e-3), velocity=zwidth.FOAW(2e-5, 8))
+    expected = zwidth.simulate(scene, 5e3, 20, resolution=2e-5, start_position=1e-3).position
+    np.testing.assert_array_equal(outcome.table["position_m"], expected)
+    assert "linearly" not in outcome.notes[0]
+    with pytest.raises(ValueError, match="no linear form and no such maximum; write walls"):
+        study_of(**keys, stiffness_fraction=0.5)
+
+
+def test_the_scene_supplies_device_and_wall(tmp_path):
+    file = tmp_path / "a.yaml"
+    text = (
+        "scene: {mass: 0.1, period: 1 ms, stiffness: 3 kN/m, virtual_damping: 7}\nstudies: [{kind: simulate, name: s}]"
+    )
+    file.write_text(f"version: 1\nname: a\n{text}\n", encoding="utf-8")
+    (study,) = zwidth.load_config(file).studies
+    assert isinstance(study, SimulateStudy)
+    assert study.walls == (PhysicalWall(stiffness=3e3, virtual_damping=7.0),)
+
+
+@pytest.mark.parametrize(
+    ("keys", "said"),
+    [
+        ({}, "stiffness_fraction or walls is missing"),
+        ({"stiffness_fraction": 0.5, "walls": [{"stiffness": 1}]}, "are both given"),
+        ({"stiffness_fraction": -0.5}, "greater than 0"),
+        ({"walls": [{"stiffness": 1}], "duration": "900000 periods", "substeps": 200}, "shorten the duration"),
+        ({"walls": [{"stiffness": 1}], "delay_model": "fractional_power"}, "write 'delay_model: held'"),
+    ],
+)
+def test_bad_input_is_told(keys, said):
+    with pytest.raises(ValueError, match=said):
+        study_of(**keys)
+
+
+def test_a_normalized_scene_has_no_motion(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text(
+        "version: 1\nname: a\nscene: {delta: 0.1, d: 1}\nstudies: [{kind: simulate, name: s, walls: [{alpha: 0.1}]}]\n",
+        encoding="utf-8",
+    )
+    with pytest.raises(zwidth.ConfigError, match=r"studies\[0\]\.device: missing; a motion in m and N needs a device"):
+        zwidth.load_config(file)
+
+
+def test_figures_draw_the_motions(impact):
+    table = impact.table
+    assert list(impact.figures) == ["", "_phase", "_energy"]
+    position, force = impact.figures[""]()
+    (plane,) = impact.figures["_phase"]()
+    energies = impact.figures["_energy"]()
+    for label in ("0.6 of K_max", "1.05 of K_max"):
+        rows = select(table, label=label)
+        for ax, column, factor in ((position, "position_m", 1e3), (force, "wall_force_N", 1.0)):
+            (line,) = [line for line in ax.lines if line.get_label() == label]
+            np.testing.assert_allclose(line.get_xdata(), rows["time_s"] * 1e3)
+            np.testing.assert_allclose(line.get_ydata(), rows[column] * factor)
+        (line,) = [line for line in plane.lines if line.get_label() == label]
+        np.testing.assert_allclose(line.get_xdata(), rows["position_m"] * 1e3)
+        np.testing.assert_allclose(line.get_ydata(), rows["velocity_m_per_s"] * 1e3)
+    assert len(energies) == 3
+    lines = {line.get_label(): line.get_ydata() for line in energies[2].lines}
+    rows = select(table, label="1.05 of K_max")
+    np.testing.assert_allclose(lines["given by the wall"], rows["wall_work_J"] * 1e3)
+    # There is no friction, and nothing of it is drawn.
+    assert "taken by friction" not in lines
+
+
+def test_a_motion_without_end_does_not_hide_the_others():
+    walls = [{"stiffness": 5e3, "virtual_damping": 20}, {"stiffness": 40e3}]
+    table = study_of(walls=walls, start_position=1e-4, duration="300 periods").compute(None, True).table
+    assert np.abs(table["position_m"]).max() > 1.0
+    position, _ = figures.draw_motion(table)
+    low, high = position.get_ylim()
+    # 0.1 mm, in µm: eight times as far is shown.
+    assert -1000 < low < -500 < 500 < high < 1000
+
+
+def test_a_run_writes_everything(tmp_path):
+    file = tmp_path / "a.yaml"
+    file.write_text(
+        "version: 1\nname: a\nscene: {mass: 0.1 kg, period: 1 ms}\nstudies:\n"
+        "  - {kind: simulate, name: s, stiffness_fraction: 0.5, start_position: 10 um, duration: 50 periods}\n",
+        encoding="utf-8",
+    )
+    result = zwidth.run(file, out=tmp_path / "out")
+    assert result.ok
+    names = [
+        "s.csv",
+        "s_summary.csv",
+        *(f"s{part}.{kind}" for part in ("", "_phase", "_energy") for kind in ("png", "svg")),
+    ]
+    assert all((tmp_path / "out" / name).stat().st_size for name in names)
+    header = (tmp_path / "out" / "s.csv").read_text(encoding="utf-8").splitlines()[0]
+    assert header.startswith("label,stiffness_N_per_m,virtual_damping_N_s_per_m,time_s,position_m,velocity_m_per_s")
