@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 from zwidth.errors import InputError
 from zwidth.linear.stiffest import stiffest_wall
-from zwidth.parts.velocity import BackwardDifference, VelocityFilter, WindowedDifference
+from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scene import Scene
 from zwidth.status import Status
 
@@ -98,6 +98,6 @@ def _sample_faster(scene: Scene, faster: int) -> Scene:
     changes: dict[str, float] = {"period": scene.timing.period / faster}
     if isinstance(scene.velocity, WindowedDifference):
         changes["velocity.samples"] = scene.velocity.samples * faster
-    if not isinstance(scene.velocity, VelocityFilter) and scene.velocity.coded_period is not None:
+    if not isinstance(scene.velocity, VelocityFilter | FOAW) and scene.velocity.coded_period is not None:
         changes["velocity.coded_period"] = scene.velocity.coded_period / faster
     return scene.replace(**changes)

@@ -84,11 +84,13 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="referrer" content="no-referrer">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="referrer" content="no-referrer">'
         f"<title>{name}: stability of virtual walls</title><style>{style}</style></head><body><main>"
         f"<h1>{name}</h1><p>{escape(str(content.get('description') or ''))}</p>"
         f'<p class="soft">Computed from {escape(str(content.get("started", "")))} on, in '
-        f"{escape(str(content.get('precision', 'float64')))}, by zwidth {escape(str(content['versions'].get('zwidth', '')))}.</p>"
+        f"{escape(str(content.get('precision', 'float64')))}, by zwidth "
+        f"{escape(str(content['versions'].get('zwidth', '')))}.</p>"
         f'<nav aria-label="Studies"><ul>{contents}<li><a href="#again">How to compute it again</a></li></ul></nav>'
         f"{sections}{_reproduce(where, content)}</main><script>{script}</script></body></html>\n"
     )
@@ -101,8 +103,9 @@ def _section(where: Path, entry: dict[str, Any]) -> str:
     body = "".join(_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
     beside = f'<p class="soft">Files beside this report: {listed}</p>' if listed else ""
-    seconds = f"{float(entry.get('seconds', 0.0)):.2g} s"
-    return f'<section><h2 id="{name}">{name} <small class="soft">({escape(kind)}, {seconds})</small></h2>{method}{notes}{body}{beside}</section>'
+    kind, seconds = escape(kind), float(entry.get("seconds", 0.0))
+    head = f'<h2 id="{name}">{name} <small class="soft">({kind}, {seconds:.2g} s)</small></h2>'
+    return f"<section>{head}{method}{notes}{body}{beside}</section>"
 
 
 def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
@@ -133,9 +136,8 @@ def _published(content: dict[str, Any]) -> str:
         for row in content["published"]
     )
     head = "".join(f'<th scope="col">{word}</th>' for word in ("quantity", "where", "printed", "computed", ""))
-    return (
-        f'<h3>Printed numbers beside computed ones</h3><div class="wide" tabindex="0" role="region" '
-        f'aria-label="Printed and computed numbers"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+    return "<h3>Printed numbers beside computed ones</h3>" + _scrolling(
+        "Printed and computed numbers", f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody>"
     )
 
 
@@ -153,9 +155,14 @@ def _reproduce(where: Path, content: dict[str, Any]) -> str:
         "<p>Save the configuration below as <code>config.yaml</code>, install these versions, and run "
         "<code>zwidth run config.yaml</code>. The same versions give the same numbers.</p>"
         f'<p class="soft">SHA-256 of the configuration: {digest}</p>'
-        f'<div class="wide" tabindex="0" role="region" aria-label="Versions"><table><tbody>{versions}</tbody></table></div>'
-        f"{config}</section>"
+        + _scrolling("Versions", f"<tbody>{versions}</tbody>")
+        + f"{config}</section>"
     )
+
+
+def _scrolling(name: str, rows: str) -> str:
+    """A table that scrolls by itself where the page is narrow, by keyboard as well."""
+    return f'<div class="wide" tabindex="0" role="region" aria-label="{name}"><table>{rows}</table></div>'
 
 
 def _resource(name: str) -> str:

@@ -37,7 +37,7 @@ class Summary(NamedTuple):
     impact: Array  # velocity at the first sample in contact
     given: Array  # the most energy that the wall has given so far
     halves: Extent  # of the tail, (2, lanes)
-    turns: Array  # how often the velocity turned positive in the tail
+    turns: Array  # how often the velocity turned positive in each half of it, (2, lanes)
     first_turn: Array
     last_turn: Array
 
@@ -82,7 +82,7 @@ def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) ->
     zero, far = np.zeros(x.size), np.full(x.size, np.inf)
     program = Program(positions, _settle(lanes, x, v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
     halves = Extent(np.stack([far, far]), np.stack([-far, -far]))
-    summary = Summary(zero, zero, zero, zero + np.nan, zero, halves, zero, zero, zero)
+    summary = Summary(zero, zero, zero, zero + np.nan, zero, halves, np.stack([zero, zero]), zero, zero)
     return State(BodyState(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
 
 
@@ -142,7 +142,7 @@ def _summarize(
     known = state.summary
     x, v, next_v = dot(lanes.place[0], state.body.x), dot(motion, state.body.x), dot(motion, body.x)
     first = reading.touching & ~state.program.touching & (k > 0) & jnp.isnan(known.impact)
-    turning = (v <= 0) & (next_v > 0) & (k >= ends[0])
+    turning = (v <= 0) & (next_v > 0)
     moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
     within = jnp.stack([k >= ends[0], k >= ends[1]]) & jnp.stack([k < ends[1], k < ends[2]])
     within = within[:, None]
@@ -156,9 +156,9 @@ def _summarize(
             jnp.where(within, jnp.fmin(known.halves.low, x), known.halves.low),
             jnp.where(within, jnp.fmax(known.halves.high, x), known.halves.high),
         ),
-        known.turns + turning,
-        jnp.where(turning & (known.turns == 0), moment, known.first_turn),
-        jnp.where(turning, moment, known.last_turn),
+        known.turns + (turning & within),
+        jnp.where(turning & (k >= ends[0]) & (known.turns.sum(0) == 0), moment, known.first_turn),
+        jnp.where(turning & (k >= ends[0]), moment, known.last_turn),
     )
 
 

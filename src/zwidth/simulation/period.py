@@ -51,6 +51,10 @@ def look_back(ring: Array, k: Array, back: Array) -> Array:
     return jnp.take_along_axis(ring, place[None], 0)[0]
 
 
+# Of FOAW's bound.
+_SLACK = 1.0 + 1e-9
+
+
 def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: Array) -> tuple[Program, Reading]:
     """Measure, estimate the velocity and command a force (T2)."""
     quantum = lanes.resolution
@@ -84,7 +88,8 @@ def _adapt_window(ring: Array, k: Array, newest: Array, bound: Array, most: int)
     back = np.arange(1, most + 1)[:, None]
     slopes = (newest - past[1:]) / back
     missed = jnp.abs(past[1:] - (newest - slopes[:, None] * back))  # (window, sample, lanes)
-    within = jnp.all((missed <= bound) | (back > back[:, None]), axis=1)
+    # Positions are counts: a line that misses by just the bound is not left to rounding.
+    within = jnp.all((missed <= bound * _SLACK) | (back > back[:, None]), axis=1)
     length = jnp.sum(jnp.cumprod(within, 0), 0)
     return jnp.take_along_axis(slopes, jnp.maximum(length - 1, 0)[None], 0)[0]
 

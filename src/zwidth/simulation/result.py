@@ -22,10 +22,11 @@ class MotionKind(IntEnum):
     STEADY = 2
     GROWING = 3
     DIVERGED = 4
+    UNCLEAR = 5
 
 
-# A tail this small beside the widest motion is at rest; halves this much alike are steady.
-_AT_REST, _ALIKE, _BEYOND = 1e-9, 0.02, 1e100
+# A tail this small beside the widest motion is at rest; halves this much alike are steady, and hold so many swings.
+_AT_REST, _ALIKE, _SWINGS, _BEYOND = 1e-9, 0.02, 2, 1e100
 
 OF_MOTION = {
     "position": ("position of the device, into the wall", "m"),
@@ -46,6 +47,7 @@ OF_MOTION = {
 }
 OF_WHOLE = {
     "amplitude": ("half of the peak-to-peak position in the tail", "m"),
+    "trend": ("width of the second half of the tail over that of the first", "1"),
     "frequency": ("frequency of the motion in the tail", "Hz"),
     "penetration": ("largest position at a sample", "m"),
     "bounces": ("times the wall was left again", "1"),
@@ -70,14 +72,16 @@ class Motion:
         wall_work, push_work: energy given by the wall and by the hand's push since the start, in J.
         damping_loss, friction_loss: energy taken by dampers and by friction.
         energy: kinetic and elastic energy of all bodies; grows by the work done and falls by what is lost.
-        amplitude: half of the peak-to-peak position in the tail, in m, at the samples.
-        frequency: of the motion in the tail, in Hz; NaN where the velocity does not turn twice there.
+        amplitude: half of the peak-to-peak position in the tail, in m, at the samples; infinite for a diverged motion.
+        trend: the peak-to-peak position in the second half of the tail over that in the first.
+        frequency: of the motion in the tail, in Hz; NaN at rest and where the velocity does not turn twice there.
         penetration: the largest position at a sample, in m, at least 0.
         bounces: how often the wall was left again.
-        impact_velocity: at the first sample in contact, in m/s; NaN where there is none or the motion starts there.
+        impact_velocity: at the first sample at which the wall is entered from outside, in m/s; NaN where it never is.
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
-        outcome: a code of `zwidth.MotionKind`: REST, the tail's motion is below 1e-9 of the widest; STEADY, its two
-            halves differ by at most 2 % in width; DECAYING, GROWING; DIVERGED, beyond 1e100.
+        outcome: a code of `zwidth.MotionKind`, of the tail alone: REST, its second half is below 1e-9 of the widest
+            motion; STEADY, the widths of its halves differ by at most 2 % and what the encoder's steps and noise can
+            make; DECAYING, GROWING; DIVERGED, beyond 1e100; UNCLEAR, fewer than two swings in a half: simulate longer.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed.
     """
@@ -99,6 +103,7 @@ class Motion:
     friction_loss: Any
     energy: Any
     amplitude: Any
+    trend: Any
     frequency: Any
     penetration: Any
     bounces: Any
@@ -131,35 +136,42 @@ class Motion:
         return data
 
 
-def classify(widest: np.ndarray, first: np.ndarray, second: np.ndarray, finite: np.ndarray) -> np.ndarray:
-    """The outcome by the widths of the tail's halves."""
-    with np.errstate(invalid="ignore"):
-        alike = np.abs(first - second) <= _ALIKE * np.maximum(first, second)
+def classify(known: Any, finite: np.ndarray, blur: np.ndarray) -> np.ndarray:
+    """How motions end; ``blur`` is by how much the widths of two halves may differ for no reason of the loop's."""
+    first, second = known.halves.high - known.halves.low
     changing = np.where(second < first, MotionKind.DECAYING, MotionKind.GROWING)
-    outcome = np.where(second <= _AT_REST * widest, MotionKind.REST, np.where(alike, MotionKind.STEADY, changing))
-    return np.where(finite & (widest < _BEYOND), outcome, MotionKind.DIVERGED)
+    alike = np.abs(first - second) <= _ALIKE * np.maximum(first, second) + blur
+    kind = np.where(alike, MotionKind.STEADY, changing)
+    kind = np.where(known.turns.min(0) < _SWINGS, MotionKind.UNCLEAR, kind)
+    # A tail of a period or two has not moved for want of time.
+    still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest)
+    kind = np.where(still, MotionKind.REST, kind)
+    return np.where(finite & (known.widest < _BEYOND), kind, MotionKind.DIVERGED)
 
 
+@np.errstate(all="ignore")
 def to_si(
-    found: Any, instants: np.ndarray | None, period: np.ndarray, mass: np.ndarray, bodies: tuple[str, ...]
-) -> dict[str, np.ndarray]:
+    found: Any, given: Any, instants: np.ndarray | None, period: np.ndarray, mass: np.ndarray, bodies: Any
+) -> Any:
     """Columns of one row a simulation, by the names of `Motion`; ``bodies`` names the positions of all bodies."""
     state, reading, frame = found
     known, force = state.summary, mass / period**2
-    widths = 0.5 * (known.halves.high - known.halves.low)
+    low, high = known.halves
     finite = np.isfinite(state.body.x).all(0)
-    with np.errstate(all="ignore"):
-        frequency = (known.turns - 1) / ((known.last_turn - known.first_turn) * period)
+    turns = known.turns.sum(0)
+    frequency = (turns - 1) / ((known.last_turn - known.first_turn) * period)
+    outcome = classify(known, finite, 2.0 * given.resolution + 6.0 * given.noise)
     # A motion that is lost before it is large was not followed.
     lost = ~finite & (known.widest < _BEYOND)
     columns = {
-        "amplitude": widths.max(0),
-        "frequency": np.where(known.turns > 1, frequency, np.nan),
+        "amplitude": np.where(outcome == MotionKind.DIVERGED, np.inf, 0.5 * (high.max(0) - low.min(0))),
+        "trend": (high[1] - low[1]) / (high[0] - low[0]),
+        "frequency": np.where((turns > 1) & (outcome != MotionKind.REST), frequency, np.nan),
         "penetration": known.deepest,
         "bounces": known.exits.astype(int),
         "impact_velocity": known.impact / period,
         "energy_given": known.given * force,
-        "outcome": classify(known.widest, widths[0], widths[1], finite),
+        "outcome": outcome,
         "status": np.where(lost, Status.NOT_CONVERGED, Status.OK),
     }
     if frame is None:
@@ -173,7 +185,7 @@ def to_si(
     columns |= {
         "velocity": unroll(frame.velocity) / period[:, None],
         "wall_force": unroll(frame.force) * force[:, None],
-        "sticking": unroll(frame.slip) == 0,
+        "sticking": (unroll(frame.slip) == 0) & (given.static > 0)[:, None],
         "measured": reading.measured.T,
         "estimated_velocity": reading.velocity.T / period[:, None],
         "command": reading.command.T * force[:, None],

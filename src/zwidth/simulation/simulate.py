@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -106,9 +108,8 @@ def simulate(
 
     Numerics:
         Float64. Matrix exponentials over the constant parts of a period; with friction the instants of stopping and
-        starting to the last bit (docs/theory/simulation.md). JAX compiles for about a second for each combination of
-        bodies and nonlinear parts; then a rigid sample takes tens of nanoseconds in a batch, with friction some
-        microseconds.
+        starting to the last bit (docs/theory/simulation.md). JAX compiles for one to three seconds for each combination
+        of bodies and nonlinear parts; what each then costs stands in docs/simulation.md.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section II (the loop).
@@ -164,16 +165,22 @@ def simulate(
         # What was put in place of a bad number is no one's motion.
         column[~good] = _missing(column.dtype)
     found["status"][~good] = Status.INVALID_INPUT
-    if record and "time" not in found:
-        clock = np.array([float(scene.timing.period) for scene in known])
-        steps = np.arange(periods * substeps) / substeps
-        same = len(set(clock.tolist())) == 1
-        found["time"] = steps * clock[0] if same else steps * clock[which][:, None]
+    if record:
+        found["time"] = _lay_time(known, which, np.arange(periods * substeps) / substeps, found.get("time"))
     shaped = {
         name: column if name == "time" and column.ndim == 1 else column.reshape((*shape, *column.shape[1:]))[()]
         for name, column in found.items()
     }
     return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
+
+
+def _lay_time(known: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
+    """The instants: of one axis where all share them, else of every simulation; those that jitter drew as they are."""
+    clock = np.array([float(scene.timing.period) for scene in known])
+    if drawn is None and len(set(clock.tolist())) == 1:
+        return steps * clock[0]
+    even = steps * clock[which][:, None]
+    return even if drawn is None else np.where(np.isnan(drawn), even, drawn)
 
 
 def _missing(dtype: np.dtype) -> Any:
@@ -183,20 +190,20 @@ def _missing(dtype: np.dtype) -> Any:
 def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     """The scenes that are different objects, and which of them each place of the batch has."""
     array = np.empty((), object)
-    if hasattr(scenes, "device"):
-        array[()] = scenes
+    if isinstance(scenes, np.ndarray):
+        array = scenes
+    elif isinstance(scenes, Iterable):
+        listed = list(scenes)
+        array = np.empty(len(listed), object)
+        array[:] = listed
     else:
-        listed = list(scenes) if not isinstance(scenes, np.ndarray) else scenes
-        array = np.empty(np.shape(listed) if isinstance(listed, np.ndarray) else len(listed), object)
-        array[...] = listed
+        array[()] = scenes
     known: dict[int, int] = {}
     which = np.empty(array.shape, int)
     for place, scene in np.ndenumerate(array):
         if not (hasattr(scene, "device") and hasattr(scene, "timing")):
             raise InputError(f"scenes: got {scene!r}; a zwidth.Scene or a list of them is needed")
         which[place] = known.setdefault(id(scene), len(known))
-    if not known:
-        raise InputError("scenes: got an empty list; one zwidth.Scene at least is needed")
     return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which
 
 
@@ -223,10 +230,14 @@ def _read(
     try:
         shape = np.broadcast_shapes(which.shape, seeds.shape, *(array.shape for array in arrays.values()), *outer)
     except ValueError as error:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in arrays.items() if array.shape)
+        known_shapes = {**{name: array.shape for name, array in arrays.items()}, "seed": seeds.shape}
+        known_shapes |= dict.fromkeys(["push_history without its last axis"], outer[0]) if outer else {}
+        shapes = ", ".join(f"{name} {shape}" for name, shape in known_shapes.items() if shape)
         raise InputError(
             f"shapes do not broadcast: scenes {which.shape}, {shapes}; make each axis equal or 1"
         ) from error
+    if not math.prod(shape):
+        raise InputError(f"scenes: got a batch of shape {shape}; one simulation at least is needed")
     which = np.broadcast_to(which, shape)
     clock = np.array([float(scene.timing.period) for scene in known])
     good = np.ones(shape, bool)
@@ -238,9 +249,11 @@ def _read(
     flat = {name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()}
     steady = None
     if pushes is not None:
-        steady = np.broadcast_to(pushes, (*shape, periods)).reshape(-1, periods)
-        if not np.all(np.isfinite(steady)):
+        if pushes.ndim == 1 and not np.all(np.isfinite(pushes)):
             raise InputError("push_history: got a force that is not finite; fill the gaps")
+        finite = np.isfinite(pushes)
+        good &= np.broadcast_to(finite.all(-1), shape)
+        steady = np.broadcast_to(np.where(finite, pushes, 0.0), (*shape, periods)).reshape(-1, periods)
     numbers = Numbers(**flat, seed=np.broadcast_to(seeds, shape).reshape(-1), history=steady)
     return numbers, which, good.reshape(-1)
 
@@ -260,7 +273,10 @@ def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: 
 
 
 def _read_seeds(seed: Any) -> np.ndarray:
-    seeds = np.asarray(seed)
+    try:
+        seeds = np.asarray(seed)
+    except ValueError:
+        seeds = np.asarray("ragged")
     if seeds.dtype.kind not in "iu" or np.any(seeds < 0):
         raise InputError(f"seed: got {seed!r}; whole numbers of at least 0 are needed")
     return seeds

@@ -23,8 +23,7 @@ from zwidth.formatting import with_unit
 from zwidth.parts.velocity import FOAW
 from zwidth.quantities import NOT_NEGATIVE, POSITIVE
 from zwidth.scene import Scene
-from zwidth.simulation.result import OF_WHOLE
-from zwidth.simulation.result import Outcome as End
+from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.status import Status
 from zwidth.studies.outcome import Outcome, csv_text, stack
 from zwidth.studies.simulate import SimulatedStudy, check_circumstances, name_column
@@ -252,7 +251,7 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
 
 def describe_shares(motion: Any, stable: np.ndarray, silence: float, widest: float) -> str:
     """How much of the linearly stable and unstable walls is silent, buzzes, or goes beyond."""
-    beyond = (motion.outcome == End.DIVERGED) | (motion.amplitude > widest)
+    beyond = (motion.outcome == MotionKind.DIVERGED) | (motion.amplitude > widest)
     silent = ~beyond & (motion.amplitude < silence)
     known = motion.status == Status.OK
     ends = {"silent": silent, "buzzing": ~silent & ~beyond, "beyond": beyond}

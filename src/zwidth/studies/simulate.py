@@ -32,8 +32,7 @@ from zwidth.formatting import with_unit
 from zwidth.parts.velocity import FOAW
 from zwidth.quantities import POSITIVE, Range
 from zwidth.scene import Scene
-from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion
-from zwidth.simulation.result import Outcome as End
+from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, si_scales, stack
 
 _POSITIVE = {"type": "number", "exclusiveMinimum": 0}
@@ -41,13 +40,11 @@ Fractions = Annotated[Axis, PlainValidator(axis(POSITIVE)), SPELLED, axis_schema
 
 # What the program makes of a sample stays until the next one.
 _OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
-# In a tail of fewer swings its halves are not compared.
-_FEW_SWINGS = 4.0
 _WORDS = {
-    End.REST: "at rest",
-    End.DECAYING: "decaying",
-    End.GROWING: "growing",
-    End.DIVERGED: "growing without end",
+    MotionKind.REST: "at rest",
+    MotionKind.DECAYING: "decaying",
+    MotionKind.GROWING: "growing",
+    MotionKind.DIVERGED: "growing without end",
 }
 
 
@@ -172,11 +169,9 @@ class SimulateStudy(SimulatedStudy, Circumstances):
         for k, (label, *wall) in enumerate(walls):
             named = {"label": label, **dict(zip(SI_COLUMNS, wall, strict=True))}
             parts.append({**named, **tabulate_motion(motion, k, self.substeps)})
-            words = describe_end(motion, k, self.device.period)
+            words = describe_end(motion, k)
             judged = {} if linear is None else {"linearly_stable": bool(linear[k])}
             whole = {name_column(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
-            if motion.outcome[k] == End.REST:
-                whole["frequency_Hz"] = np.nan
             rows.append({**named, **judged, **whole, "outcome": words})
             verdict = "" if linear is None else f" (linearly {'stable' if linear[k] else 'unstable'})"
             notes.append(f"{label}{verdict}: {words}")
@@ -220,31 +215,27 @@ def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarr
     return columns
 
 
-def describe_end(motion: Motion, k: int, period: float) -> str:
+def describe_end(motion: Motion, k: int) -> str:
     """How a recorded motion of several ends, in words."""
     if motion.status[k]:
         return "not followed to its end"
-    end = End(int(motion.outcome[k]))
-    if end in (End.REST, End.DIVERGED):
+    end = MotionKind(int(motion.outcome[k]))
+    if end in (MotionKind.REST, MotionKind.DIVERGED):
         return _WORDS[end]
-    arrays = (motion.position, motion.velocity, motion.contact)
-    position, velocity, contact = (part[k] for part in arrays if part is not None)
+    velocity, contact = motion.velocity[k], motion.contact[k]
     tail = max(contact.size // 4, 1)
     if not contact[-tail:].any():
         return "gone from the wall"
     amplitude, frequency = float(motion.amplitude[k]), float(motion.frequency[k])
-    # Halves of the tail with a swing or two each tell nothing: impacts do, and where the motion is widest.
-    if not frequency * period * tail >= _FEW_SWINGS:
+    if end is MotionKind.UNCLEAR:
         hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
         if hits.size > 1:
             speeds = velocity.reshape(contact.size, -1)[hits, 0]
             first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
             change = "growing" if speeds[-1] > speeds[0] else "decaying"
             return f"bounces {change}, the first of {hits.size} impacts at {first} and the last at {last}"
-        widest_last = np.argmax(np.abs(position)) >= position.size - tail * position.size // contact.size
-        if end is End.STEADY or (end is End.GROWING) != widest_last:
-            return "too few swings at the end to tell how it goes on"
-    if end is not End.STEADY:
+        return "too few swings at the end to tell how it goes on"
+    if end is not MotionKind.STEADY:
         return _WORDS[end]
     rate = f" at {with_unit(frequency, 'Hz', 3)}" if np.isfinite(frequency) else ""
     return f"buzzing{rate}, amplitude {with_unit(amplitude, 'm', 3)}"

@@ -213,8 +213,8 @@ def test_an_undamped_swing_has_its_frequency_and_known_motions_their_outcome():
     # Halves of two swings each.
     wall = {"stiffness": share * best.stiffness, "virtual_damping": best.virtual_damping, "record": False}
     motion = run(**wall, periods=64, tail=52)
-    assert [zwidth.Outcome(code).name for code in motion.outcome] == ["DECAYING", "GROWING", "GROWING"]
+    assert [zwidth.MotionKind(code).name for code in motion.outcome] == ["DECAYING", "GROWING", "GROWING"]
     long = run(**wall, periods=9000)
-    assert [zwidth.Outcome(code).name for code in long.outcome] == ["REST", "DIVERGED", "DIVERGED"]
+    assert [zwidth.MotionKind(code).name for code in long.outcome] == ["REST", "DIVERGED", "DIVERGED"]
     held = run(stiffness=1.2 * best.stiffness, virtual_damping=best.virtual_damping, max_force=1.0, periods=9000)
-    assert zwidth.Outcome(held.outcome) == zwidth.Outcome.STEADY
+    assert zwidth.MotionKind(held.outcome) == zwidth.MotionKind.STEADY

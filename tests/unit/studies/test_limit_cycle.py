@@ -55,7 +55,7 @@ def test_the_words_count_what_the_arrays_hold(plane):
     assert len(plane.notes) == 3
     for k, note in enumerate(plane.notes[:2]):
         amplitude, stable = arrays["amplitude_m"][k], arrays["linearly_stable"][k] == 1
-        silent, beyond = amplitude < 1e-6, (amplitude > 1e-3) | (arrays["outcome"][k] == zwidth.Outcome.DIVERGED)
+        silent, beyond = amplitude < 1e-6, (amplitude > 1e-3) | (arrays["outcome"][k] == zwidth.MotionKind.DIVERGED)
         for those, name in ((stable, "stable"), (~stable, "unstable")):
             shares = [np.mean(end[those]) for end in (silent, ~silent & ~beyond, beyond)]
             told = ", ".join(f"{a:.1%} {b}" for a, b in zip(shares, ("silent", "buzzing", "beyond"), strict=True))
@@ -76,7 +76,7 @@ def test_a_plane_is_drawn_with_the_linear_boundary(plane):
         np.testing.assert_allclose(line.get_ydata()[:-1], outline.virtual_damping)
         (mesh,) = [each for each in ax.collections if hasattr(each, "get_coordinates")]
         drawn, amplitude = mesh.get_array(), plane.arrays["amplitude_m"][k].T
-        beyond = (amplitude > 1e-3) | (plane.arrays["outcome"][k].T == zwidth.Outcome.DIVERGED)
+        beyond = (amplitude > 1e-3) | (plane.arrays["outcome"][k].T == zwidth.MotionKind.DIVERGED)
         np.testing.assert_array_equal(np.ma.getmaskarray(drawn), beyond)
         np.testing.assert_allclose(drawn[~beyond], np.maximum(amplitude[~beyond], 1e-300) * 1e6)
         # What is silent lies below the colors.
