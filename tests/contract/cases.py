@@ -199,4 +199,5 @@ OTHERS = {
     "to_control": "one scene: tests/unit/linear/test_answers.py",
     "use_compilation_cache": "a setting: tests/unit/test_kernel_cache.py",
     "worst_motion": "one scene and wall: tests/unit/simulation/test_worst_motion.py",
+    "write_report": "a folder: tests/unit/html_report/test_page.py",
 }

@@ -16,6 +16,7 @@ from zwidth.quantities import OUTPUTS, VARIABLES
 if TYPE_CHECKING:
     import xarray
 
+_GRAY = "not finite, or not known"
 # Of each axis of a slice, of each other axis, and numbers a map in all: half a megabyte.
 _ALONG, _OTHERS, _MOST = 120, 9, 120_000
 
@@ -59,9 +60,11 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
         "</label>"
         for dim in others
     )
+    ends = f"not {name}, {name}" if output.dtype == "bool" else f"{low:.4g} to {content['high']:.4g} {_unit(thin)}"
     thinned = "" if thin.size == values.size else f" Every value of {thin.size:,} out of {values.size:,}."
     return (
-        f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. Gray: not known.{thinned} '
+        f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
+        f"Dark to bright: {ends}; gray: {_GRAY}.{thinned} "
         "Point, or focus the map and use the arrow keys, to read a value.</p>"
         f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
         f'</output><script type="application/json">{_embed(content)}</script></div>'

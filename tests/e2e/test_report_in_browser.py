@@ -1,0 +1,43 @@
+"""The page of a run in a browser: it opens from the disk, asks for nothing, and its slices answer to keys."""
+
+from __future__ import annotations
+
+import pytest
+
+import zwidth
+from browser import open_page
+
+STUDY = {
+    "kind": "sweep",
+    "name": "plane",
+    "axes": {
+        "alpha": {"linear": {"start": 0.01, "stop": 0.3, "num": 30}},
+        "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 20}},
+        "delta": [0.1, 0.5],
+        "d": 1,
+    },
+    "outputs": ["spectral_radius"],
+}
+
+
+@pytest.mark.parametrize("width, scheme", [(1280, "light"), (390, "dark")])
+def test_the_page_opens_from_the_disk(tmp_path, width, scheme):
+    zwidth.run({"version": 1, "name": "example", "studies": [STUDY]}, out=tmp_path / "run")
+    file = zwidth.write_report(tmp_path / "run")
+    with open_page(viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
+        page.goto(file.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") <= width
+        readout, slider = page.locator("output"), page.locator("input[type=range]")
+        before = readout.inner_text()
+        slider.focus()
+        page.keyboard.press("ArrowRight")
+        assert slider.get_attribute("aria-valuetext") == "0.5"
+        assert readout.inner_text() != before
+        page.locator("canvas").focus()
+        for _ in range(40):
+            page.keyboard.press("ArrowLeft")
+            page.keyboard.press("ArrowDown")
+        expected = zwidth.spectral_radius(0.01, -0.2, 0.5, 1.0)
+        assert float(readout.inner_text().split(":")[1]) == pytest.approx(float(expected), rel=1e-4)
+        assert page.asked == []
+        assert page.complaints == []
