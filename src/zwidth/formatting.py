@@ -33,6 +33,11 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
 
 
+def header(name: str, unit: str) -> str:
+    """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
+    return name if unit in ("", "1", "sampling periods") else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
+
+
 def describe(value: Any) -> str:
     """The value received, as YAML spells it, on one line."""
     if value is None:
