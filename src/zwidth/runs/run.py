@@ -174,7 +174,8 @@ class _Run:
             entry = self.record.entry(piece.name)
             faults = self.record.faults(piece.name)
             if entry is not None and entry["state"] == "done" and not faults:
-                self.results.append(StudyResult(piece.name, piece.kind, "kept", files=tuple(entry["files"])))
+                files, answer = (tuple(entry.get(name, ())) for name in ("files", "answer"))
+                self.results.append(StudyResult(piece.name, piece.kind, "kept", files=files, answer=answer))
                 self.tell(StudyEvent(index, self.total, piece.name, piece.kind, self.results[-1]))
                 continue
             self.repaired += [f"{piece.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
@@ -191,15 +192,16 @@ class _Run:
         clock = time.perf_counter()
         entry = {"name": piece.name, "kind": piece.kind, "state": "failed", "inputs": piece.inputs}
         notes: tuple[str, ...] = ()
+        answer: tuple[str, ...] = ()
         error: Exception | None = None
         with self.record.staging(piece.name) as stage:
             try:
                 outcome = piece.compute()
-                notes = outcome.notes
+                notes, answer = outcome.notes, outcome.answer
                 outcome.write(stage, piece.name)
             except Exception as caught:
                 error = caught
-            entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes)}
+            entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes), "answer": list(answer)}
             entry |= {"error": _describe_error(error), "state": "failed" if error else "done"}
             try:
                 self.record.keep(stage, entry)
@@ -219,6 +221,7 @@ class _Run:
             time.perf_counter() - clock,
             tuple(kept["files"]) if kept else (),
             notes,
+            answer,
             _describe_error(error),
             error,
         )
