@@ -18,7 +18,10 @@ from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.formatting import plain, with_unit
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Completion in bash (zsh, fish alike): _ZWIDTH_COMPLETE=bash_source zwidth > FILE, then '. FILE' in ~/.bashrc.",
+)
 @click.version_option(__version__, prog_name="zwidth")
 def cli() -> None:
     """Stability of haptic virtual walls: what stiffness and damping a sampled, delayed device can render.

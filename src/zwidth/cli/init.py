@@ -15,9 +15,18 @@ _PACKAGE = Path(__file__).resolve().parents[1]
 _TABLE = re.compile(r"csv: *([\w.-]+\.csv)")
 
 
+def _complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
+    return [name for name in find_examples() if name.startswith(begun)]
+
+
 @click.command()
-@click.argument("name", required=False)
-@click.option("--example", metavar="EXAMPLE", help="The example to begin with.  [default: NAME's, else quickstart]")
+@click.argument("name", required=False, shell_complete=_complete)
+@click.option(
+    "--example",
+    metavar="EXAMPLE",
+    shell_complete=_complete,
+    help="The example to begin with.  [default: NAME's, else quickstart]",
+)
 @click.option("--list", "listing", is_flag=True, help="List the examples.")
 def init(name: str | None, example: str | None, listing: bool) -> None:
     """Write an example configuration NAME.yaml, to run and to change.
