@@ -20,7 +20,7 @@ from zwidth.formatting import plain, with_unit
 
 @click.group(
     context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
-    epilog="Completion in bash (zsh, fish alike): _ZWIDTH_COMPLETE=bash_source zwidth > FILE, then '. FILE' in ~/.bashrc.",
+    epilog="Completion in bash (zsh, fish): _ZWIDTH_COMPLETE=bash_source zwidth > FILE, and '. FILE' in ~/.bashrc.",
 )
 @click.version_option(__version__, prog_name="zwidth")
 def cli() -> None:
