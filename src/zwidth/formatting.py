@@ -15,7 +15,8 @@ def plain(value: float, digits: int = 4) -> str:
     """A number with a fixed count of significant digits, without an exponent where it stays short."""
     if not math.isfinite(value):
         return "none" if math.isnan(value) else ("infinite" if value > 0 else "-infinite")
-    value = float(f"{value:.{digits - 1}e}")
+    # A zero has no sign.
+    value = float(f"{value:.{digits - 1}e}") + 0.0
     if value != 0 and not 1e-4 <= abs(value) < 1e6:
         return f"{value:.{digits - 1}e}"
     decimals = max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0
@@ -31,6 +32,11 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     if abs(float(f"{value / 10**power:.{digits - 1}e}")) >= 1000 and power < 9:
         power += 3
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
+
+
+def header(name: str, unit: str) -> str:
+    """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
+    return name if unit in ("", "1", "sampling periods") else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
 
 
 def describe(value: Any) -> str:

@@ -73,6 +73,15 @@ def test_other_walls_are_not(name, wall):
     assert verdict.stable == (wall[0] > 0)
 
 
+@pytest.mark.parametrize("name", ["rigid", "filter", "delayed"])
+@pytest.mark.parametrize("damping", [0.3, 1.0, 7.7, 10.0])
+def test_a_wall_that_takes_all_damping_away_is_not(name, damping):
+    # Two poles at z = 1, which rounding may show as one at 1 and one a little inside: the device drifts.
+    for stays, share in ((False, 1.0), (True, 0.999)):
+        scene = dataclasses.replace(free_scene(name, 0.0, -share * damping), device=zwidth.Device(0.1, damping))
+        assert zwidth.assess(scene).marginal is stays
+
+
 @pytest.mark.parametrize("delay", [0.0, 1e-3, 1.4e-3])
 def test_an_undamped_device_has_no_stable_spring(delay):
     scene = dataclasses.replace(free_scene("filter", 0.0, 0.0), timing=zwidth.Timing(1e-3, delay))

@@ -11,6 +11,7 @@ from zwidth.formatting import plain, with_unit
     "value, text",
     [
         (0.0, "0"),
+        (-0.0, "0"),
         (0.5, "0.5000"),
         (-12.34, "-12.34"),
         (1234.4, "1234"),

@@ -12,13 +12,17 @@ from zwidth.cli import runs
 from zwidth.cli.bench import bench
 from zwidth.cli.design import design
 from zwidth.cli.devices import devices
+from zwidth.cli.init import init
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.report import report
 from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.formatting import plain, with_unit
 
 
-@click.group(context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(
+    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    epilog="Completion in bash (zsh, fish): _ZWIDTH_COMPLETE=bash_source zwidth > FILE, and '. FILE' in ~/.bashrc.",
+)
 @click.version_option(__version__, prog_name="zwidth")
 def cli() -> None:
     """Stability of haptic virtual walls: what stiffness and damping a sampled, delayed device can render.
@@ -166,5 +170,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (*runs.COMMANDS, report, design, devices, bench):
+for command in (init, *runs.COMMANDS, report, design, devices, bench):
     cli.add_command(command)

@@ -158,6 +158,9 @@ def _report_end(result: RunResult, command: str) -> None:
     parts = [f"{done} of {whole} done"] if whole else []
     parts += [f"{chunks[0] + chunks[1]} of {chunks[2]} chunks done ({chunks[0]} now)"] if sweeps else []
     click.echo(f"{', '.join(parts) or 'nothing done'}, results in {result.folder}")
+    for study in result.studies:
+        for number, line in enumerate(study.answer):
+            click.echo(f"{'' if number else study.name:<20}  {line}")
     if result.hopeless:
         click.echo(f"zwidth: out: {result.folder}: {result.hopeless}", err=True)
         click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {command}", err=True)

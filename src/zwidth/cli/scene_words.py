@@ -73,7 +73,7 @@ def scene_verdict_lines(scene: Scene, verdict: SceneAssessment) -> list[str]:
         row("verdict", f"{word}, spectral radius {verdict.spectral_radius:.6f}"),
         row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B")),
         row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K")),
-        row("passive", passivity_words(wall.stiffness, verdict, sufficient=coupled)),
+        row("passive", passivity_words(scene, verdict, sufficient=coupled)),
         row("stiffest stable wall", best),
         row("slowest pole", pole_words(verdict.time_constant, verdict.frequency)),
         *margin_lines(wall.stiffness, verdict),

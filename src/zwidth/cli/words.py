@@ -14,6 +14,10 @@ if TYPE_CHECKING:
     from zwidth.scene import Scene
 
 
+# A margin is a difference of dampings; a smaller share of them is their rounding.
+_ROUNDED = 1e-12
+
+
 def row(label: str, text: str) -> str:
     return f"{label:<20}  {text}"
 
@@ -74,7 +78,7 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         "",
         row("verdict", f"{stable}, spectral radius {verdict.spectral_radius:.6f}"),
         *_distance_lines(wall.stiffness, wall.virtual_damping, verdict),
-        row("passive", passivity_words(wall.stiffness, verdict)),
+        row("passive", passivity_words(scene, verdict)),
         row(
             "stiffest stable wall",
             f"K_max = {with_unit(verdict.stiffness_max, 'N/m')} "
@@ -124,17 +128,18 @@ def margin_lines(stiffness: float, verdict: Assessment | SceneAssessment) -> lis
     return [row("margins", ", ".join(parts))]
 
 
-def passivity_words(stiffness: float, verdict: Assessment | SceneAssessment, *, sufficient: bool = False) -> str:
+def passivity_words(scene: Scene, verdict: Assessment | SceneAssessment, *, sufficient: bool = False) -> str:
     """Whether a wall is passive; where the condition is only sufficient, a wall that misses it may still be."""
+    stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
         return "not known: the sensor is not where the force acts"
     if stiffness < 0:
         return "no, and no damping makes a negative stiffness passive"
-    margin = verdict.passivity_margin
+    dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period
+    if abs(margin) <= _ROUNDED * dampings:
+        return "only just, without any physical damping to spare"
     if verdict.passive:
         return f"yes, with {with_unit(margin, 'N s/m')} of physical damping to spare"
-    if margin == 0:
-        return "only just, without any physical damping to spare"
     verb = "not proved" if sufficient else "no"
     return f"{verb}, for want of {with_unit(-margin, 'N s/m')} of physical damping"
 

@@ -26,7 +26,7 @@ LocatedProblem: TypeAlias = "tuple[FieldPath, PydanticCustomError]"
 class Fault:
     """One fault of a configuration file; line and column are None where it has no place, as for a missing file."""
 
-    file: str  # as the user named it
+    file: str  # as the user named it; empty for a configuration that is no file
     line: int | None  # from 1
     column: int | None  # in characters, from 1
     field: str  # such as ``studies[0].delta``; empty for the file as a whole
@@ -39,7 +39,7 @@ class Fault:
         if self.line is not None:
             place += f":{self.line}:{self.column}"
         text = "; ".join(part for part in (self.problem, self.allowed, self.remedy) if part)
-        return f"{place}: {self.field}: {text}" if self.field else f"{place}: {text}"
+        return ": ".join(part for part in (place, self.field, text) if part)
 
 
 class ConfigFileError(ConfigError):

@@ -1,4 +1,4 @@
-"""Reading configuration files: strict YAML 1.2, where every fault has its place in the file.
+"""Reading and writing configurations: strict YAML 1.2, where every fault has its place in the file.
 
 This is the only module that imports yaml. The model that a file is checked against is `zwidth.studies.document`'s.
 """
@@ -9,20 +9,33 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 from yaml.composer import Composer
+from yaml.emitter import Emitter
 from yaml.parser import Parser
 from yaml.reader import Reader
+from yaml.representer import SafeRepresenter
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
+from yaml.serializer import Serializer
 
 from zwidth.config.device_table import files_relative_to
-from zwidth.config.faults import ConfigFileError, Fault, FieldPath, dotted, locate, printable, problems_of
+from zwidth.config.faults import (
+    ConfigFileError,
+    Fault,
+    FieldPath,
+    LocatedProblem,
+    dotted,
+    locate,
+    printable,
+    problem,
+    problems_of,
+)
 from zwidth.formatting import describe
 
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -52,6 +65,47 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
     if found is None or faults:
         raise ConfigFileError.of(faults)
     return found
+
+
+def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
+    """Check what a file would hold against a model; a fault then has a field and no place.
+
+    Raises:
+        ConfigFileError: there are faults.
+    """
+    problems: list[LocatedProblem] = []
+    found = None
+    try:
+        found = model.model_validate(_simplify(data, (), problems))
+    except ValidationError as error:
+        problems += problems_of(error)
+    if found is None or problems:
+        texts = [(path, what.context or {}) for path, what in problems]
+        parts = [(dotted(path), *(text[key] for key in ("what", "allowed", "remedy"))) for path, text in texts]
+        raise ConfigFileError.of(Fault("", None, None, *part) for part in parts)
+    return found
+
+
+def _simplify(value: Any, path: FieldPath, problems: list[LocatedProblem]) -> Any:
+    """A value as a file would hold it: arrays and tuples as lists; keys that are no text are left out as faults."""
+    if len(path) > MAX_DEPTH:
+        problems.append((path, problem("the values are nested too deeply", f"at most {MAX_DEPTH} levels")))
+        return None
+    if isinstance(value, Mapping):
+        strange = [key for key in value if not isinstance(key, str)]
+        keys = "keys are text", "write the name of a field"
+        problems += [(path, problem(f"got the key {describe(key)}", *keys)) for key in strange]
+        return {key: _simplify(each, (*path, key), problems) for key, each in value.items() if isinstance(key, str)}
+    if callable(getattr(value, "tolist", None)):
+        value = value.tolist()
+    if isinstance(value, list | tuple):
+        return [_simplify(each, (*path, index), problems) for index, each in enumerate(value)]
+    return value
+
+
+def write_yaml(data: Mapping[str, Any]) -> str:
+    """Plain values as the text of a file that is read as the same values."""
+    return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
 
 
 def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
@@ -121,6 +175,22 @@ for _tag, _pattern, _first in (
     ("float", r"[-+]?\.(?:inf|Inf|INF)|\.nan|\.NaN|\.NAN", list("-+.")),
 ):
     _Resolver.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
+
+
+class _Dumper(Emitter, Serializer, SafeRepresenter, _Resolver):
+    """PyYAML's, with quotes around what the core schema would take for a number."""
+
+    def __init__(self, stream: Any, default_style: Any = None, default_flow_style: Any = None, **options: Any) -> None:
+        emitting = ("canonical", "indent", "width", "allow_unicode", "line_break")
+        Emitter.__init__(self, stream, **{name: options[name] for name in emitting})
+        serializing = ("encoding", "explicit_start", "explicit_end", "version", "tags")
+        Serializer.__init__(self, **{name: options[name] for name in serializing})
+        SafeRepresenter.__init__(self, default_style, default_flow_style, options["sort_keys"])
+        _Resolver.__init__(self)
+
+    def ignore_aliases(self, data: Any) -> bool:
+        """Write everything out."""
+        return True
 
 
 class _Loader(Reader, Scanner, Parser, Composer, _Resolver):

@@ -11,6 +11,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.figures import style
 from zwidth.figures.table import SI_COLUMNS, Table
+from zwidth.formatting import header
 from zwidth.quantities import PARAMETERS
 
 _WORDS = {"above": "or more", "below": "or less"}
@@ -21,27 +22,28 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     """Draw the stiffest stable wall over a parameter, and where it reaches each wanted stiffness.
 
     Args:
-        curve: columns parameter, value, stiffness_N_per_m.
-        required: columns of a design study: stiffness_N_per_m, reserve, present, value, enough, and
+        curve: columns parameter, value with its unit (as ``value_Hz``), stiffness_N_per_m.
+        required: columns of a design study: stiffness_N_per_m, reserve, present and value with their unit, enough, and
             stable_share where tolerances are given.
         axes: an Axes of yours.
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 3.8)
     parameter = PARAMETERS[str(np.asarray(curve["parameter"])[0])]
-    values, stiffness = np.asarray(curve["value"]), np.asarray(curve[SI_COLUMNS[0]])
+    value_in, present_in = (header(name, parameter.unit) for name in ("value", "present"))
+    values, stiffness = np.asarray(curve[value_in]), np.asarray(curve[SI_COLUMNS[0]])
     wanted = np.asarray(required[SI_COLUMNS[0]])
     targets = wanted * required["reserve"]
     largest = float(np.nanmax([np.nanmax(stiffness, initial=0.0), targets.max()]))
     factor, unit = style.si_unit(largest, "N/m")
-    known = np.concatenate([values, required["value"], required["present"]])
+    known = np.concatenate([values, required[value_in], required[present_in]])
     scale, spelled = style.si_unit(float(np.sqrt(np.nanmax(known) * values.min())), parameter.unit)
     if parameter.unit == "kg":
         scale, spelled = 1e3, "g"
     ax.plot(values * scale, stiffness * factor, color=style.BLACK, label="K_max", zorder=3)
     colors = style.color_by_value(targets.tolist())
     ax.set(xscale="log", yscale="log")
-    _mark_present(ax, values * scale, stiffness * factor, float(required["present"][0]) * scale)
-    rows = zip(targets, required["value"], required["enough"], strict=True)
+    _mark_present(ax, values * scale, stiffness * factor, float(required[present_in][0]) * scale)
+    rows = zip(targets, required[value_in], required["enough"], strict=True)
     curve_drawn = np.stack([values * scale, stiffness * factor])
     for target, value, enough in rows:
         _mark_required(ax, curve_drawn, target * factor, value * scale, str(enough), colors[target], spelled)
@@ -65,7 +67,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
 def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[float, str]]:
     """What each dashed line stands for: the wanted stiffness, its reserve, and the share of devices that bear it."""
     borne = "stable_share" in required
-    shares = required["stable_share"] if borne else np.full(len(required["value"]), np.nan)
+    shares = required["stable_share"] if borne else np.full(len(required["reserve"]), np.nan)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.3g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
         yield wanted * reserve, words + (f", borne by {100 * share:.3g} %" if np.isfinite(share) else "")

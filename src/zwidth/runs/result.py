@@ -24,6 +24,7 @@ class StudyResult:
     seconds: float = 0.0  # the sweeps of a run are computed together
     files: tuple[str, ...] = ()  # written in the run's folder; a sweep's is its store
     notes: tuple[str, ...] = ()  # what a reader of the results must know, such as points without an answer
+    answer: tuple[str, ...] = ()  # what was found, where a line or two can say it
     error: str = ""  # type and message of what went wrong
     exception: Exception | None = field(default=None, repr=False, compare=False)  # of a study that is no sweep
     sweep: SweepResult | None = None

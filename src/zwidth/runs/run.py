@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
 from zwidth.errors import InputError
 from zwidth.files.lock import holding
@@ -28,7 +28,7 @@ from zwidth.sweep.resume import remove, store_path
 from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy
 
-AnyConfig = Config | str | os.PathLike[str]
+AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,8 @@ def run(
     versions, how long it took, what failed, and which files are the run's own.
 
     Args:
-        config: a configuration, or the path of one.
+        config: the path of a configuration; or what its file would hold, as a dict, in which arrays serve as lists and
+            files are looked for in the present folder; or a configuration that is read already.
         out: the folder; ``runs/<name of the configuration>`` where left out.
         overwrite: replace a run that is already there: the files that its record names, and nothing else.
         resume: go on with a run that is there. What is done and undamaged is kept, what failed or is damaged is
@@ -96,9 +97,8 @@ def run(
 
     Example:
         >>> import tempfile, zwidth
-        >>> from zwidth.studies import Config
         >>> study = {"kind": "map", "name": "m", "delta": 0.1, "d": 0, "alpha": 0.2, "beta": [0.1, 0.5]}
-        >>> config = Config.model_validate({"version": 1, "name": "small", "studies": [study]})
+        >>> config = {"version": 1, "name": "small", "studies": [study]}
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     zwidth.run(config, out=f"{folder}/small").ok
         True
@@ -174,7 +174,8 @@ class _Run:
             entry = self.record.entry(piece.name)
             faults = self.record.faults(piece.name)
             if entry is not None and entry["state"] == "done" and not faults:
-                self.results.append(StudyResult(piece.name, piece.kind, "kept", files=tuple(entry["files"])))
+                files, answer = (tuple(entry.get(name, ())) for name in ("files", "answer"))
+                self.results.append(StudyResult(piece.name, piece.kind, "kept", files=files, answer=answer))
                 self.tell(StudyEvent(index, self.total, piece.name, piece.kind, self.results[-1]))
                 continue
             self.repaired += [f"{piece.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
@@ -191,15 +192,16 @@ class _Run:
         clock = time.perf_counter()
         entry = {"name": piece.name, "kind": piece.kind, "state": "failed", "inputs": piece.inputs}
         notes: tuple[str, ...] = ()
+        answer: tuple[str, ...] = ()
         error: Exception | None = None
         with self.record.staging(piece.name) as stage:
             try:
                 outcome = piece.compute()
-                notes = outcome.notes
+                notes, answer = outcome.notes, outcome.answer
                 outcome.write(stage, piece.name)
             except Exception as caught:
                 error = caught
-            entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes)}
+            entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes), "answer": list(answer)}
             entry |= {"error": _describe_error(error), "state": "failed" if error else "done"}
             try:
                 self.record.keep(stage, entry)
@@ -219,6 +221,7 @@ class _Run:
             time.perf_counter() - clock,
             tuple(kept["files"]) if kept else (),
             notes,
+            answer,
             _describe_error(error),
             error,
         )
@@ -297,8 +300,12 @@ def _spell(model: Any) -> dict[str, Any]:
 
 def _read_config(config: AnyConfig) -> tuple[Config, str]:
     """A configuration and its text."""
+    if isinstance(config, Mapping):
+        config = read_mapping(config, Config)
     if isinstance(config, Config):
-        return config, json.dumps(_spell(config), indent=2) + "\n"
+        return config, write_yaml(_spell(config))
+    if not isinstance(config, str | bytes | os.PathLike):
+        raise InputError(f"config: got {config!r}; give the path of a configuration, or a dict")
     path = Path(os.fsdecode(config))
     return load_config(path), path.read_text(encoding="utf-8-sig")
 

@@ -21,7 +21,7 @@ from zwidth.config.units import make_entry_reader
 from zwidth.design.tolerances import Tolerance, simulate_tolerances
 from zwidth.errors import InputError
 from zwidth.figures.table import SI_COLUMNS
-from zwidth.formatting import describe, short, suggestion
+from zwidth.formatting import describe, header, short, suggestion
 from zwidth.linear.required import RequiredValue
 from zwidth.parts.wall import VirtualWall
 from zwidth.quantities import PARAMETERS, PHYSICAL, Range
@@ -200,18 +200,18 @@ class DesignStudy(ComputedStudy):
 
     def _describe(self, nominal: Scene, stiffness: float, needed: RequiredValue) -> dict[str, Any]:
         """A row of the table: what is needed, the wall there, and what tolerances leave of it."""
+        unit = PARAMETERS[self.find].unit
         others = [c for c in needed.crossings if c.value != needed.value]
         row: dict[str, Any] = {
             SI_COLUMNS[0]: stiffness,
             "reserve": self.reserve,
             "parameter": self.find,
-            "unit": PARAMETERS[self.find].unit,
-            "present": self._list_parameters()[self.find],
-            "value": needed.value,
+            header("present", unit): self._list_parameters()[self.find],
+            header("value", unit): needed.value,
             "enough": needed.enough,
-            "other_crossings": "; ".join(f"{c.value!r} {c.enough}" for c in others),
-            "range_low": needed.range[0],
-            "range_high": needed.range[1],
+            header("other_crossings", unit): "; ".join(f"{c.value!r} {c.enough}" for c in others),
+            header("range_low", unit): needed.range[0],
+            header("range_high", unit): needed.range[1],
             "status": Status(needed.status).name,
             "stiffness_max_N_per_m": math.nan,
             SI_COLUMNS[1]: math.nan,
@@ -255,5 +255,6 @@ class DesignStudy(ComputedStudy):
             else:
                 if top.status == Status.OK:
                     wall = float(top.stiffness), float(top.virtual_damping)
-            rows.append({"parameter": self.find, "value": value, **dict(zip(SI_COLUMNS, wall, strict=True))})
+            named = {"parameter": self.find, header("value", PARAMETERS[self.find].unit): value}
+            rows.append({**named, **dict(zip(SI_COLUMNS, wall, strict=True))})
         return stack(rows)

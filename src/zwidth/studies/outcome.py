@@ -29,6 +29,7 @@ class Outcome:
         arrays: arrays of the study's npz file.
         figures: what draws each figure and returns its Axes, by what its file name adds to the study's name.
         documents: texts by file name.
+        answer: what was found, in a line or two for a terminal.
         notes: what a reader of the results must know, such as points without an answer.
     """
 
@@ -36,6 +37,7 @@ class Outcome:
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
     figures: Mapping[str, Callable[[], Any]] = field(default_factory=dict)
     documents: dict[str, str] = field(default_factory=dict)
+    answer: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
     def write(self, folder: Path, name: str) -> None:

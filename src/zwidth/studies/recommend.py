@@ -20,7 +20,7 @@ from zwidth.stability.ridge import alpha_max
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, add_si_columns, si_scales, stack
 from zwidth.studies.passivity import passive_outlines
-from zwidth.studies.recommend_with_parts import recommend_with_parts
+from zwidth.studies.recommend_with_parts import recommend_with_parts, spell_answer
 from zwidth.studies.step import ResponseStudy
 
 
@@ -83,6 +83,7 @@ class RecommendStudy(ResponseStudy):
                 f"{stem}.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
                 f"{stem}.md": _markdown(device, wall, verdict, found),
             },
+            answer=spell_answer(found, verdict),
             notes=(*notes, *([note] if note else [])),
         )
 

@@ -8,7 +8,7 @@ from functools import partial
 from typing import Any
 
 from zwidth import figures
-from zwidth.formatting import with_unit
+from zwidth.formatting import plain, with_unit
 from zwidth.linear.passivity import has_condition
 from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
@@ -16,6 +16,7 @@ from zwidth.studies.outcome import Outcome, stack
 from zwidth.studies.stable_set import bound_damping, name_kind, tabulate_walls, trace_outlines
 
 _DECAY = math.log(50.0)
+_SIDES = ("lower", "upper")
 _PASSIVE = {True: "yes", False: "no", None: "not known, the sensor is not where the force acts"}
 
 
@@ -38,8 +39,30 @@ def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -
             f"{stem}.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
             f"{stem}.md": _describe(scene, found),
         },
+        answer=spell_answer(found, scene.margins(wall.stiffness, wall.virtual_damping)),
         notes=tuple(notes),
     )
+
+
+def spell_answer(found: dict[str, Any], margins: Any) -> tuple[str, ...]:
+    """A recommended wall in two lines, what to set and how far that is from trouble; nothing where there is none."""
+    best, most = found["recommended"], found["maximum"]
+    if best["stiffness"] is None:
+        return ()
+    stiffness, largest = (with_unit(row["stiffness"], "N/m") for row in (best, most))
+    share = f"{100 * best['stiffness_fraction']:g} % of the stiffest stable wall, {largest}"
+    wall = f"K = {stiffness}, B = {with_unit(best['virtual_damping'], 'N s/m')}: {share}"
+    if not best["stable"]:
+        return wall, "NOT stable; choose a smaller stiffness_fraction"
+    lower, upper = (plain(math.nan if (end := best[f"virtual_damping_{side}"]) is None else end) for side in _SIDES)
+    delay = float(margins.delay_margin)
+    apart = (
+        f"gain {plain(float(margins.gain_margin))}",
+        f"phase {plain(float(margins.phase_margin))} degrees",
+        f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
+    )
+    passive = _PASSIVE[best["passive"]]
+    return wall, f"stable for B from {lower} to {upper} N s/m; margins: {', '.join(apart)}; passive: {passive}"
 
 
 def _summarize(

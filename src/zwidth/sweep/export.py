@@ -11,6 +11,7 @@ import numpy as np
 
 from zwidth.errors import StoreError, StoreExistsError
 from zwidth.files.whole import hidden_beside
+from zwidth.formatting import header
 from zwidth.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 from zwidth.sweep.store import open_dataset
 
@@ -45,6 +46,8 @@ def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> Non
 def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
     """Write the results of a small sweep as a table, one row a point, all parameters and outputs in columns.
 
+    Columns in SI units carry their unit, as ``stiffness_N_per_m``; those of normalized quantities none.
+
     Args:
         path: as for `open_dataset`.
         file: the file to make.
@@ -65,7 +68,11 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
     with hidden_beside(target) as partial:
         # What a folder lists first differs from one machine to the next; a table has one order.
         table = rows.to_dataframe(dim_order=sorted(map(str, rows.sizes), key=_place))
-        table[sorted(map(str, table.columns), key=_place)].to_csv(partial, index=bool(dataset.sizes))
+        table = table[sorted(map(str, table.columns), key=_place)]
+        units = {name: str(values.attrs.get("units", "")) for name, values in rows.variables.items()}
+        table.columns = [header(name, units[name]) for name in table.columns]
+        table.index.names = [header(str(name), units.get(name, "")) for name in table.index.names]
+        table.to_csv(partial, index=bool(dataset.sizes))
         os.replace(partial, target)
 
 

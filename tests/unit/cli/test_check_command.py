@@ -4,6 +4,8 @@ import json
 import re
 import subprocess
 import sys
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
+from zwidth.cli.words import passivity_words
 
 DEVICE = ["--mass", "100 g", "--damping", "10", "--delay", "1 periods"]
 RATE = ["--rate", "1 kHz"]
@@ -213,6 +216,35 @@ def test_a_wall_without_stiffness(parts, damping, word):
     assert word in said
     assert "-0 N s/m" not in said
     assert "neither decays nor grows" in said
+
+
+BARELY = "only just, without any physical damping to spare"
+
+
+@pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100)], ids=["rigid", "filter"])
+@pytest.mark.parametrize("delay", [0.0, 1.0 / 3.0, 1.0, 20.0])
+@pytest.mark.parametrize("wall", [(12345.0, 7.3), (777.7, 40.0), (20e3, -5.0), (0.0, 5.0), (1e-3, 0.0)])
+def test_a_wall_on_the_edge_of_the_passive_ones_is_just_passive(wall, delay, velocity):
+    timing = zwidth.Timing(1 / 3000, f"{delay!r} periods")
+
+    def say(damping):
+        scene = zwidth.Scene(zwidth.Device(0.07, damping), timing, zwidth.VirtualWall(*wall), velocity)
+        margin = float(scene.passivity_margin(*wall))
+        verdict: Any = SimpleNamespace(passive=bool(scene.is_passive(*wall)), passivity_margin=margin)
+        return passivity_words(scene, verdict), margin
+
+    # The margin follows the damping one to one; a second time, near the edge, its rounding is that of the edge.
+    needed = 100.0
+    for _ in range(2):
+        needed -= say(needed)[1]
+    assert say(needed)[0] == BARELY
+    assert say(needed * (1 + 1e-6))[0].startswith("yes, with ")
+    assert say(needed * (1 - 1e-6))[0].startswith("no, for want of ")
+
+
+def test_nothing_on_an_undamped_device_is_just_passive():
+    said = run("check", "--stiffness", "0", "--virtual-damping", "0", "--mass", "100 g", *RATE).stdout
+    assert f"  {BARELY}" in said
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from zwidth.config.faults import ConfigFileError
-from zwidth.studies.document import load_config
+from zwidth.config.reader import _Tree, read_mapping
+from zwidth.studies.document import Config, load_config
 
 FOLDER = Path(__file__).parents[2] / "data" / "bad_configs"
 
@@ -181,6 +182,32 @@ def test_faults_and_their_places(name):
         assert line == str(fault)
         assert line.startswith(f"{path}:{start}")
         assert fault.remedy.startswith(remedy)
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_dict_has_the_faults_of_a_file_without_places(name):
+    file = FOLDER / f"{name}.yaml"
+    try:
+        tree = _Tree(str(file), file.read_text(encoding="utf-8-sig"))
+    except ValueError:
+        pytest.skip("no YAML, hence no values")
+    if tree.faults or not isinstance(tree.data, dict):
+        pytest.skip("a fault of the text, which values do not have")
+    with pytest.raises(ConfigFileError) as caught:
+        read_mapping(tree.data, Config)
+    told = {(fault.field, fault.problem, fault.allowed, fault.remedy) for fault in faults_of(file).faults}
+    assert {(fault.field, fault.problem, fault.allowed, fault.remedy) for fault in caught.value.faults} == told
+    assert not any(line.startswith(":") or str(file) in line for line in str(caught.value).split("\n"))
+
+
+def test_a_dict_has_faults_of_its_own():
+    endless = {"version": 1, "name": "endless", 3: 4}
+    endless["studies"] = [endless]
+    with pytest.raises(ConfigFileError) as caught:
+        read_mapping(endless, Config)
+    lines = str(caught.value).split("\n")
+    assert "got the key 3; keys are text; write the name of a field" in lines
+    assert any(line.endswith("the values are nested too deeply; at most 20 levels") for line in lines)
 
 
 def test_a_missing_file():

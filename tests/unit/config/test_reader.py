@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
 from zwidth.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
@@ -157,11 +158,22 @@ def test_configs_are_frozen_and_travel_between_processes():
     assert pickle.loads(pickle.dumps(config)) == config
 
 
+@pytest.mark.parametrize("text", ["1e-3", "no", "0o7", "0x1F", "~", "", "it: is\nmany", "- µ", "true", "1 kHz"])
+def test_what_is_written_is_read_as_it_was(tmp_path, text):
+    study = {"kind": "ridge", "name": "r", "delta": [1e-7, 1e22, 0.1 + 0.2], "d": 0}
+    data = {"version": 1, "name": "n", "description": text, "studies": [study, {**study, "name": "again"}]}
+    (tmp_path / "written.yaml").write_text(write_yaml(data), encoding="utf-8")
+    read = load_config(tmp_path / "written.yaml")
+    assert read == read_mapping(data, Config)
+    assert read.description == text
+
+
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_a_dump_leads_back_to_the_same_config(path):
+def test_a_dump_leads_back_to_the_same_config(path, tmp_path):
     dump = load_config(path).model_dump(mode="json", exclude_none=True)
-    again = Config.model_validate(json.loads(json.dumps(dump)))
-    assert again.model_dump(mode="json", exclude_none=True) == dump
+    (tmp_path / "dump.yaml").write_text(write_yaml(dump), encoding="utf-8")
+    for again in (Config.model_validate(json.loads(json.dumps(dump))), load_config(tmp_path / "dump.yaml")):
+        assert again.model_dump(mode="json", exclude_none=True) == dump
 
 
 def conforms(value, schema, root):

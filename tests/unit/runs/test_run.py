@@ -4,17 +4,19 @@ import json
 import shutil
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import zwidth
 from run_folders import BOTH, SMALL, contents, record_of, states
-from zwidth.errors import ConfigError, StoreExistsError
+from zwidth.errors import ConfigError, InputError, StoreError, StoreExistsError
 from zwidth.runs import run
 from zwidth.runs.run import _list_computations
 from zwidth.studies import Config, Outcome, load_config
 from zwidth.studies.map import MapStudy
+from zwidth.sweep.verify import verify
 
 
 def test_a_run_writes_what_its_record_lists(config, tmp_path):
@@ -42,6 +44,32 @@ def test_the_folder_is_named_after_the_configuration(config, tmp_path, monkeypat
 def test_a_configuration_in_memory_leaves_a_file_that_can_be_run(config, tmp_path):
     result = run(load_config(config), out=tmp_path / "out")
     assert load_config(result.folder / "config.yaml") == load_config(config)
+
+
+def test_a_dict_is_a_configuration_that_can_be_gone_on_with(tmp_path):
+    study = {"kind": "map", "name": "one", "alpha": np.array([0.1, 0.2]), "beta": (0.1, 0.4), "delta": 0.1, "d": 0}
+    swept = {"kind": "sweep", "name": "swept", "axes": {"alpha": np.linspace(0.1, 0.9, 2), "beta": 0.1, "delta": 0.1}}
+    swept["axes"]["d"] = np.int64(1)
+    config = {"version": 1, "name": "small", "description": "1e-3", "studies": [study, swept]}
+    out = tmp_path / "out"
+    assert run(config, out=out).ok
+    read: Any = load_config(out / "config.yaml")
+    assert read.description == "1e-3"
+    np.testing.assert_array_equal(read.studies[0].alpha.values(), study["alpha"])
+    assert all(store.ok for store in verify(out))
+    for again in (config, out / "config.yaml"):
+        assert {study.state for study in run(again, out=out, resume=True).studies if not study.sweep} == {"kept"}
+    (out / "one.npz").write_bytes(b"damaged")
+    assert run(config, out=out, resume=True).repaired == ("one: one.npz is damaged",)
+    study["alpha"] = [0.1, 0.3]
+    with pytest.raises(StoreError, match="alpha"):
+        run(config, out=out, resume=True)
+
+
+@pytest.mark.parametrize("config", [7, None, ["version"]])
+def test_what_is_no_configuration_is_refused(config: Any):
+    with pytest.raises(InputError, match=r"config: got .*path.*dict"):
+        run(config)
 
 
 def test_a_run_tells_when_studies_start_and_end(config, tmp_path):

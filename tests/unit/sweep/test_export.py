@@ -57,7 +57,10 @@ def test_a_table_has_a_row_a_point(folder, tmp_path, monkeypatch):
     with open(tmp_path / "map.csv", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 6
-    assert {"device", "stiffness", "stable", "status", "mass"} <= set(rows[0])
+    assert {"device", "stiffness_N_per_m", "stable", "status", "mass_kg", "rate_Hz", "damping_N_s_per_m"} <= set(
+        rows[0]
+    )
+    assert not {"stiffness", "mass", "rate"} & set(rows[0])
     assert rows[-1]["stable"] == "False"
     monkeypatch.setattr(export, "MAX_CSV_POINTS", 5)
     with pytest.raises(StoreError, match="6 points, a table may have 5; export to netCDF"):

@@ -101,7 +101,7 @@ def test_numbers_of_published_filters(folder):
 def test_names_in_stores_tables_and_netcdf_have_no_dots(folder, tmp_path):
     to_csv(folder / "devices.zarr", tmp_path / "devices.csv")
     header = (tmp_path / "devices.csv").read_text().splitlines()[0].split(",")
-    assert header[:2] == ["damping", "velocity_cutoff"]
+    assert header[:2] == ["damping_N_s_per_m", "velocity_cutoff_Hz"]
     to_netcdf(folder / "walls.zarr", tmp_path / "walls.nc")
     data = open_dataset(folder / "walls.zarr")
     assert data.velocity_cutoff.attrs["units"] == "Hz"

@@ -1,0 +1,43 @@
+"""Completion in shells, as docs/shell-completion.md tells: the scripts are made, and commands are completed."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+PAGE = Path(__file__).resolve().parents[3] / "docs" / "shell-completion.md"
+
+
+def zwidth(**variables):
+    command = [sys.executable, "-m", "zwidth"]
+    done = subprocess.run(
+        command, env={**os.environ, **variables}, capture_output=True, text=True, check=False, timeout=60
+    )
+    return done.stdout
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_of_a_shell_is_made_as_the_page_tells(shell):
+    assert f"`_ZWIDTH_COMPLETE={shell}_source zwidth > " in PAGE.read_text(encoding="utf-8")
+    script = zwidth(_ZWIDTH_COMPLETE=f"{shell}_source")
+    assert f"_ZWIDTH_COMPLETE={shell}_complete" in script
+    if shutil.which(shell):
+        subprocess.run([shell, "-n"], input=script, text=True, check=True, timeout=60)
+
+
+@pytest.mark.parametrize(
+    "words, place, expected",
+    [
+        ("zwidth ver", 1, ["plain,verify"]),
+        ("zwidth figures --ov", 2, []),
+        ("zwidth run --dry", 2, ["plain,--dry-run"]),
+        ("zwidth init quick", 2, ["plain,quickstart"]),
+        ("zwidth init --example tele", 3, ["plain,teleoperation"]),
+    ],
+)
+def test_commands_options_and_examples_are_completed(words, place, expected):
+    told = zwidth(_ZWIDTH_COMPLETE="bash_complete", COMP_WORDS=words, COMP_CWORD=str(place))
+    assert told.split() == expected

@@ -1,0 +1,61 @@
+"""`zwidth run` says what was found, not only where it was written."""
+
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+from zwidth.formatting import plain, with_unit
+from zwidth.studies.recommend_with_parts import spell_answer
+
+HEAD = "version: 1\nname: small\n"
+STUDY = "studies: [{kind: recommend, name: best, stiffness_fraction: %s}]\n"
+SCENES = {
+    "rigid": ("{mass: 0.1, damping: 10, period: 1e-3, delay: 1 ms}", zwidth.BackwardDifference()),
+    "filter": (
+        "{mass: 0.1, damping: 10, period: 1e-3, delay: 1 ms, velocity: {kind: low_pass, cutoff: 100}}",
+        zwidth.LowPass(cutoff=100),
+    ),
+}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+    def run_config(text, *arguments):
+        (tmp_path / "small.yaml").write_text(HEAD + text, encoding="utf-8")
+        result = CliRunner().invoke(cli, ["run", "small.yaml", *arguments], catch_exceptions=False)
+        assert result.exit_code == 0, result.output
+        lines = result.output.splitlines()
+        start = next(k for k, line in enumerate(lines) if line.startswith("1 of 1 done"))
+        return lines[start + 1 :]
+
+    return run_config
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_recommendation_is_told_again_whenever_the_run_is(name, run):
+    scene, velocity = SCENES[name]
+    told = run(f"scene: {scene}\n" + STUDY % 0.5)
+    bare = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), velocity=velocity)
+    top = bare.max_stiffness()
+    wall = 0.5 * float(top.stiffness), float(top.virtual_damping)
+    margins = bare.margins(*wall)
+    first, second = told
+    stiffness, top_stiffness, damping = with_unit(wall[0], "N/m"), with_unit(2 * wall[0], "N/m"), plain(wall[1])
+    share = f"50 % of the stiffest stable wall, {top_stiffness}"
+    assert " ".join(first.split()) == f"best K = {stiffness}, B = {damping} N s/m: {share}"
+    assert f"gain {plain(margins.gain_margin)}, phase {plain(margins.phase_margin)} degrees, delay " in second
+    assert with_unit(float(margins.delay_margin), "s") in second
+    assert second.endswith(f"passive: {'yes' if bare.is_passive(*wall) else 'no'}")
+    assert run(f"scene: {scene}\n" + STUDY % 0.5, "--resume") == told
+
+
+def test_a_recommendation_that_is_not_stable_says_so():
+    best = {"stiffness_fraction": 0.5, "stiffness": 5e3, "virtual_damping": 20.0, "stable": False}
+    found = {"recommended": best, "maximum": {"stiffness": 10e3}}
+    first, second = spell_answer(found, None)
+    assert first.startswith("K = 5.000 kN/m, B = 20.00 N s/m: 50 % of")
+    assert second == "NOT stable; choose a smaller stiffness_fraction"
+    assert spell_answer({**found, "recommended": {**best, "stiffness": None}}, None) == ()

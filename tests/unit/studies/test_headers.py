@@ -1,0 +1,64 @@
+"""The headers of tables: a quantity in SI units carries its unit, a normalized one, a count or a word carries none."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from zwidth.formatting import header
+from zwidth.studies import Config, load_config
+
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
+WORDS = {"label", "curve", "kind", "delay_model", "estimate", "parameter", "enough", "status", "piece"}
+COUNTS = {"number", "islands", "samples", "best"}
+SHARES = {"reserve", "stable_share", "stable_share_low", "stable_share_high"}
+NORMALIZED = {"d", "delta", "omega", "alpha", "beta", "beta_lower", "beta_upper", "alpha_max"}
+NORMALIZED |= {"alpha_max_passive", "beta_passive"}
+PLAIN = WORDS | COUNTS | SHARES | NORMALIZED
+UNITS = tuple(header("", unit) for unit in ("N/m", "N s/m", "s", "m", "m/s", "N", "Hz", "kg"))
+
+
+FILTERS = {
+    "kind": "filters",
+    "name": "f",
+    "cutoff": [100],
+    "samples": [1],
+    "resolution": "20 um",
+    "noise_limit": "1 mm/s",
+}
+
+
+def cheap():
+    """Studies of every kind that writes tables, those that take a second."""
+    configs = [load_config(CONFIGS / f"{name}.yaml") for name in ("quickstart", "compliance", "requirements", "paper")]
+    scene = {"mass": 0.1, "period": 1e-3}
+    configs.append(Config.model_validate({"version": 1, "name": "filters", "scene": scene, "studies": [FILTERS]}))
+    for config in configs:
+        for study in config.studies:
+            if study.name not in ("cutoff", "fig6"):
+                yield pytest.param(study, config.scene, id=f"{config.name}-{study.name}")
+
+
+@pytest.mark.parametrize("study, scene", list(cheap()))
+def test_every_header_says_its_unit(study, scene):
+    outcome = study.compute(scene, True)
+    headers = [list(outcome.table)]
+    headers += [text.splitlines()[0].split(",") for name, text in outcome.documents.items() if name.endswith(".csv")]
+    assert [name for names in headers for name in names if name not in PLAIN and not name.endswith(UNITS)] == []
+    numbers = [name for name in outcome.table if np.asarray(outcome.table[name]).dtype.kind == "U"]
+    assert [name for name in numbers if name not in WORDS and not name.startswith("other_crossings_")] == []
+
+
+@pytest.mark.parametrize(
+    "name, unit, expected",
+    [
+        ("stiffness", "N/m", "stiffness_N_per_m"),
+        ("virtual_damping", "N s/m", "virtual_damping_N_s_per_m"),
+        ("delay", "s", "delay_s"),
+        ("delay", "sampling periods", "delay"),
+        ("alpha", "1", "alpha"),
+        ("samples", "", "samples"),
+    ],
+)
+def test_units_in_headers(name, unit, expected):
+    assert header(name, unit) == expected
