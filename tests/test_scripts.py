@@ -16,7 +16,19 @@ ON_EVERY_CORE = ["--numprocesses", "auto", "--dist", "loadfile"]
 ROOMS = (
     "test_scene.py",
     "test_loop.py",
-    *["parts", "linear", "simulation", "stability", "design", "sweep", "studies", "config", "cli", "figures"],
+    *[
+        "parts",
+        "linear",
+        "simulation",
+        "stability",
+        "design",
+        "sweep",
+        "studies",
+        "config",
+        "cli",
+        "figures",
+        "html_report",
+    ],
 )
 
 # Every call becomes a line in the file "calls"; uv makes an environment whose pytest does the same.

@@ -51,6 +51,9 @@ def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | N
     Raises:
         StoreError: the folder holds no run, or nothing of it is done.
 
+    References:
+        West, Barth, Veditz 2016, Content Security Policy Level 2 (W3C).
+
     Example:
         >>> import tempfile, zwidth
         >>> studies = [{"kind": "ridge", "name": "top", "delta": [0, 1], "d": 1}]

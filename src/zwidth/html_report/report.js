@@ -36,7 +36,7 @@
       }
       painter.putImageData(image, 0, 0);
       sliders.forEach((slider, k) => {
-        const text = `${spell(data.others[k].values[slider.value])} ${data.others[k].unit}`;
+        const text = `${spell(data.others[k].values[slider.value])} ${data.others[k].unit}`.trim();
         slider.setAttribute("aria-valuetext", text);
         slider.parentElement.querySelector("span").textContent = text;
       });

@@ -149,7 +149,7 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, course: Co
         outside = Given(given.start_position, given.start_velocity * period, drawn, history, durations)
         with compute_concretely():
             found = run_lanes(lanes, options, course, outside, rings)
-        return to_si(found, given, instants, period, mass, names)
+        return to_si(found, given, instants, period, mass, names, course.tail)
 
     count = which.size
     size = min(TOGETHER, 1 << (count - 1).bit_length())

@@ -26,7 +26,7 @@ class MotionKind(IntEnum):
 
 
 # A tail this small beside the widest motion is at rest; halves this much alike are steady, and hold so many swings.
-_AT_REST, _ALIKE, _SWINGS, _BEYOND = 1e-9, 0.02, 2, 1e100
+_AT_REST, _STILL, _ALIKE, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 2, 1e100
 
 OF_MOTION = {
     "position": ("position of the device, into the wall", "m"),
@@ -136,7 +136,7 @@ class Motion:
         return data
 
 
-def classify(known: Any, finite: np.ndarray, blur: np.ndarray) -> np.ndarray:
+def classify(known: Any, finite: np.ndarray, blur: np.ndarray, tail: int) -> np.ndarray:
     """How motions end; ``blur`` is by how much the widths of two halves may differ for no reason of the loop's."""
     first, second = known.halves.high - known.halves.low
     changing = np.where(second < first, MotionKind.DECAYING, MotionKind.GROWING)
@@ -145,7 +145,7 @@ def classify(known: Any, finite: np.ndarray, blur: np.ndarray) -> np.ndarray:
     kind = np.where(known.turns.min(0) < _SWINGS, MotionKind.UNCLEAR, kind)
     # A tail of a period or two has not moved for want of time.
     still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest)
-    kind = np.where(still, MotionKind.REST, kind)
+    kind = np.where(still & (tail >= _STILL), MotionKind.REST, kind)
     return np.where(finite & (known.widest < _BEYOND), kind, MotionKind.DIVERGED)
 
 
@@ -160,7 +160,7 @@ def to_si(
     finite = np.isfinite(state.body.x).all(0)
     turns = known.turns.sum(0)
     frequency = (turns - 1) / ((known.last_turn - known.first_turn) * period)
-    outcome = classify(known, finite, 2.0 * given.resolution + 6.0 * given.noise)
+    outcome = classify(known, finite, 2.0 * given.resolution + 6.0 * given.noise, tail)
     # A motion that is lost before it is large was not followed.
     lost = ~finite & (known.widest < _BEYOND)
     columns = {

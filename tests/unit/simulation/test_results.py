@@ -1,0 +1,130 @@
+"""What is said of a motion: how it ends, how wide and how fast it swings, and what a batch makes of odd inputs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth import MotionKind, Status
+from zwidth.errors import InputError
+
+TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
+SCENE = zwidth.Scene(zwidth.Device(mass=0.1, damping=2.0), TIMING)
+COUPLED = zwidth.Scene(zwidth.Device(0.1, 2.0, zwidth.Coupling(0.05, 5e3, 1.0)), TIMING)
+TOP = SCENE.max_stiffness()
+
+
+@pytest.mark.parametrize("share, periods, kind", [(0.5, 200, "DECAYING"), (1.1, 400, "GROWING"), (0.5, 4000, "REST")])
+def test_a_linear_motion_ends_as_its_poles_say(share, periods, kind):
+    found = SCENE.simulate(share * TOP.stiffness, TOP.virtual_damping, start_position=1e-3, periods=periods)
+    assert MotionKind(found.outcome).name == kind
+    assert (found.trend < 1) == (share < 1) or kind == "REST"
+
+
+def test_an_undamped_swing_is_steady():
+    free = zwidth.Scene(zwidth.Device(mass=0.1, damping=0.5), zwidth.Timing(period=1e-3))
+    found = free.simulate(1e3, 0.0, start_position=1e-3, periods=4000)
+    assert MotionKind(found.outcome) is MotionKind.STEADY
+    assert found.trend == pytest.approx(float(free.spectral_radius(1e3, 0.0)) ** 500, rel=1e-3)
+    assert found.amplitude == pytest.approx(1e-3, rel=0.02)
+    assert found.frequency == pytest.approx(np.sqrt(1e3 / 0.1) / (2 * np.pi), rel=1e-2)
+
+
+@pytest.mark.parametrize("periods", [1, 3, 16, 64])
+def test_too_few_swings_are_not_judged(periods):
+    found = SCENE.simulate(1.2 * TOP.stiffness, TOP.virtual_damping, start_position=1e-3, periods=periods)
+    assert MotionKind(found.outcome) is MotionKind.UNCLEAR
+
+
+def test_the_steps_of_an_encoder_make_no_trend():
+    stiffness = np.linspace(1e3, 0.9 * float(TOP.stiffness), 200)
+    found = SCENE.simulate(stiffness, 20.0, start_position=1e-4, resolution=2e-5, periods=4000, record=False)
+    stable = SCENE.is_stable(stiffness, 20.0)
+    assert stable.sum() > 100
+    assert set(found.outcome[stable].tolist()) == {MotionKind.REST, MotionKind.STEADY}
+
+
+def test_the_amplitude_is_that_of_the_whole_tail():
+    found = SCENE.simulate(1.1 * TOP.stiffness, TOP.virtual_damping, start_position=1e-3, periods=200, tail=60)
+    tail = found.position[-60:]
+    assert found.amplitude == pytest.approx(0.5 * np.ptp(tail))
+    assert found.trend == pytest.approx(np.ptp(tail[30:]) / np.ptp(tail[:30]))
+
+
+def test_a_motion_beyond_all_numbers_diverges_without_a_warning():
+    found = SCENE.simulate(1e7, 0.0, start_position=1e-3, periods=3000)
+    assert MotionKind(found.outcome) is MotionKind.DIVERGED
+    assert found.amplitude == np.inf
+    assert found.status == Status.OK
+
+
+def test_what_rests_has_no_frequency_and_without_friction_nothing_sticks():
+    held = SCENE.simulate(5e3, 5.0, start_position=1e-5, coulomb=1.0)
+    assert MotionKind(held.outcome) is MotionKind.REST
+    assert np.isnan(held.frequency)
+    assert held.sticking.all()
+    assert not SCENE.simulate(5e3, 5.0, start_position=1e-5).sticking.any()
+
+
+def test_an_array_of_scenes_is_a_batch():
+    scenes = np.empty((2, 1), object)
+    scenes[:, 0] = SCENE, COUPLED
+    found = zwidth.simulate(scenes, [1e3, 2e3], 5.0, start_position=1e-3, periods=50)
+    assert found.position.shape == (2, 2, 50)
+    for row, scene in enumerate((SCENE, COUPLED)):
+        alone = scene.simulate([1e3, 2e3], 5.0, start_position=1e-3, periods=50)
+        np.testing.assert_allclose(found.position[row], alone.position, rtol=1e-12)
+
+
+def test_scenes_without_jitter_have_instants_beside_some_that_have_it():
+    found = zwidth.simulate([SCENE, COUPLED], 1e3, 5.0, jitter=[0.0, 3e-4], start_position=1e-3, periods=20)
+    np.testing.assert_allclose(found.time[0], 1e-3 * np.arange(20))
+    late = found.time[1] - 1e-3 * np.arange(20)
+    assert late[0] == 0
+    assert np.all((late >= 0) & (late <= 3e-4))
+    assert late.max() > 0
+
+
+@pytest.mark.parametrize(
+    "scenes, options, words",
+    [
+        (None, {}, "scenes: got None"),
+        (3, {}, "scenes: got 3"),
+        ([SCENE, "x"], {}, "scenes: got 'x'"),
+        (SCENE, {"seed": [[1], [2, 3]]}, "seed: got"),
+        (SCENE, {"stiffness": np.ones(0)}, "one simulation at least"),
+        ([], {}, "one simulation at least"),
+        (SCENE, {"push_history": np.zeros((3, 10)), "stiffness": [1.0, 2.0]}, "push_history"),
+        (SCENE, {"push_history": [0.0] * 9 + [np.nan]}, "push_history: got a force that is not finite"),
+    ],
+)
+def test_what_cannot_be_simulated_is_named(scenes, options, words):
+    with pytest.raises(InputError, match=words):
+        zwidth.simulate(scenes, **{"stiffness": 1e3, "virtual_damping": 1.0, "periods": 10, **options})
+
+
+def test_a_gap_in_one_history_spoils_no_other():
+    pushes = np.ones((3, 20))
+    pushes[1, 5] = np.nan
+    found = SCENE.simulate(1e3, 5.0, push_history=pushes, periods=20)
+    assert found.status.tolist() == [Status.OK, Status.INVALID_INPUT, Status.OK]
+    assert np.isnan(found.position[1]).all()
+    np.testing.assert_array_equal(found.position[0], found.position[2])
+
+
+def test_an_adaptive_window_takes_a_line_that_misses_by_just_its_bound():
+    """A ramp of a count a period, read by an encoder: every window fits, and the longest is taken."""
+    quantum = 1e-5
+    scene = zwidth.Scene(zwidth.Device(1.0), TIMING, velocity=zwidth.FOAW(noise=quantum, samples=8))
+    found = scene.simulate(0.0, 0.0, start_velocity=0.5 * quantum / 1e-3, resolution=quantum, periods=60)
+    past = found.measured
+    for k in range(10, 60):
+        allowed = []
+        for n in range(1, 9):
+            slope = (past[k] - past[k - n]) / n
+            missed = [abs(past[k - j] - (past[k] - slope * j)) for j in range(1, n)]
+            if max(missed, default=0.0) > quantum * (1 + 1e-9):
+                break
+            allowed.append(slope / 1e-3)
+        assert found.estimated_velocity[k] == pytest.approx(allowed[-1], rel=1e-12)
