@@ -151,8 +151,14 @@ def classify(known: Any, finite: np.ndarray, blur: np.ndarray, tail: int) -> np.
 
 @np.errstate(all="ignore")
 def to_si(
-    found: Any, given: Any, instants: np.ndarray | None, period: np.ndarray, mass: np.ndarray, bodies: Any
-) -> Any:
+    found: Any,
+    given: Any,
+    instants: np.ndarray | None,
+    period: np.ndarray,
+    mass: np.ndarray,
+    bodies: tuple[str, ...],
+    tail: int,
+) -> dict[str, np.ndarray]:
     """Columns of one row a simulation, by the names of `Motion`; ``bodies`` names the positions of all bodies."""
     state, reading, frame = found
     known, force = state.summary, mass / period**2
