@@ -10,7 +10,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
+
+import zwidth
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -91,6 +94,22 @@ def test_every_dependency_is_pinned_within_its_bounds():
         if requirement.name != project["name"] and not requirement.specifier.contains(pins[requirement.name])
     ]
     assert outside == []
+
+
+def test_the_citation_is_of_this_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == project["version"] == zwidth.__version__
+    assert citation["license"] == project["license"]
+    assert citation["keywords"] == project["keywords"]
+    # What the format, 1.2.0, asks for.
+    assert {"cff-version", "message", "title", "authors"} <= citation.keys()
+    for work in (citation, *citation["references"]):
+        assert work["title"]
+        assert all({"name"} <= author.keys() or {"family-names"} <= author.keys() for author in work["authors"])
+    (paper,) = citation["references"]
+    assert (paper["type"], paper["year"]) == ("conference-paper", 2006)
+    assert [author["family-names"] for author in paper["authors"]] == ["Hulin", "Preusche", "Hirzinger"]
 
 
 @pytest.mark.parametrize("what", FOREIGN_TEXT)

@@ -230,25 +230,59 @@ class Slice(click.ParamType):
         self.fail(f"got {value!r}; write NAME=VALUE, as in delta=0.1", param, ctx)
 
 
+class FigureSize(click.ParamType):
+    """Width and height in inches: ``7x4.5``."""
+
+    name = "WxH"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Parse one option."""
+        if isinstance(value, tuple):
+            return value
+        try:
+            width, height = (float(part) for part in str(value).lower().split("x"))
+        except ValueError:
+            width = height = 0.0
+        if 1 <= width <= 100 and 1 <= height <= 100:
+            return width, height
+        self.fail(f"got {value!r}; write width x height from 1 to 100 inches, as in 7x4.5", param, ctx)
+
+
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--at", multiple=True, type=Slice(), help="Draw this slice, as in --at delta=0.1 --at d=1.")
+@click.option("--x", metavar="NAME", help="The parameter from left to right.")
+@click.option("--y", metavar="NAME", help="The parameter from bottom to top, of a plane.")
+@click.option("--hue", metavar="NAME", help="Draw curves, one for each value of this parameter.")
+@click.option("--col", metavar="NAME", help="A panel for each value of this parameter, all others at their first.")
+@click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
+              help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
+@click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
+@click.option("--size", type=FigureSize(), help="Width and height in inches, as in 7x4.5.")
+@click.option("--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
 @json_option
-def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool) -> None:
+def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool, **drawing: Any) -> None:
     """Draw the sweeps in DIR, as PNG and SVG.
 
     Stable and passive walls with their boundaries, contours of margins and settling times, surfaces of the stiffest
     wall. --at chooses slices by the nearest value that the sweep has, in the units of the store; without it up to
     three values of a parameter have a panel each.
     """
-    from zwidth.runs.draw import draw_stores
+    from zwidth.runs.draw import Drawing, draw_stores
 
     files = draw_stores(
-        folder, out, at=dict(at), progress=None if as_json else lambda file: click.echo(f"wrote {file}")
+        folder,
+        out,
+        at=dict(at),
+        drawing=Drawing(**drawing),
+        progress=None if as_json else lambda file: click.echo(f"wrote {file}"),
+        note=lambda text: click.echo(f"zwidth: {text}", err=True),
     )
     if as_json:
         click.echo(json.dumps({"files": [str(file) for file in files]}, indent=2))
+    if not files:
+        raise SystemExit(_EXIT_FAILED)
 
 
 COMMANDS = (run, verify, export, figures)

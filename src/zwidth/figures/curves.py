@@ -22,20 +22,33 @@ _CURVES = 9
 
 
 @style.house_style()
-def draw_curves(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = None) -> np.ndarray:
+def draw_curves(
+    data: xarray.Dataset,
+    name: str,
+    axes: style.AnyAxes | None = None,
+    *,
+    x: str | None = None,
+    hue: str | None = None,
+    col: str | None = None,
+) -> np.ndarray:
     """Draw an output of a sweep over one parameter, a curve for each value of another one, panels for a third.
 
     Args:
         data: results of a sweep, as `zwidth.open_dataset` gives them, or a part of them.
         name: the output, a number.
         axes: Axes of yours, one for each panel or fewer.
+        x: the parameter from left to right; the one with most values of the first two that vary where left out.
+        hue: the one that has a curve for each of its values.
+        col: the one of the panels; all others are then at their first value.
     """
     output, data = OUTPUTS[name], grid.prepare(data, [name])
-    dims = sorted(grid.choose_axes(data, name), key=lambda dim: -data.sizes[dim])
+    dims = grid.choose_axes(data, name, x, but=(hue, col))
+    dims = dims if x else sorted(dims, key=lambda dim: -data.sizes[dim])
     if not dims:
         raise InputError(f"name: {name!r} varies over no parameter that it could be drawn over")
-    x, several = dims[0], [*dims[1:], *[dim for dim in reversed(grid.list_varied(data, name)) if dim not in dims]][:1]
-    parts, columns = grid.panels(data, [x, *several])
+    x, others = dims[0], [dim for dim in reversed(grid.list_varied(data, name)) if dim not in (*dims, col)]
+    several = [hue] if hue else [*dims[1:], *others][:1]
+    parts, columns = grid.panels(data, [x, *several], col=col)
     panels = panel_grid(axes, len(parts), columns)
     picked = style.pick_evenly(data.sizes[several[0]], _CURVES) if several else [0]
     labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]

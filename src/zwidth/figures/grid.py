@@ -31,10 +31,14 @@ def list_varied(data: xarray.Dataset, name: str) -> list[str]:
     return [str(dim) for dim in data[name].dims if data.sizes[dim] > 1]
 
 
-def choose_axes(data: xarray.Dataset, name: str) -> list[str]:
-    """One or two parameters that a variable is drawn over."""
+def choose_axes(
+    data: xarray.Dataset, name: str, x: str | None = None, y: str | None = None, *, but: Sequence[str | None] = ()
+) -> list[str]:
+    """One or two parameters that a variable is drawn over: those given, and the first others that it varies over."""
     dims = list_varied(data, name)
-    return [dim for dim in _ORDER if dim in dims][:2]
+    free = iter([dim for dim in _ORDER if dim in dims and dim not in (x, y, *but)])
+    axes = [x or next(free, None), y or next(free, None)]
+    return [dim for dim in axes if dim is not None]
 
 
 def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
@@ -78,15 +82,21 @@ def _readable(values: np.ndarray, unit: str) -> tuple[float, str]:
     return style.si_unit(float(np.max(np.abs(values))), unit)
 
 
-def panels(data: xarray.Dataset, over: list[str], plane: Sequence[str] = ()) -> tuple[list[xarray.Dataset], int]:
+def panels(
+    data: xarray.Dataset, over: list[str], plane: Sequence[str] = (), col: str | None = None
+) -> tuple[list[xarray.Dataset], int]:
     """A part of a dataset for each panel, and how many panels are beside each other.
 
     Args:
         data: as `prepare` gives it.
         over: the dimensions that a panel has; the last two others vary from panel to panel.
         plane: those of them that are drawn as a plane, which resolves so many values and no more.
+        col: the one dimension that varies from panel to panel; all others are at their first value.
     """
     free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
+    if col is not None:
+        data = data.isel(dict.fromkeys([dim for dim in free if dim != col], 0))
+        free = [col]
     data = data.isel(dict.fromkeys(free[:-2], 0))
     free = free[-2:]
     picked = [style.pick_evenly(data.sizes[dim], _MANY_PANELS if len(free) == 1 else _ACROSS) for dim in free]

@@ -35,7 +35,15 @@ _PEAK: dict[str, Any] = {"marker": "o", "markersize": 5, "markerfacecolor": "whi
 
 
 @style.house_style()
-def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = None) -> np.ndarray:
+def draw_plane(
+    data: xarray.Dataset,
+    name: str,
+    axes: style.AnyAxes | None = None,
+    *,
+    x: str | None = None,
+    y: str | None = None,
+    col: str | None = None,
+) -> np.ndarray:
     """Draw an output of a sweep over two parameters, a panel for each of some values of the others.
 
     Truth values are shown as regions within their boundary, ``passive`` over ``stable`` where both are known; numbers
@@ -46,15 +54,18 @@ def draw_plane(data: xarray.Dataset, name: str, axes: style.AnyAxes | None = Non
         data: results of a sweep, as `zwidth.open_dataset` gives them, or a part of them.
         name: the output.
         axes: Axes of yours, one for each panel or fewer.
+        x: the parameter from left to right; stiffness or the first that varies where left out.
+        y: the one from bottom to top.
+        col: the one of the panels; all others are then at their first value.
 
     Raises:
         InputError: the output varies over less than two parameters.
     """
-    dims = grid.choose_axes(data, name)
+    dims = grid.choose_axes(data, name, x, y, but=(col,))
     if len(dims) < 2:
         raise InputError(f"name: {name!r} varies over less than two parameters, a plane needs them")
     x, y = dims
-    parts, columns = grid.panels(_add_peak(data, _select_drawn(data, name), x, y), dims, plane=dims)
+    parts, columns = grid.panels(_add_peak(data, _select_drawn(data, name), x, y), dims, plane=dims, col=col)
     panels = panel_grid(axes, len(parts), columns)
     parts = [part.compute() for part in parts[: len(panels)]]
     norm, image = _norm(parts, name), None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -16,6 +17,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+
+from zwidth.errors import InputError
 
 # Okabe and Ito's palette, told apart with any color vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -38,6 +41,9 @@ AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 
 WIDTH = 7.0  # inches: both columns of a journal page
 PNG_DPI = 180
+
+# Dates and versions out of the files, for the same figure is to give the same bytes.
+_METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 _RC: Any = {
     "font.family": "sans-serif",
@@ -77,11 +83,31 @@ _RC: Any = {
 }
 
 
+# What a user's style sheet changes of it.
+_changes: ContextVar[Any] = ContextVar("changes", default=None)
+
+
 @contextmanager
 def house_style() -> Iterator[None]:
     """Draw and save within this look; the settings of before return at the end. Serves as a decorator, too."""
-    with matplotlib.rc_context(_RC):
+    with matplotlib.rc_context({**_RC, **(_changes.get() or {})}):
         yield
+
+
+@contextmanager
+def style_sheet(file: Path | None) -> Iterator[None]:
+    """Let a style sheet of matplotlib have the last word on the look."""
+    token = None
+    if file is not None:
+        try:
+            token = _changes.set(dict(matplotlib.rc_params_from_file(file, use_default_template=False)))
+        except OSError as error:
+            raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
+    try:
+        yield
+    finally:
+        if token is not None:
+            _changes.reset(token)
 
 
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
@@ -165,18 +191,35 @@ def figure_of(drawn: AnyAxes | Figure) -> Figure:
     return figure
 
 
-def save(drawn: AnyAxes | Figure, stem: Path) -> tuple[Path, Path]:
-    """Write the figure of some Axes as ``stem.png`` and ``stem.svg``; the same figure gives the same bytes."""
+def save(
+    drawn: AnyAxes | Figure,
+    stem: Path,
+    formats: Sequence[str] = ("png", "svg"),
+    dpi: float | None = None,
+    size: tuple[float, float] | None = None,
+) -> tuple[Path, ...]:
+    """Write the figure of some Axes as ``stem.png`` and so on; the same figure gives the same bytes.
+
+    Args:
+        drawn: the figure, or Axes of it.
+        stem: the files' name without its ending.
+        formats: the endings, of "png", "svg" and "pdf".
+        dpi: dots an inch, also of maps within an SVG or a PDF.
+        size: width and height in inches; as it was drawn where left out.
+    """
     figure = figure_of(drawn)
-    png, svg = stem.with_name(stem.name + ".png"), stem.with_name(stem.name + ".svg")
+    if size is not None:
+        figure.set_size_inches(*size)
+    files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
     engine = figure.get_layout_engine()
     with house_style():
-        figure.savefig(png, dpi=PNG_DPI, metadata={"Software": None})
-        # What is laid out once need not be again: it is half of the work.
-        figure.set_layout_engine("none")
-        figure.savefig(svg, metadata={"Date": None})
+        for file in files:
+            usual = PNG_DPI if file.suffix == ".png" else "figure"
+            figure.savefig(file, dpi=dpi or usual, metadata=_METADATA[file.suffix])
+            # What is laid out once need not be again: it is half of the work.
+            figure.set_layout_engine("none")
     figure.set_layout_engine(engine)
-    return png, svg
+    return files
 
 
 def ordered_colors(count: int) -> list[Any]:

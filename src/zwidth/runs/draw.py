@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,9 +13,10 @@ import numpy as np
 
 from zwidth.errors import InputError, StoreError
 from zwidth.figures.curves import draw_curves, draw_outlines, find_outlines
-from zwidth.figures.grid import choose_axes
+from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
-from zwidth.figures.style import save
+from zwidth.figures.style import save, style_sheet
+from zwidth.formatting import short
 from zwidth.quantities import OUTPUTS
 from zwidth.sweep.store import SUFFIX, find_stores, open_dataset
 
@@ -27,12 +29,34 @@ FOLDER = "figures"
 _SURFACE = 6
 
 
+@dataclass(frozen=True)
+class Drawing:
+    """Which parameters a figure is drawn over, and how its files are written."""
+
+    x: str | None = None  # from left to right
+    y: str | None = None  # from bottom to top, of a plane
+    hue: str | None = None  # a curve for each of its values
+    col: str | None = None  # a panel for each of its values
+    formats: tuple[str, ...] = ("png", "svg")
+    dpi: float | None = None
+    size: tuple[float, float] | None = None  # in inches
+    style: Path | None = None  # a style sheet of matplotlib
+
+    @property
+    def axes(self) -> dict[str, str]:
+        """The parameters that are given, as stores spell them, by what they are."""
+        named = {"x": self.x, "y": self.y, "hue": self.hue, "col": self.col}
+        return {role: name.replace(".", "_") for role, name in named.items() if name}
+
+
 def draw_stores(
     path: str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,
     *,
     at: Mapping[str, float | str] | None = None,
+    drawing: Drawing | None = None,
     progress: Callable[[Path], None] | None = None,
+    note: Callable[[str], None] | None = None,
 ) -> tuple[Path, ...]:
     """Draw the sweeps in a store, or in all stores of a folder, as PNG and SVG.
 
@@ -41,16 +65,19 @@ def draw_stores(
         out: where the figures go; ``figures`` beside the stores where left out. Figures that are there are replaced.
         at: values of parameters by name, in the units of the store, or the label of a device: the slices to draw. The
             nearest values that the sweep has are taken; of a parameter that is not given, up to three are shown.
+        drawing: the axes to draw over and the kind of files; chosen from the sweep where left out.
         progress: called with every file when it is there.
+        note: called with what a reader should know: values that differ from those wanted, stores without a figure.
 
     Returns:
         The files.
 
     Raises:
         StoreError: there is no store, or one is damaged.
-        InputError: no sweep has a parameter of ``at``, or not the device.
+        InputError: no sweep has a parameter of ``at`` or of the axes, or not the device; a value lies beyond what a
+            sweep has by more than half a step; the style sheet cannot be read.
     """
-    folder = Path(os.fsdecode(path))
+    folder, drawing, note = Path(os.fsdecode(path)), drawing or Drawing(), note or (lambda text: None)
     stores = find_stores(folder)
     if not stores:
         raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
@@ -62,33 +89,84 @@ def draw_stores(
     unknown = [name for name in wanted if name not in known]
     if unknown:
         raise InputError(f"at: no sweep in {folder} varies {unknown[0]!r}; choose from {', '.join(known)}")
-    slices = {
-        store: data.isel({str(dim): _nearest(data, str(dim), wanted[str(dim)]) for dim in data.dims if dim in wanted})
-        for store, data in datasets.items()
-    }
-    target.mkdir(parents=True, exist_ok=True)
+    slices = {store: _cut(store, data, wanted, note) for store, data in datasets.items()}
+    _check_axes(drawing.axes, slices)
     files = []
-    for store, data in slices.items():
-        for name, draw in figures_of(data):
-            for file in save(draw(), target / f"{store.name.removesuffix(SUFFIX)}_{name}"):
-                files.append(file)
-                (progress or (lambda file: None))(file)
+    with style_sheet(drawing.style):
+        for store, data in slices.items():
+            drawn = list(figures_of(data, drawing.axes))
+            if not drawn:
+                note(f"{store.name}: no figure, for {_explain_absence(data, drawing.axes)}")
+            for name, draw in drawn:
+                target.mkdir(parents=True, exist_ok=True)
+                stem = target / f"{store.name.removesuffix(SUFFIX)}_{name}"
+                for file in save(draw(), stem, drawing.formats, drawing.dpi, drawing.size):
+                    files.append(file)
+                    (progress or (lambda file: None))(file)
     return tuple(files)
 
 
-def figures_of(data: xarray.Dataset) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The name of each figure of a sweep, or of a part of one, and what draws it."""
+def _check_axes(axes: Mapping[str, str], slices: Mapping[Path, xarray.Dataset]) -> None:
+    """Refuse axes that no sweep has, or that exclude each other."""
+    varied = sorted({str(dim) for data in slices.values() for dim, size in data.sizes.items() if size > 1})
+    if "y" in axes and "hue" in axes:
+        raise InputError("y, hue: got both; a plane has y, curves have a hue, give one of them")
+    for role, name in axes.items():
+        first = next(other for other, value in axes.items() if value == name)
+        if first != role:
+            raise InputError(f"{role}: got {name!r}, which is {first} already; choose another")
+        if name not in varied:
+            others = f"choose from {', '.join(varied)}" if varied else "a single point is left"
+            raise InputError(f"{role}: no sweep that is drawn varies {name!r}; {others}")
+        if name == "device" and role in ("x", "y"):
+            raise InputError(f"{role}: devices have no order; draw them with hue or col")
+
+
+def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
+    """Why nothing of a sweep is drawn."""
+    varied = [str(dim) for dim, size in data.sizes.items() if size > 1]
+    missing = ", ".join(name for name in axes.values() if name not in varied)
+    if not varied:
+        return "it is a single point"
+    return (
+        f"it varies over {', '.join(varied)}, {f'not over {missing}' if missing else 'which draws none of its outputs'}"
+    )
+
+
+def figures_of(data: xarray.Dataset, axes: Mapping[str, str] | None = None) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """The name of each figure of a sweep, or of a part of one, and what draws it; over some axes by what they are."""
+    given = dict(axes or {})
     for name in map(str, data.data_vars):
         if name not in OUTPUTS or name == "kind" or (name == "passive" and "stable" in data):
             continue
-        axes = choose_axes(data, name)
-        few = OUTPUTS[name].family == "device" and min((data.sizes[axis] for axis in axes), default=0) < _SURFACE
-        if len(axes) == 2 and not few:
-            yield name, partial(draw_plane, data, name)
-        elif axes and OUTPUTS[name].dtype == "float64":
-            yield name, partial(draw_curves, data, name)
-    if find_outlines(data):
+        if not set(given.values()) <= set(list_varied(data, name)):
+            continue
+        x, y, col = (given.get(role) for role in ("x", "y", "col"))
+        over = choose_axes(data, name, x, y, but=(given.get("hue"), col))
+        few = OUTPUTS[name].family == "device" and min((data.sizes[axis] for axis in over), default=0) < _SURFACE
+        if y or (len(over) == 2 and not few and "hue" not in given):
+            if len(over) == 2:
+                yield name, partial(draw_plane, data, name, **given)
+        elif over and OUTPUTS[name].dtype == "float64":
+            yield name, partial(draw_curves, data, name, **given)
+    if not given and find_outlines(data):
         yield "boundaries", partial(draw_outlines, data)
+
+
+def _cut(
+    store: Path, data: xarray.Dataset, wanted: Mapping[str, float | str], note: Callable[[str], None]
+) -> xarray.Dataset:
+    """The slice of a sweep that is nearest to what is wanted of it."""
+    places = {str(dim): _nearest(data, str(dim), wanted[str(dim)]) for dim in data.dims if dim in wanted}
+    for dim, place in places.items():
+        if dim != "device" and not np.isclose(float(data[dim][place]), float(wanted[dim]), rtol=1e-9, atol=0.0):
+            taken = _spell(float(data[dim][place]), data[dim].attrs["units"])
+            note(f"{store.name}: {dim} = {taken}, the nearest to {wanted[dim]} that the sweep has")
+    return data.isel(places)
+
+
+def _spell(value: float, unit: str) -> str:
+    return f"{short(value)} {unit}".removesuffix(" 1")
 
 
 def _nearest(data: xarray.Dataset, dim: str, value: float | str) -> int:
@@ -98,10 +176,19 @@ def _nearest(data: xarray.Dataset, dim: str, value: float | str) -> int:
         if str(value) not in labels:
             raise InputError(f"at: there is no device {str(value)!r}; choose from {', '.join(labels)}")
         return labels.index(str(value))
+    unit = data[dim].attrs["units"]
     try:
         wanted = float(value)
     except ValueError as error:
-        raise InputError(f"at: {dim}: got {value!r}; write a number in {data[dim].attrs['units']}") from error
+        raise InputError(f"at: {dim}: got {value!r}; write a number in {unit}") from error
     if not np.isfinite(wanted):
         raise InputError(f"at: {dim}: got {value!r}; write a finite number")
-    return int(np.argmin(np.abs(np.asarray(data[dim].values, dtype=float) - wanted)))
+    values = np.asarray(data[dim].values, dtype=float)
+    place, ordered = int(np.argmin(np.abs(values - wanted))), np.sort(values)
+    # Half a step beyond either end; a single value has none.
+    steps = np.diff(ordered) if values.size > 1 else np.zeros(1)
+    slack = 1e-9 * abs(wanted)
+    if not ordered[0] - 0.5 * steps[0] - slack <= wanted <= ordered[-1] + 0.5 * steps[-1] + slack:
+        has = " to ".join(_spell(float(end), unit) for end in dict.fromkeys((ordered[0], ordered[-1])))
+        raise InputError(f"at: {dim}: got {_spell(wanted, unit)}, the sweep has {has}; choose a value that it has")
+    return place

@@ -124,7 +124,9 @@ def test_responses_that_are_alike_are_two_all_the_same():
 def test_every_function_takes_axes_last_and_returns_them():
     for name in (name for name in dir(figures) if name.startswith("draw_")):
         signature = inspect.signature(getattr(figures, name))
-        (where,) = [each for each in signature.parameters.values() if each.default is None]
+        places = [each for each in signature.parameters.values() if each.kind is not inspect.Parameter.KEYWORD_ONLY]
+        (where,) = [each for each in places if each.default is None]
+        assert where is places[-1], name
         assert where.name == ("ax" if name == "draw_zero_stiffness" else "axes"), name
         assert signature.return_annotation == ("Axes" if where.name == "ax" else "np.ndarray"), name
 

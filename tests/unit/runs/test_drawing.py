@@ -1,0 +1,189 @@
+"""Figures of sweeps as somebody wants them: slices, axes, kinds of files, sizes, and why there are none."""
+
+import re
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from sweeping import config_of, main_of, run_sweeps, study
+from zwidth.errors import InputError
+from zwidth.figures import draw_curves, draw_plane
+from zwidth.figures.style import figure_of
+from zwidth.runs import draw
+from zwidth.runs.draw import Drawing, draw_stores
+from zwidth.sweep.store import open_dataset
+
+AXES = {
+    "mass": [0.1, 0.2, 0.5],
+    "damping": {"linear": {"start": 1, "stop": 10, "num": 7}},
+    "rate": {"log": {"start": 500, "stop": 4000, "num": 8}},
+    "delay": ["0 periods", "1 periods"],
+}
+WALLS = {"alpha": [0.1, 0.5, 0.9], "beta": [0.1, 0.4], "delta": [0.05, 0.1, 0.2, 0.4], "d": [0, 1]}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    studies = [
+        study("ridge", axes=AXES, outputs=("stiffness_max", "kind")),
+        study("walls", axes=WALLS, outputs=("stable", "margin")),
+        study("point", axes={"alpha": 0.1, "beta": 0.1, "delta": 0.1, "d": 1}),
+    ]
+    assert run_sweeps(config_of(*studies), folder).ok
+    return folder
+
+
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """Draws without writing, and returns the Axes of each figure by its name, and the notes."""
+    found, notes = {}, []
+    monkeypatch.setattr(draw, "save", lambda axes, stem, *_: found.setdefault(stem.name, axes) is None or (stem,))
+
+    def draw_over(path, at=None, **axes):
+        found.clear()
+        notes.clear()
+        draw_stores(path, tmp_path, at=at, drawing=Drawing(**axes), note=notes.append)
+        return found, notes
+
+    return draw_over
+
+
+@pytest.mark.parametrize(
+    "wanted, taken, told",
+    [
+        ("0.2", 0.2, []),
+        (0.2 * (1 + 1e-12), 0.2, []),
+        ("0.21", 0.2, ["ridge.zarr: mass = 0.2 kg, the nearest to 0.21 that the sweep has"]),
+        ("0.64", 0.5, ["ridge.zarr: mass = 0.5 kg, the nearest to 0.64 that the sweep has"]),
+        ("0.06", 0.1, ["ridge.zarr: mass = 0.1 kg, the nearest to 0.06 that the sweep has"]),
+    ],
+)
+def test_a_value_that_the_sweep_has_not_is_told(folder, drawn, wanted, taken, told):
+    found, notes = drawn(folder / "ridge.zarr", {"mass": wanted})
+    assert rf"$m = {taken:g}\,\mathrm{{kg}}$" in found["ridge_stiffness_max"][0].get_title(loc="left")
+    assert notes == told
+
+
+@pytest.mark.parametrize("wanted", ["9", "0.66", "0.04", "-0.1"])
+def test_a_value_beyond_half_a_step_is_refused(folder, drawn, wanted):
+    with pytest.raises(InputError, match=rf"at: mass: got {wanted} kg, the sweep has 0.1 kg to 0.5 kg; choose"):
+        drawn(folder / "ridge.zarr", {"mass": wanted})
+    # A single value has no steps.
+    with pytest.raises(InputError, match=r"at: mass: got 0.11 kg, the sweep has 0.1 kg; choose"):
+        draw._nearest(open_dataset(folder / "ridge.zarr").isel(mass=[0]), "mass", 0.11)
+
+
+def test_curves_over_the_axes_that_are_wanted(folder, drawn):
+    found, notes = drawn(folder, x="rate", hue="delay", col="mass")
+    assert list(found) == ["ridge_stiffness_max"]
+    assert notes == [
+        "point.zarr: no figure, for it is a single point",
+        "walls.zarr: no figure, for it varies over alpha, beta, delta, d, not over rate, delay, mass",
+    ]
+    kept = open_dataset(folder / "ridge.zarr").stiffness_max.isel(damping=0)
+    axes = found["ridge_stiffness_max"]
+    assert len(axes) == 3
+    for mass, ax in enumerate(axes):
+        assert len(ax.lines) == 2
+        for delay, line in enumerate(ax.lines):
+            np.testing.assert_allclose(line.get_xdata(), kept.rate.values / 1e3, rtol=1e-15)
+            np.testing.assert_allclose(line.get_ydata(), kept.isel(mass=mass, delay=delay).values / 1e3, rtol=1e-15)
+
+
+def test_a_plane_over_the_axes_that_are_wanted(folder, drawn):
+    found, _ = drawn(folder / "ridge.zarr", x="rate", y="mass", col="delay")
+    axes = found["ridge_stiffness_max"]
+    kept = open_dataset(folder / "ridge.zarr").stiffness_max.isel(damping=0)
+    for delay, ax in enumerate(axes):
+        np.testing.assert_allclose(
+            ax.collections[0].get_array(), kept.isel(delay=delay).transpose("mass", "rate").values / 1e3, rtol=1e-15
+        )
+    assert figure_of(axes).get_supxlabel().startswith("sampling rate")
+
+
+def test_an_axis_alone_leaves_the_others_to_the_program(folder):
+    data = open_dataset(folder / "walls.zarr").load()
+    (ax, *_) = draw_plane(data, "margin", x="delta")
+    assert ax.collections[0].get_array().shape == (3, 4)
+    # Those of the walls, which come first, are taken for colors and panels.
+    axes = draw_curves(data, "margin", hue="alpha", col="beta")
+    assert len(axes) == 2
+    np.testing.assert_array_equal(axes[1].lines[2].get_xdata(), data.delta.values)
+    np.testing.assert_array_equal(axes[1].lines[2].get_ydata(), data.margin.isel(d=0, beta=1, alpha=2).values)
+
+
+@pytest.mark.parametrize(
+    "axes, says",
+    [
+        ({"x": "mas"}, "x: no sweep that is drawn varies 'mas'; choose from .*mass"),
+        ({"hue": "mass", "col": "mass"}, "col: got 'mass', which is hue already; choose another"),
+        ({"y": "mass", "hue": "delay"}, "y, hue: got both; a plane has y, curves have a hue"),
+    ],
+)
+def test_axes_that_cannot_be_are_refused(folder, drawn, axes, says):
+    with pytest.raises(InputError, match=says):
+        drawn(folder, **axes)
+
+
+def test_an_axis_that_a_slice_took_away_is_refused(folder, drawn):
+    with pytest.raises(InputError, match="x: no sweep that is drawn varies 'mass'; choose from damping, delay, rate"):
+        drawn(folder / "ridge.zarr", {"mass": 0.1}, x="mass")
+
+
+def test_files_of_the_kind_size_and_style_that_are_wanted(folder, tmp_path, capsys):
+    sheet = tmp_path / "mine.mplstyle"
+    sheet.write_text("lines.linewidth: 4\n", encoding="utf-8")
+    words = ["--x", "rate", "--hue", "mass", "--at", "delay=0", "--at", "damping=1", "--style", sheet]
+    words += ["--format", "png", "--format", "pdf", "--dpi", "50", "--size", "6x3"]
+    before = dict(matplotlib.rcParams)
+    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert dict(matplotlib.rcParams) == before
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [
+        "ridge_stiffness_max.pdf",
+        "ridge_stiffness_max.png",
+    ]
+    assert imread(tmp_path / "out" / "ridge_stiffness_max.png").shape[:2] == (150, 300)
+    assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes().startswith(b"%PDF")
+    first = (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes()
+    assert main_of("figures", folder / "ridge.zarr", *words, "--out", tmp_path / "out") == 0
+    assert (tmp_path / "out" / "ridge_stiffness_max.pdf").read_bytes() == first
+    with draw.style_sheet(sheet):
+        (ax,) = draw_curves(open_dataset(folder / "ridge.zarr").isel(delay=0, damping=0), "stiffness_max", x="rate")
+    assert ax.lines[0].get_linewidth() == 4
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    "words, says",
+    [
+        (["--size", "7"], "got '7'; write width x height"),
+        (["--size", "0x4"], "got '0x4'; write width x height"),
+        (["--format", "gif"], "'gif' is not one of"),
+        (["--style", "no/such.mplstyle"], "style: no/such.mplstyle: No such file"),
+    ],
+)
+def test_kinds_of_files_that_cannot_be_are_refused(folder, tmp_path, capsys, words, says):
+    assert main_of("figures", folder, *words, "--out", tmp_path / "out") == 2
+    assert says in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "store, words, why",
+    [
+        ("point", [], "point.zarr: no figure, for it is a single point"),
+        (
+            "walls",
+            ["--x", "delta", "--hue", "d", "--at", "alpha=0.1", "--at", "beta=0.1", "--at", "d=0"],
+            "hue: no sweep that is drawn varies 'd'; choose from delta",
+        ),
+    ],
+)
+def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys, store, words, why):
+    code = main_of("figures", folder / f"{store}.zarr", *words, "--out", tmp_path / "out")
+    assert code == (2 if words else 1)
+    assert re.search(re.escape(why), capsys.readouterr().err)
+    assert not (tmp_path / "out").exists()
