@@ -19,20 +19,21 @@ from zwidth.sweep.store import SUFFIX, open_dataset
 
 FILE = "report.html"
 
+# How each kind of study computes, and how far its numbers may be off.
 _METHODS = {
-    "boundary": "closed form of the boundary; which side is stable by counting poles",
-    "ridge": "stationary points of the closed form and corners at z = -1, to a few rounding errors",
-    "map": "verdicts by the phase at the one gain crossover; radii by Newton's method on it",
-    "passivity": "the worst frequency of Colgate's condition for the exact delay",
-    "step": "exact solution between the instants at which a force changes",
-    "slope": "the limit polynomial of eq. (22)",
-    "recommend": "closed forms of boundary, ridge and margins",
-    "compare": "closed forms; with parts, signed crossings of the boundary curve",
-    "filters": "signed crossings of the boundary curve, one stiffest wall a filter",
-    "design": "the stiffest wall, solved for the parameter",
-    "sweep": "closed forms in float64, the same bits for every chunk and worker",
-    "simulate": "matrix exponentials between events; instants of friction to the last bit",
-    "limit_cycle": "simulations, exact between samples, judged by the end of each",
+    "boundary": "Closed form of the boundary, to a few rounding errors of its condition; the stable side by counting poles.",
+    "ridge": "Stationary points of the closed form and corners at z = -1, to some ten rounding errors.",
+    "map": "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors.",
+    "passivity": "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms.",
+    "step": "Exact solution between the instants at which a force changes; rounding alone.",
+    "slope": "The limit polynomial of eq. (22), to some rounding errors.",
+    "recommend": "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings of the boundary curve.",
+    "compare": "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge.",
+    "filters": "The highest point of all edges of the stable set, one filter after the other, to about 1e-13.",
+    "design": "The stiffest wall, solved for the parameter to 1e-11.",
+    "sweep": "Closed forms in float64; the same bits whatever the chunks and workers.",
+    "simulate": "Matrix exponentials between events, instants of friction to the last bit; rounding alone.",
+    "limit_cycle": "Simulations, exact between samples, each judged by the end of what was simulated.",
 }
 
 
@@ -102,7 +103,7 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
 def _section(where: Path, entry: dict[str, Any]) -> str:
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
     notes = "".join(f"<p>{escape(str(note))}</p>" for note in entry.get("notes", ()))
-    method = f'<p class="soft">{escape(_METHODS.get(kind, ""))}.</p>' if kind in _METHODS else ""
+    method = f'<p class="soft">{escape(_METHODS.get(kind, ""))}</p>' if kind in _METHODS else ""
     body = "".join(_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
     beside = f'<p class="soft">Files beside this report: {listed}</p>' if listed else ""
