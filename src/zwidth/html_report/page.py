@@ -21,13 +21,13 @@ FILE = "report.html"
 
 # How each kind of study computes, and how far its numbers may be off.
 _METHODS = {
-    "boundary": "Closed form of the boundary, to a few rounding errors of its condition; the stable side by counting poles.",
+    "boundary": "Closed form of the boundary, to a few rounding errors; the stable side by counting poles.",
     "ridge": "Stationary points of the closed form and corners at z = -1, to some ten rounding errors.",
     "map": "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors.",
     "passivity": "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms.",
     "step": "Exact solution between the instants at which a force changes; rounding alone.",
     "slope": "The limit polynomial of eq. (22), to some rounding errors.",
-    "recommend": "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings of the boundary curve.",
+    "recommend": "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings.",
     "compare": "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge.",
     "filters": "The highest point of all edges of the stable set, one filter after the other, to about 1e-13.",
     "design": "The stiffest wall, solved for the parameter to 1e-11.",
