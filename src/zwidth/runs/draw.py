@@ -124,7 +124,7 @@ def _check_axes(axes: Mapping[str, str], slices: Mapping[Path, xarray.Dataset]) 
 
 def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
     """Why nothing of a sweep is drawn."""
-    varied = [str(dim) for dim, size in data.sizes.items() if size > 1]
+    varied = sorted(str(dim) for dim, size in data.sizes.items() if size > 1)
     missing = ", ".join(name for name in axes.values() if name not in varied)
     if not varied:
         return "it is a single point"

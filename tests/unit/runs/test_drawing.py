@@ -81,7 +81,7 @@ def test_curves_over_the_axes_that_are_wanted(folder, drawn):
     assert list(found) == ["ridge_stiffness_max"]
     assert notes == [
         "point.zarr: no figure, for it is a single point",
-        "walls.zarr: no figure, for it varies over alpha, beta, delta, d, not over rate, delay, mass",
+        "walls.zarr: no figure, for it varies over alpha, beta, d, delta, not over rate, delay, mass",
     ]
     kept = open_dataset(folder / "ridge.zarr").stiffness_max.isel(damping=0)
     axes = found["ridge_stiffness_max"]
