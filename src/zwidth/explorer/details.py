@@ -1,0 +1,81 @@
+"""What follows when a slider rests: the costlier parts of the page, one after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.assessment import Assessment, assess
+from zwidth.design.limits import limits_of
+from zwidth.explorer import model
+from zwidth.scene import Scene
+
+# What a part of the page shows: the columns of a source, or a text, by name.
+Update = dict[str, Any]
+
+
+class Words(NamedTuple):
+    """What the commands say of a scene, line by line: `zwidth check` of a verdict and its limits, `zwidth ridge`."""
+
+    check: Callable[..., list[str]]
+    slopes: Callable[[Scene], list[str]]
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be computed."""
+
+    scene: Scene
+    normalized: bool
+    across: model.Range
+    up: model.Range
+    outline: bool  # of a device that has changed
+    contact: bool
+    costly: bool  # what takes seconds in a scene with parts
+
+
+def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
+    """The parts in the order in which they are wanted; whoever asks may stop after each."""
+    scene, rigid = wish.scene, wish.scene.is_rigid
+    if wish.outline and not rigid:
+        yield show_outlines(model.outlines(scene))
+    verdict = assess(scene)
+    check = model.normalized_lines if isinstance(verdict, Assessment) and wish.normalized else None
+    lines = check(verdict) if check else words.check(scene, verdict, [])
+    yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(scene, verdict)}
+    if wish.outline:
+        yield {"contours": model.contours(scene, wish.across, wish.up)}
+        passive = model.passive_set(scene)
+        known = passive if passive is not None else (np.empty(0), np.empty(0))
+        yield {"passive": {"x": known[0], "y": known[1]}}
+    if not check:
+        yield {"verdict": "\n".join(words.check(scene, verdict, limits_of(scene)))}
+    if rigid or wish.costly:
+        x, y = model.ridge_path(scene)
+        yield {"ridge": {"x": x, "y": y}}
+        yield {"slopes": "\n".join([] if wish.normalized else words.slopes(scene))}
+    if wish.contact:
+        time, position, force, text = model.contact_motion(scene, model.length_of(scene, verdict))
+        yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}
+
+
+def show_outlines(outlines: list[model.Curve]) -> Update:
+    """All outlines as one area: what lies within two of them is a hole."""
+    rings = [[x, y] for x, y in outlines]
+    return {"area": {"xs": [[[x for x, _ in rings]]], "ys": [[[y for _, y in rings]]]}}
+
+
+def _wall_curves(scene: Scene, verdict: Any) -> Update:
+    """The Nyquist curve, its crossover, the step response, and the stiffest wall."""
+    curve, cross = model.nyquist_curve(scene), model.crossover(scene, verdict)
+    time, position = model.step_motion(scene, model.length_of(scene, verdict))
+    best = verdict.stiffness_max, verdict.virtual_damping_at_max
+    return {
+        "nyquist": {"x": curve.real, "y": curve.imag},
+        "crossover": {"x": [cross.real], "y": [cross.imag]},
+        "step": {"x": time, "y": position},
+        "best": {"x": [best[0]], "y": [best[1]]},
+    }

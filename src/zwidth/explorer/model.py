@@ -1,0 +1,225 @@
+"""What the page shows of a scene, as plain arrays; nothing here knows of a browser.
+
+K and B stand for alpha and beta where the scene is normalized (m = 1, T = 1).
+"""
+
+from __future__ import annotations
+
+from math import ceil, floor, isfinite, log10
+from typing import Any
+
+import numpy as np
+
+from zwidth.assessment import Assessment, SceneAssessment
+from zwidth.formatting import plain
+from zwidth.linear.passivity import has_condition
+from zwidth.linear.polynomial import affine_polynomial
+from zwidth.linear_loop import circle
+from zwidth.scene import Scene
+from zwidth.simulation.result import Outcome
+from zwidth.stability.poles import companion
+from zwidth.stability.region import stable_region
+from zwidth.stability.ridge import alpha_max
+
+Curve = tuple[np.ndarray, np.ndarray]
+Range = tuple[float, float]
+
+# Points of the boundary while a slider moves; how many coefficients leave time to ask every so manieth for its poles.
+_QUICK_CURVE, _QUICK_LINE = 513, 65
+_STRIDES = ((13, 4), (25, 8), (41, 16))
+# Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
+_ON_EDGE = 1e-5
+LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
+_GRID = (48, 40)
+_LARGE_LOOP, _COARSE_GRID = 12, (24, 20)
+_DIRECTIONS, _FEW_DIRECTIONS = 181, 41
+_RIDGE_POINTS, _FEW_RIDGE_POINTS, _MOST_DAMPING = 61, 9, 4.0
+_SHORTEST, _LONGEST = 30, 3000
+_IMPACT, _APPROACH = 0.1, 5.0
+
+
+def outlines(scene: Scene) -> list[Curve]:
+    """The closed outlines of the stable set, holes and islands among them, as `zwidth` finds them."""
+    if scene.is_rigid:
+        region, units = stable_region(float(scene.delta), float(scene.d)), scene.units
+        return [(region.alpha * units.stiffness, region.beta * units.virtual_damping)]
+    return [(piece.stiffness, piece.virtual_damping) for piece in scene.stable_region()]
+
+
+def quick_edge(scene: Scene) -> Curve:
+    """Points of the stable set's edge, NaN between its parts, at a cost that follows a drag.
+
+    On the boundary curve and on the two lines of real poles, those at which no pole lies outside of the unit circle.
+    """
+    if scene.is_rigid:
+        return outlines(scene)[0]
+    # Closer together at low frequencies, where loops with a hand have their resonance.
+    w = np.pi * ((np.arange(_QUICK_CURVE) + 0.5) / _QUICK_CURVE) ** 2
+    parts = [_on_edge(scene, *scene.boundary(w / scene.timing.period))]
+    known = parts[0][1][np.isfinite(parts[0][1])]
+    low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
+    damping = np.linspace(low - 0.5 * (high - low), high + 0.5 * (high - low), _QUICK_LINE)
+    at, units = circle(np.array([0.0, np.pi])), scene.units
+    for q, f in zip(scene.loop.needed(at).value.real, scene.loop.estimate.jet(at).value.real, strict=True):
+        parts.append(_on_edge(scene, (q - damping / units.virtual_damping * f) * units.stiffness, damping))
+    x, y = (np.concatenate([np.append(part[k], np.nan) for part in parts]) for k in (0, 1))
+    return x, y
+
+
+def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
+    """Points of a curve that border the stable set, the others NaN: some are asked, then those between two answers."""
+    D, N1, N2 = affine_polynomial(scene.loop)
+    alpha, beta = scene.normalize_walls(stiffness, damping)
+    finite = np.isfinite(alpha) & np.isfinite(beta)
+    edge = np.zeros(alpha.size, bool)
+
+    def ask(places: np.ndarray) -> None:
+        places = places[finite[places]]
+        polynomials = D + alpha[places, None] * N1 + beta[places, None] * N2
+        poles = np.linalg.eigvals(companion(polynomials / D[0]))
+        edge[places] = np.abs(poles).max(-1) <= 1.0 + _ON_EDGE
+
+    stride = next((stride for most, stride in _STRIDES if D.size <= most), 32)
+    places = np.arange(0, alpha.size, stride)
+    ask(places)
+    while stride > 1:
+        between = places[:-1] + stride // 2
+        same = edge[places[:-1]] == edge[places[1:]]
+        edge[between[same]] = edge[places[:-1]][same]
+        ask(between[~same])
+        stride //= 2
+        places = np.arange(0, alpha.size, stride)
+    edge &= finite
+    return np.where(edge, stiffness, np.nan), np.where(edge, damping, np.nan)
+
+
+def judge_quickly(scene: Scene) -> tuple[bool, np.ndarray]:
+    """Whether the scene's wall is stable, and its poles."""
+    wall = scene.wall.stiffness, scene.wall.virtual_damping
+    return bool(scene.decide_stability(*wall, method="companion").stable), scene.poles(*wall)
+
+
+def frame(curves: list[Curve], wall: tuple[float, float]) -> tuple[Range, Range]:
+    """Round axis ranges that hold the outlines, and the wall where it is not far beyond them."""
+    ranges = []
+    for axis in (0, 1):
+        values = np.concatenate([np.zeros(1), *(curve[axis] for curve in curves)])
+        values = values[np.isfinite(values)]
+        low, high = float(values.min()), float(values.max())
+        size = (high - low) or abs(wall[axis]) or 1.0
+        if low - 2 * size <= wall[axis] <= high + 2 * size:
+            low, high = min(low, wall[axis]), max(high, wall[axis])
+        step = 10.0 ** floor(log10((high - low) or size)) / 4.0
+        ranges.append((step * floor(low / step - 0.2), step * ceil(high / step + 0.2)))
+    return ranges[0], ranges[1]
+
+
+def nyquist_curve(scene: Scene) -> np.ndarray:
+    """The open loop L up to half the sampling rate, complex."""
+    top = 0.5 / scene.timing.period
+    return scene.frequency_response(scene.wall.stiffness, scene.wall.virtual_damping, np.geomspace(1e-4, 1.0, 600) * top)
+
+
+def crossover(scene: Scene, verdict: Assessment | SceneAssessment) -> complex:
+    """The open loop where its magnitude is 1, the frequency of which the verdict has; NaN without one."""
+    hertz = verdict.gain_crossover
+    wall = scene.wall.stiffness, scene.wall.virtual_damping
+    return complex(scene.frequency_response(*wall, hertz)) if isfinite(hertz) else complex("nan+nanj")
+
+
+def length_of(scene: Scene, verdict: Assessment | SceneAssessment) -> int:
+    """How many periods show the wall's slowest motion: six of its time constants, if that is neither few nor many."""
+    periods = 6.0 * abs(verdict.time_constant) / scene.timing.period
+    return int(min(max(periods, _SHORTEST), _LONGEST)) if isfinite(periods) else 10 * _SHORTEST
+
+
+def step_motion(scene: Scene, periods: int) -> Curve:
+    """Time and position at the samples under a force of 1 that sets in at 0, with the wall on both sides."""
+    loop = scene.state_space(scene.wall.stiffness, scene.wall.virtual_damping)
+    state, position = np.zeros(loop.A.shape[0]), np.empty(periods + 1)
+    with np.errstate(all="ignore"):
+        for k in range(periods + 1):
+            position[k] = (loop.C @ state)[0] + loop.D[0, 0]
+            state = loop.A @ state + loop.B[:, 0]
+    return np.arange(periods + 1) * scene.timing.period, position
+
+
+def passive_set(scene: Scene) -> Curve | None:
+    """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
+    if not has_condition(scene.device):
+        return None
+    damping, units = float(scene.device.damping), scene.units
+    if damping == 0:
+        return np.empty(0), np.empty(0)
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS if scene.is_rigid else _FEW_DIRECTIONS)
+    # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
+    along = np.maximum(np.cos(turn), 0.0) * units.stiffness, np.sin(turn) * units.virtual_damping
+    share = damping / (damping - np.asarray(scene.passivity_margin(*along)))
+    return along[0] * share, along[1] * share
+
+
+def radius_map(scene: Scene, across: Range, up: Range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stiffness and damping over a frame, and the spectral radius of the walls there."""
+    grid = _GRID if scene.is_rigid or scene.poles(1.0, 1.0).size <= _LARGE_LOOP else _COARSE_GRID
+    stiffness, damping = np.linspace(*across, grid[0]), np.linspace(*up, grid[1])
+    return stiffness, damping, np.asarray(scene.spectral_radius(stiffness, damping[:, None]))
+
+
+def ridge_path(scene: Scene) -> Curve:
+    """The stiffest stable wall as the device's damping grows from none to four times what it is."""
+    units = scene.units
+    own = float(scene.damping) if scene.is_rigid else float(scene.device.damping)
+    most = _MOST_DAMPING * (own or 0.25 * units.virtual_damping)
+    if scene.is_rigid:
+        path = alpha_max(np.linspace(0.0, most, _RIDGE_POINTS) / units.virtual_damping, float(scene.d))
+        return np.asarray(path.alpha) * units.stiffness, np.asarray(path.beta) * units.virtual_damping
+    dampings = np.linspace(0.0, most, _FEW_RIDGE_POINTS)
+    walls = [scene.replace(damping=float(damping)).max_stiffness() for damping in dampings]
+    return np.array([float(w.stiffness) for w in walls]), np.array([float(w.virtual_damping) for w in walls])
+
+
+def contact_motion(scene: Scene, periods: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """Time, position and wall force of the device that hits the wall, and what comes of it in words."""
+    # From five periods before the wall at a tenth of a meter a second; the normalized device at as many units.
+    start = -_APPROACH * _IMPACT * scene.timing.period
+    hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
+    assert hit.time is not None and hit.position is not None and hit.wall_force is not None, "it was recorded"
+    words = f"leaves the wall {int(hit.bounces)} times, {Outcome(int(hit.outcome)).name.lower()} at the end"
+    return hit.time, hit.position, hit.wall_force, words
+
+
+def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
+    """The lines on which the spectral radius is one of the `LEVELS`, and where to write which."""
+    from contourpy import contour_generator
+
+    x, y, values = radius_map(scene, across, up)
+    generator = contour_generator(x, y, np.ma.masked_invalid(values))
+    found: dict[str, list[Any]] = {"xs": [], "ys": [], "x": [], "y": [], "text": []}
+    for level in LEVELS:
+        lines: Any = generator.lines(level)
+        for line in lines:
+            top = line[np.argmax(line[:, 0])]
+            for name, value in zip(found, (line[:, 0], line[:, 1], *top, f"{level:g}"), strict=True):
+                found[name].append(value)
+    return found
+
+
+def normalized_lines(verdict: Assessment) -> list[str]:
+    """The verdict on a normalized wall, whose units are the period and the mass."""
+    span = f"{plain(verdict.virtual_damping_lower)} to {plain(verdict.virtual_damping_upper)}"
+    rows = {
+        "verdict": f"{word_of(verdict)}, spectral radius {verdict.spectral_radius:.6f}",
+        "stable alpha": f"up to {plain(verdict.stiffness_limit)} at this beta",
+        "stable beta": f"{span} at this alpha",
+        "passive": f"{'yes' if verdict.passive else 'no'}, margin {plain(verdict.passivity_margin)} of delta",
+        "stiffest stable wall": f"alpha_max = {plain(verdict.alpha_max)} at beta = {plain(verdict.beta_at_max)}",
+        "slowest pole": f"time constant {plain(verdict.time_constant)} periods",
+        "margins": f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, "
+        f"delay {plain(verdict.delay_margin)} periods, modulus {plain(verdict.modulus_margin)}",
+    }
+    return [f"{label:<20}  {text}" for label, text in rows.items()]
+
+
+def word_of(verdict: Assessment | SceneAssessment) -> str:
+    """The verdict in a word."""
+    return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"
