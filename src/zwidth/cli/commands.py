@@ -12,6 +12,7 @@ from zwidth.cli import runs
 from zwidth.cli.bench import bench
 from zwidth.cli.design import design
 from zwidth.cli.devices import devices
+from zwidth.cli.explore import explore
 from zwidth.cli.init import init
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.report import report
@@ -170,5 +171,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (init, *runs.COMMANDS, report, design, devices, bench):
+for command in (init, *runs.COMMANDS, report, design, devices, explore, bench):
     cli.add_command(command)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,6 +13,9 @@ from zwidth.assessment import Assessment, assess
 from zwidth.design.limits import limits_of
 from zwidth.explorer import model
 from zwidth.scene import Scene
+
+# Held while JAX is being imported: what looks for it meanwhile would find half of it.
+IMPORTING = Lock()
 
 # What a part of the page shows: the columns of a source, or a text, by name.
 Update = dict[str, Any]
@@ -45,20 +49,23 @@ def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
     verdict = assess(scene)
     check = model.normalized_lines if isinstance(verdict, Assessment) and wish.normalized else None
     lines = check(verdict) if check else words.check(scene, verdict, [])
-    yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(scene, verdict)}
+    yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(wish, verdict)}
     if wish.outline:
-        yield {"contours": model.contours(scene, wish.across, wish.up)}
         passive = model.passive_set(scene)
-        known = passive if passive is not None else (np.empty(0), np.empty(0))
-        yield {"passive": {"x": known[0], "y": known[1]}}
+        x, y = passive if passive is not None else (np.empty(0), np.empty(0))
+        yield {"passive": {"x": x, "y": y}, "contours": model.contours(scene, wish.across, wish.up)}
     if not check:
         yield {"verdict": "\n".join(words.check(scene, verdict, limits_of(scene)))}
+    if wish.contact or (wish.costly and not rigid):
+        with IMPORTING:
+            import jax  # noqa: F401
     if rigid or wish.costly:
         x, y = model.ridge_path(scene)
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if wish.normalized else words.slopes(scene))}
     if wish.contact:
         time, position, force, text = model.contact_motion(scene, model.length_of(scene, verdict))
+        position = position * _length(wish)
         yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}
 
 
@@ -68,14 +75,20 @@ def show_outlines(outlines: list[model.Curve]) -> Update:
     return {"area": {"xs": [[[x for x, _ in rings]]], "ys": [[[y for _, y in rings]]]}}
 
 
-def _wall_curves(scene: Scene, verdict: Any) -> Update:
+def _length(wish: Wish) -> float:
+    """How many of the units of length that the page shows are one of the scene's: it shows millimeters."""
+    return 1.0 if wish.normalized else 1e3
+
+
+def _wall_curves(wish: Wish, verdict: Any) -> Update:
     """The Nyquist curve, its crossover, the step response, and the stiffest wall."""
+    scene = wish.scene
     curve, cross = model.nyquist_curve(scene), model.crossover(scene, verdict)
     time, position = model.step_motion(scene, model.length_of(scene, verdict))
     best = verdict.stiffness_max, verdict.virtual_damping_at_max
     return {
         "nyquist": {"x": curve.real, "y": curve.imag},
         "crossover": {"x": [cross.real], "y": [cross.imag]},
-        "step": {"x": time, "y": position},
+        "step": {"x": time, "y": position * _length(wish)},
         "best": {"x": [best[0]], "y": [best[1]]},
     }

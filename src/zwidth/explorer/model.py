@@ -30,8 +30,7 @@ _STRIDES = ((13, 4), (25, 8), (41, 16))
 # Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
 _ON_EDGE = 1e-5
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
-_GRID = (48, 40)
-_LARGE_LOOP, _COARSE_GRID = 12, (24, 20)
+_FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (96, 80), (48, 40), 12, (24, 20)
 _DIRECTIONS, _FEW_DIRECTIONS = 181, 41
 _RIDGE_POINTS, _FEW_RIDGE_POINTS, _MOST_DAMPING = 61, 9, 4.0
 _SHORTEST, _LONGEST = 30, 3000
@@ -99,25 +98,27 @@ def judge_quickly(scene: Scene) -> tuple[bool, np.ndarray]:
     return bool(scene.decide_stability(*wall, method="companion").stable), scene.poles(*wall)
 
 
-def frame(curves: list[Curve], wall: tuple[float, float]) -> tuple[Range, Range]:
-    """Round axis ranges that hold the outlines, and the wall where it is not far beyond them."""
+def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
+    """Round axis ranges that hold a curve, and the wall where it is not far beyond it."""
     ranges = []
     for axis in (0, 1):
-        values = np.concatenate([np.zeros(1), *(curve[axis] for curve in curves)])
-        values = values[np.isfinite(values)]
-        low, high = float(values.min()), float(values.max())
-        size = (high - low) or abs(wall[axis]) or 1.0
-        if low - 2 * size <= wall[axis] <= high + 2 * size:
-            low, high = min(low, wall[axis]), max(high, wall[axis])
-        step = 10.0 ** floor(log10((high - low) or size)) / 4.0
-        ranges.append((step * floor(low / step - 0.2), step * ceil(high / step + 0.2)))
+        values = np.append(curve[axis][np.isfinite(curve[axis])], 0.0)
+        low, high, place = float(values.min()), float(values.max()), wall[axis]
+        size = (high - low) or abs(place) or 1.0
+        step = 10.0 ** floor(log10(size)) / 4.0
+        low, high = step * floor(low / step - 0.2), step * ceil(high / step + 0.2)
+        if low - 2.0 * size <= place <= high + 2.0 * size:
+            low, high = min(low, step * floor(place / step)), max(high, step * ceil(place / step))
+        ranges.append((low, high))
     return ranges[0], ranges[1]
 
 
 def nyquist_curve(scene: Scene) -> np.ndarray:
     """The open loop L up to half the sampling rate, complex."""
     top = 0.5 / scene.timing.period
-    return scene.frequency_response(scene.wall.stiffness, scene.wall.virtual_damping, np.geomspace(1e-4, 1.0, 600) * top)
+    return scene.frequency_response(
+        scene.wall.stiffness, scene.wall.virtual_damping, np.geomspace(1e-4, 1.0, 600) * top
+    )
 
 
 def crossover(scene: Scene, verdict: Assessment | SceneAssessment) -> complex:
@@ -160,7 +161,8 @@ def passive_set(scene: Scene) -> Curve | None:
 
 def radius_map(scene: Scene, across: Range, up: Range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stiffness and damping over a frame, and the spectral radius of the walls there."""
-    grid = _GRID if scene.is_rigid or scene.poles(1.0, 1.0).size <= _LARGE_LOOP else _COARSE_GRID
+    small = scene.poles(1.0, 1.0).size <= _LARGE_LOOP
+    grid = _FINE_GRID if scene.is_rigid else _GRID if small else _COARSE_GRID
     stiffness, damping = np.linspace(*across, grid[0]), np.linspace(*up, grid[1])
     return stiffness, damping, np.asarray(scene.spectral_radius(stiffness, damping[:, None]))
 
@@ -184,7 +186,7 @@ def contact_motion(scene: Scene, periods: int) -> tuple[np.ndarray, np.ndarray, 
     start = -_APPROACH * _IMPACT * scene.timing.period
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     assert hit.time is not None and hit.position is not None and hit.wall_force is not None, "it was recorded"
-    words = f"leaves the wall {int(hit.bounces)} times, {Outcome(int(hit.outcome)).name.lower()} at the end"
+    words = f"(leaves it {int(hit.bounces)} times, {Outcome(int(hit.outcome)).name.lower()} at the end)"
     return hit.time, hit.position, hit.wall_force, words
 
 
@@ -197,9 +199,11 @@ def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
     found: dict[str, list[Any]] = {"xs": [], "ys": [], "x": [], "y": [], "text": []}
     for level in LEVELS:
         lines: Any = generator.lines(level)
-        for line in lines:
-            top = line[np.argmax(line[:, 0])]
-            for name, value in zip(found, (line[:, 0], line[:, 1], *top, f"{level:g}"), strict=True):
+        for line in sorted(lines, key=len, reverse=True):
+            # Below the ridge, where no other line runs; of several pieces the longest one has the name.
+            named = line[np.argmax(line[:, 0] / np.ptp(across) - 0.7 * line[:, 1] / np.ptp(up))]
+            text = f"{level:g}" if line is max(lines, key=len) else ""
+            for name, value in zip(found, (line[:, 0], line[:, 1], *named, text), strict=True):
                 found[name].append(value)
     return found
 

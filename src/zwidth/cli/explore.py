@@ -1,0 +1,58 @@
+"""`zwidth explore`: a local page on which a scene is moved by sliders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+
+@click.command()
+@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(exists=True, path_type=Path))
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
+@click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
+def explore(path: Path | None, port: int, no_browser: bool) -> None:
+    """Open a page with sliders for device, timing and wall, on which the stable walls follow.
+
+    It starts from the scene of a CONFIG file, or of the run in DIR. The server is for this machine alone and asks for
+    the token in its address. Ctrl-C ends it.
+    """
+    import webbrowser
+
+    from zwidth.errors import InputError
+
+    try:
+        from zwidth.explorer.server import Explorer
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
+            raise
+        raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
+    from zwidth.explorer.controls import read_controls
+    from zwidth.explorer.details import Words
+
+    explorer = Explorer(read_controls(path), Words(check_lines, slope_lines), port)
+    click.echo(f"{explorer.address}  (Ctrl-C ends it)")
+    if not no_browser:
+        webbrowser.open(explorer.address)
+    explorer.run()
+    click.echo("stopped")
+
+
+def check_lines(scene: Any, verdict: Any, limits: list[Any]) -> list[str]:
+    """What `zwidth check` says of a scene's wall, without color."""
+    from zwidth.assessment import Assessment
+    from zwidth.cli import scene_words
+    from zwidth.cli.words import row, verdict_lines
+
+    rigid = isinstance(verdict, Assessment)
+    lines = verdict_lines(scene, verdict) if rigid else scene_words.scene_verdict_lines(scene, verdict)
+    lines += scene_words.limit_lines(limits)
+    return [click.unstyle(line) for line in [*lines, *(row("note", n) for n in scene_words.coded_period_notes(scene))]]
+
+
+def slope_lines(scene: Any) -> list[str]:
+    """What `zwidth ridge` says of a little more of every parameter."""
+    from zwidth.cli.scene_words import part_slopes
+
+    return [slope.line() for slope in part_slopes(scene)]

@@ -1,0 +1,162 @@
+"use strict";
+// Native controls on the left, Bokeh's figures beside them; one source carries changes to Python, one its answers back.
+const start = JSON.parse(document.getElementById("start").textContent);
+const by = id => document.getElementById(id);
+const STEPS = 1000;
+const GROUPS = { mode: [], velocity: ["samples", "cutoff", "order"], operator: ["hand_mass", "hand_damping",
+  "hand_stiffness", "grasp_stiffness", "grasp_damping"], coupling: ["tip_mass", "tip_stiffness", "tip_damping"] };
+const LABELS = { mode: "numbers", velocity: "velocity estimate", operator: "operator", coupling: "compliance" };
+const fields = {};
+let inputs = null, serial = 0, answered = 0, waiting = {}, rests = false, scheduled = false;
+
+// A slider's place, 0 to STEPS, and its value: logarithmic above 0, cubic from 0, linear through 0.
+function valueAt(field, place) {
+  const { low, high } = field, share = place / STEPS;
+  const value = field.linear || low < 0 ? low + (high - low) * share : low > 0 ? low * (high / low) ** share : high * share ** 3;
+  return field.whole ? Math.round(value) : Number(value.toPrecision(4));
+}
+function placeOf(field, value) {
+  const { low, high } = field, held = Math.min(Math.max(value, low), high);
+  const share = field.linear || low < 0 ? (held - low) / (high - low) : low > 0 ? Math.log(held / low) / Math.log(high / low) : (held / high) ** (1 / 3);
+  return Math.round(share * STEPS);
+}
+function element(tag, attributes, ...children) {
+  const made = Object.assign(document.createElement(tag), attributes);
+  made.append(...children);
+  return made;
+}
+function addRow(form, name, label, ...controls) {
+  const row = element("div", { className: "row" }, element("label", { htmlFor: name, textContent: label }), ...controls);
+  form.append(row);
+  return row;
+}
+function addSlider(form, name) {
+  const field = { ...start.sliders[name] };
+  const label = field.unit ? `${field.label} in ${field.unit}` : field.label;
+  field.range = element("input", { type: "range", min: 0, max: STEPS, step: 1, id: `${name}-slider` });
+  field.range.setAttribute("aria-label", `${label}, slider`);
+  field.number = element("input", { type: "number", step: "any", id: name });
+  field.row = addRow(form, name, label, field.range, field.number);
+  const slide = rest => {
+    field.number.value = valueAt(field, Number(field.range.value));
+    field.range.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
+    send({ [name]: Number(field.number.value) }, rest);
+  };
+  field.range.addEventListener("input", () => slide(false));
+  field.range.addEventListener("change", () => slide(true));
+  field.number.addEventListener("change", () => field.number.value !== "" && send({ [name]: field.number.valueAsNumber }, true));
+  fields[name] = field;
+}
+function addChoice(form, name) {
+  const select = element("select", { id: name });
+  for (const [value, text] of Object.entries(start.choices[name])) select.append(element("option", { value, textContent: text }));
+  select.addEventListener("change", () => send({ [name]: select.value }, true));
+  fields[name] = { select, row: addRow(form, name, LABELS[name], select), shown_if: name === "mode" ? "" : "mode=physical" };
+}
+function build() {
+  const form = by("controls"), grouped = Object.values(GROUPS).flat();
+  form.addEventListener("submit", event => event.preventDefault());
+  addChoice(form, "mode");
+  for (const name of Object.keys(start.sliders).filter(name => !grouped.includes(name))) {
+    addSlider(form, name);
+    if (name === "period") {
+      const rate = element("input", { type: "number", step: "any", id: "rate", min: 0 });
+      const row = addRow(form, "rate", "or rate 1/T in Hz", element("span"), rate);
+      rate.addEventListener("change", () => rate.valueAsNumber > 0 && send({ period: 1e3 / rate.valueAsNumber }, true));
+      fields.rate = { rate, row, shown_if: "mode=physical" };
+    }
+  }
+  for (const [choice, names] of Object.entries(GROUPS)) {
+    if (choice === "mode") continue;
+    addChoice(form, choice);
+    for (const name of names) addSlider(form, name);
+  }
+}
+
+// The newest values go out when the last answer is in: what lies between is skipped, and nothing queues up.
+function send(changes, rest) {
+  Object.assign(waiting, changes);
+  rests = rests || rest;
+  document.body.classList.add("busy");
+  flush();
+}
+function flush() {
+  if (inputs === null || scheduled || answered < serial || (Object.keys(waiting).length === 0 && !rests)) return;
+  scheduled = true;
+  requestAnimationFrame(() => {
+    scheduled = false;
+    serial += 1;
+    const message = { serial, rest: rests, set: waiting, dark: dark.matches, contact: by("contact-wanted").checked, costly: by("costly").checked };
+    waiting = {};
+    rests = false;
+    inputs.data = { json: [JSON.stringify(message)] };
+  });
+}
+function show(answer) {
+  for (const id of ["error", "word", "radius", "contact_words"]) if (id in answer) by(id).textContent = answer[id];
+  for (const id of ["verdict", "slopes"]) if (id in answer) showLines(by(id), answer[id]);
+  for (const id of ["yaml", "python"]) if (id in answer) by(id).value = answer[id];
+  if ("word" in answer) by("word").dataset.word = answer.word;
+  if ("busy" in answer) document.body.classList.toggle("busy", answer.busy);
+  if (answer.frame) for (const [k, names] of [[0, ["stiffness", "alpha"]], [1, ["virtual_damping", "beta"]]])
+    for (const name of names) Object.assign(fields[name], { low: answer.frame[k][0], high: answer.frame[k][1], linear: true });
+  if (answer.state) showState(answer.state);
+  if ("state" in answer || "error" in answer) answered = Math.max(answered, answer.serial);
+  flush();
+}
+// Lines of the commands: a label of 20 characters, and what is said.
+function showLines(box, text) {
+  box.dataset.text = text;
+  const line = part => element("div", {}, element("span", { textContent: part.slice(0, 20).trim() }), element("span", { textContent: part.slice(20).trim() }));
+  box.replaceChildren(...text.split("\n").map(line));
+}
+function showState(state) {
+  for (const [name, field] of Object.entries(fields)) {
+    const [choice, values] = field.shown_if.split("=");
+    field.row.hidden = choice !== "" && (!values.split("|").includes(state[choice]) || (choice !== "mode" && state.mode !== "physical"));
+    if (name in waiting) continue;
+    if (field.select) field.select.value = state[name];
+    else if (field.rate) { if (document.activeElement !== field.rate) field.rate.value = Number((1e3 / state.period).toPrecision(6)); }
+    else {
+      if (document.activeElement !== field.range) field.range.value = placeOf(field, state[name]);
+      if (document.activeElement !== field.number) field.number.value = Number(state[name].toPrecision(10));
+      field.range.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
+    }
+  }
+}
+function moveWall(event) {
+  const steps = { ArrowLeft: [0, -1], ArrowRight: [0, 1], ArrowUp: [1, 1], ArrowDown: [1, -1] }[event.key];
+  if (!steps) return;
+  event.preventDefault();
+  const names = by("mode").value === "normalized" ? ["alpha", "beta"] : ["stiffness", "virtual_damping"];
+  const name = names[steps[0]], field = fields[name];
+  const value = field.number.valueAsNumber + steps[1] * (event.shiftKey ? 10 : 1) * (field.high - field.low) / 200;
+  field.number.value = Number(value.toPrecision(6));
+  send({ [name]: field.number.valueAsNumber }, true);
+}
+async function copy(event) {
+  const area = by(event.target.dataset.copy);
+  area.select();
+  try {
+    await navigator.clipboard.writeText(area.value);
+    by("copied").textContent = "copied";
+  } catch {
+    by("copied").textContent = "the text is selected; copy it with Ctrl-C";
+  }
+}
+
+const dark = window.matchMedia("(prefers-color-scheme: dark)");
+dark.addEventListener("change", () => send({}, true));
+build();
+by("plane").addEventListener("keydown", moveWall);
+for (const id of ["contact-wanted", "costly"]) by(id).addEventListener("change", () => send({}, true));
+for (const button of document.querySelectorAll("[data-copy]")) button.addEventListener("click", copy);
+Bokeh.set_log_level("error");
+Bokeh.embed.embed_items({}, start.items).then(() => {
+  const figures = Bokeh.documents[0];
+  inputs = figures.get_model_by_name("inputs");
+  const answer = figures.get_model_by_name("answer");
+  answer.connect(answer.properties.data.change, () => answer.data.json.forEach(text => show(JSON.parse(text))));
+  figures.on_event("connection_lost", () => { by("error").textContent = "zwidth explore has ended; start it again"; });
+  send({}, true);
+}, error => { by("error").textContent = `the page could not connect: ${error}`; });
