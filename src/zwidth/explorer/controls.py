@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from zwidth.errors import InputError
-from zwidth.normalization import normalize
 from zwidth.parts.coupling import Coupling
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator

@@ -54,7 +54,10 @@ class Page:
         self.device: tuple[Any, ...] = ()
         self.drawn = False
         self.options = {"contact": False, "costly": False}
-        self.sources = {name: ColumnDataSource({c: [] for c in names}, name=name) for name, names in _COLUMNS.items()}
+        self.sources = {
+            name: ColumnDataSource({column: [] for column in columns}, name=f"{name} data")
+            for name, columns in _COLUMNS.items()
+        }
         self.inputs = ColumnDataSource({"json": []}, name="inputs")
         self.answer = ColumnDataSource({"json": []}, name="answer")
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))

@@ -35,6 +35,8 @@ HOST = "127.0.0.1"
 _ASSETS = Path(__file__).parent / "assets"
 # Pages open at one time, bytes of a message, seconds until a page that never connected is forgotten.
 _MOST_PAGES, _LONGEST_MESSAGE, _UNUSED = 16, 1 << 18, 10
+# The page, its socket, Bokeh's scripts and our own; Bokeh would serve more.
+_SERVED = ("", "ws", "static", "assets")
 _POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "font-src 'self' data:; connect-src 'self' ws://{host}; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -69,8 +71,9 @@ class GuardedServer(BokehTornado):
 
     def find_handler(self, request: HTTPServerRequest, **keywords: Any) -> Any:
         """The handler of an address, that of errors for whoever does not know the token."""
-        first = request.path.lstrip("/").partition("/")[0]
+        first, _, rest = request.path.lstrip("/").partition("/")
         known = hmac.compare_digest(first.encode("utf-8", "replace"), self.token.encode())
+        known = known and rest.partition("/")[0] in _SERVED
         origin = request.headers.get("Origin", f"http://{self.host}")
         # Another host's name that leads here is another origin, too.
         if not known or request.host != self.host or origin != f"http://{self.host}":

@@ -1,0 +1,382 @@
+"""`zwidth explore` as somebody uses it: a browser, a keyboard, a mouse, and strangers who knock."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from concurrent.futures import ThreadPoolExecutor
+
+import jax
+import numpy as np
+import pytest
+import zwidth
+from click.testing import CliRunner
+from zwidth.cli.commands import cli
+
+pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+QUIET = ["--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update"]
+QUIET += ["--disable-sync", "--no-first-run"]
+# Long enough for the slowest machine; nothing waits for it to end.
+PATIENCE = 20.0
+
+
+class Server:
+    """A running command."""
+
+    def __init__(self, folder, *arguments):
+        command = [sys.executable, "-m", "zwidth", "explore", "--no-browser", *arguments]
+        self.process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        line = self.process.stdout.readline()
+        assert line.startswith("http://127.0.0.1:"), self.process.stderr.read()
+        self.address = line.split()[0]
+        self.host = self.address.split("/")[2]
+
+    def end(self):
+        self.process.send_signal(signal.SIGINT)
+        try:
+            return (*self.process.communicate(timeout=PATIENCE), self.process.returncode)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            raise
+
+    def get(self, path="", **headers):
+        request = urllib.request.Request(f"{self.address}{path}", headers=headers)
+        try:
+            with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+                return answer.status, answer.headers, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            return error.code, error.headers, error.read().decode()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("explore")
+    running = Server(folder)
+    yield running
+    out, err, code = running.end()
+    assert (out, err, code) == ("stopped\n", "", 0)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def browser():
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    if CHROMIUM is None:
+        if os.environ.get("CI"):
+            pytest.fail("no chromium on this machine")
+        pytest.skip("no chromium on this machine")
+    with sync_api.sync_playwright() as playwright:
+        running = playwright.chromium.launch(executable_path=CHROMIUM, args=QUIET)
+        yield running
+        running.close()
+
+
+@pytest.fixture
+def page(browser, server):
+    context = browser.new_context(viewport={"width": 1280, "height": 1000})
+    context.grant_permissions(["clipboard-read", "clipboard-write"])
+    opened = context.new_page()
+    opened.complaints, opened.asked = [], []
+    opened.on("console", lambda text: opened.complaints.append(text.text) if text.type in ("error", "warning") else None)
+    opened.on("pageerror", lambda error: opened.complaints.append(str(error)))
+    opened.on("request", lambda request: opened.asked.append(request.url))
+    opened.on("websocket", lambda socket: opened.asked.append(socket.url))
+    opened.goto(server.address)
+    settle(opened)
+    yield opened
+    context.close()
+
+
+def wait(page, condition):
+    # Asked from here: the page's own policy lets nobody evaluate texts in it.
+    end = time.monotonic() + PATIENCE
+    while not page.evaluate(condition):
+        assert time.monotonic() < end, f"{condition}; {page.complaints}; {page.inner_text('header')}"
+        time.sleep(0.02)
+
+
+def settle(page):
+    """Until everything that is shown belongs to what is set."""
+    time.sleep(0.2)
+    wait(page, "inputs !== null && answered === serial && !document.body.classList.contains('busy')"
+               " && document.getElementById('verdict').dataset.text !== undefined")  # fmt: skip
+
+
+def data_of(page, name):
+    columns = page.evaluate(
+        "name => Object.fromEntries(Object.entries(Bokeh.documents[0].get_model_by_name(`${name} data`).data)"
+        ".map(([column, values]) => [column, Array.from(values)]))",
+        name,
+    )
+    return {column: np.array([np.nan if v is None else v for v in values]) for column, values in columns.items()}
+
+
+def value_of(page, name):
+    return float(page.input_value(f"#{name}"))
+
+
+def shown_scene(page):
+    """The scene of the fields, in SI units."""
+    numbers = {name: value_of(page, name) for name in ("mass", "damping", "period", "delay")}
+    device = zwidth.Device(numbers["mass"] / 1e3, numbers["damping"])
+    wall = zwidth.VirtualWall(value_of(page, "stiffness"), value_of(page, "virtual_damping"))
+    return zwidth.Scene(device, zwidth.Timing(numbers["period"] / 1e3, numbers["delay"] / 1e3), wall)
+
+
+def words_of_check(scene):
+    options = {"mass": scene.mass, "damping": scene.damping, "period": scene.timing.period, "delay": scene.timing.delay}
+    options |= {"stiffness": scene.wall.stiffness, "virtual-damping": scene.wall.virtual_damping}
+    words = [f"--{name}={value!r}" for name, value in options.items()]
+    done = CliRunner().invoke(cli, ["check", *words])
+    assert done.exit_code == 0, done.output
+    return done.stdout.rstrip("\n")
+
+
+def assert_edge_is_of(page, scene):
+    region, units = zwidth.stable_region(scene.delta, scene.d), scene.units
+    edge = data_of(page, "edge")
+    np.testing.assert_array_equal(edge["x"], region.alpha * units.stiffness)
+    np.testing.assert_array_equal(edge["y"], region.beta * units.virtual_damping)
+
+
+def test_the_page_asks_nobody_else_and_complains_of_nothing(page, server):
+    allowed = (server.address, f"ws://{server.host}/", "data:", "blob:")
+    assert [url for url in page.asked if not url.startswith(allowed)] == []
+    assert len(page.asked) >= 4
+    assert page.complaints == []
+    assert_edge_is_of(page, shown_scene(page))
+
+
+def test_a_slider_moved_by_the_keyboard_changes_the_boundary(page):
+    before = value_of(page, "damping")
+    page.focus("#damping-slider")
+    for _ in range(5):
+        page.keyboard.press("ArrowRight")
+    settle(page)
+    assert value_of(page, "damping") > before
+    assert_edge_is_of(page, shown_scene(page))
+
+
+def test_every_control_is_reached_by_the_keyboard(page):
+    wanted = page.evaluate(
+        "[...document.querySelectorAll('#controls input, #controls select, button, #plane, input[type=checkbox]')]"
+        ".filter(e => e.offsetParent !== null).map(e => e.id || e.dataset.copy)"
+    )
+    reached = set()
+    page.focus("#mode")
+    for _ in range(3 * len(wanted)):
+        reached.add(page.evaluate("document.activeElement.id || document.activeElement.dataset.copy"))
+        page.keyboard.press("Tab")
+    assert set(wanted) - reached == set()
+    unlabelled = page.evaluate(
+        "[...document.querySelectorAll('input, select, textarea')]"
+        ".filter(e => !e.labels.length && !e.getAttribute('aria-label')).map(e => e.id)"
+    )
+    assert unlabelled == []
+
+
+@pytest.mark.parametrize("place", [(0.4, 0.5), (0.85, 0.25)])
+def test_a_click_gives_the_verdict_of_check(page, place):
+    plane = page.locator("#plane").bounding_box()
+    before = value_of(page, "stiffness")
+    page.mouse.click(plane["x"] + place[0] * plane["width"], plane["y"] + place[1] * plane["height"])
+    wait(page, f"document.getElementById('stiffness').valueAsNumber !== {before!r}")
+    settle(page)
+    assert page.get_attribute("#verdict", "data-text") == words_of_check(shown_scene(page))
+    assert page.inner_text("#word") == ("stable" if zwidth.assess(shown_scene(page)).stable else "UNSTABLE")
+
+
+def test_arrow_keys_move_the_wall(page):
+    before = shown_scene(page).wall
+    page.focus("#plane")
+    page.keyboard.press("Shift+ArrowRight")
+    page.keyboard.press("ArrowUp")
+    settle(page)
+    after = shown_scene(page).wall
+    assert after.stiffness > before.stiffness
+    assert after.virtual_damping > before.virtual_damping
+    wall = data_of(page, "wall")
+    assert (wall["x"][0], wall["y"][0]) == (after.stiffness, after.virtual_damping)
+
+
+def test_what_is_copied_runs(page, tmp_path):
+    page.fill("#damping", "7.5")
+    page.press("#damping", "Enter")
+    page.select_option("#velocity", "low_pass")
+    settle(page)
+    page.click("[data-copy=yaml]")
+    wait(page, "document.getElementById('copied').textContent === 'copied'")
+    text = page.evaluate("navigator.clipboard.readText()")
+    file = tmp_path / "copied.yaml"
+    file.write_text(text, encoding="utf-8")
+    assert zwidth.run(file, out=tmp_path / "run").ok
+    scene = zwidth.load_config(file).scene.to_scene()
+    assert scene.device.damping == 7.5
+    assert scene.velocity == zwidth.LowPass(cutoff=value_of(page, "cutoff"), order=1)
+
+
+def test_a_contact_is_simulated_on_demand(page):
+    assert data_of(page, "contact")["x"].size == 0
+    page.check("#contact-wanted")
+    wait(page, "document.getElementById('contact_words').textContent !== ''")
+    settle(page)
+    scene, shown = shown_scene(page), data_of(page, "contact")
+    start = -0.5 * scene.timing.period
+    # The simulation adds arrays of different ranks, which this session forbids.
+    with jax.numpy_rank_promotion("allow"):
+        hit = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=shown["x"].size)
+    np.testing.assert_array_equal(shown["force"], hit.wall_force)
+    assert page.complaints == []
+
+
+def test_a_refused_value_is_said_and_the_page_goes_on(page):
+    page.fill("#mass", "-5")
+    page.press("#mass", "Enter")
+    wait(page, "document.getElementById('error').textContent.startsWith('mass: got -0.005')")
+    page.fill("#mass", "200")
+    page.press("#mass", "Enter")
+    settle(page)
+    assert page.inner_text("#error") == ""
+    assert_edge_is_of(page, shown_scene(page))
+
+
+@pytest.mark.parametrize("width", [1280, 390])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_nothing_is_wider_than_the_window(browser, server, width, scheme):
+    context = browser.new_context(viewport={"width": width, "height": 900}, color_scheme=scheme)
+    opened = context.new_page()
+    opened.complaints = []
+    opened.goto(server.address)
+    settle(opened)
+    assert opened.evaluate("document.documentElement.scrollWidth") <= width
+    # WCAG's contrast of the text on what it stands on: 4.5 for AA.
+    assert opened.evaluate(CONTRAST) >= 4.5
+    context.close()
+
+
+CONTRAST = """(() => {
+  const light = color => color.match(/[\\d.]+/g).slice(0, 3).map(Number).map(v => v / 255)
+    .map(v => v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4)
+    .reduce((sum, v, k) => sum + v * [0.2126, 0.7152, 0.0722][k], 0);
+  const behind = element => {
+    const color = getComputedStyle(element).backgroundColor;
+    return color === "rgba(0, 0, 0, 0)" && element.parentElement ? behind(element.parentElement) : color;
+  };
+  const texts = [...document.querySelectorAll("h1, h2, p, label, span, strong, button, select, input, textarea")];
+  return Math.min(...texts.filter(e => e.offsetParent !== null).map(e => {
+    const pair = [light(getComputedStyle(e).color), light(behind(e))].sort((a, b) => b - a);
+    return (pair[0] + 0.05) / (pair[1] + 0.05);
+  }));
+})()"""
+
+
+def test_the_page_forbids_what_it_does_not_need(server):
+    status, headers, text = server.get()
+    assert status == 200
+    policy = headers["Content-Security-Policy"]
+    assert "default-src 'none'" in policy
+    assert "script-src 'self';" in policy
+    assert re.findall(r"(?:src|href)=\"(?:https?:)?//", text) == []
+
+
+@pytest.mark.parametrize(
+    "address", ["/", "/wrong/", "/%ff%fe/", "/ws", "/wrong/ws", "/static/js/bokeh.min.js", "/../../etc/passwd"]
+)
+def test_who_does_not_know_the_token_is_refused(server, address):
+    with pytest.raises(urllib.error.HTTPError) as refusal:
+        urllib.request.urlopen(f"http://{server.host}{address}", timeout=PATIENCE)
+    with refusal.value:
+        assert refusal.value.code == 403
+
+
+@pytest.mark.parametrize("headers", [{"Origin": "http://example.invalid"}, {"Host": "example.invalid"}])
+def test_another_origin_is_refused(server, headers):
+    assert server.get(**headers)[0] == 403
+
+
+@pytest.mark.parametrize("path", ["assets/../server.py", "assets/%2e%2e/server.py", "assets//etc/passwd", "metadata", "autoload.js"])
+def test_nothing_else_is_served(server, path):
+    assert server.get(path)[0] in (403, 404)
+
+
+def run_apart(function, *arguments, **keywords):
+    """A coroutine in a thread of its own: the browser's driver has a loop in this one."""
+    with ThreadPoolExecutor(1) as pool:
+        return pool.submit(lambda: asyncio.run(function(*arguments, **keywords))).result()
+
+
+async def converse(server, messages, origin=None):
+    """Open the page's socket with its own ticket, say something, and return how it was closed."""
+    from tornado.httpclient import HTTPRequest
+    from tornado.websocket import websocket_connect
+
+    text = server.get()[2]
+    ticket = json.loads(re.search(r'id="start">(.*?)</script>', text)[1])["items"][0]["token"]
+    headers = {"Origin": origin or f"http://{server.host}"}
+    request = HTTPRequest(server.address.replace("http:", "ws:") + "ws", headers=headers)
+    socket = await websocket_connect(request, subprotocols=["bokeh", ticket])
+    try:
+        assert await asyncio.wait_for(socket.read_message(), PATIENCE) is not None
+        for message in messages:
+            await socket.write_message(message, binary=isinstance(message, bytes))
+        while await asyncio.wait_for(socket.read_message(), PATIENCE) is not None:
+            pass
+    finally:
+        socket.close()
+    return socket.close_code
+
+
+def test_a_socket_of_another_origin_is_refused(server):
+    from tornado.httpclient import HTTPClientError
+
+    with pytest.raises(HTTPClientError) as refusal:
+        run_apart(converse, server, [], origin="http://example.invalid")
+    assert refusal.value.code == 403
+
+
+@pytest.mark.parametrize(
+    "messages",
+    [
+        ["no JSON"] * 3,
+        [b"\x00\xff" * 100],
+        ["{}", "{}", "{}"],
+        ["x" * (1 << 19)],
+        ["[" * 80_000] * 3,
+    ],
+    ids=["text", "bytes", "empty", "oversized", "deep"],
+)
+def test_a_malformed_message_ends_its_own_connection_alone(server, messages):
+    assert run_apart(converse, server, messages) is not None
+    assert server.get()[0] == 200
+
+
+def test_two_hundred_at_a_time_are_survived(server):
+    async def knock(k):
+        reader, writer = await asyncio.open_connection(*server.host.split(":"))
+        path = server.address.partition(server.host)[2] if k % 2 else "/nobody/"
+        writer.write(f"GET {path} HTTP/1.1\r\nHost: {server.host}\r\nConnection: close\r\n\r\n".encode())
+        answer = await asyncio.wait_for(reader.read(), PATIENCE)
+        writer.close()
+        return int(answer.split()[1])
+
+    async def crowd():
+        return await asyncio.gather(*(knock(k) for k in range(200)))
+
+    codes = run_apart(crowd)
+    assert set(codes[::2]) == {403}
+    # Some get a page, the others are told that too many are open; later there is room again.
+    assert set(codes[1::2]) <= {200, 503}
+    end = time.monotonic() + PATIENCE
+    while server.get()[0] != 200:
+        assert time.monotonic() < end
+        time.sleep(0.2)
