@@ -18,8 +18,9 @@ from concurrent.futures import ThreadPoolExecutor
 import jax
 import numpy as np
 import pytest
-import zwidth
 from click.testing import CliRunner
+
+import zwidth
 from zwidth.cli.commands import cli
 
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
@@ -87,7 +88,9 @@ def page(browser, server):
     context.grant_permissions(["clipboard-read", "clipboard-write"])
     opened = context.new_page()
     opened.complaints, opened.asked = [], []
-    opened.on("console", lambda text: opened.complaints.append(text.text) if text.type in ("error", "warning") else None)
+    opened.on(
+        "console", lambda text: opened.complaints.append(text.text) if text.type in ("error", "warning") else None
+    )
     opened.on("pageerror", lambda error: opened.complaints.append(str(error)))
     opened.on("request", lambda request: opened.asked.append(request.url))
     opened.on("websocket", lambda socket: opened.asked.append(socket.url))
@@ -122,7 +125,7 @@ def data_of(page, name):
 
 
 def value_of(page, name):
-    return float(page.input_value(f"#{name}"))
+    return float(page.input_value(f"[id='{name}']"))
 
 
 def shown_scene(page):
@@ -212,7 +215,7 @@ def test_arrow_keys_move_the_wall(page):
 def test_what_is_copied_runs(page, tmp_path):
     page.fill("#damping", "7.5")
     page.press("#damping", "Enter")
-    page.select_option("#velocity", "low_pass")
+    page.select_option("#velocity", "LowPass")
     settle(page)
     page.click("[data-copy=yaml]")
     wait(page, "document.getElementById('copied').textContent === 'copied'")
@@ -222,7 +225,7 @@ def test_what_is_copied_runs(page, tmp_path):
     assert zwidth.run(file, out=tmp_path / "run").ok
     scene = zwidth.load_config(file).scene.to_scene()
     assert scene.device.damping == 7.5
-    assert scene.velocity == zwidth.LowPass(cutoff=value_of(page, "cutoff"), order=1)
+    assert scene.velocity == zwidth.LowPass(cutoff=value_of(page, "velocity.cutoff"), order=1)
 
 
 def test_a_contact_is_simulated_on_demand(page):
@@ -304,7 +307,9 @@ def test_another_origin_is_refused(server, headers):
     assert server.get(**headers)[0] == 403
 
 
-@pytest.mark.parametrize("path", ["assets/../server.py", "assets/%2e%2e/server.py", "assets//etc/passwd", "metadata", "autoload.js"])
+@pytest.mark.parametrize(
+    "path", ["assets/../server.py", "assets/%2e%2e/server.py", "assets//etc/passwd", "metadata", "autoload.js"]
+)
 def test_nothing_else_is_served(server, path):
     assert server.get(path)[0] in (403, 404)
 

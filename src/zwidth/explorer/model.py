@@ -30,7 +30,8 @@ _STRIDES = ((13, 4), (25, 8), (41, 16))
 # Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
 _ON_EDGE = 1e-5
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
-_FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (96, 80), (48, 40), 12, (24, 20)
+# So few that no compiler is asked for (`zwidth.batching.FEW`).
+_FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (72, 56), (48, 40), 12, (24, 20)
 _DIRECTIONS, _FEW_DIRECTIONS = 181, 41
 _RIDGE_POINTS, _FEW_RIDGE_POINTS, _MOST_DAMPING = 61, 9, 4.0
 _SHORTEST, _LONGEST = 30, 3000

@@ -20,6 +20,7 @@ from zwidth.explorer.controls import Controls
 from zwidth.explorer.details import IMPORTING, Update, Wish, Words, compute_details, show_outlines
 from zwidth.explorer.recipes import to_python, to_yaml
 from zwidth.figures import style
+from zwidth.parts.wall import VirtualWall
 
 # A message holds some dozen numbers.
 _LONGEST_MESSAGE = 4000
@@ -203,20 +204,20 @@ class Page:
         try:
             with IMPORTING:
                 controls = self.controls.change(changes)
-                scene = controls.scene()
-                self._show_at_once(controls, scene, rest)
+                self._show_at_once(controls, rest)
         except Exception as error:
             self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
         if rest:
             assert self.frame is not None, "it has just been shown"
-            wish = Wish(scene, controls.normalized, *self.frame, outline=not self.drawn, **self.options)
+            wish = Wish(controls.scene, controls.normalized, *self.frame, outline=not self.drawn, **self.options)
             self.executor.submit(self._compute, self.generation, wish)
 
-    def _show_at_once(self, controls: Controls, scene: Any, rest: bool) -> None:
+    def _show_at_once(self, controls: Controls, rest: bool) -> None:
+        scene = controls.scene
         edge = model.quick_edge(scene)
         stable, poles = model.judge_quickly(scene)
-        device = replace(controls, stiffness=0.0, virtual_damping=0.0, alpha=0.0, beta=0.0), scene.is_rigid
+        device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
         if device != self.device:
             self.device, self.drawn = device, False
             outline = show_outlines([edge]) if scene.is_rigid else {"area": {"xs": [], "ys": []}}

@@ -9,7 +9,13 @@ from typing import Any
 from zwidth.explorer.controls import Controls
 from zwidth.scene import Scene
 
-_KINDS = {"WindowedDifference": "windowed_difference", "LowPass": "low_pass", "Butterworth": "butterworth"}
+_KINDS = {
+    "BackwardDifference": "backward_difference",
+    "WindowedDifference": "windowed_difference",
+    "LowPass": "low_pass",
+    "Butterworth": "butterworth",
+    "VelocityFilter": "filter",
+}
 _SCRIPT = """\
 import matplotlib.pyplot as plt
 import zwidth
@@ -29,31 +35,28 @@ plt.show()
 
 
 def to_yaml(controls: Controls) -> str:
-    """A configuration: the scene, and studies of its walls."""
-    scene = controls.scene()
-    study: dict[str, Any] = {"kind": "boundary", "name": "stable_walls"}
-    if scene.is_rigid and scene.operator is None:
-        study["passivity"] = True
-    lines = ["version: 1", "name: explored", "scene:"]
+    """A configuration: the scene, its stable walls and, of a rigid device, the passive ones and the response."""
+    scene = controls.scene
+    studies: list[dict[str, Any]] = [{"kind": "boundary", "name": "stable_walls"}]
+    if scene.is_rigid:
+        studies[0] |= {"passivity": True} if scene.operator is None else {}
+        studies.append({"kind": "step", "name": "response"})
     # JSON is YAML of one line.
-    lines += [f"  {name}: {json.dumps(value)}" for name, value in _section(controls, scene).items()]
-    studies = [study] + ([{"kind": "step", "name": "response"}] if scene.is_rigid else [])
-    lines += ["studies:", *(f"  - {json.dumps(study)}" for study in studies)]
-    return "\n".join(lines) + "\n"
+    lines = ["version: 1", "name: explored", "scene:"]
+    lines += [f"  {name}: {json.dumps(value)}" for name, value in _section(controls).items()]
+    return "\n".join([*lines, "studies:", *(f"  - {json.dumps(study)}" for study in studies)]) + "\n"
 
 
-def _section(controls: Controls, scene: Scene) -> dict[str, Any]:
+def _section(controls: Controls) -> dict[str, Any]:
     """The scene as a configuration spells it."""
     if controls.normalized:
-        return {name: getattr(controls, name) for name in ("delta", "d", "alpha", "beta")}
-    found: dict[str, Any] = {"mass": scene.device.mass, "damping": scene.device.damping}
-    found |= {"period": scene.timing.period, "delay": scene.timing.delay}
-    found |= {"stiffness": scene.wall.stiffness, "virtual_damping": scene.wall.virtual_damping}
-    kind = _KINDS.get(type(scene.velocity).__name__)
-    if kind is not None:
-        found["velocity"] = {"kind": kind, **_given(scene.velocity)}
+        return {name: value for name, value in controls.shown().items() if name != "mode"}
+    scene: Scene = controls.scene
+    found = _given(scene.timing) | _given(scene.wall) | {"velocity": {"kind": _KINDS[type(scene.velocity).__name__]}}
+    found["velocity"] |= _given(scene.velocity)
     parts = {"operator": scene.operator, "coupling": scene.device.coupling}
-    return found | {name: _given(part) for name, part in parts.items() if part is not None}
+    found |= {name: _given(part) for name, part in parts.items() if part is not None}
+    return {"mass": scene.device.mass, "damping": scene.device.damping} | found
 
 
 def _given(part: Any) -> dict[str, Any]:
@@ -64,9 +67,7 @@ def _given(part: Any) -> dict[str, Any]:
 
 def to_python(controls: Controls) -> str:
     """A script that builds the scene, judges its wall and draws the stable set."""
-    scene = controls.scene()
-    parts = {"device": scene.device, "timing": scene.timing, "wall": scene.wall}
-    parts |= _given(scene)
+    parts = _given(controls.scene)
     text = "zwidth.Scene(\n" + "".join(f"    {name}={_spell(part)},\n" for name, part in parts.items()) + ")"
     normalized = {"notes": "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "unit": "(alpha)"}
     normalized |= {"x": "normalized stiffness alpha", "y": "normalized damping beta"}

@@ -3,8 +3,6 @@
 const start = JSON.parse(document.getElementById("start").textContent);
 const by = id => document.getElementById(id);
 const STEPS = 1000;
-const GROUPS = { mode: [], velocity: ["samples", "cutoff", "order"], operator: ["hand_mass", "hand_damping",
-  "hand_stiffness", "grasp_stiffness", "grasp_damping"], coupling: ["tip_mass", "tip_stiffness", "tip_damping"] };
 const LABELS = { mode: "numbers", velocity: "velocity estimate", operator: "operator", coupling: "compliance" };
 const fields = {};
 let inputs = null, serial = 0, answered = 0, waiting = {}, rests = false, scheduled = false;
@@ -51,25 +49,24 @@ function addChoice(form, name) {
   const select = element("select", { id: name });
   for (const [value, text] of Object.entries(start.choices[name])) select.append(element("option", { value, textContent: text }));
   select.addEventListener("change", () => send({ [name]: select.value }, true));
-  fields[name] = { select, row: addRow(form, name, LABELS[name], select), shown_if: name === "mode" ? "" : "mode=physical" };
+  fields[name] = { select, row: addRow(form, name, LABELS[name], select) };
 }
 function build() {
-  const form = by("controls"), grouped = Object.values(GROUPS).flat();
+  const form = by("controls"), names = Object.keys(start.sliders);
   form.addEventListener("submit", event => event.preventDefault());
   addChoice(form, "mode");
-  for (const name of Object.keys(start.sliders).filter(name => !grouped.includes(name))) {
+  for (const name of names.filter(name => !name.includes("."))) {
     addSlider(form, name);
     if (name === "period") {
       const rate = element("input", { type: "number", step: "any", id: "rate", min: 0 });
       const row = addRow(form, "rate", "or rate 1/T in Hz", element("span"), rate);
       rate.addEventListener("change", () => rate.valueAsNumber > 0 && send({ period: 1e3 / rate.valueAsNumber }, true));
-      fields.rate = { rate, row, shown_if: "mode=physical" };
+      fields.rate = { rate, row };
     }
   }
-  for (const [choice, names] of Object.entries(GROUPS)) {
-    if (choice === "mode") continue;
-    addChoice(form, choice);
-    for (const name of names) addSlider(form, name);
+  for (const part of ["velocity", "operator", "coupling"]) {
+    addChoice(form, part);
+    for (const name of names.filter(name => name.startsWith(`${part}.`))) addSlider(form, name);
   }
 }
 
@@ -112,9 +109,8 @@ function showLines(box, text) {
 }
 function showState(state) {
   for (const [name, field] of Object.entries(fields)) {
-    const [choice, values] = field.shown_if.split("=");
-    field.row.hidden = choice !== "" && (!values.split("|").includes(state[choice]) || (choice !== "mode" && state.mode !== "physical"));
-    if (name in waiting) continue;
+    field.row.hidden = !((name === "rate" ? "period" : name) in state);
+    if (field.row.hidden || name in waiting) continue;
     if (field.select) field.select.value = state[name];
     else if (field.rate) { if (document.activeElement !== field.rate) field.rate.value = Number((1e3 / state.period).toPrecision(6)); }
     else {
