@@ -139,7 +139,7 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore")
     import click, equinox, jax, jaxopt, lineax, matplotlib.pyplot, numpy, optimistix
     import pydantic, rich.progress, scipy.linalg, scipy.optimize, yaml
-    for name in ("dask", "distributed", "flint", "xarray", "zarr"):
+    for name in ("bokeh.server.server", "dask", "distributed", "flint", "xarray", "zarr"):
         try:
             importlib.import_module(name)
         except ImportError:

@@ -28,6 +28,7 @@ ROOMS = (
         "cli",
         "figures",
         "html_report",
+        "explorer",
     ],
 )
 

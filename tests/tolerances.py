@@ -150,3 +150,15 @@ FRICTION_TRUTH = Tolerance(
 SIMULATED_AGAIN = Tolerance(
     1e-12, "Relative to the widest motion: the same simulation in a batch, where sums are rounded in another order."
 )
+
+CONTOUR = Tolerance(
+    0.01, "Of the spectral radius: between the places of a grid of some dozens a side it is taken for linear."
+)
+EDGE_RADIUS = Tolerance(
+    2e-5,
+    "Of the spectral radius from 1. Places are asked with eigenvalues to 1e-5, which double poles lose to rounding.",
+)
+QUICK_EDGE = Tolerance(
+    0.03,
+    "Relative to the largest outline's width and height: 513 places on the curve, a lobe has some dozens at least.",
+)

@@ -21,6 +21,8 @@ from zwidth.studies.document import load_config
 
 # Beyond so many, the poles cannot follow a drag.
 _MOST_POLES = 80
+# Of a number that the page sends, in its units.
+_LARGEST = 1e100
 
 
 class Slider(NamedTuple):
@@ -122,7 +124,7 @@ class Controls:
             if name not in new.shown():
                 # A slider that has just gone, or none that ever was.
                 raise InputError(f"{str(name)[:40]!r}: the page has no such number now")
-            if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
+            if isinstance(value, bool) or not isinstance(value, int | float) or not -_LARGEST <= value <= _LARGEST:
                 raise InputError(f"{SLIDERS[name].label}: got {str(value)[:40]!r}; a finite number is needed")
             number = round(value) if SLIDERS[name].whole else float(value) / SLIDERS[name].per_si
             new = replace(new, scene=new.scene.replace(**{_NORMALIZED.get(name, name): number}))

@@ -16,7 +16,7 @@ from zwidth.linear.passivity import has_condition
 from zwidth.linear.polynomial import affine_polynomial
 from zwidth.linear_loop import circle
 from zwidth.scene import Scene
-from zwidth.simulation.result import Outcome
+from zwidth.simulation.result import MotionKind
 from zwidth.stability.poles import companion
 from zwidth.stability.region import stable_region
 from zwidth.stability.ridge import alpha_max
@@ -26,12 +26,12 @@ Range = tuple[float, float]
 
 # Points of the boundary while a slider moves; how many coefficients leave time to ask every so manieth for its poles.
 _QUICK_CURVE, _QUICK_LINE = 513, 65
-_STRIDES = ((13, 4), (25, 8), (41, 16))
+_STRIDES = ((9, 1), (15, 2), (26, 4), (42, 8))
 # Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
 _ON_EDGE = 1e-5
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
 # So few that no compiler is asked for (`zwidth.batching.FEW`).
-_FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (72, 56), (48, 40), 12, (24, 20)
+_FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (72, 56), (48, 40), 12, (36, 30)
 _DIRECTIONS, _FEW_DIRECTIONS = 181, 41
 _RIDGE_POINTS, _FEW_RIDGE_POINTS, _MOST_DAMPING = 61, 9, 4.0
 _SHORTEST, _LONGEST = 30, 3000
@@ -79,7 +79,7 @@ def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
         poles = np.linalg.eigvals(companion(polynomials / D[0]))
         edge[places] = np.abs(poles).max(-1) <= 1.0 + _ON_EDGE
 
-    stride = next((stride for most, stride in _STRIDES if D.size <= most), 32)
+    stride = next((stride for most, stride in _STRIDES if D.size <= most), 16)
     places = np.arange(0, alpha.size, stride)
     ask(places)
     while stride > 1:
@@ -187,7 +187,7 @@ def contact_motion(scene: Scene, periods: int) -> tuple[np.ndarray, np.ndarray, 
     start = -_APPROACH * _IMPACT * scene.timing.period
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     assert hit.time is not None and hit.position is not None and hit.wall_force is not None, "it was recorded"
-    words = f"(leaves it {int(hit.bounces)} times, {Outcome(int(hit.outcome)).name.lower()} at the end)"
+    words = f"(leaves it {int(hit.bounces)} times, {MotionKind(int(hit.outcome)).name.lower()} at the end)"
     return hit.time, hit.position, hit.wall_force, words
 
 

@@ -7,6 +7,7 @@ import json
 import logging
 import secrets
 import signal
+import socket
 import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +24,6 @@ from bokeh.server.views.session_handler import SessionHandler
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop
-from tornado.netutil import bind_sockets
 from tornado.web import ErrorHandler, StaticFileHandler
 
 from zwidth.errors import InputError
@@ -117,7 +117,7 @@ class Explorer:
 
     def __init__(self, controls: Controls, words: Words, port: int = 0) -> None:
         try:
-            sockets = bind_sockets(port, HOST)
+            listening = socket.create_server((HOST, port), backlog=256)
         except OSError as error:
             raise InputError(
                 f"--port: {port} cannot be had ({error.strerror}); choose another, or 0 for any"
@@ -125,7 +125,8 @@ class Explorer:
         # What a stranger sends is no news, and what goes wrong in the page is said there.
         for name in ("bokeh", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-        token, self.port = secrets.token_urlsafe(24), sockets[0].getsockname()[1]
+        listening.setblocking(False)
+        token, self.port = secrets.token_urlsafe(24), listening.getsockname()[1]
         self.address = f"http://{HOST}:{self.port}/{token}/"
         self.loop = IOLoop.current()
         self._executor = ThreadPoolExecutor(1, thread_name_prefix="explorer")
@@ -137,7 +138,7 @@ class Explorer:
 
         application = GuardedServer(make, token, self.port)
         http = HTTPServer(application, max_header_size=1 << 14, max_body_size=1 << 16, idle_connection_timeout=60)
-        http.add_sockets(sockets)
+        http.add_sockets([listening])
         self._server = BaseServer(self.loop, application, http)
 
     def run(self) -> None:
