@@ -159,6 +159,5 @@ EDGE_RADIUS = Tolerance(
     "Of the spectral radius from 1. Places are asked with eigenvalues to 1e-5, which double poles lose to rounding.",
 )
 QUICK_EDGE = Tolerance(
-    0.03,
-    "Relative to the largest outline's width and height: 513 places on the curve, a lobe has some dozens at least.",
+    0.03, "Relative to the largest outline's width and height: at a corner a step of curve and of line may be missing."
 )

@@ -12,6 +12,7 @@ import time
 import urllib.error
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,8 +33,9 @@ class Server:
     def __init__(self, folder, *arguments):
         command = [sys.executable, "-m", "zwidth", "explore", "--no-browser", *arguments]
         self.process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        line = self.process.stdout.readline()
-        assert line.startswith("http://127.0.0.1:"), self.process.stderr.read()
+        out: Any = self.process.stdout
+        line = out.readline()
+        assert line.startswith("http://127.0.0.1:"), self.process.communicate()
         self.address = line.split()[0]
         self.host = self.address.split("/")[2]
 
@@ -198,7 +200,8 @@ def test_what_is_copied_runs(page, tmp_path):
     file = tmp_path / "copied.yaml"
     file.write_text(text, encoding="utf-8")
     assert zwidth.run(file, out=tmp_path / "run").ok
-    scene = zwidth.load_config(file).scene.to_scene()
+    given: Any = zwidth.load_config(file).scene
+    scene = given.to_scene()
     assert scene.device.damping == 7.5
     assert scene.velocity == zwidth.LowPass(cutoff=value_of(page, "velocity.cutoff"), order=1)
 
@@ -296,7 +299,7 @@ async def converse(server, messages, origin=None):
     from tornado.websocket import websocket_connect
 
     text = server.get()[2]
-    ticket = json.loads(re.search(r'id="start">(.*?)</script>', text)[1])["items"][0]["token"]
+    ticket = json.loads(re.findall(r'id="start">(.*?)</script>', text)[0])["items"][0]["token"]
     headers = {"Origin": origin or f"http://{server.host}"}
     request = HTTPRequest(server.address.replace("http:", "ws:") + "ws", headers=headers)
     socket = await websocket_connect(request, subprotocols=["bokeh", ticket])

@@ -47,14 +47,14 @@ def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
     if wish.outline and not rigid:
         yield show_outlines(model.outlines(scene))
     verdict = assess(scene)
-    check = model.normalized_lines if isinstance(verdict, Assessment) and wish.normalized else None
-    lines = check(verdict) if check else words.check(scene, verdict, [])
+    own = model.normalized_lines(verdict) if wish.normalized and isinstance(verdict, Assessment) else None
+    lines = own or words.check(scene, verdict, [])
     yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(wish, verdict)}
     if wish.outline:
         passive = model.passive_set(scene)
         x, y = passive if passive is not None else (np.empty(0), np.empty(0))
         yield {"passive": {"x": x, "y": y}, "contours": model.contours(scene, wish.across, wish.up)}
-    if not check:
+    if not own:
         yield {"verdict": "\n".join(words.check(scene, verdict, limits_of(scene)))}
     if wish.contact or (wish.costly and not rigid):
         with IMPORTING:
@@ -87,7 +87,7 @@ def _wall_curves(wish: Wish, verdict: Any) -> Update:
     time, position = model.step_motion(scene, model.length_of(scene, verdict))
     best = verdict.stiffness_max, verdict.virtual_damping_at_max
     return {
-        "nyquist": {"x": curve.real, "y": curve.imag},
+        "nyquist": {"x": np.real(curve), "y": np.imag(curve)},
         "crossover": {"x": [cross.real], "y": [cross.imag]},
         "step": {"x": time, "y": position * _length(wish)},
         "best": {"x": [best[0]], "y": [best[1]]},

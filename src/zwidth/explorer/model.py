@@ -12,9 +12,9 @@ import numpy as np
 
 from zwidth.assessment import Assessment, SceneAssessment
 from zwidth.formatting import plain
+from zwidth.linear.crossing_lines import end_lines
 from zwidth.linear.passivity import has_condition
 from zwidth.linear.polynomial import affine_polynomial
-from zwidth.linear_loop import circle
 from zwidth.scene import Scene
 from zwidth.simulation.result import MotionKind
 from zwidth.stability.poles import companion
@@ -24,8 +24,9 @@ from zwidth.stability.ridge import alpha_max
 Curve = tuple[np.ndarray, np.ndarray]
 Range = tuple[float, float]
 
-# Points of the boundary while a slider moves; how many coefficients leave time to ask every so manieth for its poles.
-_QUICK_CURVE, _QUICK_LINE = 513, 65
+# Points of the curve and of a line while a slider moves.
+_QUICK_CURVE, _QUICK_LINE = 513, 129
+# How many coefficients of the poles leave time to ask every so many place at first.
 _STRIDES = ((9, 1), (15, 2), (26, 4), (42, 8))
 # Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
 _ON_EDGE = 1e-5
@@ -49,7 +50,8 @@ def outlines(scene: Scene) -> list[Curve]:
 def quick_edge(scene: Scene) -> Curve:
     """Points of the stable set's edge, NaN between its parts, at a cost that follows a drag.
 
-    On the boundary curve and on the two lines of real poles, those at which no pole lies outside of the unit circle.
+    On the boundary curve and on the lines of real poles, those at which no pole lies outside of the unit circle. A
+    part through which the curve runs in a few of its places, as behind a long window, comes with the `outlines` only.
     """
     if scene.is_rigid:
         return outlines(scene)[0]
@@ -59,9 +61,10 @@ def quick_edge(scene: Scene) -> Curve:
     known = parts[0][1][np.isfinite(parts[0][1])]
     low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
     damping = np.linspace(low - 0.5 * (high - low), high + 0.5 * (high - low), _QUICK_LINE)
-    at, units = circle(np.array([0.0, np.pi])), scene.units
-    for q, f in zip(scene.loop.needed(at).value.real, scene.loop.estimate.jet(at).value.real, strict=True):
-        parts.append(_on_edge(scene, (q - damping / units.virtual_damping * f) * units.stiffness, damping))
+    units = scene.units
+    for line in end_lines(scene.loop):
+        stiffness = (line.q - damping / units.virtual_damping * line.f) * units.stiffness
+        parts.append(_on_edge(scene, stiffness, damping))
     x, y = (np.concatenate([np.append(part[k], np.nan) for part in parts]) for k in (0, 1))
     return x, y
 
@@ -82,6 +85,7 @@ def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
     stride = next((stride for most, stride in _STRIDES if D.size <= most), 16)
     places = np.arange(0, alpha.size, stride)
     ask(places)
+    ask(np.arange(places[-1] + 1, alpha.size))
     while stride > 1:
         between = places[:-1] + stride // 2
         same = edge[places[:-1]] == edge[places[1:]]
@@ -181,12 +185,11 @@ def ridge_path(scene: Scene) -> Curve:
     return np.array([float(w.stiffness) for w in walls]), np.array([float(w.virtual_damping) for w in walls])
 
 
-def contact_motion(scene: Scene, periods: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     """Time, position and wall force of the device that hits the wall, and what comes of it in words."""
     # From five periods before the wall at a tenth of a meter a second; the normalized device at as many units.
     start = -_APPROACH * _IMPACT * scene.timing.period
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
-    assert hit.time is not None and hit.position is not None and hit.wall_force is not None, "it was recorded"
     words = f"(leaves it {int(hit.bounces)} times, {MotionKind(int(hit.outcome)).name.lower()} at the end)"
     return hit.time, hit.position, hit.wall_force, words
 

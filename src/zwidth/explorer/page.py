@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from bokeh.document import Document
 from bokeh.events import Tap
-from bokeh.models import ColumnDataSource, DataRange1d, Range1d
+from bokeh.models import ColumnDataSource, DataRange1d
 from bokeh.plotting import figure
 
 from zwidth.errors import ZwidthError
@@ -43,7 +43,7 @@ _OF_DEVICE = ("contours", "passive", "ridge", "best")
 # Ink, edge, passive, ridge and the rest on a light page and on a dark one.
 _LIGHT = {"ink": style.BLACK, "faint": "#565656", "edge": style.BLUE, "passive": "#00735A", "ridge": style.VERMILION}
 _DARK = {"ink": "#F2F2F2", "faint": "#A6A6A6", "edge": style.SKY, "passive": "#2FC79C", "ridge": style.ORANGE}
-_TURN = np.exp(1j * np.linspace(0.0, 2.0 * np.pi, 361))
+_TURN = np.linspace(0.0, 2.0 * np.pi, 361)
 
 
 class Page:
@@ -97,7 +97,7 @@ class Page:
         return drawn
 
     def _draw_plane(self) -> figure:
-        plot = self._new(460, x_range=Range1d(0, 1), y_range=Range1d(0, 1))
+        plot = self._new(460, x_range=(0, 1), y_range=(0, 1))
         # Lines alone carry the meaning; what is filled is pale.
         area = {"line_color": None, "fill_alpha": 0.13}
         self._add(plot, "multi_polygons", "area", "edge", parts="fill", xs="xs", ys="ys", legend_label="stable", **area)
@@ -121,7 +121,7 @@ class Page:
     def _draw_circle(self, seen: list[str]) -> figure:
         """A plane of complex numbers with the unit circle; the ranges hold what is named."""
         plot = self._new(280, match_aspect=True)
-        circle = plot.line(_TURN.real, _TURN.imag, line_width=1.5)
+        circle = plot.line(np.cos(_TURN), np.sin(_TURN), line_width=1.5)
         self.inks.append((circle.glyph, "line_color", "faint"))
         plot.x_range, plot.y_range = (DataRange1d(renderers=[circle]) for _ in "xy")
         plot.tags = seen
@@ -131,7 +131,7 @@ class Page:
         plot = self._draw_circle(["poles"])
         poles = self._add(plot, "scatter", "poles", "edge", x="x", y="y", marker="x", size=11, line_width=2.5)
         for axis in (plot.x_range, plot.y_range):
-            axis.renderers = [*axis.renderers, poles]
+            axis.renderers = [*axis.renderers, poles]  # pyright: ignore[reportAttributeAccessIssue]
         plot.xaxis.axis_label, plot.yaxis.axis_label = "Re z", "Im z"
         return plot
 
@@ -227,12 +227,14 @@ class Page:
         self.controls = controls
         self._name_axes()
         wall = {"x": [controls.wall[0]], "y": [controls.wall[1]]}
-        self._fill({"wall": wall, "poles": {"x": poles.real, "y": poles.imag}})
+        self._fill({"wall": wall, "poles": {"x": np.real(poles), "y": np.imag(poles)}})
         frame = model.frame(edge, controls.wall)
         if frame != self.frame:
             self.frame = frame
-            plane = self.plots["plane"]
-            (plane.x_range.start, plane.x_range.end), (plane.y_range.start, plane.y_range.end) = frame
+            for axis, (low, high) in zip(
+                (self.plots["plane"].x_range, self.plots["plane"].y_range), frame, strict=True
+            ):
+                axis.update(start=low, end=high)
         word = "stable" if stable else "UNSTABLE"
         radius = f"spectral radius {np.abs(poles).max():.6f}"
         recipes = {"yaml": to_yaml(controls), "python": to_python(controls)} if rest else {}

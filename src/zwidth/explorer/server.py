@@ -98,7 +98,7 @@ class PageHandler(SessionHandler):
             self.set_header("Content-Type", "text/plain")
             self.finish(f"{_MOST_PAGES} pages are open; close one, or wait {_UNUSED} s\n")
             return
-        session = await self.get_session()
+        session: Any = await self.get_session()  # pyright: ignore[reportGeneralTypeIssues]
         roots = {root.id: root.name for root in session.document.roots}
         item = {"token": session.token, "roots": roots, "root_ids": list(roots), "use_for_title": False}
         sliders = {name: slider._asdict() for name, slider in SLIDERS.items()}

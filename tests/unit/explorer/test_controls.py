@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -81,7 +82,7 @@ def test_what_cannot_be_is_refused_by_its_name(change, says):
 
 @pytest.mark.parametrize("file", sorted(CONFIGS.glob("*.yaml")), ids=lambda file: file.stem)
 def test_configurations_set_their_own_scene_or_say_why_not(file):
-    given = zwidth.load_config(file).scene
+    given: Any = zwidth.load_config(file).scene
     if given is None:
         with pytest.raises(zwidth.InputError, match="scene: missing"):
             read_controls(file)
@@ -108,7 +109,8 @@ def test_configurations_set_their_own_scene_or_say_why_not(file):
 def test_any_estimate_of_a_configuration_is_kept(tmp_path, velocity):
     file = written(tmp_path, f"{DEVICE}, stiffness: 1000, virtual_damping: 2, velocity: {velocity}")
     controls = read_controls(file)
-    assert controls.scene == zwidth.load_config(file).scene.to_scene()
+    given: Any = zwidth.load_config(file).scene
+    assert controls.scene == given.to_scene()
     assert controls.change({"mass": 200}).scene.velocity == controls.scene.velocity
     assert controls.change(controls.shown()).scene.d == 1.5
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,8 +38,9 @@ class Queue:
 
 @pytest.fixture
 def page():
-    queue, texts = Queue(), {}
-    opened = Page(Document(), Controls(), Words(check_lines, slope_lines), queue)
+    queue: Any = Queue()
+    texts: dict[str, Any] = {}
+    opened: Any = Page(Document(), Controls(), Words(check_lines, slope_lines), queue)
     opened.answer.on_change("data", lambda _, __, data: texts.update(json.loads(data["json"][0])))
     # There is no loop: what is handed over is taken at once.
     opened._hand_over = opened._take
