@@ -18,6 +18,7 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     It starts from the scene of a CONFIG file, or of the run in DIR. The server is for this machine alone and asks for
     the token in its address. Ctrl-C ends it.
     """
+    import threading
     import webbrowser
 
     from zwidth.errors import InputError
@@ -34,7 +35,8 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     explorer = Explorer(read_controls(path), Words(check_lines, slope_lines), port)
     click.echo(f"{explorer.address}  (Ctrl-C ends it)")
     if not no_browser:
-        webbrowser.open(explorer.address)
+        # A browser in the terminal would keep the server waiting for its own page.
+        threading.Thread(target=webbrowser.open, args=(explorer.address,), daemon=True).start()
     explorer.run()
     click.echo("stopped")
 

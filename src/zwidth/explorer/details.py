@@ -70,9 +70,10 @@ def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
 
 
 def show_outlines(outlines: list[model.Curve]) -> Update:
-    """All outlines as one area: what lies within two of them is a hole."""
-    rings = [[x, y] for x, y in outlines]
-    return {"area": {"xs": [[[x for x, _ in rings]]], "ys": [[[y for _, y in rings]]]}}
+    """All outlines, closed, as one line and as one area: what lies within two of them is a hole."""
+    xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines] for axis in (0, 1))
+    x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
+    return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}}
 
 
 def _length(wish: Wish) -> float:

@@ -101,11 +101,13 @@ function show(answer) {
   if ("state" in answer || "error" in answer) answered = Math.max(answered, answer.serial);
   flush();
 }
-// Lines of the commands: a label of 20 characters, and what is said.
+// Lines of the commands: a label of 20 characters or more, two spaces, and what is said.
 function showLines(box, text) {
   box.dataset.text = text;
-  const line = part => element("div", {}, element("span", { textContent: part.slice(0, 20).trim() }), element("span", { textContent: part.slice(20).trim() }));
-  box.replaceChildren(...text.split("\n").map(line));
+  box.replaceChildren(...text.split("\n").map(line => {
+    const [, label, words] = /^(.{20}.*?) {2}(.*)$/.exec(line) ?? ["", line, ""];
+    return element("div", {}, ...[label.trim(), words].map(textContent => element("span", { textContent })));
+  }));
 }
 function showState(state) {
   for (const [name, field] of Object.entries(fields)) {
