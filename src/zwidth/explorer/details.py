@@ -64,7 +64,7 @@ def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if wish.normalized else words.slopes(scene))}
     if wish.contact:
-        time, position, force, text = model.contact_motion(scene, model.length_of(scene, verdict))
+        time, position, force, text = model.contact_motion(scene, 2 * model.length_of(scene, verdict))
         position = position * _length(wish)
         yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}
 

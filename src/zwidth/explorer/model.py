@@ -190,7 +190,9 @@ def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     # From five periods before the wall at a tenth of a meter a second; the normalized device at as many units.
     start = -_APPROACH * _IMPACT * scene.timing.period
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
-    words = f"(leaves it {int(hit.bounces)} times, {MotionKind(int(hit.outcome)).name.lower()} at the end)"
+    kind = MotionKind(int(hit.outcome))
+    end = "" if kind == MotionKind.UNCLEAR else f", {kind.name.lower()} at the end"
+    words = f"(leaves it {int(hit.bounces)} times{end})"
     return hit.time, hit.position, hit.wall_force, words
 
 

@@ -7,6 +7,7 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from zwidth.explorer.controls import Controls
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.scene import Scene
 
 _KINDS = {
@@ -52,8 +53,9 @@ def _section(controls: Controls) -> dict[str, Any]:
     if controls.normalized:
         return {name: value for name, value in controls.shown().items() if name != "mode"}
     scene: Scene = controls.scene
-    found = _given(scene.timing) | _given(scene.wall) | {"velocity": {"kind": _KINDS[type(scene.velocity).__name__]}}
-    found["velocity"] |= _given(scene.velocity)
+    found = _given(scene.timing) | _given(scene.wall)
+    if scene.velocity != BackwardDifference():
+        found["velocity"] = {"kind": _KINDS[type(scene.velocity).__name__], **_given(scene.velocity)}
     parts = {"operator": scene.operator, "coupling": scene.device.coupling}
     found |= {name: _given(part) for name, part in parts.items() if part is not None}
     return {"mass": scene.device.mass, "damping": scene.device.damping} | found
