@@ -3,9 +3,9 @@
 
 A page is run from top to bottom in a folder of its own, which has the project's configs/ and scripts/ and the files of
 docs/guides/files. Each command of a ``console`` block and each ``>>>`` of a ``python`` block is followed by what it
-prints. A figure that the page shows from docs/figures/guides is the file of that name that the page has written. Between
-``<!-- include: WHAT -->`` and ``<!-- end -->`` stands a file of the project, a section of one (FILE#HEADING), the gallery
-or the table of the paper's numbers. ``--check`` changes nothing and fails where a page is out of date.
+prints. A figure that the page shows from docs/figures/guides is the file of that name that the page has written.
+Between ``<!-- include: WHAT -->`` and ``<!-- end -->`` stands a file of the project, a section of one (FILE#HEADING),
+the gallery or the table of the paper's numbers. ``--check`` changes nothing and fails where a page is out of date.
 """
 
 from __future__ import annotations

@@ -22,8 +22,7 @@ TARGET = ROOT / "docs" / "figures"
 
 # configuration -> the figures that README.md shows
 SHOWN = {
-    "paper": ("fig5", "fig10", "fig11", "passivity_cost"),
-    "phantom": ("recommend",),
+    "paper": ("fig5", "fig10", "passivity_cost"),
     "velocity_filter": ("stiffest",),
     "dense": ("region_stable",),
 }

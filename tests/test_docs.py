@@ -44,7 +44,7 @@ def test_outputs_are_written_where_they_are_missing_or_old(refresh_docs):
     "text, error",
     [
         ("```python\n>>> 1 / 0\n```", ZeroDivisionError),
-        ("```python\nnot python\n```", SyntaxError),
+        ("```python\nno python\n```", SyntaxError),
         ("```console\n$ zwidth check --stiffness 1\n```", subprocess.CalledProcessError),
         ("```console\n$ ls\n```", SystemExit),
         ("![a figure](figures/guides/nobody.svg)", SystemExit),
