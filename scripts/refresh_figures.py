@@ -1,11 +1,18 @@
 #!/usr/bin/env python3
-"""Draw the pictures of README.md anew: run their configurations and copy the SVG files to docs/figures."""
+"""Draw the pictures of README.md and of the gallery anew: run every configuration, or those named.
+
+Every figure of a configuration goes to docs/figures/CONFIGURATION as PNG, with few colors so that it is small; those of
+README.md go to docs/figures as SVG. Afterwards scripts/refresh_docs.py puts new ones into docs/gallery.md.
+"""
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import tempfile
 from pathlib import Path
+
+from PIL import Image
 
 import zwidth
 from zwidth.runs.draw import draw_stores
@@ -13,32 +20,45 @@ from zwidth.runs.draw import draw_stores
 ROOT = Path(__file__).resolve().parents[1]
 TARGET = ROOT / "docs" / "figures"
 
-# configuration -> the figures that are shown
+# configuration -> the figures that README.md shows
 SHOWN = {
-    "paper": ("fig5", "fig10", "fig11", "passivity_cost"),
-    "phantom": ("recommend",),
+    "paper": ("fig5", "fig10", "passivity_cost"),
     "velocity_filter": ("stiffest",),
+    "dense": ("region_stable",),
 }
-# The figure of configs/dense.yaml that is shown.
-STORED = "region_stable.svg"
+# Lines and shades of one figure, with their antialiasing; a color map takes most.
+COLORS = 192
+
+
+def draw(config: Path, out: Path) -> list[Path]:
+    """Run a configuration, or go on with it; returns its figures as PNG, each with an SVG beside it."""
+    result = zwidth.run(config, out=out, resume=True)
+    if not result.ok:
+        raise SystemExit("\n".join(f"{study.name}: {study.error}" for study in result.failed))
+    files = [out / file for study in result.studies for file in study.files]
+    if result.sweeps:
+        files += draw_stores(out)
+    return [file for file in files if file.suffix == ".png"]
 
 
 def main() -> None:
-    """Run every configuration and copy what is shown of it."""
-    TARGET.mkdir(parents=True, exist_ok=True)
+    """Run the configurations and copy what is shown of them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("names", nargs="*", help="configurations without folder and ending; all where left out")
+    parser.add_argument("--runs", type=Path, help="folder that keeps the runs, which go on where they are there")
+    options = parser.parse_args()
+    names = options.names or sorted(path.stem for path in (ROOT / "configs").glob("*.yaml"))
     with tempfile.TemporaryDirectory() as folder:
-        for name, figures in SHOWN.items():
-            result = zwidth.run(ROOT / "configs" / f"{name}.yaml", out=Path(folder, name))
-            if not result.ok:
-                raise SystemExit("\n".join(f"{study.name}: {study.error}" for study in result.failed))
-            for figure in figures:
-                shutil.copy(result.folder / f"{figure}.svg", TARGET)
-                print(TARGET.relative_to(ROOT) / f"{figure}.svg")
-        out = Path(folder, "dense")
-        zwidth.run(ROOT / "configs" / "dense.yaml", out=out)
-        drawn = {file.name: file for file in draw_stores(out)}
-        shutil.copy(drawn[STORED], TARGET)
-        print(TARGET.relative_to(ROOT) / STORED)
+        for name in names:
+            pictures = draw(ROOT / "configs" / f"{name}.yaml", (options.runs or Path(folder)) / name)
+            shutil.rmtree(TARGET / name, ignore_errors=True)
+            (TARGET / name).mkdir(parents=True)
+            for picture in pictures:
+                small = Image.open(picture).convert("RGB").quantize(COLORS, dither=Image.Dither.NONE)
+                small.save(TARGET / name / picture.name, optimize=True)
+                if picture.stem in SHOWN.get(name, ()):
+                    shutil.copy(picture.with_suffix(".svg"), TARGET)
+            print(f"{name}: {len(pictures)} figures")
 
 
 if __name__ == "__main__":

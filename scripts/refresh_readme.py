@@ -8,6 +8,7 @@ root and followed by its output. ``--check`` changes nothing and fails where REA
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import re
 import shlex
@@ -24,23 +25,24 @@ def output_of(command: str) -> str:
     """What one command prints, without colors."""
     words = shlex.split(command)
     if words[0] == "cat":
-        return "".join((ROOT / name).read_text(encoding="utf-8") for name in words[1:])
+        return "".join(Path(name).read_text(encoding="utf-8") for name in words[1:])
     if words[0] != "zwidth":
-        raise SystemExit(f"README.md: {command!r} is neither zwidth nor cat")
+        raise SystemExit(f"{command!r} is neither zwidth nor cat")
     call = [sys.executable, "-m", "zwidth", *words[1:]]
     environment = {**os.environ, "NO_COLOR": "1", "COLUMNS": "100"}
-    return subprocess.run(call, cwd=ROOT, env=environment, check=True, capture_output=True, text=True).stdout
+    return subprocess.run(call, env=environment, check=True, capture_output=True, text=True).stdout
+
+
+def show_commands(block: str) -> str:
+    """The commands of a console block, run in the current folder, each with its output."""
+    commands = [line[2:] for line in block.splitlines() if line.startswith("$ ")]
+    return "\n".join(f"$ {command}\n{output_of(command).rstrip()}\n" for command in commands)
 
 
 def refreshed(text: str) -> str:
     """The text with the output of every command in its console blocks."""
-
-    def fill(block: re.Match[str]) -> str:
-        commands = [line[2:] for line in block.group(1).splitlines() if line.startswith("$ ")]
-        parts = [f"$ {command}\n{output_of(command).rstrip()}\n" for command in commands]
-        return "```console\n" + "\n".join(parts) + "```"
-
-    return _BLOCK.sub(fill, text)
+    with contextlib.chdir(ROOT):
+        return _BLOCK.sub(lambda block: f"```console\n{show_commands(block.group(1))}```", text)
 
 
 def main() -> None:

@@ -1,0 +1,174 @@
+"""The documentation site: built strictly, then read in a browser that reaches nothing else."""
+
+from __future__ import annotations
+
+import functools
+import http.server
+import os
+import shutil
+import subprocess
+import sys
+import threading
+from contextlib import contextmanager
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+from browser import open_page
+
+ROOT = Path(__file__).resolve().parents[2]
+DOCS = ROOT / "docs"
+WIDE, NARROW = 1280, 390
+# Contrast of WCAG 2, level AA, of normal and of large text.
+NORMAL, LARGE = 4.5, 3.0
+# Every text that is shown, with its color and that of the ground behind it, mixed where they are transparent.
+TEXTS = """() => {
+    const parse = (css) => { const n = css.match(/[\\d.]+/g).map(Number); return n.length < 4 ? [...n, 1] : n };
+    const over = (top, under) => under.map((c, k) => top[3] * top[k] + (1 - top[3]) * c);
+    const found = [];
+    const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
+    while (walker.nextNode()) {
+        const element = walker.currentNode.parentElement;
+        const style = getComputedStyle(element);
+        const seen = element.checkVisibility({opacityProperty: true, visibilityProperty: true});
+        if (!seen || !walker.currentNode.data.trim()) continue;
+        const grounds = [];
+        for (let at = element; at; at = at.parentElement) grounds.unshift(parse(getComputedStyle(at).backgroundColor));
+        const ground = grounds.reduce((under, top) => over(top, under), [255, 255, 255]);
+        const size = parseFloat(style.fontSize);
+        const large = size >= 24 || (size >= 18.66 && style.fontWeight >= 700);
+        found.push([walker.currentNode.data.trim().slice(0, 40), over(parse(style.color), ground), ground, large]);
+    }
+    return found;
+}"""
+
+
+def build(folder, site):
+    """Build the project in a folder as scripts/docs does."""
+    if not all(map(find_spec, ("mkdocs", "material", "mkdocstrings"))):
+        (pytest.fail if os.environ.get("CI") else pytest.skip)("the extra docs is not installed: scripts/setup docs")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--config-file", "-", "--site-dir", site]
+    with (folder / "docs" / "mkdocs.yml").open() as config:
+        return subprocess.run(
+            command,
+            stdin=config,
+            cwd=folder,
+            env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=200,
+        )
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """The folder of the built site."""
+    folder = tmp_path_factory.mktemp("site")
+    done = build(ROOT, folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+@pytest.fixture(scope="module")
+def address(site):
+    """Where the site is served, on this machine only."""
+
+    class Silent(http.server.SimpleHTTPRequestHandler):
+        def log_message(self, format, *args):
+            pass
+
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), functools.partial(Silent, directory=site))
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}/"
+    server.shutdown()
+    server.server_close()
+
+
+@contextmanager
+def read(width, scheme="light"):
+    """A page of one width and color scheme; in the end nothing may have gone wrong in it."""
+    with open_page(viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
+        yield page
+        assert page.asked == []
+        assert page.complaints == []
+
+
+def contrast(color, ground):
+    """The ratio of WCAG 2."""
+
+    def luminance(rgb):
+        linear = [c / 12.92 if c <= 0.04045 else ((c + 0.055) / 1.055) ** 2.4 for c in (v / 255 for v in rgb)]
+        return 0.2126 * linear[0] + 0.7152 * linear[1] + 0.0722 * linear[2]
+
+    dark, bright = sorted((luminance(color), luminance(ground)))
+    return (bright + 0.05) / (dark + 0.05)
+
+
+def test_contrast_is_that_of_wcag():
+    assert contrast((0, 0, 0), (255, 255, 255)) == 21.0
+    assert round(contrast((0x76, 0x76, 0x76), (255, 255, 255)), 2) == 4.54
+
+
+def test_a_broken_link_fails_the_build(tmp_path):
+    shutil.copytree(DOCS, tmp_path / "docs")
+    (tmp_path / "src").symlink_to(ROOT / "src")
+    with (tmp_path / "docs" / "index.md").open("a") as page:
+        page.write("\n[nowhere](nowhere.md)\n")
+    done = build(tmp_path, tmp_path / "site")
+    assert done.returncode != 0
+    assert "nowhere.md" in done.stderr
+
+
+def test_only_pages_and_pictures_are_published(site):
+    endings = {path.suffix for path in site.rglob("*") if path.is_file()}
+    assert not endings & {".py", ".yml", ".yaml", ".md"}
+
+
+@pytest.mark.parametrize("width", [WIDE, NARROW])
+def test_every_page_is_readable_and_asks_nobody_else(site, address, width):
+    pages = sorted(path.relative_to(site).as_posix() for path in site.rglob("*.html"))
+    assert len(pages) > 30
+    too_wide = []
+    with read(width) as page:
+        for name in pages:
+            page.goto(address + name)
+            if page.evaluate("document.documentElement.scrollWidth > innerWidth"):
+                too_wide.append(name)
+    assert too_wide == []
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_text_has_enough_contrast(address, scheme):
+    faint, count = set(), 0
+    with read(WIDE, scheme) as page:
+        for name in ("index", "how-to-choose", "gallery", "guides/time", "reference/design"):
+            page.goto(f"{address}{name}.html")
+            for text, color, ground, large in page.evaluate(TEXTS):
+                count += 1
+                if contrast(color, ground) < (LARGE if large else NORMAL):
+                    faint.add((name, text, round(contrast(color, ground), 2)))
+    assert count > 1000
+    assert faint == set()
+
+
+def test_the_search_finds_a_function(address):
+    with read(WIDE) as page:
+        page.goto(address + "index.html")
+        page.locator(".md-search__input").fill("alpha_max")
+        first = page.locator(
+            '.md-search-result__link[href*="reference/boundary.html"][href$="#zwidth.alpha_max"]'
+        ).first
+        first.wait_for(timeout=20_000)
+        first.click()
+        page.wait_for_url("**/reference/boundary.html**")
+
+
+def test_the_palette_follows_the_reader(address):
+    with read(WIDE, "dark") as page:
+        page.goto(address + "index.html")
+        scheme = page.locator("body")
+        assert scheme.get_attribute("data-md-color-scheme") == "slate"
+        page.locator('label[title="Light"]').click()
+        assert scheme.get_attribute("data-md-color-scheme") == "default"
