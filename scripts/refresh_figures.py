@@ -22,9 +22,7 @@ TARGET = ROOT / "docs" / "figures"
 
 # configuration -> the figures that README.md shows
 SHOWN = {
-    "paper": ("fig5", "fig10", "passivity_cost"),
-    "velocity_filter": ("stiffest",),
-    "dense": ("region_stable",),
+    "paper": ("fig10", "passivity_cost"),
 }
 # Lines and shades of one figure, with their antialiasing; a color map takes most.
 COLORS = 192

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import jax
 import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -18,6 +19,14 @@ PAGES = sorted(DOCS.rglob("*.md"))
 PORTRAITS = {"docs-site.png", "explorer.png"}
 # What all pictures together may take in a clone.
 MOST_BYTES = 6_000_000
+
+
+@pytest.fixture(autouse=True)
+def jax_settings():
+    """Pages set JAX's precision as a user does; other tests keep their own."""
+    before = jax.config.jax_enable_x64
+    yield
+    jax.config.update("jax_enable_x64", before)
 
 
 @pytest.fixture

@@ -20,14 +20,15 @@ def is_jax(value: Any) -> bool:
     """Whether a value is a JAX array, traced or not. Where JAX was never imported, none can exist."""
     if isinstance(value, _HOST_TYPES):
         return False
-    jax = sys.modules.get("jax")
-    return jax is not None and isinstance(value, jax.Array)
+    kind = getattr(sys.modules.get("jax"), "Array", None)
+    # None also while another thread is about to import JAX.
+    return kind is not None and isinstance(value, kind)
 
 
 def is_traced(*values: Any) -> bool:
     """Whether any argument is inside a JAX transformation."""
-    jax = sys.modules.get("jax")
-    return jax is not None and any(isinstance(value, jax.core.Tracer) for value in values)
+    kind = getattr(getattr(sys.modules.get("jax"), "core", None), "Tracer", None)
+    return kind is not None and any(isinstance(value, kind) for value in values)
 
 
 def namespace(*values: Any) -> Any:

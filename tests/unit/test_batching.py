@@ -1,6 +1,8 @@
 """Batching: shapes, types, pieces, and a caller's own transformations, with kernels whose answers are known."""
 
+import sys
 import threading
+import types
 import warnings
 from typing import NamedTuple
 
@@ -12,7 +14,7 @@ import pytest
 from zwidth import batching
 from zwidth.batching import FEW, as_float64, broadcast, concrete_delay, elementwise, is_traced, map_flat, pointwise
 from zwidth.errors import InputError, PrecisionWarning, TracedDelayError
-from zwidth.xp import namespace
+from zwidth.xp import is_jax, namespace
 
 
 class Weighted(NamedTuple):
@@ -213,3 +215,10 @@ def test_the_first_gradient_hands_out_no_intermediate_results(x64):
     # Outside `jit`, what goes from the value to the gradient: one number an argument.
     _, pullback = jax.vjp(lambda x, y: elementwise(long, ("x", "y"), (x, y)), 0.5, 0.25)
     assert len(jax.tree.leaves(pullback)) <= 4
+
+
+def test_a_module_that_is_still_being_imported_makes_no_arrays(monkeypatch):
+    """Another thread may be about to import JAX, whose module is empty at first."""
+    monkeypatch.setitem(sys.modules, "jax", types.ModuleType("jax"))
+    assert not is_jax(object())
+    assert not is_traced(object())
