@@ -16,10 +16,11 @@ def on_page_content(html: str, **_: Any) -> str:
     return _NAME.sub(r'<autoref identifier="\1" optional>\g<0></autoref>', html)
 
 
-class ExampleSections(griffe.Extension):
-    """Makes of "Example:" the section that mkdocstrings renders as code."""
+class Docstrings(griffe.Extension):
+    """Says in Markdown what the docstrings say in plain text."""
 
     def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Rename the section in one docstring."""
+        """Name the section "Example:" as mkdocstrings does, and keep "> 0" at the start of a line from quoting it."""
         if obj.docstring:
-            obj.docstring.value = re.sub(r"^( *)Example:$", r"\1Examples:", obj.docstring.value, flags=re.MULTILINE)
+            text = re.sub(r"^( *)Example:$", r"\1Examples:", obj.docstring.value, flags=re.MULTILINE)
+            obj.docstring.value = re.sub(r"^( *)>(?!>)", r"\1\\>", text, flags=re.MULTILINE)

@@ -15,8 +15,8 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
-# Shown by the project's README, or nowhere yet.
-PORTRAITS = {"docs-site.png", "explorer.png"}
+# For the project's README.
+PORTRAITS = {"docs-site.png"}
 # What all pictures together may take in a clone.
 MOST_BYTES = 6_000_000
 

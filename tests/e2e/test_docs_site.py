@@ -126,6 +126,15 @@ def test_only_pages_and_pictures_are_published(site):
     assert not endings & {".py", ".yml", ".yaml", ".md"}
 
 
+def test_names_are_links_and_examples_are_code(site):
+    choose = (site / "how-to-choose.html").read_text(encoding="utf-8")
+    assert 'href="reference/stability.html#zwidth.is_stable"' in choose
+    pages = {page.name: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
+    # What Markdown makes of ">>>" that nobody has told it is an example.
+    assert [name for name, text in pages.items() if "<blockquote" in text] == []
+    assert pages["stability.html"].count('class="gp"') > 10
+
+
 @pytest.mark.parametrize("width", [WIDE, NARROW])
 def test_every_page_is_readable_and_asks_nobody_else(site, address, width):
     pages = sorted(path.relative_to(site).as_posix() for path in site.rglob("*.html"))
