@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.errors import InputError
 from zwidth.figures import grid, style
@@ -54,6 +53,8 @@ def draw_curves(
     labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]
     colors = style.ordered_colors(len(picked))
     few = data.sizes[x] <= 12
+    whole = np.concatenate([part[name].values.ravel() for part in parts])
+    positive = whole[np.isfinite(whole) & (whole > 0)]
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
         shown = [np.where(np.isfinite(curve[name].values), curve[name].values, np.nan) for curve in curves]
@@ -63,10 +64,8 @@ def draw_curves(
         ax.set_title(grid.title(part))
         ax.margins(y=0.06)
         if output.look in ("logarithmic", "steep"):
-            ax.set_yscale("log")
-            ax.yaxis.set_major_locator(LogLocator(subs=_decade(np.concatenate(shown))))
-            ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            ax.yaxis.set_minor_formatter(NullFormatter())
+            # Panels share the axis: ticks that fit all of them.
+            style.use_logarithmic(ax, "y", float(positive.min(initial=1.0)), float(positive.max(initial=1.0)))
         if output.look == "diverging":
             ax.axhline(output.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)
     values = data[x].values
@@ -122,12 +121,6 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np
     style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)
     _name_colors(panels, labels, colors, outside=axes is None, title="boundaries of the stable walls")
     return panels
-
-
-def _decade(values: np.ndarray) -> tuple[float, ...]:
-    """Which multiples of a power of ten are labelled: the fewer, the more powers there are."""
-    positive = values[np.isfinite(values) & (values > 0)]
-    return (1.0, 2.0, 5.0) if positive.size and positive.max() < 100 * positive.min() else (1.0,)
 
 
 def _name_colors(
