@@ -82,9 +82,7 @@ def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: 
     ax.plot([present], [height], linestyle="", label="present", zorder=5, **look)
 
 
-def _mark_required(
-    ax: Axes, curve: np.ndarray, target: float, value: float, enough: str, color: Any, unit: str
-) -> str:
+def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, enough: str, color: Any, unit: str) -> str:
     """Mark the wanted stiffness, and where on the curve there is enough for it; returns the value that is, in words."""
     ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"wanted {target:g}")
     known = np.isfinite(value) and enough in _WORDS

@@ -152,22 +152,22 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
         ax.set(xlabel=x, ylabel=y)
 
 
-def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: str = "upper", **keywords: Any) -> None:
+def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: Any = "upper", **keywords: Any) -> None:
     """Explain what is drawn, above the panels (or below) in as many columns as fit, or within the first."""
     if not outside or not handles:
         if handles:
             axes[0].legend(handles=handles)
         return
     figure, columns = figure_of(axes), keywords.pop("ncols", 1)
-    for count in range(columns, 0, -1):
-        drawn = figure.legend(handles=handles, loc=f"outside {place} center", ncols=count, **keywords)
-        width = float(drawn.get_window_extent().width / figure.bbox.width)
-        if width <= 1.0 or count == 1:
-            break
+    place = f"outside {place} center"
+    drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
+    while (share := drawn.get_window_extent().width / figure.bbox.width) > 1.0 and columns > 1:
+        columns -= 1
         drawn.remove()
-    for text in drawn.get_texts() if width > 1.0 else ():
+        drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
+    for text in drawn.get_texts() if share > 1.0 else ():
         if "$" not in text.get_text():
-            text.set_text(fill(text.get_text(), max(int(0.9 * len(text.get_text()) / width), 12)))
+            text.set_text(fill(text.get_text(), max(int(0.9 * len(text.get_text()) / share), 12)))
 
 
 def use_logarithmic(ax: Axes, which: str, low: float, high: float, wide: float = 100.0) -> None:
