@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.errors import InputError
 from zwidth.figures import grid, style
-from zwidth.figures.plane import SMOOTH, boundary_level, panel_grid
+from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
+from zwidth.figures.region import agrees, fit_axes
 from zwidth.quantities import OUTPUTS, WALL
 
 if TYPE_CHECKING:
@@ -54,6 +54,9 @@ def draw_curves(
     labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]
     colors = style.ordered_colors(len(picked))
     few = data.sizes[x] <= 12
+    whole = np.concatenate([part[name].values.ravel() for part in parts])
+    positive = whole[np.isfinite(whole) & (whole > 0)]
+    positive = positive if positive.size else np.ones(1)
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
         shown = [np.where(np.isfinite(curve[name].values), curve[name].values, np.nan) for curve in curves]
@@ -63,10 +66,8 @@ def draw_curves(
         ax.set_title(grid.title(part))
         ax.margins(y=0.06)
         if output.look in ("logarithmic", "steep"):
-            ax.set_yscale("log")
-            ax.yaxis.set_major_locator(LogLocator(subs=_decade(np.concatenate(shown))))
-            ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-            ax.yaxis.set_minor_formatter(NullFormatter())
+            # Panels share the axis: ticks that fit all of them.
+            style.use_logarithmic(ax, "y", float(positive.min()), float(positive.max()))
         if output.look == "diverging":
             ax.axhline(output.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)
     values = data[x].values
@@ -77,7 +78,7 @@ def draw_curves(
     return panels
 
 
-def find_outlines(data: xarray.Dataset) -> tuple[str, str] | None:
+def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
     """The output whose contours are the boundaries of walls, and the parameter each of whose values has one."""
     name = next((name for name in (*SMOOTH, "stable") if name in data and _has_walls(data, name)), None)
     dims = [dim for dim in grid.list_varied(data, name) if dim not in WALL] if name else []
@@ -91,14 +92,15 @@ def _has_walls(data: xarray.Dataset, name: str) -> bool:
 
 
 @style.house_style()
-def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np.ndarray:
+def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, edges: Edges | None = None) -> np.ndarray:
     """Draw the boundaries of the stable walls of many devices into one panel, panels for a further parameter.
 
     Args:
         data: results of a sweep over walls and devices, as `zwidth.open_dataset` gives them, or a part of them.
         axes: Axes of yours, one for each panel or fewer.
+        edges: gives the exact outlines of the stable walls, drawn in place of contours that agree with them.
     """
-    found = find_outlines(data)
+    found = find_family(data)
     if found is None:
         raise InputError("data: holds no boundaries of several devices; a sweep over walls and devices does")
     name, family = found
@@ -110,24 +112,24 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None) -> np
     colors = style.ordered_colors(len(picked))
     labels = [grid.spell(data[family][k]) for k in picked]
     for part, ax in zip(parts, panels, strict=False):
-        for k, color in zip(picked, colors, strict=True):
-            shown = np.ma.masked_invalid(part[name].isel({family: k}).transpose(y, x).values)
-            level = boundary_level(name)
-            if shown.count() and shown.min() < level < shown.max():
-                ax.contour(part[x].values, part[y].values, shown, levels=[level], colors=[color], linewidths=1.4)
-        ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
         grid.scale_axis(ax, "x", part[x])
         grid.scale_axis(ax, "y", part[y])
+        for k, color in zip(picked, colors, strict=True):
+            device = part.isel({family: k}).transpose(y, x)
+            shown = np.ma.masked_invalid(device[name].values)
+            level = boundary_level(name)
+            stable = np.ma.filled(shown < level if OUTPUTS[name].below else shown > level, False)
+            known = find_outlines(device, edges).get("stable")
+            if known is not None and agrees(known, part[x].values, part[y].values, stable):
+                for points, _ in fit_axes(known, ax):
+                    ax.plot(*np.append(points, points[:1], 0).T, color=color, linewidth=1.4, label="exact edge")
+            elif shown.count() and shown.min() < level < shown.max():
+                ax.contour(part[x].values, part[y].values, shown, levels=[level], colors=[color], linewidths=1.4)
+        ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
         ax.set_title(grid.title(part))
     style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)
     _name_colors(panels, labels, colors, outside=axes is None, title="boundaries of the stable walls")
     return panels
-
-
-def _decade(values: np.ndarray) -> tuple[float, ...]:
-    """Which multiples of a power of ten are labelled: the fewer, the more powers there are."""
-    positive = values[np.isfinite(values) & (values > 0)]
-    return (1.0, 2.0, 5.0) if positive.size and positive.max() < 100 * positive.min() else (1.0,)
 
 
 def _name_colors(

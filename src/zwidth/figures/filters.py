@@ -6,12 +6,13 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from zwidth.figures import style
+from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, select
 
 _STIFFNESS = SI_COLUMNS[0]
+# From so many times its least value on, an axis has powers of ten only.
+_WIDE = 3000.0
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
@@ -42,7 +43,10 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
                 bare * factor, color=color, linewidth=0.9, linestyle=style.DASHED, label=f"difference, b = {damping:g}"
             )
         ax.set_xlabel(_OVER[kind][1])
-        _use_logarithmic(ax, "x" if kind == "low_pass" else "", "y")
+        over = select(table, estimate=kind)[_OVER[kind][0]]
+        _use_logarithmic(ax, "y", table[_STIFFNESS])
+        if kind == "low_pass" or grid.logarithmic(np.unique(over)):
+            _use_logarithmic(ax, "x", over)
     panels[0].set_ylabel(f"maximum stable stiffness  $K_{{\\max}}$  in {unit}")
     handles = [style.line(rf"$b = {damping:g}$ N s/m", color=color) for damping, color in colors.items()]
     handles.append(style.line("one-sample difference", style.DASHED, 0.9))
@@ -82,7 +86,8 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
         handles.append(style.line(rf"$b = {damping:g}$ N s/m{best}", color=color))
     if np.isfinite(limit):
         ax.axvline(limit * 1e3, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
-    _use_logarithmic(ax, "x", "y")
+    _use_logarithmic(ax, "x", table["velocity_noise_m_per_s"])
+    _use_logarithmic(ax, "y", table[_STIFFNESS])
     ax.set(
         xlabel=r"noise of the velocity  $\sigma_v$  in mm/s",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
@@ -111,10 +116,5 @@ def _dots(rows: Table) -> dict[str, Any]:
     return {"marker": "o", "markersize": 3.5} if len(rows[_STIFFNESS]) <= 24 else {}
 
 
-def _use_logarithmic(ax: Axes, *which: str) -> None:
-    for name in filter(None, which):
-        getattr(ax, f"set_{name}scale")("log")
-        axis = getattr(ax, f"{name}axis")
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axis.set_minor_formatter(NullFormatter())
+def _use_logarithmic(ax: Axes, which: str, values: Any) -> None:
+    style.use_logarithmic(ax, which, float(np.nanmin(values)), float(np.nanmax(values)), _WIDE)

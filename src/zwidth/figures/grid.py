@@ -20,6 +20,8 @@ _RESOLVED, _RESOLVED_BY_MANY = 1000, 500
 # A grid of more panels than this says nothing on a page: evenly spaced values stand for all.
 _ACROSS = 3
 _MANY_PANELS = 9
+# Values that are no exact ratios of each other are on a logarithmic axis from here on, which has 2 and 5 up to there.
+_WIDE, _FEW_DECADES = 5.0, 50.0
 # What an axis of a plane is, rather than a choice of panels: the first two that vary.
 _FIRST = ("alpha", "stiffness", "beta", "virtual_damping")
 _PARTS = tuple(parameter.variable for parameter in VARIABLES.values() if parameter.name in OF_PARTS)
@@ -69,7 +71,9 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
     for name, values in data.coords.items():
         if name in VARIABLES:
             factor, unit = _readable(values.values, str(values.attrs.get("units", "1")))
-            data = data.assign_coords({name: (values * factor).assign_attrs(units=unit, factor=factor)})
+            # Without the coordinates of its own, which would bring back those that are scaled already.
+            scaled = (values.dims, values.values * factor, {**values.attrs, "units": unit, "factor": factor})
+            data = data.assign_coords({name: scaled})
     return data.drop_vars(status)
 
 
@@ -142,16 +146,31 @@ def _in_unit(data: xarray.Dataset, name: str) -> str:
 
 
 def logarithmic(values: np.ndarray) -> bool:
-    """Whether the values of an axis are spaced so."""
+    """Whether the values of an axis are in equal ratios, or nearly so and far apart, as 1, 2, 5 and 10 are."""
+    values = np.asarray(values, dtype=np.float64)
     if values.size < 3 or not (values > 0).all():
         return False
-    steps = values[1:] / values[:-1]
-    return bool(np.allclose(steps, steps[0], rtol=1e-6) and not np.isclose(steps[0], 1.0))
+    steps, ratios = np.diff(values), np.diff(np.log(values))
+    if not ((ratios > 0).all() or (ratios < 0).all()):
+        return False
+    if np.allclose(ratios, ratios[0], rtol=1e-6):
+        return not np.allclose(steps, steps[0], rtol=1e-6)
+    uneven, unequal = (float(np.ptp(each) / np.abs(each.mean())) for each in (steps, ratios))
+    return bool(unequal < 0.5 * uneven and values.max() >= _WIDE * values.min())
+
+
+def find_edges(values: np.ndarray) -> np.ndarray:
+    """Where the cells of a plane end, half way between values, up to the first and the last one's own half."""
+    scaled = np.log(values) if logarithmic(values) else np.asarray(values, dtype=np.float64)
+    middle = 0.5 * (scaled[1:] + scaled[:-1])
+    edges = np.concatenate([[2 * scaled[0] - middle[0]], middle, [2 * scaled[-1] - middle[-1]]])
+    return np.exp(edges) if logarithmic(values) else edges
 
 
 def scale_axis(ax: Axes, which: str, values: Any) -> None:
     """The range of an axis, and its spacing."""
     values = np.asarray(values)
+    low, high = float(values.min()), float(values.max())
     if logarithmic(values):
-        getattr(ax, f"set_{which}scale")("log")
-    getattr(ax, f"set_{which}lim")(float(values.min()), float(values.max()))
+        style.use_logarithmic(ax, which, low, high, _FEW_DECADES)
+    getattr(ax, f"set_{which}lim")(low, high)

@@ -12,6 +12,8 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, LogLocator, NullLocat
 
 from zwidth.figures import style
 
+# Points from one name to the next.
+_LETTERS = 11.0
 # Where no error was seen; left of every measured one.
 _NONE_SEEN = 1e-17
 _LEAST = 3e-18
@@ -47,13 +49,14 @@ def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.
         axes: Axes of yours, one for each delay or fewer.
     """
     delays = sorted({mark.d for mark in marks})
-    columns = min(4, len(delays))
-    size = (max(3.2 * columns, 5.0), 3.6 * -(-len(delays) // columns) + 0.5)
+    columns = min(3, len(delays))
+    rates = min(mark.rate for mark in marks) / 3, max(mark.rate for mark in marks) * 5
+    size = (max(4.0 * columns, 5.0), 3.6 * -(-len(delays) // columns) + 0.5)
     panels = style.panels(axes, len(delays), *size, columns, sharex=True, sharey=True)
     for ax, d in zip(panels, delays, strict=False):
-        _draw_panel(ax, [mark for mark in marks if mark.d == d])
+        _scale(ax, marks, rates)
+        _draw_panel(ax, [mark for mark in marks if mark.d == d], rates)
         ax.set_title(f"d = {d:,.10g}")
-        _scale(ax, marks)
     for lowest in panels[-columns:]:
         lowest.set_xlabel("worst error seen")
     for ax in panels[::columns]:
@@ -62,7 +65,7 @@ def draw_pareto(marks: Sequence[Mark], axes: style.AnyAxes | None = None) -> np.
     return panels
 
 
-def _draw_panel(ax: Axes, marks: Sequence[Mark]) -> None:
+def _draw_panel(ax: Axes, marks: Sequence[Mark], rates: tuple[float, float]) -> None:
     drawn: dict[tuple[str, ...], Mark] = {}
     for mark in marks:
         drawn.setdefault(mark[:3], mark)
@@ -79,29 +82,38 @@ def _draw_panel(ax: Axes, marks: Sequence[Mark]) -> None:
             markeredgewidth=1.1,
         )
         labelled.setdefault(f"{mark.quantity} {mark.method}", []).append(mark)
-    # One name for the two marks of a method, beside the faster one; names in one place move apart.
-    tops = [max(group, key=lambda mark: mark.rate) for group in labelled.values()]
-    places = 10 ** style.spread([np.log10(top.rate) for top in tops], 0.34)
-    for top, place in zip(tops, places, strict=True):
-        x = max(top.error, _NONE_SEEN)
-        left = x > 1e-6
-        ax.annotate(
-            top.method,
-            (x, place),
-            xytext=(-7 if left else 7, 0),
-            textcoords="offset points",
-            ha="right" if left else "left",
-            va="center",
-            fontsize=6.8,
-            color=_COLORS[top.quantity],
-        )
+    for group in (each for each in labelled.values() if len(each) > 1):
+        line = {"color": _COLORS[group[0].quantity], "linewidth": 0.6, "zorder": 1}
+        ax.plot([max(mark.error, _NONE_SEEN) for mark in group], [mark.rate for mark in group], **line)
+    _name_methods(ax, [max(group, key=lambda mark: mark.rate) for group in labelled.values()], rates)
     ax.axvline(10 * _NONE_SEEN, color=style.GRAY, linewidth=0.5, linestyle=style.DOTTED)
 
 
-def _scale(ax: Axes, marks: Sequence[Mark]) -> None:
-    rates = [mark.rate for mark in marks]
+def _name_methods(ax: Axes, tops: Sequence[Mark], rates: tuple[float, float]) -> None:
+    """One name for the two marks of a method, beside the panel, with a thin line from the faster one."""
+    low, high = np.log10(rates)
+    gap = _LETTERS / (72.0 * ax.get_window_extent().height / style.figure_of(ax).dpi)
+    heights = [(np.log10(top.rate) - low) / (high - low) for top in tops]
+    # None below the panel, where the next one's title is.
+    ranks = np.argsort(np.argsort(heights, kind="stable"))
+    for top, place in zip(tops, style.spread(np.maximum(heights, gap * ranks).tolist(), gap), strict=True):
+        color = _COLORS[top.quantity]
+        ax.annotate(
+            top.method,
+            (max(top.error, _NONE_SEEN), top.rate),
+            xytext=(1.03, place),
+            textcoords="axes fraction",
+            va="center",
+            fontsize=6.8,
+            color=color,
+            annotation_clip=False,
+            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.4, "alpha": 0.6, "shrinkA": 1, "shrinkB": 3},
+        )
+
+
+def _scale(ax: Axes, marks: Sequence[Mark], rates: tuple[float, float]) -> None:
     right = max(1e-11, 30 * max(mark.error for mark in marks))
-    ax.set(xscale="log", yscale="log", xlim=(_LEAST, right), ylim=(min(rates) / 3, max(rates) * 5))
+    ax.set(xscale="log", yscale="log", xlim=(_LEAST, right), ylim=rates)
     ax.xaxis.set_major_locator(FixedLocator([tick for tick in _TICKS if tick < right]))
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: "none" if x < 1e-16 else f"$10^{{{round(np.log10(x))}}}$"))

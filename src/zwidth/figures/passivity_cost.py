@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from zwidth.figures import style
+from zwidth.figures import grid, style
 from zwidth.figures.table import Table, curves
 
 
@@ -25,7 +25,7 @@ def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.n
     for ax, draw in zip(panels, (_draw_maxima, _draw_ratio), strict=False):
         draw(ax, costs, colors)
         deltas = np.asarray(table["delta"])
-        ax.set_xlim(float(deltas.min()), float(deltas.max()))
+        grid.scale_axis(ax, "x", np.unique(deltas))
         ax.set_xlabel(style.DELTA_LABEL)
     style.letter(panels)
     return panels

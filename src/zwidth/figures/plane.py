@@ -2,27 +2,35 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize, TwoSlopeNorm
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from zwidth.errors import InputError
-from zwidth.figures import grid, style
+from zwidth.figures import grid, region, style
+from zwidth.figures.contours import label_contours
 from zwidth.figures.stability_map import SHADES
 from zwidth.quantities import OUTPUTS, Output
 
 if TYPE_CHECKING:
     import xarray
 
+# Gives the outlines of the "stable" and the "passive" walls of a panel, in its units and stiffness first.
+Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, region.Outlines]]"
+
 _MISSING = "#D9D9D9"
 # Numbers whose contour is the boundary of the stable walls, smoother than that of truth values.
 SMOOTH = ("margin", "spectral_radius")
+_SMOOTH = {"stable": SMOOTH, "passive": ("passivity_margin",)}
+# What is finite for stable walls alone.
+_FINITE_IF_STABLE = ("settling_time", "delay_margin")
 # The stiffest stable wall in a plane of walls.
 _PEAKS = {"alpha": ("alpha_max", "beta_at_max"), "stiffness": ("stiffness_max", "virtual_damping_at_max")}
 # Beyond this multiple of the smallest, a output that grows without end has one color.
@@ -43,6 +51,7 @@ def draw_plane(
     x: str | None = None,
     y: str | None = None,
     col: str | None = None,
+    edges: Edges | None = None,
 ) -> np.ndarray:
     """Draw an output of a sweep over two parameters, a panel for each of some values of the others.
 
@@ -57,6 +66,8 @@ def draw_plane(
         x: the parameter from left to right; stiffness or the first that varies where left out.
         y: the one from bottom to top.
         col: the one of the panels; all others are then at their first value.
+        edges: gives the exact outlines of the stable and the passive walls of a panel, which are drawn in place of
+            contours and of the edges of cells where all cells agree with them.
 
     Raises:
         InputError: the output varies over less than two parameters.
@@ -67,10 +78,10 @@ def draw_plane(
     x, y = dims
     parts, columns = grid.panels(_add_peak(data, _select_drawn(data, name), x, y), dims, plane=dims, col=col)
     panels = panel_grid(axes, len(parts), columns)
-    parts = [part.compute() for part in parts[: len(panels)]]
+    parts = [part.compute().transpose(y, x) for part in parts[: len(panels)]]
     norm, image = _norm(parts, name), None
     for part, ax in zip(parts, panels, strict=True):
-        image = _draw_panel(ax, part.transpose(y, x), name, norm)
+        image = _draw_panel(ax, part, name, norm, find_outlines(part, edges))
     style.label_axes(panels, grid.axis_label(parts[0], x), grid.axis_label(parts[0], y), once=axes is None)
     _explain(panels, parts, name, image, outside=axes is None)
     return panels
@@ -78,9 +89,11 @@ def draw_plane(
 
 def _select_drawn(data: xarray.Dataset, name: str) -> xarray.Dataset:
     """The output, and what is drawn along with it."""
-    beside = ["passive", *[edge for edge in SMOOTH if edge in data][:1]] if name == "stable" else []
+    shown = [each for each in ("stable", "passive") if each in (name, "passive" if name == "stable" else "")]
+    smooth = [next((edge for edge in _SMOOTH[each] if edge in data), each) for each in shown]
+    beside = [*shown, *smooth]
     beside += ["kind"] if OUTPUTS[name].family == "device" else []
-    data = grid.prepare(data, [name, *[each for each in beside if each in data and each != name]])
+    data = grid.prepare(data, [name, *[each for each in dict.fromkeys(beside) if each in data and each != name]])
     if name in ("settling_time", "gain_margin", "delay_margin"):
         data[name] = data[name].where(np.isfinite(data[name]) & (data[name] > 0))
     return data
@@ -108,24 +121,40 @@ def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndar
     return style.panels(given, count, width, height, columns, sharex=True, sharey=True)
 
 
-def _draw_panel(ax: Axes, part: xarray.Dataset, name: str, norm: Any) -> Any:
+def find_outlines(part: xarray.Dataset, edges: Edges | None) -> dict[str, region.Outlines]:
+    """The exact outlines of a panel (y, x), with x first; none where nobody knows them."""
+    dims = [str(dim) for dim in reversed(next(iter(part.data_vars.values())).dims)]
+    found = edges(part) if edges else {}
+    turn = -1 if dims[0] in ("beta", "virtual_damping") else 1
+    return {name: [(points[:, ::turn], hole) for points, hole in each] for name, each in found.items()}
+
+
+def _draw_panel(ax: Axes, part: xarray.Dataset, name: str, norm: Any, outlines: Mapping[str, region.Outlines]) -> Any:
     x, y = (part[dim].values for dim in reversed(part[name].dims))
     output = OUTPUTS[name]
     ax.set_facecolor(_MISSING)
-    mesh: dict[str, Any] = {"shading": "nearest", "rasterized": True}
+    for which, values in (("x", x), ("y", y)):
+        grid.scale_axis(ax, which, values)
     if output.look == "truth":
-        image = _draw_regions(ax, part, name, mesh)
+        image = _draw_regions(ax, part, name, outlines)
     else:
         shown = np.ma.masked_invalid(part[name].values)
-        image = ax.pcolormesh(x, y, shown, cmap=_colors(output), norm=norm, **mesh)
-        _draw_contours(ax, x, y, shown, output, norm)
+        image = _draw_cells(ax, part, shown, cmap=_colors(output), norm=norm)
+        _draw_contours(ax, part, name, shown, norm, outlines)
         _draw_corners(ax, x, y, part)
     peak = _find_peak(part)
     if peak is not None:
         ax.plot(*peak, linestyle="", zorder=5, clip_on=False, label="stiffest stable wall", **_PEAK)
-    for which, values in (("x", x), ("y", y)):
-        grid.scale_axis(ax, which, values)
     ax.set_title(grid.title(part))
+    return image
+
+
+def _draw_cells(ax: Axes, part: xarray.Dataset, values: Any, **look: Any) -> Any:
+    """A cell round each point; the frame cuts those at the ends in half."""
+    limits = ax.get_xlim(), ax.get_ylim()
+    y, x = (grid.find_edges(part[dim].values) for dim in next(iter(part.data_vars.values())).dims)
+    image = ax.pcolormesh(x, y, values, shading="flat", rasterized=True, **look)
+    ax.set(xlim=limits[0], ylim=limits[1])
     return image
 
 
@@ -136,47 +165,91 @@ def _find_peak(part: xarray.Dataset) -> list[float] | None:
     return list(peaks.values()) if peaks and all(inside) else None
 
 
-def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, mesh: dict[str, Any]) -> Any:
+def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[str, region.Outlines]) -> Any:
     """Stable and passive walls as areas, each with its boundary."""
     image = None
     x, y = (part[dim].values for dim in reversed(part[name].dims))
     for each, dash in (("stable", style.SOLID), ("passive", style.DASH_DOTTED)):
         if each not in part or (each != name and name != "stable"):
             continue
-        shades = ListedColormap(["white" if image is None else (0, 0, 0, 0), SHADES[each]])
         shown = np.ma.masked_invalid(part[each].values)
-        image = ax.pcolormesh(x, y, shown, cmap=shades, vmin=0, vmax=1, **mesh)
-        edge = next((edge for edge in SMOOTH if each == "stable" and edge in part), each)
-        _draw_line(ax, x, y, np.ma.masked_invalid(part[edge].values), boundary_level(edge), dash)
+        edge = next((edge for edge in _SMOOTH[each] if edge in part), each)
+        smooth, level = np.ma.masked_invalid(part[edge].values), boundary_level(edge)
+        # Where a part is missing, its cells are all that says where.
+        whole = min(smooth.shape) > 1 and shown.count() == smooth.count() == shown.size
+        exact = whole and each in outlines and region.agrees(outlines[each], x, y, shown.data > 0.5)
+        outside = "white" if image is None else (0, 0, 0, 0)
+        shades = ListedColormap([outside, outside if whole else SHADES[each]])
+        image = _draw_cells(ax, part, shown, cmap=shades, vmin=0, vmax=1)
+        if exact:
+            _draw_outline(ax, outlines[each], dash, SHADES[each])
+        else:
+            if whole and smooth.min() < level < smooth.max():
+                ends = [-np.inf, level] if OUTPUTS[edge].below else [level, np.inf]
+                ax.contourf(x, y, smooth, levels=ends, colors=[SHADES[each]])
+            elif whole and np.all(shown):
+                ax.set_facecolor(SHADES[each])
+                image.set_cmap(ListedColormap([SHADES[each], SHADES[each]]))
+            _draw_line(ax, x, y, smooth, level, dash)
     return image
 
 
-def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> None:
+def _draw_outline(ax: Axes, outlines: region.Outlines, dash: Any, shade: Any = "none") -> None:
+    """The boundary where it is known, and what lies within."""
+    fitted = region.fit_axes(outlines, ax)
+    if fitted:
+        ax.add_patch(PathPatch(region.to_path(fitted), facecolor=shade, linewidth=0.0, zorder=1.5))
+    for points, _ in fitted:
+        closed = np.append(points, points[:1], 0)
+        ax.plot(*closed.T, color=style.BLACK, linewidth=1.3, linestyle=dash, label="exact edge", zorder=2.2)
+
+
+def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> Any:
     """The boundary: the contour on which something changes, where the panel has one."""
     if min(values.shape) < 2 or not values.count() or not values.min() < level < values.max():
-        return
-    ax.contour(x, y, values, levels=[level], colors=style.BLACK, linewidths=1.3,
-               linestyles=[dash])  # fmt: skip
+        return None
+    return ax.contour(x, y, values, levels=[level], colors=style.BLACK, linewidths=1.3, linestyles=[dash])
 
 
-def _draw_contours(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, output: Output, norm: Any) -> None:
+def _draw_contours(
+    ax: Axes, part: xarray.Dataset, name: str, values: Any, norm: Any, outlines: Mapping[str, region.Outlines]
+) -> None:
     """Labelled contours where a number is good, and the bold one at which it ceases to be."""
+    x, y = (part[dim].values for dim in reversed(part[name].dims))
+    output = OUTPUTS[name]
     if min(values.shape) < 2 or not values.count():
         return
+    others = _draw_edge(ax, x, y, values, name, outlines)
+    peak = _find_peak(part)
+    others += [np.array([peak])] if peak else []
     levels = _levels(values, output, norm)
-    if levels.size:
-        # Over a dark color a light line, over a light one a dark line.
-        shade = _colors(output)(norm(levels))
-        luminance = shade[:, :3] @ np.array([0.299, 0.587, 0.114])
-        colors = [("white" if dark < 0.5 else "#303030") for dark in luminance]
-        drawn = ax.contour(x, y, values, levels=levels, colors=colors, linewidths=0.7)
-        within = (values < levels.max()) if output.below else (values > levels.min())
-        if output.look == "steep":
-            within = values < levels.max()
-        if within.filled(False).mean() > _LABELLED:
-            ax.clabel(drawn, fontsize=7, inline_spacing=2, fmt=lambda level: f"{level:.4g}")
-    if output.look == "diverging":
-        _draw_line(ax, x, y, values, output.center)
+    if not levels.size:
+        return
+    # Over a dark color a light line, over a light one a dark line.
+    shades = _colors(output)(norm(levels))
+    luminance = shades[:, :3] @ np.array([0.299, 0.587, 0.114])
+    colors = [("white" if dark < 0.5 else "#303030") for dark in luminance]
+    drawn = ax.contour(x, y, values, levels=levels, colors=colors, linewidths=0.7)
+    within = (values < levels.max()) if output.below or output.look == "steep" else (values > levels.min())
+    if within.filled(False).mean() > _LABELLED:
+        label_contours(ax, drawn, colors, shades, others)
+
+
+def _draw_edge(
+    ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, name: str, outlines: Mapping[str, region.Outlines]
+) -> list[np.ndarray]:
+    """The edge of what is stable or passive, exactly where it is known; returns its lines."""
+    output = OUTPUTS[name]
+    if output.look != "diverging" and name not in _FINITE_IF_STABLE:
+        return []
+    known = outlines.get("passive" if name == "passivity_margin" else "stable")
+    good = values < output.center if output.below else values > output.center
+    good = good if output.look == "diverging" else ~np.ma.getmaskarray(values)
+    if known is not None and region.agrees(known, x, y, np.ma.filled(good, False)):
+        _draw_outline(ax, known, style.SOLID)
+        return [points for points, _ in region.fit_axes(known, ax)]
+    drawn = _draw_line(ax, x, y, values, output.center) if output.look == "diverging" else None
+    return drawn.get_paths()[0].to_polygons(closed_only=False) if drawn else []
 
 
 def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
@@ -248,7 +321,8 @@ def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: An
         label = grid.output_label(parts[0], name)
         bar = axes[0].figure.colorbar(image, ax=list(axes), label=label, extend=extend)
         bar.ax.tick_params(labelsize=8)
-    if output.look == "diverging":
+    exact = any(line.get_label() == "exact edge" for ax in axes for line in ax.lines)
+    if output.look == "diverging" or (exact and output.look != "truth"):
         what = "passive" if name == "passivity_margin" else "stable"
         handles.append(style.line(f"edge of what is {what}", width=1.3, color=style.BLACK))
     if name in ("settling_time", "delay_margin"):

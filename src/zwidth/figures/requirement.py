@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.figures import style
 from zwidth.figures.table import SI_COLUMNS, Table
@@ -15,6 +14,8 @@ from zwidth.formatting import header
 from zwidth.quantities import PARAMETERS
 
 _WORDS = {"above": "or more", "below": "or less"}
+# From so many times its least value on, an axis has powers of ten only.
+_WIDE = 3000.0
 
 
 @style.house_style()
@@ -45,19 +46,19 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     _mark_present(ax, values * scale, stiffness * factor, float(required[present_in][0]) * scale)
     rows = zip(targets, required[value_in], required["enough"], strict=True)
     curve_drawn = np.stack([values * scale, stiffness * factor])
-    for target, value, enough in rows:
+    names = [
         _mark_required(ax, curve_drawn, target * factor, value * scale, str(enough), colors[target], spelled)
+        for target, value, enough in rows
+    ]
     for name, scaled in (("x", values * scale), ("y", stiffness * factor)):
-        axis = getattr(ax, f"{name}axis")
-        decades = np.log10(np.nanmax(scaled) / np.nanmin(scaled))
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if decades < 3.5 else (1.0,)))
-        axis.set_major_formatter(FuncFormatter(lambda number, _: f"{number:g}"))
-        axis.set_minor_formatter(NullFormatter())
+        style.use_logarithmic(ax, name, float(np.nanmin(scaled)), float(np.nanmax(scaled)), _WIDE)
     ax.set(
         xlim=(values[0] * scale, values[-1] * scale),
         xlabel=f"{parameter.words}  ${parameter.symbol}$  in {spelled}",
         ylabel=f"maximum stable stiffness  $K_{{\\max}}$  in {unit}",
     )
+    # Beside the panel: below its dot a value would stand on the line of the next one.
+    style.name_heights(ax, names, (targets * factor).tolist(), [colors[target] for target in targets])
     handles = [style.line(words, style.DASHED, color=colors[at]) for at, words in _name_targets(required, factor, unit)]
     handles.append(style.line("as it is", "", color=style.BLACK, marker="s", markerfacecolor="white", markersize=5))
     style.legend(panels, handles, outside=axes is None, ncols=2)
@@ -81,10 +82,8 @@ def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: 
     ax.plot([present], [height], linestyle="", label="present", zorder=5, **look)
 
 
-def _mark_required(
-    ax: Axes, curve: np.ndarray, target: float, value: float, enough: str, color: Any, unit: str
-) -> None:
-    """The wanted stiffness, where on the curve there is enough for it, and the value that is."""
+def _mark_required(ax: Axes, curve: np.ndarray, target: float, value: float, enough: str, color: Any, unit: str) -> str:
+    """Mark the wanted stiffness, and where on the curve there is enough for it; returns the value that is, in words."""
     ax.axhline(target, color=color, linewidth=0.9, linestyle=style.DASHED, zorder=2, label=f"wanted {target:g}")
     known = np.isfinite(value) and enough in _WORDS
     x, y = (np.append(part, end) for part, end in zip(curve, (value, target) if known else (np.nan,) * 2, strict=True))
@@ -92,20 +91,9 @@ def _mark_required(
     band = np.where(y[order] >= target, target, np.nan)
     ax.plot(x[order], band, color=color, linewidth=3.5, alpha=0.35, label="enough", zorder=2.5)
     if not known:
-        return
+        return ""
     ax.plot([value], [target], linestyle="", marker="o", markersize=6, color=color, label="required", zorder=6)
-    side = 1 if enough == "above" else -1
-    ax.annotate(
-        f"{_round_safely(value, enough):g} {unit} {_WORDS[enough]}",
-        (value, target),
-        xytext=(side * 8, -11),
-        textcoords="offset points",
-        ha="left" if side > 0 else "right",
-        fontsize=8,
-        color=color,
-        bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.6},
-        zorder=4,
-    )
+    return f"{_round_safely(value, enough):g} {unit} {_WORDS[enough]}"
 
 
 def _round_safely(value: float, enough: str) -> float:

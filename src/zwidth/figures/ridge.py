@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from zwidth.figures import style
+from zwidth.figures import grid, style
 from zwidth.figures.table import Table, curves, held_or_all, select
 
 # The first scaling of Fig. 10 shows this share of the range of delta.
@@ -45,7 +45,13 @@ def _draw_panel(ax: Axes, table: Table, share: float) -> None:
         if held:
             ax.fill_between(path.delta, 0.0, path.alpha_max, color=color, alpha=0.07, linewidth=0.0, zorder=1)
     ax.set_xlim(float(columns["delta"].min()), end)
-    ax.set_ylim(0.0, 1.04 * float(np.nanmax(columns["alpha_max"])))
+    highest = float(np.nanmax(columns["alpha_max"]))
+    ax.set_ylim(0.0, 1.04 * highest)
+    if grid.logarithmic(shown[0].delta):
+        # The stiffest wall grows with the damping, over as many decades.
+        ax.set_xscale("log")
+        style.use_logarithmic(ax, "y", float(np.nanmin(columns["alpha_max"])), highest)
+        ax.set_ylim(float(np.nanmin(columns["alpha_max"])), 1.2 * highest)
     named = held_or_all(shown)
     style.label_ends(ax, named, [path.alpha_max[-1] for path in named], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=style.ALPHA_MAX_LABEL)

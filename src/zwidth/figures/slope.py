@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves, held_or_all
@@ -47,13 +46,10 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
         ax.plot(delta, path.alpha_max[shown] / delta, color=color, linestyle=dash, label=label, zorder=3)
         ax.axhline(path.limit, color=color, linestyle=style.DOTTED, linewidth=0.9, label=f"g, d = {path.d:g}", zorder=2)
     limits = [path.limit for path in paths]
-    ax.set(xscale="log", yscale="log")
+    ax.set_xscale("log")
+    style.use_logarithmic(ax, "y", min(limits), max(limits))
     ax.set_xlim(_LEAST_DELTA, max(float(path.delta.max()) for path in paths))
     ax.set_ylim(0.7 * min(limits), 3.0 * max(limits))
-    # Ticks as plain numbers: the axis spans a decade or two.
-    ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    ax.yaxis.set_minor_formatter(NullFormatter())
     named = held_or_all(paths)
     style.label_ends(ax, named, [path.limit for path in named], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=r"$\alpha_{\max}/\delta = K_{\max}T/b$")

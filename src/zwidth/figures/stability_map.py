@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, TwoSlopeNorm
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, PathPatch
 
-from zwidth.figures import style
+from zwidth.figures import region, style
 from zwidth.figures.table import si_scale
 
 # A grid of more panels than this says nothing on a page: evenly spaced deltas and delays stand for all.
@@ -22,7 +22,13 @@ SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
 
 
 @style.house_style()
-def draw_map(arrays: Mapping[str, np.ndarray], output: str, axes: style.AnyAxes | None = None) -> np.ndarray:
+def draw_map(
+    arrays: Mapping[str, np.ndarray],
+    output: str,
+    axes: style.AnyAxes | None = None,
+    *,
+    outlines: Mapping[tuple[float, float], region.Outlines] | None = None,
+) -> np.ndarray:
     """Draw one output over alpha and beta: panels for delta (columns) and d (rows), three of each at most.
 
     Args:
@@ -30,6 +36,8 @@ def draw_map(arrays: Mapping[str, np.ndarray], output: str, axes: style.AnyAxes 
             stiffness_N_per_m and virtual_damping_N_s_per_m a single panel is in SI units as well.
         output: "stable", "spectral_radius" or "passive".
         axes: an Axes of yours for the first delta and d alone, or one for each panel.
+        outlines: the exact edge of what is stable or passive, by delta and d, drawn in place of that of the cells where
+            all cells agree with it; where left out, the contour of the spectral radius bounds stable walls.
     """
     delta, d = arrays["delta"], arrays["d"]
     rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
@@ -40,7 +48,11 @@ def draw_map(arrays: Mapping[str, np.ndarray], output: str, axes: style.AnyAxes 
     panels = style.panels(axes, len(places), *size, sharex=True, sharey=True)
     image: Any = None
     for ax, (row, column) in zip(panels, places, strict=False):
-        image = _draw_panel(ax, arrays, output, arrays[output][:, :, column, row].T)
+        place = np.s_[:, :, column, row]
+        exact = (outlines or {}).get((float(delta[column]), float(d[row])))
+        image = _draw_panel(ax, arrays, output, arrays[output][place].T)
+        if output in SHADES and _draw_region(ax, arrays, output, place, exact):
+            image.set_cmap(ListedColormap(["white", "white"]))
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
     style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
     scale = si_scale(arrays)
@@ -55,6 +67,29 @@ def draw_map(arrays: Mapping[str, np.ndarray], output: str, axes: style.AnyAxes 
     handles = [Patch(facecolor=color, label=label, **edge) for label, color in shades.items()]
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
+
+
+def _draw_region(
+    ax: Axes, arrays: Mapping[str, np.ndarray], output: str, place: Any, exact: region.Outlines | None
+) -> bool:
+    """The region within its exact edge, or within the contour of the radius; tells whether either is known."""
+    alpha, beta, good = arrays["alpha"], arrays["beta"], arrays[output][place].T.astype(bool)
+    look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
+    if exact is not None and region.agrees(exact, alpha, beta, good):
+        ax.add_patch(PathPatch(region.to_path(exact), facecolor=SHADES[output], linewidth=0.0, zorder=1))
+        for points, _ in exact:
+            ax.plot(*np.append(points, points[:1], 0).T, label="exact edge", **look)
+        return True
+    radius = arrays["spectral_radius"][place].T if output == "stable" and "spectral_radius" in arrays else None
+    # On alpha = 0 a pole sits at z = 1 whatever beta is, and the contour would follow that column.
+    keep = alpha != 0
+    if radius is None or min(radius[:, keep].shape) < 2 or not np.isfinite(radius).all():
+        return False
+    if not radius[:, keep].min() < 1.0 < radius[:, keep].max():
+        return False
+    ax.contourf(alpha[keep], beta, radius[:, keep], levels=[-np.inf, 1.0], colors=[SHADES[output]], zorder=1)
+    ax.contour(alpha[keep], beta, radius[:, keep], levels=[1.0], colors=style.BLACK, linewidths=1.2, zorder=2)
+    return True
 
 
 def _draw_panel(ax: Axes, arrays: Mapping[str, np.ndarray], output: str, values: np.ndarray) -> Any:

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import PathPatch
-from matplotlib.path import Path
 
 from zwidth.figures import style
+from zwidth.figures.region import to_path
 from zwidth.figures.table import SI_COLUMNS, Table, curves, select
 
 _MARKS: dict[str, dict[str, Any]] = {
@@ -55,22 +55,13 @@ def _draw_pieces(ax: Axes, table: Table, color: Any, factor: float, shade: float
     """One device's outlines, shaded inside; returns which kinds of them there are."""
     found = curves(table, "number", "piece")
     paths = [np.stack([getattr(one, SI_COLUMNS[0]) * factor, getattr(one, SI_COLUMNS[1])], -1) for one in found]
-    inside = Path.make_compound_path(
-        *(Path(_wind(path, one.piece), closed=True) for path, one in zip(paths, found, strict=True))
-    )
+    inside = to_path([(path, one.piece == "hole") for path, one in zip(paths, found, strict=True)])
     ax.add_patch(PathPatch(inside, facecolor=color, alpha=shade, linewidth=0.0, zorder=1))
     dashes = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED}
     for path, one in zip(paths, found, strict=True):
         look = {"color": color, "linestyle": dashes[one.piece], "zorder": 3}
         ax.plot(path[:, 0], path[:, 1], label=f"{one.piece} {one.number}", **look)
     return {str(one.piece) for one in found}
-
-
-def _wind(path: np.ndarray, piece: str) -> np.ndarray:
-    """Holes run the other way round, so that they stay empty."""
-    x, y = path[:-1].T
-    turn = float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
-    return path if (turn > 0) != (piece == "hole") else path[::-1]
 
 
 def _mark_walls(ax: Axes, walls: Table, color: Any, factor: float, unit: str, *, spell: bool) -> None:

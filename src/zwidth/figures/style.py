@@ -9,6 +9,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
+from textwrap import fill
 from typing import Any, TypeAlias
 
 import matplotlib
@@ -17,6 +18,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.errors import InputError
 
@@ -77,14 +79,16 @@ _RC: Any = {
     "figure.facecolor": "white",
     "figure.dpi": 100.0,
     "savefig.facecolor": "white",
-    # Text as outlines: an SVG looks the same on a machine without the font.
+    # Text as outlines: without DejaVu Sans, a browser sets formulas, and the words beside them, in a serif, letter by
+    # letter at places that fit another font. Text as text saves a sixth of a file; `save` writes it where it is wanted.
     "svg.fonttype": "path",
     "svg.hashsalt": "zwidth",
 }
 
 
-# What a user's style sheet changes of it.
+# What a user's style sheet changes of it, and the size of new figures that a user wants.
 _changes: ContextVar[Any] = ContextVar("changes", default=None)
+_size: ContextVar[tuple[float, float] | None] = ContextVar("size", default=None)
 
 
 @contextmanager
@@ -95,17 +99,19 @@ def house_style() -> Iterator[None]:
 
 
 @contextmanager
-def style_sheet(file: Path | None) -> Iterator[None]:
-    """Let a style sheet of matplotlib have the last word on the look."""
-    token = None
+def style_sheet(file: Path | None, size: tuple[float, float] | None = None) -> Iterator[None]:
+    """Let a style sheet of matplotlib have the last word on the look; new figures have a size, in inches, if given."""
+    token, sized = None, _size.set(size)
     if file is not None:
         try:
             token = _changes.set(dict(matplotlib.rc_params_from_file(file, use_default_template=False)))
         except OSError as error:
+            _size.reset(sized)
             raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error
     try:
         yield
     finally:
+        _size.reset(sized)
         if token is not None:
             _changes.reset(token)
 
@@ -113,7 +119,7 @@ def style_sheet(file: Path | None) -> Iterator[None]:
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
     """A figure of its own, unknown to pyplot, and its axes as a 2-D array."""
     engine = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)
-    figure = Figure(figsize=(width, height), layout=engine)
+    figure = Figure(figsize=_size.get() or (width, height), layout=engine)
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
 
@@ -146,28 +152,52 @@ def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
         ax.set(xlabel=x, ylabel=y)
 
 
-def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: str = "upper", **keywords: Any) -> None:
-    """Explain what is drawn, above the panels (or below), or within the first."""
-    if handles and outside:
-        axes[0].figure.legend(handles=handles, loc=f"outside {place} center", **keywords)
-    elif handles:
-        axes[0].legend(handles=handles)
+def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: Any = "upper", **keywords: Any) -> None:
+    """Explain what is drawn, above the panels (or below) in as many columns as fit, or within the first."""
+    if not outside or not handles:
+        if handles:
+            axes[0].legend(handles=handles)
+        return
+    figure, columns = figure_of(axes), keywords.pop("ncols", 1)
+    place = f"outside {place} center"
+    drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
+    while (share := drawn.get_window_extent().width / figure.bbox.width) > 1.0 and columns > 1:
+        columns -= 1
+        drawn.remove()
+        drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
+    for text in drawn.get_texts() if share > 1.0 else ():
+        if "$" not in text.get_text():
+            text.set_text(fill(text.get_text(), max(int(0.9 * len(text.get_text()) / share), 12)))
+
+
+def use_logarithmic(ax: Axes, which: str, low: float, high: float, wide: float = 100.0) -> None:
+    """A logarithmic axis with plain numbers, which has 2 and 5 as well unless it is as wide as that."""
+    getattr(ax, f"set_{which}scale")("log")
+    axis = getattr(ax, f"{which}axis")
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < wide * low else (1.0,)))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
-    """Write the delay of each curve to the right of its end, moved apart where names would overlap."""
+    """Write the delay of each curve to the right of its end."""
+    name_heights(ax, [f"$d = {curve.d:g}$" for curve in found], ends, [colors[curve.d] for curve in found])
+
+
+def name_heights(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: Sequence[Any]) -> None:
+    """Write names to the right of a panel, moved apart where they would overlap."""
     to_scale = ax.yaxis.get_transform().transform
     low, high = to_scale(np.array(ax.get_ylim()))
     heights = (to_scale(np.array(ends, dtype=np.float64)) - low) / (high - low)
     spec = ax.get_subplotspec()
     rows = spec.get_gridspec().nrows if spec else 1
     places = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
-    for curve, place in zip(found, places, strict=True):
+    for name, place, color in zip(names, places, colors, strict=True):
         ax.annotate(
-            f"$d = {curve.d:g}$",
+            name,
             (1.015, place),
             xycoords="axes fraction",
-            color=colors[curve.d],
+            color=color,
             fontsize=8,
             va="center",
             annotation_clip=False,
@@ -197,6 +227,8 @@ def save(
     formats: Sequence[str] = ("png", "svg"),
     dpi: float | None = None,
     size: tuple[float, float] | None = None,
+    *,
+    text: bool = False,
 ) -> tuple[Path, ...]:
     """Write the figure of some Axes as ``stem.png`` and so on; the same figure gives the same bytes.
 
@@ -206,13 +238,14 @@ def save(
         formats: the endings, of "png", "svg" and "pdf".
         dpi: dots an inch, also of maps within an SVG or a PDF.
         size: width and height in inches; as it was drawn where left out.
+        text: whether an SVG keeps text as text, which can be searched and needs the font DejaVu Sans to look right.
     """
     figure = figure_of(drawn)
     if size is not None:
         figure.set_size_inches(*size)
     files = tuple(stem.with_name(f"{stem.name}.{ending}") for ending in formats)
     engine = figure.get_layout_engine()
-    with house_style():
+    with house_style(), matplotlib.rc_context({"svg.fonttype": "none"} if text else {}):
         for file in files:
             usual = PNG_DPI if file.suffix == ".png" else "figure"
             figure.savefig(file, dpi=dpi or usual, metadata=_METADATA[file.suffix])
@@ -273,7 +306,8 @@ _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"
 
 def si_unit(largest: float, unit: str) -> tuple[float, str]:
     """The factor and the unit in which values up to ``largest`` have one to three digits before the point."""
-    if not np.isfinite(largest) or largest <= 0:
+    if not np.isfinite(largest) or largest <= 0 or unit.startswith("1/"):
+        # Of an inverse the prefix would be read as its unit's.
         return 1.0, unit
     power = int(np.clip(3 * np.floor(np.log10(largest) / 3), -12, 9))
     return 10.0**-power, _PREFIXES[power] + unit

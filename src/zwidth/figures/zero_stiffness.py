@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
-from zwidth.figures import style
+from zwidth.figures import grid, style
 from zwidth.figures.table import Table, curves, held_or_all
 
 
@@ -42,7 +42,7 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
             ax.plot(interval.delta, getattr(interval, name), label=f"passive {name}, d = {interval.d:g}", **look)
     _draw_lower_bound(ax, stable[0], several=len(colors) > 1)
     deltas = np.concatenate([interval.delta for interval in stable])
-    ax.set_xlim(float(deltas.min()), float(deltas.max()))
+    grid.scale_axis(ax, "x", np.unique(deltas))
     values = np.concatenate([np.r_[interval.beta_lower, interval.beta_upper] for interval in stable])
     ax.set_ylim(*style.span(float(values.min()), float(values.max())))
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)

@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.errors import InputError, StoreError
-from zwidth.figures.curves import draw_curves, draw_outlines, find_outlines
+from zwidth.figures.curves import draw_curves, draw_outlines, find_family
 from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.style import save, style_sheet
 from zwidth.formatting import short
-from zwidth.quantities import OUTPUTS
-from zwidth.sweep.store import SUFFIX, find_stores, open_dataset
+from zwidth.quantities import OUTPUTS, VARIABLES
+from zwidth.runs.edges import Edges, make_edges
+from zwidth.sweep.store import SUFFIX, Store, find_stores, open_dataset
 
 if TYPE_CHECKING:
     import xarray
@@ -41,6 +42,7 @@ class Drawing:
     dpi: float | None = None
     size: tuple[float, float] | None = None  # in inches
     style: Path | None = None  # a style sheet of matplotlib
+    text: bool = False  # whether an SVG keeps text as text
 
     @property
     def axes(self) -> dict[str, str]:
@@ -92,15 +94,15 @@ def draw_stores(
     slices = {store: _cut(store, data, wanted, note) for store, data in datasets.items()}
     _check_axes(drawing.axes, slices)
     files = []
-    with style_sheet(drawing.style):
+    with style_sheet(drawing.style, drawing.size):
         for store, data in slices.items():
-            drawn = list(figures_of(data, drawing.axes))
+            drawn = list(figures_of(data, drawing.axes, make_edges(Store(store))))
             if not drawn:
                 note(f"{store.name}: no figure, for {_explain_absence(data, drawing.axes)}")
             for name, draw in drawn:
                 target.mkdir(parents=True, exist_ok=True)
                 stem = target / f"{store.name.removesuffix(SUFFIX)}_{name}"
-                for file in save(draw(), stem, drawing.formats, drawing.dpi, drawing.size):
+                for file in save(draw(), stem, drawing.formats, drawing.dpi, drawing.size, text=drawing.text):
                     files.append(file)
                     (progress or (lambda file: None))(file)
     return tuple(files)
@@ -124,7 +126,8 @@ def _check_axes(axes: Mapping[str, str], slices: Mapping[Path, xarray.Dataset]) 
 
 def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
     """Why nothing of a sweep is drawn."""
-    varied = sorted(str(dim) for dim, size in data.sizes.items() if size > 1)
+    # A store lists its dimensions in any order.
+    varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
     missing = ", ".join(name for name in axes.values() if name not in varied)
     if not varied:
         return "it is a single point"
@@ -133,11 +136,20 @@ def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
     )
 
 
-def figures_of(data: xarray.Dataset, axes: Mapping[str, str] | None = None) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The name of each figure of a sweep, or of a part of one, and what draws it; over some axes by what they are."""
+def figures_of(
+    data: xarray.Dataset, axes: Mapping[str, str] | None = None, edges: Edges | None = None
+) -> Iterator[tuple[str, Callable[[], Any]]]:
+    """The name of each figure of a sweep, or of a part of one, and what draws it.
+
+    Args:
+        data: the sweep, or the part.
+        axes: the parameters to draw over, by what they are; chosen from the sweep where left out.
+        edges: the exact outlines of its walls, of `zwidth.runs.edges`.
+    """
     given = dict(axes or {})
-    for name in map(str, data.data_vars):
-        if name not in OUTPUTS or name == "kind" or (name == "passive" and "stable" in data):
+    # A store lists its variables in any order.
+    for name in OUTPUTS:
+        if name not in data or name == "kind" or (name == "passive" and "stable" in data):
             continue
         if not set(given.values()) <= set(list_varied(data, name)):
             continue
@@ -146,11 +158,11 @@ def figures_of(data: xarray.Dataset, axes: Mapping[str, str] | None = None) -> I
         few = OUTPUTS[name].family == "device" and min((data.sizes[axis] for axis in over), default=0) < _SURFACE
         if y or (len(over) == 2 and not few and "hue" not in given):
             if len(over) == 2:
-                yield name, partial(draw_plane, data, name, **given)
+                yield name, partial(draw_plane, data, name, edges=edges, **given)
         elif over and OUTPUTS[name].dtype == "float64":
             yield name, partial(draw_curves, data, name, **given)
-    if not given and find_outlines(data):
-        yield "boundaries", partial(draw_outlines, data)
+    if not given and find_family(data):
+        yield "boundaries", partial(draw_outlines, data, edges=edges)
 
 
 def _cut(

@@ -1,10 +1,13 @@
 """The benchmark's own parts: problems with proved answers, a tiny run, and what is written of it."""
 
 import json
+from itertools import combinations
+from pathlib import Path
 
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from matplotlib.text import Text
 
 from zwidth.bench import problems, report, suite
 from zwidth.bench.baselines import available
@@ -87,7 +90,7 @@ def test_the_figure_has_a_panel_for_each_delay_and_a_mark_for_each_method():
     titles = ["d = 0", "d = 1", "d = 4", "d = 8", "d = 50"]
     assert [ax.get_title(loc="left") for ax in axes] == titles
     # Below a panel without a neighbor, too.
-    assert [bool(ax.get_xlabel()) for ax in axes] == [False, True, True, True, True]
+    assert [bool(ax.get_xlabel()) for ax in axes] == [False, False, True, True, True]
     drawn = [line.get_data() for line in axes[0].lines if len(line.get_xdata()) == 1]
     assert [float(y[0]) for _, y in drawn] == [1e9, 1e8]
 
@@ -98,3 +101,19 @@ def test_results_are_not_overwritten(tmp_path):
         CliRunner().invoke(cli, ["bench", "--out", str(tmp_path)], catch_exceptions=False)
     with pytest.raises(InputError, match="not a folder"):
         CliRunner().invoke(cli, ["bench", "--out", str(tmp_path / "bench.json" / "x")], catch_exceptions=False)
+
+
+def test_names_of_methods_are_apart_and_on_the_page():
+    kept = Path(__file__).parents[3] / "benchmarks" / "results" / "bench.json"
+    rows = [row for row in json.loads(kept.read_text(encoding="utf-8"))["rows"] if row["layout"] != "one"]
+    axes = draw_pareto([Mark(*(row[name] for name in Mark._fields)) for row in rows])
+    figure = axes[0].figure
+    figure.draw_without_rendering()
+    for ax in axes:
+        boxes = [Text.get_window_extent(name) for name in ax.texts]
+        assert len(boxes) > 3
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+        assert all(figure.bbox.contains(box.x0, box.y0) and figure.bbox.contains(box.x1, box.y1) for box in boxes)
+        # None lies on a mark, nor below the panel.
+        assert min(box.x0 for box in boxes) > ax.get_window_extent().x1
+        assert min(box.y0 for box in boxes) > ax.get_window_extent().y0 - max(box.height for box in boxes)

@@ -59,7 +59,9 @@ def titles(axes):
 def test_every_sweep_is_drawn(folder, tmp_path, monkeypatch):
     told = []
     # To write the files takes longer than all the rest; another test does.
-    monkeypatch.setattr(draw, "save", lambda drawn, stem, *_: (stem.with_suffix(".png"), stem.with_suffix(".svg")))
+    monkeypatch.setattr(
+        draw, "save", lambda drawn, stem, *_, **__: (stem.with_suffix(".png"), stem.with_suffix(".svg"))
+    )
     files = draw_stores(folder, tmp_path, progress=told.append)
     assert told == list(files)
     names = {file.stem for file in files}
@@ -142,7 +144,7 @@ def test_a_single_value_is_no_figure(plane, draw):
 def test_slices_are_the_nearest_values(folder, capsys, tmp_path, monkeypatch):
     found = []
     with monkeypatch.context() as patch:
-        patch.setattr(draw, "save", lambda drawn, stem, *_: found.append((stem.name, drawn)) or ())
+        patch.setattr(draw, "save", lambda drawn, stem, *_, **__: found.append((stem.name, drawn)) or ())
         draw_stores(folder / "plane.zarr", tmp_path, at={"delta": "0.12", "d": 0.9})
         draw_stores(folder / "devices.zarr", tmp_path, at={"device": "heavy"})
     drawn = dict(found)

@@ -40,7 +40,7 @@ def folder(tmp_path_factory):
 def drawn(monkeypatch, tmp_path):
     """Draws without writing, and returns the Axes of each figure by its name, and the notes."""
     found, notes = {}, []
-    monkeypatch.setattr(draw, "save", lambda axes, stem, *_: found.setdefault(stem.name, axes) is None or (stem,))
+    monkeypatch.setattr(draw, "save", lambda axes, stem, *_, **__: found.setdefault(stem.name, axes) is None or (stem,))
 
     def draw_over(path, at=None, **axes):
         found.clear()
@@ -63,7 +63,7 @@ def drawn(monkeypatch, tmp_path):
 )
 def test_a_value_that_the_sweep_has_not_is_told(folder, drawn, wanted, taken, told):
     found, notes = drawn(folder / "ridge.zarr", {"mass": wanted})
-    assert rf"$m = {taken:g}\,\mathrm{{kg}}$" in found["ridge_stiffness_max"][0].get_title(loc="left")
+    assert rf"$m = {1e3 * taken:g}\,\mathrm{{g}}$" in found["ridge_stiffness_max"][0].get_title(loc="left")
     assert notes == told
 
 
@@ -81,7 +81,7 @@ def test_curves_over_the_axes_that_are_wanted(folder, drawn):
     assert list(found) == ["ridge_stiffness_max"]
     assert notes == [
         "point.zarr: no figure, for it is a single point",
-        "walls.zarr: no figure, for it varies over alpha, beta, d, delta, not over rate, delay, mass",
+        "walls.zarr: no figure, for it varies over d, delta, alpha, beta, not over rate, delay, mass",
     ]
     kept = open_dataset(folder / "ridge.zarr").stiffness_max.isel(damping=0)
     axes = found["ridge_stiffness_max"]

@@ -1,0 +1,96 @@
+"""What all figures share: legends that fit, spacing of axes, names beside panels, and the kinds of files."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from matplotlib.text import Annotation, Text
+
+from figure_tables import EVERY_FIGURE, RIDGE
+from zwidth import figures
+from zwidth.figures import grid, style
+
+LONG = "a device with a filter, a coupling and a hand, number {}"
+
+
+@pytest.mark.parametrize(
+    "words, columns", [("short {}", 5), ("a scene with a name {}", 3), (LONG, 1), (LONG + ", " + LONG * 2, 1)]
+)
+def test_a_legend_is_no_wider_than_its_figure(words, columns):
+    panels = style.panels(None, 1, 6.4, 4.0)
+    style.legend(panels, [style.line(words.format(k, k, k)) for k in range(5)], outside=True, ncols=5)
+    figure = style.figure_of(panels)
+    figure.draw_without_rendering()
+    (legend,) = figure.legends
+    assert legend._ncols == columns
+    box = legend.get_window_extent()
+    assert box.x0 >= 0
+    assert box.x1 <= figure.bbox.x1
+    boxes = [text.get_window_extent() for text in legend.get_texts()]
+    assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+    assert [" ".join(text.get_text().split()) for text in legend.get_texts()] == [
+        words.format(k, k, k) for k in range(5)
+    ]
+
+
+def test_a_legend_fits_the_size_that_is_wanted():
+    with style.style_sheet(None, (3.0, 2.0)):
+        panels = style.panels(None, 1, 6.4, 4.0)
+    figure = style.figure_of(panels)
+    assert figure.get_size_inches().tolist() == [3.0, 2.0]
+    assert style.figure_of(style.panels(None, 1, 6.4, 4.0)).get_size_inches().tolist() == [6.4, 4.0]
+
+
+@pytest.mark.parametrize("name", EVERY_FIGURE)
+def test_no_two_names_overlap(name):
+    drawn = getattr(figures, name.split()[0])(*EVERY_FIGURE[name])
+    figure = style.figure_of(drawn)
+    figure.draw_without_rendering()
+    for ax in figure.axes:
+        boxes = [Text.get_window_extent(text) for text in ax.texts if isinstance(text, Annotation)]
+        assert not any(one.overlaps(other) for one, other in combinations(boxes, 2))
+
+
+@pytest.mark.parametrize(
+    "values, expected",
+    [
+        (np.geomspace(1e-3, 10, 7), True),
+        (np.geomspace(2.0, 3.0, 5), True),
+        ([1, 2, 5, 10, 20], True),
+        ([4000, 2000, 1000, 500, 200], True),
+        ([1, 2, 4], True),
+        ([0.1, 0.2, 0.3, 0.4], False),
+        (np.linspace(1, 1000, 50), False),
+        ([0, 1, 10, 100], False),
+        ([1, 10], False),
+        ([2, 3, 2, 3], False),
+        ([1, 1.5, 2.2], False),
+        ([5, 5, 5], False),
+    ],
+)
+def test_ratios_that_are_nearly_equal_are_logarithmic(values, expected):
+    assert grid.logarithmic(np.asarray(values, dtype=float)) is expected
+
+
+def test_cells_end_half_way_between_their_values():
+    np.testing.assert_allclose(grid.find_edges(np.array([1.0, 2.0, 3.0])), [0.5, 1.5, 2.5, 3.5], rtol=1e-15)
+    edges = grid.find_edges(np.array([1.0, 10.0, 100.0]))
+    np.testing.assert_allclose(edges, 10.0 ** np.array([-0.5, 0.5, 1.5, 2.5]), rtol=1e-14)
+
+
+def test_dampings_in_equal_ratios_are_on_a_logarithmic_axis():
+    delta = np.geomspace(0.1, 1e4, 41)
+    columns = {name: values[:41] for name, values in RIDGE.items()}
+    (ax,) = figures.draw_ridge({**columns, "delta": delta, "alpha_max": 3 * delta + 1})
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    (even,) = figures.draw_ridge(columns)
+    assert (even.get_xscale(), even.get_yscale()) == ("linear", "linear")
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_text_is_kept_as_text_where_it_is_wanted(tmp_path, text):
+    (file,) = figures.save(figures.draw_ridge(RIDGE), tmp_path / "ridge", ("svg",), text=text)
+    written = file.read_text(encoding="utf-8")
+    assert ("<text" in written) is text
+    # A comment in the outlines says it, too.
+    assert (">held delay (exact)<" in written) is text

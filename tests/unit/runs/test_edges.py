@@ -1,0 +1,139 @@
+"""The exact edges of a sweep's walls, and that figures draw them only where the sweep agrees."""
+
+import numpy as np
+import pytest
+
+from sweeping import config_of, run_sweeps, study
+from zwidth import Device, LowPass, Scene, Timing, is_passive, is_stable
+from zwidth.figures import draw_outlines, draw_plane
+from zwidth.figures.grid import prepare
+from zwidth.runs.edges import make_edges
+from zwidth.sweep.store import Store, open_dataset
+
+WALLS = {
+    "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 21}},
+    "beta": {"linear": {"start": -0.6, "stop": 1.6, "num": 23}},
+    "delta": [0.05, 0.5],
+    "d": [0, 1],
+}
+IN_SI = {
+    "stiffness": {"log": {"start": 100, "stop": 40000, "num": 20}},
+    "virtual_damping": {"linear": {"start": -20, "stop": 100, "num": 20}},
+    "devices": {"label": ["light", "heavy"], "mass": [0.1, 0.2], "damping": [1, 5]},
+    "rate": "1 kHz",
+    "delay": "1 ms",
+}
+FILTERED = {**IN_SI, "devices": {"label": ["one"], "mass": [0.1], "damping": [5]}}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run")
+    studies = [
+        study("walls", axes=WALLS, outputs=("stable", "passive")),
+        study("si", axes=IN_SI, outputs=("stable", "settling_time")),
+        study("filtered", axes=FILTERED, velocity={"kind": "low_pass", "cutoff": "50 Hz"}),
+    ]
+    assert run_sweeps(config_of(*studies), folder).ok
+    return folder
+
+
+def opened(folder, name):
+    path = folder / f"{name}.zarr"
+    return open_dataset(path).reset_coords(drop=True).load(), make_edges(Store(path))
+
+
+def around(points, size):
+    """Walls at a share of the way from the middle of an outline to its points, off alpha = 0."""
+    middle = points[points[:, 0] > 0].mean(axis=0)
+    walls = middle + size * (points - middle)
+    return walls[(points[:, 0] > 1e-3 * points[:, 0].max())].T
+
+
+@pytest.mark.parametrize("place", [{"d": 0, "delta": 1}, {"d": 1, "delta": 0}])
+def test_verdicts_change_at_the_edges(folder, place):
+    data, edges = opened(folder, "walls")
+    part = prepare(data, ["stable"]).isel(place)
+    found = edges(part)
+    device = float(part.delta), float(part.d)
+    for name, judge in (("stable", is_stable), ("passive", is_passive)):
+        ((points, hole),) = found[name]
+        assert not hole
+        assert np.all(judge(*around(points, 0.999), *device))
+        assert not np.any(judge(*around(points, 1.001), *device))
+
+
+def test_edges_are_in_the_units_of_the_figure(folder):
+    data, edges = opened(folder, "si")
+    part = prepare(data, ["stable"]).isel(device=1)
+    assert part.stiffness.attrs["units"] == "kN/m"
+    ((points, _),) = edges(part)["stable"]
+    scene = Scene(Device(mass=0.2, damping=5), Timing(period=1e-3, delay=1e-3))
+    for size, stable in ((0.999, True), (1.001, False)):
+        stiffness, damping = around(points, size)
+        assert set(scene.is_stable(1e3 * stiffness, damping)) == {stable}
+
+
+def test_scenes_with_parts_have_their_own_edges(folder):
+    data, edges = opened(folder, "filtered")
+    ((points, _), *_) = edges(prepare(data, ["stable"]))["stable"]
+    scene = Scene(Device(mass=0.1, damping=5), Timing(period=1e-3, delay=1e-3), velocity=LowPass(50.0))
+    for size, stable in ((0.999, True), (1.001, False)):
+        stiffness, damping = around(points, size)
+        assert set(scene.is_stable(1e3 * stiffness, damping)) == {stable}
+    (ax,) = draw_plane(data, "stable", edges=edges)
+    assert exact_lines(ax)
+
+
+def exact_lines(ax):
+    return [line.get_xydata() for line in ax.lines if line.get_label() == "exact edge"]
+
+
+def test_a_plane_draws_the_edges(folder):
+    data, edges = opened(folder, "walls")
+    for ax, place in zip(
+        draw_plane(data, "stable", edges=edges), [(d, k) for d in (0, 1) for k in (0, 1)], strict=True
+    ):
+        part = prepare(data, ["stable"]).isel(d=place[0], delta=place[1])
+        lines = exact_lines(ax)
+        assert len(lines) == 2
+        for line, name in zip(lines, ("stable", "passive"), strict=True):
+            np.testing.assert_array_equal(line[:-1], edges(part)[name][0][0])
+    # Without them: the edges of cells.
+    assert not any(map(exact_lines, draw_plane(data, "stable")))
+    for ax in draw_outlines(data, edges=edges):
+        assert len(exact_lines(ax)) == 2
+
+
+def test_axes_may_be_turned(folder):
+    data, edges = opened(folder, "walls")
+    part = data.isel(d=1, delta=1)
+    (ax,) = draw_plane(part, "stable", x="beta", y="alpha", edges=edges)
+    (upright,) = draw_plane(part, "stable", edges=edges)
+    np.testing.assert_array_equal(exact_lines(ax)[0][:, ::-1], exact_lines(upright)[0])
+
+
+def test_what_the_sweep_contradicts_is_not_drawn(folder):
+    data, edges = opened(folder, "walls")
+    part = data.isel(d=[1], delta=[1])
+    wrong = part.copy(deep=True)
+    wrong["stable"][..., 2:8, 8:14] = ~wrong["stable"][..., 2:8, 8:14]
+    (ax,) = draw_plane(wrong, "stable", edges=edges)
+    # Of what is passive alone.
+    assert len(exact_lines(ax)) == 1
+    (ax,) = draw_plane(part, "stable", edges=edges)
+    assert len(exact_lines(ax)) == 2
+
+
+def test_of_other_planes_nothing_is_known(folder):
+    data, edges = opened(folder, "walls")
+    assert edges(prepare(data, ["stable"]).isel(alpha=0, d=0)) == {}
+
+
+def test_times_to_settle_end_at_the_edge(folder):
+    data, edges = opened(folder, "si")
+    axes = draw_plane(data, "settling_time", edges=edges)
+    for ax in axes:
+        assert ax.get_xscale() == "log"
+        assert len(exact_lines(ax)) == 1
+    assert "edge of what is stable" in [text.get_text() for text in axes[0].figure.legends[0].get_texts()]
