@@ -55,12 +55,13 @@ def test_verdicts_change_at_the_edges(folder, place):
     data, edges = opened(folder, "walls")
     part = prepare(data, ["stable"]).isel(place)
     found = edges(part)
-    device = float(part.delta), float(part.d)
+    delta, d = float(part.delta), float(part.d)
     for name, judge in (("stable", is_stable), ("passive", is_passive)):
         ((points, hole),) = found[name]
         assert not hole
-        assert np.all(judge(*around(points, 0.999), *device))
-        assert not np.any(judge(*around(points, 1.001), *device))
+        for size, expected in ((0.999, True), (1.001, False)):
+            alpha, beta = around(points, size)
+            assert set(np.asarray(judge(alpha, beta, delta, d))) == {expected}
 
 
 def test_edges_are_in_the_units_of_the_figure(folder):

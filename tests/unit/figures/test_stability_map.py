@@ -1,0 +1,41 @@
+"""Maps end at the exact edge where one is known."""
+
+import numpy as np
+
+from figure_tables import grid_map
+from zwidth import figures
+
+TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 100)
+# Of the made-up map: alpha + beta^2 = 0.5.
+EDGE = np.append(np.stack([0.5 * (1 - np.sin(TURN) ** 2), np.sqrt(0.5) * np.sin(TURN)], -1), [[0.0, np.sqrt(0.5)]], 0)
+
+
+def exact(ax):
+    return [line.get_xydata() for line in ax.lines if line.get_label() == "exact edge"]
+
+
+def test_the_outline_is_drawn_where_the_cells_agree():
+    (ax,) = figures.draw_map(grid_map(), "stable", outlines={(0.1, 1.0): [(EDGE, False)]})
+    (line,) = exact(ax)
+    np.testing.assert_array_equal(line[:-1], EDGE)
+    # All is white below it.
+    assert ax.collections[0].get_cmap()(0) == ax.collections[0].get_cmap()(1)
+    for outlines in ({(0.2, 1.0): [(EDGE, False)]}, {(0.1, 1.0): [(EDGE * [0.1, 1], False)]}):
+        (ax,) = figures.draw_map({**fine(), "delta": np.array([0.1])}, "stable", outlines=outlines)
+        assert not exact(ax)
+
+
+def fine():
+    alpha, beta = np.linspace(0.0, 1.0, 30), np.linspace(-1.0, 1.0, 30)
+    radius = 0.5 + alpha[:, None] + beta[None] ** 2
+    return {"alpha": alpha, "beta": beta, "d": np.array([1.0]), "stable": (radius < 1)[:, :, None, None]}
+
+
+def test_the_contour_of_the_radius_bounds_what_is_stable():
+    (ax,) = figures.draw_map(grid_map(), "stable")
+    line = ax.collections[2].get_paths()[0].vertices
+    assert np.abs(line[:, 0] + line[:, 1] ** 2 - 0.5).max() < 0.07
+    # A straight piece between two values of beta, 0.5 apart, is off by (0.5/2)^2 at most.
+    without = {name: values for name, values in grid_map().items() if name != "spectral_radius"}
+    (ax,) = figures.draw_map(without, "stable")
+    assert len(ax.collections) == 1
