@@ -15,7 +15,7 @@ from zwidth.figures import region, style
 from zwidth.figures.table import si_scale
 
 # A grid of more panels than this says nothing on a page: evenly spaced deltas and delays stand for all.
-_PANELS = 3
+PANELS = 3
 
 # Light, so that labels and curves drawn over them stay legible; in gray, passive is the darker one.
 SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
@@ -40,7 +40,7 @@ def draw_map(
             all cells agree with it; where left out, the contour of the spectral radius bounds stable walls.
     """
     delta, d = arrays["delta"], arrays["d"]
-    rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
+    rows, columns = style.pick_evenly(d.size, PANELS), style.pick_evenly(delta.size, PANELS)
     places = list(product(rows, columns))
     single = len(places) == 1
     width, height = (5.9, 4.3) if single else (0.6 + 2.3 * len(columns), 1.0 + 2.1 * len(rows))

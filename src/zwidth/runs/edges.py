@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING, TypeAlias
@@ -11,8 +10,7 @@ import numpy as np
 
 from zwidth.errors import InputError
 from zwidth.figures.region import Outlines
-from zwidth.stability.passivity import passivity_margin
-from zwidth.stability.region import stable_region
+from zwidth.studies.stable_set import find_edges
 from zwidth.sweep.part_axes import make_scene
 from zwidth.sweep.store import Store
 
@@ -22,7 +20,6 @@ if TYPE_CHECKING:
 Edges: TypeAlias = Callable[["xarray.Dataset"], dict[str, Outlines]]
 
 _PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})
-_ANGLES = 721
 
 
 def make_edges(store: Store) -> Edges:
@@ -68,26 +65,11 @@ def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
             return {"stable": [(np.stack([one.stiffness, one.virtual_damping], -1), one.hole) for one in pieces]}
         block = store.grid.block(slices)
         delta, d = float(block.delta[0]), float(block.d[0])
-        found = stable_region(delta, d)
+        found = find_edges(delta, d)
     except InputError:
         return {}
     units = np.ones(2)
     if block.mass.size:
         rate = float(block.mass[0] / block.period[0])
         units = np.array([rate / float(block.period[0]), rate])
-    outlines: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1) * units, False)]}
-    if not found.verified:
-        return {}
-    if delta > 0:
-        outlines["passive"] = [(_find_passive(delta, d) * units, False)]
-    return outlines
-
-
-def _find_passive(delta: float, d: float) -> np.ndarray:
-    """The edge of the passive walls: the damping that a wall needs grows as the wall does."""
-    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, _ANGLES)
-    walls = np.stack([np.cos(angle), np.sin(angle)], -1)
-    needed = -np.asarray(passivity_margin(walls[:, 0], walls[:, 1], 0.0, d))
-    # The smallest cosines are rounded zeros.
-    walls[[0, -1], 0] = 0.0
-    return delta * walls / needed[:, None]
+    return {name: [(points * units, hole) for points, hole in outlines] for name, outlines in found.items()}

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Annotated, ClassVar, Literal, TypeAlias
+from itertools import product
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 import numpy as np
 from pydantic import WrapValidator
@@ -84,4 +85,18 @@ class MapStudy(ComputedStudy):
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
         arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
-        return Outcome(arrays=arrays, figures={f"_{name}": partial(figures.draw_map, arrays, name) for name in names})
+        return Outcome(arrays=arrays, figures={f"_{name}": partial(_draw, arrays, name) for name in names})
+
+
+def _draw(arrays: dict[str, Any], name: str) -> Any:
+    """A figure with the exact edges of the panels that it has."""
+    from zwidth.figures.stability_map import PANELS
+    from zwidth.figures.style import pick_evenly
+    from zwidth.studies.stable_set import find_edges
+
+    delta, d = arrays["delta"], arrays["d"]
+    shown = product(delta[pick_evenly(delta.size, PANELS)], d[pick_evenly(d.size, PANELS)])
+    edges = (
+        {place: find_edges(*map(float, place)).get(name) for place in shown} if name in ("stable", "passive") else {}
+    )
+    return figures.draw_map(arrays, name, outlines={place: edge for place, edge in edges.items() if edge})

@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
+from zwidth.stability.passivity import passivity_margin
+from zwidth.stability.region import stable_region
 from zwidth.stability.ridge import RidgeKind
 from zwidth.status import Status
 from zwidth.studies.outcome import Table
 
+if TYPE_CHECKING:
+    from zwidth.figures.region import Outlines
+
+_ANGLES = 721
 # Places between which a bound is looked for, and how often: to the last digit.
 _PLACES, _ROUNDS = np.arange(1, 32) / 32.0, 11
 
@@ -75,3 +81,24 @@ def _sharpen(scene: Scene, stiffness: float, inside: float, near: float) -> floa
             float(places[first]) if first < held.size else outside,
         )
     return inside
+
+
+def find_edges(delta: float, d: float) -> dict[str, Outlines]:
+    """Where the stable and the passive walls of a rigid device end, normalized; none where that is not verified."""
+    found = stable_region(delta, d)
+    if not found.verified:
+        return {}
+    edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
+    if delta > 0:
+        edges["passive"] = [(_find_passive(delta, d), False)]
+    return edges
+
+
+def _find_passive(delta: float, d: float) -> np.ndarray:
+    """The edge of the passive walls: the damping that a wall needs grows as the wall does."""
+    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, _ANGLES)
+    walls = np.stack([np.cos(angle), np.sin(angle)], -1)
+    needed = -np.asarray(passivity_margin(walls[:, 0], walls[:, 1], 0.0, d))
+    # The smallest cosines are rounded zeros.
+    walls[[0, -1], 0] = 0.0
+    return delta * walls / needed[:, None]
