@@ -60,8 +60,12 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
         "</label>"
         for dim in others
     )
-    ends = f"not {name}, {name}" if output.dtype == "bool" else f"{low:.4g} to {content['high']:.4g} {_unit(thin)}"
-    thinned = "" if thin.size == values.size else f" Every value of {thin.size:,} out of {values.size:,}."
+    ends = (
+        f"not {name}, {name}"
+        if output.dtype == "bool"
+        else f"{low:.4g} to {content['high']:.4g} {_unit(thin)}".rstrip()
+    )
+    thinned = "" if thin.size == values.size else f" Shown are {thin.size:,} of {values.size:,} values."
     return (
         f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
         f"Dark to bright: {ends}; gray: {_GRAY}.{thinned} "
