@@ -260,6 +260,7 @@ class FigureSize(click.ParamType):
 @click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
 @click.option("--size", type=FigureSize(), help="Width and height in inches, as in 7x4.5.")
 @click.option("--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib.")
+@click.option("--text", is_flag=True, help="Keep text as text in an SVG: it can be searched, and needs the font.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
 @json_option
 def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool, **drawing: Any) -> None:

@@ -187,3 +187,10 @@ def test_a_command_that_draws_nothing_says_why(folder, tmp_path, capsys, store, 
     assert code == (2 if words else 1)
     assert re.search(re.escape(why), capsys.readouterr().err)
     assert not (tmp_path / "out").exists()
+
+
+def test_text_stays_text_where_wanted(folder, tmp_path):
+    assert main_of("figures", folder, "--out", tmp_path, "--format", "svg", "--text") == 0
+    files = list(tmp_path.glob("*.svg"))
+    assert files
+    assert all("<text" in file.read_text(encoding="utf-8") for file in files)
