@@ -11,6 +11,8 @@ import numpy as np
 from zwidth.errors import InputError
 from zwidth.fitting.buzzing import Onsets, needed_answer
 from zwidth.fitting.device_fit import (
+    MASS_OPEN,
+    VAGUE,
     DeviceFit,
     FurtherExperiment,
     in_si,
@@ -37,8 +39,6 @@ _BESIDE = 1e-6
 # 1e-4 the points contradict each other.
 _AS_GOOD, _CHANCE = 5.99, 1e-4
 _ANGLES = 240
-# A standard error beyond this share leaves a value open.
-_VAGUE = 0.5
 # Relative noise that no record is better than, for telling exact points from equal ones.
 _EXACT = 1e-12
 
@@ -135,9 +135,10 @@ def fit_buzz(
             break
     values, by_theta = in_si(*best.theta, period)
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
-    if covariance[0, 0] > (_VAGUE * values[0]) ** 2:
-        doubts.append("the mass is hardly determined: its standard error is more than half of it")
-    doubts += [f"the {name} is 0 at best: a negative one would fit better" for name in best.held]
+    if covariance[0, 0] > (VAGUE * values[0]) ** 2:
+        doubts.append(MASS_OPEN)
+    if best.squares > _EXACT:
+        doubts += [f"the {name} is 0 at best: a negative one would fit better" for name in best.held]
     scene = scene_of(*values, period, velocity)
     stiffness, gradient = stiffness_with_gradient(scene)
     wanted = gradient @ by_theta

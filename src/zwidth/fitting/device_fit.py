@@ -16,6 +16,9 @@ from zwidth.scene import Scene
 NAMES = ("mass", "damping", "delay")
 # Of the intervals.
 _CONFIDENCE = 0.95
+# A standard error beyond this share leaves a value open.
+VAGUE = 0.5
+MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
 
 
 class ErrorBar(NamedTuple):
@@ -85,7 +88,10 @@ class DeviceFit:
         return dict(zip((*NAMES, "stiffness_max"), bars, strict=True))
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
+        """Plain numbers, for JSON; None for what is NaN."""
+        return _without_nan(self._numbers())
+
+    def _numbers(self) -> dict[str, Any]:
         return {
             **{name: getattr(self, name) for name in NAMES},
             "stiffness_max": self.stiffness_max,
@@ -99,6 +105,14 @@ class DeviceFit:
             "status": int(self.status),
             "next": None if self.next is None else self.next._asdict(),
         }
+
+
+def _without_nan(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _without_nan(part) for name, part in value.items()}
+    if isinstance(value, list):
+        return [_without_nan(part) for part in value]
+    return None if value != value else value
 
 
 def scene_of(mass: float, damping: float, delay: float, period: float, velocity: Velocity) -> Scene:

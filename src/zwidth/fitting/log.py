@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth._types import ArrayLike
 from zwidth.errors import InputError
-from zwidth.fitting.device_fit import DeviceFit, in_si, reach_of, scene_of, stiffness_with_gradient
+from zwidth.fitting.device_fit import MASS_OPEN, VAGUE, DeviceFit, in_si, reach_of, scene_of, stiffness_with_gradient
 from zwidth.fitting.moving import Recording, Recordings
 from zwidth.fitting.recordings import Log, read_logs
 from zwidth.formatting import plain, with_unit
@@ -26,7 +26,7 @@ _LONGEST = 20
 # The masses of devices, in kg: outside a unit is suspected.
 _LIGHTEST, _HEAVIEST = 2e-3, 20.0
 # A slope of less than so many of its standard errors is none.
-_SEEN = 4.0
+_SEEN = 5.0
 # Residuals of noise are hardly correlated from sample to sample.
 _CORRELATED = 0.2
 # Smaller residuals, as a share of the way moved, are rounding.
@@ -66,8 +66,8 @@ def fit_log(
 
     Numerics:
         Exact discretization for delays of any length, exact derivatives, Gauss and Newton within bounds. A log of
-        10,000 samples takes some tenths of a second, nothing is compiled. Errors are those of white noise in the
-        position.
+        10,000 samples takes some tenths of a second, nothing is compiled. Errors allow for
+        residuals that are alike from sample to sample, as an encoder's, up to twice the cube root of the samples.
 
     References:
         Ljung 1999, System Identification, section 4.2 (output error). Hulin, Preusche, Hirzinger 2006, eq. (9).
@@ -93,13 +93,13 @@ def fit_log(
     # One more number has to lower Schwarz's criterion.
     better = count * np.log(max(pushed[2], _floor(pushed[0])) / max(plainly[2], _floor(plainly[0]))) + np.log(count) < 0
     model, theta, squares, arrived = pushed if better else plainly
+    _refuse_unmoved(model, theta, squares, period)
     places, slopes = model.predict(theta)
     residuals = model.measured - places
     variance = squares / max(1, count - theta.size)
     sizes = np.linalg.norm(slopes, axis=0)
     scaled = slopes / np.where(sizes > 0, sizes, 1.0)
-    spread = variance * np.linalg.pinv(scaled.T @ scaled) / np.outer(sizes, sizes)
-    _refuse_unmoved(theta, spread, period)
+    spread = variance * _inflation(residuals) * np.linalg.pinv(scaled.T @ scaled) / np.outer(sizes, sizes)
     values, by_theta = in_si(np.log(period**2 / theta[0]), theta[1], theta[2], period)
     # From g = T^2/m to ln m.
     by_theta = by_theta @ np.diag([-1.0 / theta[0], 1.0, 1.0])
@@ -192,18 +192,34 @@ def _refine(
     return at(solution.x), 2.0 * float(solution.cost) * unit**2, solution.status > 0
 
 
-def _refuse_unmoved(theta: np.ndarray, spread: np.ndarray, period: float) -> None:
-    error = float(np.sqrt(spread[0, 0]))
-    if theta[0] < -_SEEN * error:
-        raise InputError(
-            f"force: the device runs away from it, as if its mass were {with_unit(1e3 * period**2 / theta[0], 'g')}; "
-            "turn the sign of the force, or of the position"
-        )
-    if theta[0] <= _SEEN * error:
+def _refuse_unmoved(model: Recordings, theta: np.ndarray, squares: float, period: float) -> None:
+    """Raise `InputError` where the force explains nothing of the motion, or the contrary of it."""
+    alone = model.columns(theta[1], theta[2])[:, 1:]
+    sizes = np.linalg.norm(alone, axis=0)
+    rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
+    if float(rest @ rest) - squares <= _SEEN**2 * squares / model.measured.size:
         raise InputError(
             "force: the position does not follow it; check that both columns are of the same axis, and that nothing "
             "holds the device"
         )
+    if theta[0] <= 0:
+        raise InputError(
+            f"force: the device runs away from it, as if its mass were {with_unit(1e3 * period**2 / theta[0], 'g')}; "
+            "turn the sign of the force, or of the position"
+        )
+
+
+def _inflation(residuals: np.ndarray) -> float:
+    """By how much neighbors that are alike make variances larger than those of white noise: 1 + 2 sum of correlations.
+
+    Weighed by Bartlett's triangle over twice the cube root of the samples.
+    """
+    count, size = residuals.size, float(residuals @ residuals)
+    if size == 0:
+        return 1.0
+    reach = int(2 * np.ceil(count ** (1 / 3)))
+    alike = [(1 - k / (reach + 1)) * float(residuals[k:] @ residuals[:-k]) / size for k in range(1, reach + 1)]
+    return max(1.0, 1.0 + 2.0 * sum(alike))
 
 
 def _doubts(values: np.ndarray, errors: np.ndarray, residuals: np.ndarray, logs: tuple[Log, ...]) -> list[str]:
@@ -212,13 +228,15 @@ def _doubts(values: np.ndarray, errors: np.ndarray, residuals: np.ndarray, logs:
     if not _LIGHTEST <= mass <= _HEAVIEST:
         slip = "the position may be in mm, or the force in kN" if mass < _LIGHTEST else "the force may be in mN"
         doubts.append(f"a mass of {with_unit(1e3 * mass, 'g')} is far from any device; {slip}: m, N and s are meant")
+    if errors[0] > VAGUE * mass:
+        doubts.append(MASS_OPEN)
     size = float(residuals @ residuals)
     if size <= _EXACT**2 * residuals.size * max(float(np.ptp(log.position)) for log in logs) ** 2:
         # Nothing but rounding is left.
         return doubts
     if damping == 0:
         doubts.append("the damping is 0 at best: a negative one would fit better")
-    elif errors[1] > 0.5 * damping:
+    elif errors[1] > VAGUE * damping:
         span = max(log.force.size for log in logs)
         doubts.append(
             f"the damping is hardly seen, its standard error is {with_unit(errors[1], 'N s/m', 2)}; record longer than "
@@ -229,7 +247,7 @@ def _doubts(values: np.ndarray, errors: np.ndarray, residuals: np.ndarray, logs:
     near = float(residuals[1:] @ residuals[:-1]) / size
     if near > _CORRELATED and near > _SEEN / np.sqrt(residuals.size):
         doubts.append(
-            f"what the fit leaves is no noise (neighbors correlate by {plain(near, 2)}), and the errors are too small; "
+            f"what the fit leaves is no noise (neighbors correlate by {plain(near, 2)}), and the errors may be too small; "
             "look for friction, a compliance, a hand that holds the device, or coarse steps of the encoder"
         )
     return doubts
