@@ -187,11 +187,10 @@ def _lines(found: DeviceFit, source: str) -> list[str]:
     lines = [row("fitted to", source)]
     for name, symbol in _SYMBOLS.items():
         lines.append(row(symbol, f"{_amount(name, getattr(found, name))} ({_between(found, name)})"))
-    if isinstance(found.noise, float):
-        lines.append(row("noise of the position", with_unit(found.noise, "m", 3)))
+    if isinstance(found.noise, tuple):
+        lines.append(row("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in found.noise)))
     else:
-        shares = " and ".join(f"{plain(100 * share, 2)} %" for share in found.noise)
-        lines.append(row("noise of K and f", shares))
+        lines.append(row("noise of the position", with_unit(found.noise, "m", 3)))
     if found.offset:
         lines.append(row("constant force", with_unit(found.offset, "N", 3)))
     lines += [row("doubt", doubt) for doubt in found.doubts]
@@ -202,8 +201,8 @@ def _lines(found: DeviceFit, source: str) -> list[str]:
         lines.append(
             row(
                 "measure next",
-                f"K at B = {with_unit(step.virtual_damping, 'N s/m', 3)}, near {with_unit(step.stiffness, 'N/m', 3)} and "
-                f"{with_unit(step.frequency, 'Hz', 3)}: K_max's standard error falls from "
+                f"K at B = {with_unit(step.virtual_damping, 'N s/m', 3)}, near {with_unit(step.stiffness, 'N/m', 3)} "
+                f"and {with_unit(step.frequency, 'Hz', 3)}: K_max's standard error falls from "
                 f"{with_unit(found.stiffness_error, 'N/m', 2)} to {with_unit(step.error_afterwards, 'N/m', 2)}",
             )
         )

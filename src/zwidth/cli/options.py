@@ -113,7 +113,9 @@ def velocity_options(function: Command) -> Command:
     @wraps(function)
     def with_velocity(**given: Any) -> Any:
         named = {path.partition(".")[2]: given.pop(path.replace(".", "__")) for path in paths}
-        return function(velocity=_velocity({name: value for name, value in named.items() if value is not None}), **given)
+        return function(
+            velocity=_velocity({name: value for name, value in named.items() if value is not None}), **given
+        )
 
     command = with_velocity
     for path in reversed(paths):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -15,10 +15,9 @@ from zwidth.fitting.device_fit import (
     VAGUE,
     DeviceFit,
     FurtherExperiment,
+    StiffnessEstimate,
     in_si,
-    reach_of,
     scene_of,
-    stiffness_with_gradient,
 )
 from zwidth.formatting import plain, with_unit
 from zwidth.linear_loop import circle
@@ -58,7 +57,7 @@ class BuzzPoint(NamedTuple):
 
 
 def fit_buzz(
-    points: Sequence[Any],
+    points: Iterable[Any],
     *,
     period: Any,
     velocity: Velocity | None = None,
@@ -115,7 +114,9 @@ def fit_buzz(
     on_edge = [fit for fit in found if fit.found and _at_edge(onsets, fit, period, velocity)]
     best, status = (on_edge or found)[0], Status.OK if on_edge else Status.NO_BOUNDARY
     if not on_edge:
-        doubts.append("the walls do not lie on the edge of this device's stable set: they began to buzz before or later")
+        doubts.append(
+            "the walls do not lie on the edge of this device's stable set: they began to buzz before or later"
+        )
     scale = 1.0 if share else max(best.squares / freedom, _EXACT**2)
     if share and best.squares > _unlikely(freedom):
         doubts.append(
@@ -129,35 +130,25 @@ def fit_buzz(
         away = other.theta - best.theta
         # Not along the flat floor of the same valley.
         if other.squares - best.squares < _AS_GOOD * scale < away @ information @ away * scale:
-            values = in_si(*other.theta, period)[0]
+            values = in_si(other.theta, period)[0]
             doubts.append(f"another device fits as well: {_describe(values)}; add the experiment named next")
             status = Status.UNDECIDED
             break
-    values, by_theta = in_si(*best.theta, period)
+    values, by_theta = in_si(best.theta, period)
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
     if covariance[0, 0] > (VAGUE * values[0]) ** 2:
         doubts.append(MASS_OPEN)
     if best.squares > _EXACT:
         doubts += [f"the {name} is 0 at best: a negative one would fit better" for name in best.held]
-    scene = scene_of(*values, period, velocity)
-    stiffness, gradient = stiffness_with_gradient(scene)
-    wanted = gradient @ by_theta
-    known = tuple(share) if share else (float(np.sqrt(scale)),) * 2
-    return DeviceFit(
-        *map(float, values),
-        dict(zip(("mass", "damping", "delay"), map(float, np.sqrt(np.diag(covariance))), strict=True)),
+    stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
+    return stiffest.conclude(
         covariance,
-        stiffness,
-        float(np.sqrt(gradient @ covariance @ gradient)),
-        known,
-        best.residuals / np.sqrt(scale),
-        tuple(doubts),
-        int(status),
-        _further(scene, stiffness, best.theta, information, wanted, weights / np.sqrt(scale)),
-        0.0,
-        period,
-        velocity,
-        reach_of(None if share else freedom),
+        noise=share or (float(np.sqrt(scale)), float(np.sqrt(scale))),
+        residuals=best.residuals / np.sqrt(scale),
+        doubts=doubts,
+        status=status,
+        freedom=None if share else freedom,
+        further=_further(stiffest, best.theta, information, stiffest.gradient @ by_theta, weights / np.sqrt(scale)),
     )
 
 
@@ -166,7 +157,7 @@ def _describe(values: np.ndarray) -> str:
     return f"m = {with_unit(mass * 1e3, 'g')}, b = {with_unit(damping, 'N s/m')}, t_d = {with_unit(delay, 's')}"
 
 
-def _read(points: Sequence[Any], period: float) -> np.ndarray:
+def _read(points: Iterable[Any], period: float) -> np.ndarray:
     """The walls as an array; an impossible one is refused, and so are walls of one damping."""
     rows = []
     for k, point in enumerate(points):
@@ -190,7 +181,9 @@ def _read(points: Sequence[Any], period: float) -> np.ndarray:
     # A force over a velocity: the dampings that matter are of this size.
     unit = table[0, 0] / (2 * np.pi * table[0, 2])
     if np.ptp(table[:, 1]) <= _SAME * max(unit, np.abs(table[:, 1]).max()):
-        count = "one wall gives two equations for" if len(table) == 1 else f"{len(table)} walls of one damping cannot tell"
+        count = (
+            "one wall gives two equations for" if len(table) == 1 else f"{len(table)} walls of one damping cannot tell"
+        )
         raise InputError(
             f"points: {count} the three unknowns m, b and t_d; what is missing is a wall of another damping: raise K "
             f"at B = {with_unit(table[0, 1] + 0.4 * unit, 'N s/m', 2)}, say, until it buzzes"
@@ -263,7 +256,7 @@ def _solve(
     found = least_squares(
         lambda x: evaluate(tuple(x))[1].ravel(),
         theta[free],
-        lambda x: evaluate(tuple(x))[2],
+        lambda x: evaluate(tuple(x))[2],  # pyright: ignore[reportArgumentType]  (a function or a name)
         method="lm",
         x_scale="jac",
         xtol=tolerance,
@@ -281,7 +274,7 @@ def _at_edge(onsets: Onsets, fit: _Candidate, period: float, velocity: Velocity)
     kappa = onsets.follow(fit.theta)[0]
     if not np.all(kappa > 0):
         return False
-    scene = scene_of(*in_si(*fit.theta, period)[0], period, velocity)
+    scene = scene_of(in_si(fit.theta, period)[0], period, velocity)
     return bool(np.all(_edges(scene, kappa / period**2, onsets.rub / period)))
 
 
@@ -308,14 +301,14 @@ def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray) -> N
 
 
 def _further(
-    scene: Scene,
-    stiffest: float,
+    stiffest: StiffnessEstimate,
     theta: np.ndarray,
     information: np.ndarray,
     wanted: np.ndarray,
     weights: np.ndarray,
 ) -> FurtherExperiment | None:
     """The wall of the device's own boundary, B >= 0, after which K_max is known best."""
+    scene = stiffest.scene
     period, mass = scene.timing.period, np.exp(theta[0])
     w = np.linspace(0.0, np.pi, _ANGLES + 2)[1:-1]
     # Slow loops have all of their boundary at low frequencies.
@@ -325,7 +318,7 @@ def _further(
     rub = mass * q.imag / f.imag
     kappa = mass * q.real - rub * f.real
     # Softer walls than a tenth of the stiffest are outside of what anybody measures well.
-    real = (rub >= 0) & (kappa > 0.1 * stiffest * period**2)
+    real = (rub >= 0) & (kappa > 0.1 * stiffest.value * period**2)
     stiffness, damping = kappa[real] / period**2, rub[real] / period
     if not stiffness.size:
         return None

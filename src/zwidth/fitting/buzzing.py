@@ -10,7 +10,7 @@ two real equations a wall. At a known B they determine w and K (docs/theory/scen
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -25,13 +25,13 @@ _STEPS, _LONGEST, _ARRIVED = 40, 0.15, 1e-13
 class NeededAnswer(NamedTuple):
     """q and its derivatives in w, delta and d, at these w for these devices."""
 
-    q: np.ndarray
-    by_w: np.ndarray
-    by_delta: np.ndarray
-    by_d: np.ndarray
+    q: Any
+    by_w: Any
+    by_delta: Any
+    by_d: Any
 
 
-def needed_answer(w: np.ndarray, delta: np.ndarray, d: np.ndarray) -> NeededAnswer:
+def needed_answer(w: np.ndarray, delta: Any, d: Any) -> NeededAnswer:
     """``q = -z^n (z - 1)(z - c)/(a2 z + a1 + a0/z)`` with its derivatives; all broadcast."""
     whole, f = split_delay(np.asarray(d, float))
     plant, (by_delta, by_f) = held_plant(delta, f), plant_slopes(delta, f)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -77,7 +78,7 @@ class DeviceFit:
     @cached_property
     def scene(self) -> Scene:
         """The estimated device with its timing and velocity estimate."""
-        return scene_of(self.mass, self.damping, self.delay, self.period, self.velocity)
+        return scene_of((self.mass, self.damping, self.delay), self.period, self.velocity)
 
     @property
     def intervals(self) -> dict[str, ErrorBar]:
@@ -115,19 +116,64 @@ def _without_nan(value: Any) -> Any:
     return None if value != value else value
 
 
-def scene_of(mass: float, damping: float, delay: float, period: float, velocity: Velocity) -> Scene:
-    """A device with its timing."""
+def scene_of(values: Iterable[float], period: float, velocity: Velocity) -> Scene:
+    """A device of this mass, damping and delay with its timing."""
+    mass, damping, delay = map(float, values)
     return Scene(Device(mass, damping), Timing(period=period, delay=delay), velocity=velocity)
 
 
-def stiffness_with_gradient(scene: Scene) -> tuple[float, np.ndarray]:
-    """K_max and its derivatives in mass, damping and delay."""
-    slopes = scene.sensitivities()
-    return float(slopes.stiffness), np.array([slopes.per[name] for name in NAMES])
+@dataclass(frozen=True)
+class StiffnessEstimate:
+    """K_max of a scene and its derivatives in mass, damping and delay."""
+
+    scene: Scene
+    value: float
+    gradient: np.ndarray
+
+    @classmethod
+    def at(cls, scene: Scene) -> StiffnessEstimate:
+        """By `zwidth.Scene.sensitivities`."""
+        slopes = scene.sensitivities()
+        return cls(scene, float(slopes.stiffness), np.array([slopes.per[name] for name in NAMES]))
+
+    def conclude(
+        self,
+        covariance: np.ndarray,
+        *,
+        noise: float | tuple[float, float],
+        residuals: np.ndarray,
+        doubts: Iterable[str],
+        status: int,
+        freedom: int | None = None,
+        further: FurtherExperiment | None = None,
+        offset: float = 0.0,
+    ) -> DeviceFit:
+        """The result; ``freedom`` as for `reach_of`."""
+        scene = self.scene
+        errors = np.sqrt(np.diag(covariance)).tolist()
+        return DeviceFit(
+            mass=scene.device.mass,
+            damping=scene.device.damping,
+            delay=scene.timing.delay,
+            errors=dict(zip(NAMES, errors, strict=True)),
+            covariance=covariance,
+            stiffness_max=self.value,
+            stiffness_error=float(np.sqrt(self.gradient @ covariance @ self.gradient)),
+            noise=noise,
+            residuals=residuals,
+            doubts=tuple(doubts),
+            status=int(status),
+            next=further,
+            offset=offset,
+            period=scene.timing.period,
+            velocity=scene.velocity,
+            reach=reach_of(freedom),
+        )
 
 
-def in_si(log_mass: float, delta: float, d: float, period: float) -> tuple[np.ndarray, np.ndarray]:
+def in_si(theta: Iterable[float], period: float) -> tuple[np.ndarray, np.ndarray]:
     """Mass, damping and delay of ``(ln m, delta, d)``, and their derivatives in these."""
+    log_mass, delta, d = theta
     mass = float(np.exp(log_mass))
     rate = mass / period
     return np.array([mass, delta * rate, d * period]), np.array(

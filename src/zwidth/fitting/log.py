@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth._types import ArrayLike
 from zwidth.errors import InputError
-from zwidth.fitting.device_fit import MASS_OPEN, VAGUE, DeviceFit, in_si, reach_of, scene_of, stiffness_with_gradient
+from zwidth.fitting.device_fit import MASS_OPEN, VAGUE, DeviceFit, StiffnessEstimate, in_si, scene_of
 from zwidth.fitting.moving import Recording, Recordings
 from zwidth.fitting.recordings import Log, read_logs
 from zwidth.formatting import plain, with_unit
@@ -100,32 +100,26 @@ def fit_log(
     sizes = np.linalg.norm(slopes, axis=0)
     scaled = slopes / np.where(sizes > 0, sizes, 1.0)
     spread = variance * _inflation(residuals) * np.linalg.pinv(scaled.T @ scaled) / np.outer(sizes, sizes)
-    values, by_theta = in_si(np.log(period**2 / theta[0]), theta[1], theta[2], period)
+    values, by_theta = in_si((np.log(period**2 / theta[0]), theta[1], theta[2]), period)
     # From g = T^2/m to ln m.
     by_theta = by_theta @ np.diag([-1.0 / theta[0], 1.0, 1.0])
     covariance = by_theta @ spread[:3, :3] @ by_theta.T
-    stiffness, gradient = stiffness_with_gradient(scene_of(*map(float, values), period, velocity))
+    stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
     errors = np.sqrt(np.diag(covariance))
     doubts = _doubts(values, errors, residuals, logs)
     status = Status.OK if arrived else Status.NOT_CONVERGED
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
-        doubts.append(f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay")
-    return DeviceFit(
-        *map(float, values),
-        dict(zip(("mass", "damping", "delay"), map(float, errors), strict=True)),
+        doubts.append(
+            f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay"
+        )
+    return stiffest.conclude(
         covariance,
-        stiffness,
-        float(np.sqrt(gradient @ covariance @ gradient)),
-        float(np.sqrt(variance)),
-        _place(residuals, logs, skip),
-        tuple(doubts),
-        int(status),
-        None,
-        float(theta[-1] / theta[0]) if better else 0.0,
-        period,
-        velocity,
-        reach_of(None),
+        noise=float(np.sqrt(variance)),
+        residuals=_place(residuals, logs, skip),
+        doubts=doubts,
+        status=status,
+        offset=float(theta[-1] / theta[0]) if better else 0.0,
     )
 
 
@@ -181,7 +175,7 @@ def _refine(
     solution = least_squares(
         lambda values: (model.predict(at(values))[0] - model.measured) / unit,
         theta[free] / sizes,
-        lambda values: model.predict(at(values))[1][:, free] * sizes / unit,
+        lambda values: model.predict(at(values))[1][:, free] * sizes / unit,  # pyright: ignore[reportArgumentType]
         bounds=(low[free] / sizes, high[free] / sizes),
         x_scale="jac",
         xtol=_ARRIVED,
@@ -247,8 +241,8 @@ def _doubts(values: np.ndarray, errors: np.ndarray, residuals: np.ndarray, logs:
     near = float(residuals[1:] @ residuals[:-1]) / size
     if near > _CORRELATED and near > _SEEN / np.sqrt(residuals.size):
         doubts.append(
-            f"what the fit leaves is no noise (neighbors correlate by {plain(near, 2)}), and the errors may be too small; "
-            "look for friction, a compliance, a hand that holds the device, or coarse steps of the encoder"
+            f"what the fit leaves is no noise (neighbors correlate by {plain(near, 2)}), and the errors may be too "
+            "small; look for friction, a compliance, a hand that holds the device, or coarse steps of the encoder"
         )
     return doubts
 

@@ -53,7 +53,8 @@ class Recording:
         late = np.concatenate([[0.0], speed[:-1]])
         slower = _decaying(self._push(by_delta, turns) - plant.c * late, plant.c)
         moved = _decaying(self._push(by_f, turns), plant.c)
-        return tuple(np.cumsum(part)[self.skip :] for part in (speed, slower, moved))
+        speed, slower, moved = (np.cumsum(part)[self.skip :] for part in (speed, slower, moved))
+        return speed, slower, moved
 
     def _push(self, plant: Plant, turns: int) -> np.ndarray:
         """``(a2 + a1/z + a0/z^2) z^-turns`` of the forces."""

@@ -69,7 +69,9 @@ def _read(time: Any, position: Any, force: Any) -> tuple[Log, float]:
             raise InputError(f"{name}: {bad.size} samples are no numbers, the first is sample {bad[0]}; leave them out")
     period = check_number("time", time, "s", low_open=True) if clock is None else _period(clock)
     if np.ptp(f) == 0:
-        raise InputError(f"force: it is {plain(f[0])} N all the time; command a force that changes, as steps to and fro")
+        raise InputError(
+            f"force: it is {plain(f[0])} N all the time; command a force that changes, as steps to and fro"
+        )
     if np.ptp(x) == 0:
         raise InputError("position: it never changes; check the column, and that nothing holds the device")
     return Log(f, x), period

@@ -40,7 +40,7 @@ def random_scene(seed):
     return scene_of(10 ** rng.uniform(-2, 0.5), 10 ** rng.uniform(-3, 0.5), d, 10 ** rng.uniform(-4, -2.5))
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("count", [2, 4])
 def test_exact_walls_give_the_device_back(seed, count):
     scene = random_scene(seed)
@@ -112,16 +112,16 @@ def test_noisy_walls_are_off_by_what_they_claim():
     scene, rng, share = scene_of(0.1, 0.1, 1.4, 1e-3), np.random.default_rng(3), 0.02
     walls, true = walls_of(scene, [0.0, 0.4, 0.8, 1.1]), float(scene.max_stiffness().stiffness)
     away, inside = [], []
-    for _ in range(60):
+    for _ in range(40):
         noisy = walls.copy()
         noisy[:, [0, 2]] *= 1 + share * rng.standard_normal((4, 2))
         fit = zwidth.fit_buzz(noisy, period=1e-3, noise=share)
         away.append((fit.stiffness_max - true) / fit.stiffness_error)
         bar = fit.intervals["stiffness_max"]
         inside.append(bar.low <= true <= bar.high)
-    # 60 squares of a normal number add up to 60 within 4 times sqrt(120).
-    assert 16 < np.square(away).sum() < 104
-    assert sum(inside) >= 50
+    # 40 squares of a normal number add up to 40 within 4 times sqrt(80).
+    assert 4 < np.square(away).sum() < 76
+    assert sum(inside) >= 33
 
 
 def test_noise_is_estimated_where_it_is_not_given():
