@@ -87,15 +87,17 @@ def fit_buzz(
         InputError: a number is impossible, or an experiment is missing, which the message names.
 
     Numerics:
-        Gauss and Newton from all dips over damping and delay; exact points give the device back to about 1e-12. The
-        intervals are linear in the noise: with 2 % they held the true value in 93 to 97 % of trials.
+        Levenberg and Marquardt (SciPy's: three unknowns, nothing to compile) from the dips over damping and delay;
+        exact walls give the device back to about 1e-12. Errors are linear in the noise: with 2 % of K and f and four
+        walls, the intervals of m, b, t_d and K_max held the true value on 94.7, 94.9, 95.0 and 95.9 % of 1,000 random
+        devices, of which 8 % were UNDECIDED; 4 % more, strongly damped, were refused.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V (the boundary). Boggs, Rogers 1990 (errors in both coordinates).
 
     Example:
         >>> import zwidth
-        >>> heard = [(6.0e3, 0, 37.6), (12.8e3, 15, 56.9), (19.0e3, 30, 75.6)]
+        >>> heard = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
         >>> fit = zwidth.fit_buzz(heard, period="1 ms", noise=0.02)
         >>> print(f"{fit.mass * 1e3:.0f} g")
         100 g
