@@ -65,9 +65,11 @@ def fit_log(
         InputError: times are uneven, the force or the position never changes, or the device runs away from its force.
 
     Numerics:
-        Exact discretization for delays of any length, exact derivatives, Gauss and Newton within bounds. A log of
-        10,000 samples takes some tenths of a second, nothing is compiled. Errors allow for
-        residuals that are alike from sample to sample, as an encoder's, up to twice the cube root of the samples.
+        Exact discretization for delays of any length, exact derivatives, SciPy's least squares within bounds: a log of
+        10,000 samples takes some 0.4 s, and unlike in JAX nothing is compiled for its length. In 1,000 trials with
+        white noise the intervals of m, b, t_d and K_max held the true value in 97.0, 94.8, 96.1 and 95.8 %. Errors
+        allow for residuals that are alike from sample to sample, up to twice the cube root of the samples, yet with an
+        encoder of 2,000 steps over the way moved, and no noise, it was 89 to 92 % only (200 trials).
 
     References:
         Ljung 1999, System Identification, section 4.2 (output error). Hulin, Preusche, Hirzinger 2006, eq. (9).
