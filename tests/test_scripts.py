@@ -22,6 +22,7 @@ ROOMS = (
         "simulation",
         "stability",
         "design",
+        "fitting",
         "sweep",
         "studies",
         "config",

@@ -37,6 +37,12 @@ from .errors import PrecisionWarning as PrecisionWarning
 from .errors import StoreExistsError as StoreExistsError
 from .errors import TracedDelayError as TracedDelayError
 from .errors import ZwidthError as ZwidthError
+from .fitting.buzz import BuzzPoint as BuzzPoint
+from .fitting.buzz import fit_buzz as fit_buzz
+from .fitting.device_fit import DeviceFit as DeviceFit
+from .fitting.device_fit import ErrorBar as ErrorBar
+from .fitting.device_fit import FurtherExperiment as FurtherExperiment
+from .fitting.log import fit_log as fit_log
 from .html_report.page import write_report as write_report
 from .kernel_cache import use_compilation_cache as use_compilation_cache
 from .linear.answers import to_control as to_control

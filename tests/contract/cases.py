@@ -184,6 +184,8 @@ OTHERS = {
     "assess_many": "scenes by name: tests/unit/test_assessment.py",
     "fastest_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
     "fastest_wall": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
+    "fit_buzz": "one device: tests/unit/fitting/test_buzz.py",
+    "fit_log": "one device: tests/unit/fitting/test_log.py",
     "limits_of": "one scene: tests/unit/design/test_limits.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
     "most_robust_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",

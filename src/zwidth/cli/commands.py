@@ -13,6 +13,7 @@ from zwidth.cli.bench import bench
 from zwidth.cli.design import design
 from zwidth.cli.devices import devices
 from zwidth.cli.explore import explore
+from zwidth.cli.fit import fit
 from zwidth.cli.init import init
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.report import report
@@ -171,5 +172,5 @@ def schema() -> None:
     click.echo(json.dumps(config_json_schema(), indent=2))
 
 
-for command in (init, *runs.COMMANDS, report, design, devices, explore, bench):
+for command in (init, *runs.COMMANDS, report, design, devices, explore, fit, bench):
     cli.add_command(command)

@@ -106,6 +106,24 @@ def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]
     return decorate
 
 
+def velocity_options(function: Command) -> Command:
+    """The options of a velocity estimate alone, which the command gets as ``velocity``."""
+    paths = [path for path in _PARTS if path.startswith("velocity.")]
+
+    @wraps(function)
+    def with_velocity(**given: Any) -> Any:
+        named = {path.partition(".")[2]: given.pop(path.replace(".", "__")) for path in paths}
+        return function(
+            velocity=_velocity({name: value for name, value in named.items() if value is not None}), **given
+        )
+
+    command = with_velocity
+    for path in reversed(paths):
+        kind, words = _PARTS[path]
+        command = click.option(flag_of(path), path.replace(".", "__"), type=kind, help=words)(command)
+    return command
+
+
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
     from zwidth.cli.doubts import doubts_of

@@ -1,0 +1,1 @@
+"""A device's mass, damping and delay from what can be recorded of it."""

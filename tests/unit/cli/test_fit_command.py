@@ -1,0 +1,100 @@
+"""`zwidth fit`: walls and logs as a shell gives them, and what it prints."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+from zwidth.studies.document import load_config
+
+WALLS = ["--buzz", "K=6.846kN/m B=0 f=40.1Hz", "--buzz", "K = 15.86 kN/m, B = 18.7, f = 68.6"]
+POINTS = [(6846.0, 0.0, 40.1), (15860.0, 18.7, 68.6)]
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, ["fit", *arguments])
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+@pytest.fixture
+def log(tmp_path):
+    force = np.repeat(np.random.default_rng(0).choice([-1.0, 1.0], 24), 25)
+    scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=1e-3))
+    position = zwidth.simulate(scene, 0.0, 0.0, push_history=force, periods=600).position[:600]
+    file = tmp_path / "log.csv"
+    rows = [f"{k},{1e3 * x!r},{f!r}" for k, (x, f) in enumerate(zip(position.tolist(), force.tolist(), strict=True))]
+    file.write_text("\n".join(["t,x,f", *rows]), encoding="utf-8")
+    return str(file)
+
+
+def test_walls_are_fitted_as_in_python():
+    found = json.loads(run(*WALLS, "--period", "1 ms", "--noise", "2%", "--json"))
+    expected = zwidth.fit_buzz(POINTS, period=1e-3, noise=0.02)
+    assert found["mass"] == expected.mass
+    assert found["next"] == expected.as_dict()["next"] != {}
+    words = run(*WALLS, "--period", "1 ms", "--noise", "0.02")
+    assert "m                     100.0 g (95 % between" in words
+    assert "measure next" in words
+
+
+def test_the_velocity_estimate_counts():
+    found = json.loads(run(*WALLS, "--period", "1 ms", "--velocity-cutoff", "300", "--json"))
+    assert found["mass"] == zwidth.fit_buzz(POINTS, period=1e-3, velocity=zwidth.LowPass(cutoff=300)).mass
+
+
+def test_a_log_in_millimeters_and_milliseconds(log):
+    found = json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--force", "f", "--json"))
+    np.testing.assert_allclose([found["mass"], found["damping"]], [0.1, 2.0], rtol=1e-6)
+    assert found["delay"] == pytest.approx(0.0, abs=1e-9)
+    assert "fitted to             log.csv" in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
+
+
+@pytest.mark.parametrize("more", [[], ["--velocity-cutoff", "300"], ["--velocity-samples", "3"]])
+def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, tmp_path):
+    text = run(*WALLS, "--period", "1 ms", "--yaml", *more)
+    assert text.startswith("# Fitted to 2 buzzing walls: 95 % between")
+    assert text.count("# fitted, 95 % between") == 3
+    file = tmp_path / "fitted.yaml"
+    file.write_text(text, encoding="utf-8")
+    assert load_config(file).name == "fitted_device"
+    assert f"mass: {json.loads(run(*WALLS, '--period', '1 ms', '--json', *more))['mass']!r} kg" in text
+
+
+@pytest.mark.parametrize(
+    "arguments, words",
+    [
+        ([], "give either --buzz"),
+        ([*WALLS], "give --period"),
+        ([*WALLS, "--period", "1 ms", "--time", "t"], "--time belongs to a LOG.csv"),
+        (["--buzz", "K=1 B=2"], "write K, B and f"),
+        (["--buzz", "K=1 B=2 f=3 g=4"], "got"),
+        (["--buzz", "K=1kg f=3"], "K: got '1kg'"),
+        ([*WALLS, "--period", "1 ms", "--noise", "much"], "write a share"),
+        (["LOG", "--position", "x"], "give --position, --force"),
+        (["LOG", "--noise", "1%"], "--noise belongs to --buzz"),
+    ],
+)
+def test_wrong_use_is_told(arguments, words, log):
+    result = CliRunner().invoke(cli, ["fit", *(log if word == "LOG" else word for word in arguments)])
+    assert result.exit_code == 2
+    assert words in result.output
+
+
+@pytest.mark.parametrize(
+    "columns, words",
+    [
+        (["--time", "t", "--position", "y", "--force", "f"], "has no column 'y'"),
+        (["--time", "t", "--position", "x:furlong", "--force", "f"], "got the unit 'furlong'"),
+        (["--time", "t", "--position", "word", "--force", "f"], "bad.csv:3: got 'no' under word"),
+    ],
+)
+def test_columns_that_cannot_be_read_are_named(columns, words, tmp_path):
+    file = tmp_path / "bad.csv"
+    file.write_text("t,x,f,word\n0,0,1,1\n1,0,1,no\n", encoding="utf-8")
+    result = CliRunner().invoke(cli, ["fit", str(file), *columns])
+    assert isinstance(result.exception, zwidth.InputError)
+    assert words in str(result.exception)

@@ -1,0 +1,207 @@
+"""A device from buzzing walls: exact ones give it back, noisy ones with the error they claim, poor ones are refused."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import tolerances
+import zwidth
+from zwidth.errors import InputError
+from zwidth.status import Status
+
+EXACT = tolerances.FIT_EXACT.float64
+HEARD = [(6846.364, 0.0, 40.0945620), (15860.788, 18.7195, 68.6254)]
+
+
+def walls_of(scene, shares):
+    """Exact walls on the edge of stability of a rigid device, at shares of the damping of the stiffest one."""
+    beta = np.asarray(shares) * float(zwidth.alpha_max(scene.delta, scene.d).beta)
+    point = zwidth.boundary_point(scene.delta, scene.d, beta=beta)
+    period = scene.timing.period
+    wall = scene.to_si(alpha=point.alpha, beta=beta)
+    return np.stack([wall.stiffness, wall.virtual_damping, point.omega / (2 * np.pi * period)], -1)
+
+
+def scene_of(mass, delta, d, period):
+    return zwidth.Scene(zwidth.Device(mass, delta * mass / period), zwidth.Timing(period=period, delay=d * period))
+
+
+def assert_found(fit, scene):
+    found = [fit.mass / scene.mass, fit.damping / scene.damping, (fit.delay - scene.timing.delay) / scene.timing.period]
+    np.testing.assert_allclose(found, [1, 1, 0], rtol=EXACT, atol=EXACT)
+    assert fit.status == Status.OK
+    assert fit.doubts == ()
+
+
+def random_scene(seed):
+    rng = np.random.default_rng(seed)
+    whole = rng.random() < 0.5
+    d = float(rng.integers(0, 6)) if whole else rng.uniform(0, 6)
+    return scene_of(10 ** rng.uniform(-2, 0.5), 10 ** rng.uniform(-3, 0.5), d, 10 ** rng.uniform(-4, -2.5))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("count", [2, 4])
+def test_exact_walls_give_the_device_back(seed, count):
+    scene = random_scene(seed)
+    walls = walls_of(scene, np.linspace(0.0, 0.8, count))
+    fit = zwidth.fit_buzz(walls, period=scene.timing.period)
+    assert_found(fit, scene)
+    assert fit.stiffness_max == pytest.approx(float(scene.max_stiffness().stiffness), rel=EXACT)
+
+
+def rightmost(mass, damping, period, whole, stiffness, virtual_damping):
+    """The largest pole of a loop with whole delays, by the eigenvalues of its matrix exponential."""
+    step = expm(np.array([[0, 1, 0], [0, -damping / mass, 1 / mass], [0, 0, 0]]) * period)
+    size = 3 + whole
+    # Position, velocity, the position before, and the forces that wait.
+    loop = np.zeros((size, size))
+    loop[:2, :2] = step[:2, :2]
+    loop[2, 0] = 1.0
+    law = np.zeros(size)
+    law[0], law[2] = -stiffness - virtual_damping / period, virtual_damping / period
+    acting = law if whole == 0 else np.eye(size)[3]
+    loop[:2] += np.outer(step[:2, 2], acting)
+    for k in range(whole):
+        loop[3 + k] = np.eye(size)[4 + k] if k + 1 < whole else law
+    poles = np.linalg.eigvals(loop)
+    return poles[np.argmax(np.abs(poles))]
+
+
+@pytest.mark.parametrize("whole", [0, 2])
+def test_walls_that_eigenvalues_find_give_the_device_back(whole):
+    mass, damping, period = 0.2, 8.0, 5e-4
+    walls = []
+    for virtual_damping in (4.0, 25.0):
+        low, high = 1.0, 2e5
+        while high - low > 1e-13 * high:
+            middle = 0.5 * (low + high)
+            growing = abs(rightmost(mass, damping, period, whole, middle, virtual_damping)) > 1
+            low, high = (low, middle) if growing else (middle, high)
+            if middle in (low, high) and high - low <= 2 * np.spacing(high):
+                break
+        pole = rightmost(mass, damping, period, whole, low, virtual_damping)
+        walls.append(zwidth.BuzzPoint(low, virtual_damping, abs(np.angle(pole)) / (2 * np.pi * period)))
+    fit = zwidth.fit_buzz(walls, period="0.5 ms")
+    # An eigenvalue on the circle knows K to some 1e-12 of it.
+    np.testing.assert_allclose([fit.mass, fit.damping], [mass, damping], rtol=EXACT)
+    assert fit.delay == pytest.approx(whole * period, abs=EXACT * period)
+
+
+def test_with_a_filtered_velocity():
+    filtered = zwidth.LowPass(cutoff=150)
+    scene = zwidth.Scene(zwidth.Device(0.1, 5), zwidth.Timing(period=1e-3, delay=0.7e-3), velocity=filtered)
+    omega = np.linspace(60, 500, 400)
+    walls = scene.boundary(omega)
+    edge = np.asarray(scene.is_stable(walls.stiffness * (1 - 1e-6), walls.virtual_damping))
+    edge = edge & ~scene.is_stable(walls.stiffness * (1 + 1e-6), walls.virtual_damping) & (walls.virtual_damping > 0)
+    some = np.flatnonzero(edge)[[0, -1]]
+    points = np.stack([walls.stiffness, walls.virtual_damping, omega / (2 * np.pi)], -1)[some]
+    assert_found(zwidth.fit_buzz(points, period=1e-3, velocity=filtered), scene)
+
+
+def test_a_device_without_damping_or_delay_is_found_at_the_end_of_the_range():
+    scene = scene_of(0.5, 0.0, 0.0, 1e-3)
+    fit = zwidth.fit_buzz(walls_of(scene, [0.3, 0.6, 0.9]), period=1e-3)
+    assert fit.damping == pytest.approx(0.0, abs=EXACT)
+    assert fit.delay == pytest.approx(0.0, abs=EXACT * 1e-3)
+    assert fit.mass == pytest.approx(0.5, rel=EXACT)
+
+
+def test_noisy_walls_are_off_by_what_they_claim():
+    scene, rng, share = scene_of(0.1, 0.1, 1.4, 1e-3), np.random.default_rng(3), 0.02
+    walls, true = walls_of(scene, [0.0, 0.4, 0.8, 1.1]), float(scene.max_stiffness().stiffness)
+    away, inside = [], []
+    for _ in range(40):
+        noisy = walls.copy()
+        noisy[:, [0, 2]] *= 1 + share * rng.standard_normal((4, 2))
+        fit = zwidth.fit_buzz(noisy, period=1e-3, noise=share)
+        away.append((fit.stiffness_max - true) / fit.stiffness_error)
+        bar = fit.intervals["stiffness_max"]
+        inside.append(bar.low <= true <= bar.high)
+    # 40 squares of a normal number add up to 40 within 4 times sqrt(80).
+    assert 4 < np.square(away).sum() < 76
+    assert sum(inside) >= 33
+
+
+def test_noise_is_estimated_where_it_is_not_given():
+    scene, rng = scene_of(0.1, 0.1, 1.0, 1e-3), np.random.default_rng(1)
+    walls = walls_of(scene, np.linspace(0.0, 1.1, 40))
+    walls[:, [0, 2]] *= 1 + 0.01 * rng.standard_normal((40, 2))
+    fit = zwidth.fit_buzz(walls, period=1e-3)
+    assert isinstance(fit.noise, tuple)
+    assert fit.noise[0] == fit.noise[1] == pytest.approx(0.01, rel=0.3)
+    assert np.square(fit.residuals).sum() == pytest.approx(2 * 40 - 3)
+
+
+def test_the_next_experiment_narrows_what_it_promises():
+    walls = walls_of(scene_of(0.1, 0.1, 1.0, 1e-3), [0.0, 0.3])
+    fit = zwidth.fit_buzz(walls, period=1e-3, noise=(0.03, 0.01))
+    step = fit.next
+    assert step is not None
+    more = np.vstack([walls, [step.stiffness, step.virtual_damping, step.frequency]])
+    after = zwidth.fit_buzz(more, period=1e-3, noise=(0.03, 0.01))
+    assert after.stiffness_error == pytest.approx(step.error_afterwards, rel=1e-6)
+    assert after.stiffness_error < 0.5 * fit.stiffness_error
+
+
+def test_walls_that_contradict_each_other_are_doubted():
+    walls = walls_of(scene_of(0.1, 0.1, 1.0, 1e-3), [0.0, 0.4, 0.8])
+    walls[1, 0] *= 1.5
+    fit = zwidth.fit_buzz(walls, period=1e-3, noise=0.01)
+    assert any("contradict" in doubt for doubt in fit.doubts)
+
+
+def test_a_second_device_that_fits_as_well_is_told():
+    # So strongly damped that its mass hardly shows, with noise.
+    rng = np.random.default_rng(5)
+    walls = walls_of(scene_of(0.4, 1.9, 2.0, 1e-3), [0.0, 0.4, 0.8, 1.1])
+    told = 0
+    for _ in range(6):
+        noisy = walls.copy()
+        noisy[:, [0, 2]] *= 1 + 0.02 * rng.standard_normal((4, 2))
+        try:
+            fit = zwidth.fit_buzz(noisy, period=1e-3, noise=0.02)
+        except InputError as error:
+            told += "cannot tell" in str(error)
+        else:
+            told += fit.status == Status.UNDECIDED or "mass is hardly" in " ".join(fit.doubts)
+    assert told >= 3
+
+
+@pytest.mark.parametrize(
+    "points, words",
+    [
+        ([], "raise K at B = 0"),
+        (HEARD[:1], "another damping"),
+        ([HEARD[0], HEARD[0]], "another damping"),
+        ([HEARD[0], (7000.0, 0.0, 41.0)], "another damping"),
+        ([HEARD[0], (7000.0, 20.0, 500.0)], "half the sampling rate, 500.0 Hz"),
+        ([HEARD[0], (7000.0, 20.0, 0.0)], "greater than 0"),
+        ([HEARD[0], (-7000.0, 20.0, 70.0)], "points[1].stiffness"),
+        ([HEARD[0], (7000.0, 20.0)], "points[1]"),
+        ([HEARD[0], (7000.0, np.nan, 70.0)], "points[1]"),
+    ],
+)
+def test_what_cannot_be_fitted_is_refused(points, words):
+    with pytest.raises(InputError) as caught:
+        zwidth.fit_buzz(points, period=1e-3)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("noise", [0.0, -0.1, "much", (0.1, 0.1, 0.1), 1.0])
+def test_noise_is_a_share(noise):
+    with pytest.raises(InputError, match="noise: got"):
+        zwidth.fit_buzz(HEARD, period=1e-3, noise=noise)
+
+
+def test_the_result_as_plain_numbers():
+    fit = zwidth.fit_buzz(HEARD, period=1e-3, noise=0.02)
+    plain = fit.as_dict()
+    assert plain["mass"] == fit.mass
+    assert plain["intervals"]["stiffness_max"] == [
+        fit.stiffness_max - fit.reach * fit.stiffness_error,
+        fit.stiffness_max + fit.reach * fit.stiffness_error,
+    ]
+    assert fit.scene.device.mass == fit.mass

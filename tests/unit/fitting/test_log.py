@@ -1,0 +1,193 @@
+"""A device from logs of its motion, made and fitted again by other programs, and from logs that are no good."""
+
+import numpy as np
+import pytest
+from scipy.linalg import expm
+from scipy.optimize import least_squares
+from scipy.signal import lfilter, ss2tf
+
+import tolerances
+import zwidth
+from zwidth.errors import InputError
+from zwidth.status import Status
+
+EXACT, AGAIN = tolerances.FIT_EXACT.float64, tolerances.FIT_AGAIN.float64
+PERIOD = 1e-3
+
+
+def steps_to_and_fro(rng, count, hold=25):
+    return np.repeat(rng.choice([-1.0, 1.0], count // hold + 1), hold)[:count]
+
+
+def move(mass, damping, delay, force, start=(0.0, 0.0), offset=0.0):
+    """Positions by matrix exponentials over both parts of every period."""
+    whole, fraction = int(delay // PERIOD), delay / PERIOD % 1
+    rate = np.array([[0, 1, 0], [0, -damping / mass, 1 / mass], [0, 0, 0]])
+    first, second = expm(rate * fraction * PERIOD), expm(rate * (1 - fraction) * PERIOD)
+    late = np.concatenate([np.zeros(whole + 1), force])
+    state, places = np.array([*start, 0.0]), []
+    for k in range(force.size):
+        places.append(state[0])
+        state[2] = late[k] + offset
+        state = first @ state
+        state[2] = late[k + 1] + offset
+        state = second @ state
+    return np.array(places)
+
+
+def answer(mass, damping, delay, force):
+    """The same from rest, by SciPy's transfer functions of the two parts."""
+    whole, fraction = int(delay // PERIOD), delay / PERIOD % 1
+    rate = np.array([[0, 1, 0], [0, -damping / mass, 1 / mass], [0, 0, 0]])
+    one, first, second = (expm(rate * part * PERIOD) for part in (1.0, fraction, 1 - fraction))
+    late = np.concatenate([np.zeros(whole + 1), force])
+    moved = np.zeros(force.size)
+    pushes = (second[:2, :2] @ first[:2, 2], late[: force.size]), (second[:2, 2], late[1 : force.size + 1])
+    for push, held in pushes:
+        top, bottom = ss2tf(one[:2, :2], push[:, None], np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+        moved += lfilter(top[0], bottom, held)
+    return moved
+
+
+def fit_again(force, position, skip, start):
+    """By SciPy's least squares with difference quotients, from another start."""
+    j = np.arange(position.size - skip)
+
+    def rest(x):
+        slow = np.exp(-x[1] / x[0] * PERIOD * j)
+        model = answer(x[0], x[1], x[2] * PERIOD, force)[skip:] + x[3] + x[4] * slow
+        return (model - position[skip:]) / np.std(position)
+
+    options = {"x_scale": "jac", "xtol": 1e-15, "ftol": 1e-15, "gtol": 1e-15, "jac": "3-point"}
+    return least_squares(rest, start, **options).x[:3]
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3e-3, 2e-3, 6.75e-3])
+@pytest.mark.parametrize("mass, damping", [(0.1, 2.0), (1.5, 1.0), (0.02, 30.0)])
+def test_an_exact_log_gives_the_device_back(mass, damping, delay):
+    force = steps_to_and_fro(np.random.default_rng(0), 700)
+    fit = zwidth.fit_log(PERIOD * np.arange(700), move(mass, damping, delay, force, (0.01, -0.1)), force)
+    np.testing.assert_allclose([fit.mass, fit.damping], [mass, damping], rtol=EXACT)
+    assert fit.delay == pytest.approx(delay, abs=EXACT * PERIOD)
+    assert (fit.status, fit.offset, fit.doubts) == (Status.OK, 0.0, ())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_another_program_finds_the_same(seed):
+    rng = np.random.default_rng(seed)
+    mass, damping, delay = rng.uniform(0.05, 0.5), rng.uniform(1.0, 8.0), rng.uniform(1.1, 4.9) * PERIOD
+    force = steps_to_and_fro(rng, 800)
+    position = move(mass, damping, delay, force) + 2e-5 * rng.standard_normal(800)
+    fit = zwidth.fit_log(PERIOD, position, force)
+    start = [1.01 * mass, 0.99 * damping, delay / PERIOD + 0.02, 0.0, 0.0]
+    again = fit_again(force, position, 22, start)
+    np.testing.assert_allclose([fit.mass, fit.damping, fit.delay / PERIOD], again, rtol=AGAIN)
+
+
+def test_a_simulated_motion_gives_its_device_back():
+    scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD))
+    force = steps_to_and_fro(np.random.default_rng(4), 500)
+    late = np.concatenate([np.zeros(3), force[:-3]])
+    motion = zwidth.simulate(scene, 0.0, 0.0, push_history=late, periods=500)
+    fit = zwidth.fit_log(PERIOD, motion.position[:500], force)
+    np.testing.assert_allclose([fit.mass, fit.damping, fit.delay / PERIOD], [0.1, 2.0, 3.0], rtol=EXACT)
+
+
+def test_several_logs_and_a_constant_force():
+    rng = np.random.default_rng(2)
+    forces = [steps_to_and_fro(rng, count) for count in (300, 500)]
+    positions = [move(0.1, 2.0, 1.4e-3, f, (k, 0.3 * k), 0.25) for k, f in enumerate(forces)]
+    fit = zwidth.fit_log([PERIOD, PERIOD], positions, forces)
+    np.testing.assert_allclose([fit.mass, fit.damping, fit.delay, fit.offset], [0.1, 2.0, 1.4e-3, 0.25], rtol=1e-8)
+    assert fit.residuals.shape == (800,)
+    assert np.isnan(fit.residuals[[0, 21, 300, 321]]).all()
+    assert np.isfinite(fit.residuals).sum() == 800 - 2 * 22
+
+
+def test_noise_moves_the_estimates_as_they_claim():
+    rng = np.random.default_rng(6)
+    scene = zwidth.Scene(zwidth.Device(0.1, 5.0), zwidth.Timing(period=PERIOD, delay=1.3e-3))
+    true, force = float(scene.max_stiffness().stiffness), steps_to_and_fro(rng, 500)
+    exact = move(0.1, 5.0, 1.3e-3, force)
+    fits = [zwidth.fit_log(PERIOD, exact + 1e-4 * rng.standard_normal(500), force) for _ in range(20)]
+    # 20 squares of a normal number add up to 20 within 4 times sqrt(40).
+    for away in (
+        [(fit.stiffness_max - true) / fit.stiffness_error for fit in fits],
+        [(fit.delay - 1.3e-3) / fit.errors["delay"] for fit in fits],
+    ):
+        assert 3 < np.square(away).sum() < 46
+    assert np.mean([fit.noise for fit in fits]) == pytest.approx(1e-4, rel=0.05)
+
+
+def test_the_error_of_the_stiffest_wall_is_that_of_devices_drawn():
+    rng = np.random.default_rng(8)
+    force = steps_to_and_fro(rng, 600)
+    fit = zwidth.fit_log(PERIOD, move(0.1, 5.0, 1.3e-3, force) + 5e-5 * rng.standard_normal(600), force)
+    drawn = rng.multivariate_normal([fit.mass, fit.damping, fit.delay], fit.covariance, size=4000)
+    mass, damping, delay = drawn.T
+    stiffness = zwidth.max_stiffness(mass=mass, damping=damping, period=PERIOD, delay=delay)
+    assert np.std(stiffness) == pytest.approx(fit.stiffness_error, rel=0.06)
+
+
+def test_a_log_too_short_to_see_the_damping_says_so():
+    rng = np.random.default_rng(9)
+    force = steps_to_and_fro(rng, 120, 10)
+    exact = move(2.0, 0.5, 1e-3, force)
+    fit = zwidth.fit_log(PERIOD, exact + 0.01 * np.std(exact) * rng.standard_normal(120), force)
+    assert fit.intervals["damping"].low == 0.0
+    assert any("damping" in doubt for doubt in fit.doubts)
+
+
+@pytest.mark.parametrize("scale, unit", [(1e3, "mm"), (1e-3, "mN")])
+def test_units_off_by_a_thousand_are_doubted(scale, unit):
+    rng = np.random.default_rng(10)
+    force = steps_to_and_fro(rng, 400)
+    fit = zwidth.fit_log(PERIOD, scale * move(0.1, 2.0, 1e-3, force), force)
+    assert any(f"in {unit}" in doubt for doubt in fit.doubts)
+
+
+def test_residuals_that_are_no_noise_are_doubted():
+    rng = np.random.default_rng(11)
+    force = 2.0 * steps_to_and_fro(rng, 600, 40)
+    scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD))
+    rubbed = zwidth.simulate(scene, 0.0, 0.0, push_history=force, coulomb=0.3, periods=600).position[:600]
+    fit = zwidth.fit_log(PERIOD, rubbed, force)
+    assert any("no noise" in doubt for doubt in fit.doubts)
+
+
+def test_a_delay_beyond_the_range_is_told():
+    force = steps_to_and_fro(np.random.default_rng(12), 600)
+    position = move(0.1, 2.0, 6e-3, force)
+    fit = zwidth.fit_log(PERIOD, position, force, max_delay="3 ms")
+    assert fit.status == Status.UNREACHABLE
+    assert any("max_delay" in doubt for doubt in fit.doubts)
+    assert zwidth.fit_log(PERIOD, position, force, max_delay="8 ms").status == Status.OK
+
+
+FORCE = steps_to_and_fro(np.random.default_rng(13), 200)
+PLACES = move(0.1, 2.0, 1e-3, FORCE)
+TIMES = PERIOD * np.arange(200)
+
+
+@pytest.mark.parametrize(
+    "time, position, force, words",
+    [
+        (np.delete(np.append(TIMES, 0.2), 90), PLACES, FORCE, "not even: steps from 1.000 ms to 2.000 ms"),
+        (TIMES[::-1], PLACES, FORCE, "does not grow from sample 0 to 1"),
+        (TIMES, PLACES, 0.0 * FORCE + 2, "it is 2.000 N all the time"),
+        (TIMES, 0.0 * PLACES, FORCE, "position: it never changes"),
+        (TIMES, PLACES, -FORCE, "runs away"),
+        (TIMES, PLACES[:-1], FORCE, "shapes differ"),
+        (TIMES, np.where(np.arange(200) == 7, np.nan, PLACES), FORCE, "the first is sample 7"),
+        (TIMES[:30], PLACES[:30], np.resize([1.0, -1.0], 30), "record longer"),
+        (TIMES, np.random.default_rng(0).standard_normal(200), FORCE, "does not follow"),
+        ([PERIOD, PERIOD], [PLACES], [FORCE, FORCE], "give each log all three"),
+        ([PERIOD, 2 * PERIOD], [PLACES, PLACES], [FORCE, FORCE], "one by one"),
+        (-1.0, PLACES, FORCE, "time: got -1 s"),
+    ],
+)
+def test_bad_logs_are_refused_in_one_line(time, position, force, words):
+    with pytest.raises(InputError) as caught:
+        zwidth.fit_log(time, position, force)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
