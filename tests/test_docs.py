@@ -8,6 +8,7 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
+from typing import Any
 
 import jax
 import pytest
@@ -24,9 +25,10 @@ MOST_BYTES = 6_000_000
 @pytest.fixture(autouse=True)
 def jax_settings():
     """Pages set JAX's precision as a user does; other tests keep their own."""
-    before = jax.config.jax_enable_x64
+    config: Any = jax.config
+    before = config.jax_enable_x64
     yield
-    jax.config.update("jax_enable_x64", before)
+    config.update("jax_enable_x64", before)
 
 
 @pytest.fixture
