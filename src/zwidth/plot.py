@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, PathPatch
-from matplotlib.path import Path
 
 from zwidth._types import ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.figures import style
+from zwidth.figures.region import to_path
 from zwidth.quantities import PARAMETERS
 from zwidth.scene import Scene
 from zwidth.simulation.result import Motion
@@ -76,10 +76,7 @@ def region(
         color = style.DISTINCT[k % len(style.DISTINCT)]
         paths = [np.stack([part.stiffness / x_unit, part.virtual_damping / y_unit], -1) for part in pieces[label]]
         if paths:
-            closed = [
-                Path(_wind(path, part.hole), closed=True) for path, part in zip(paths, pieces[label], strict=True)
-            ]
-            shape = Path.make_compound_path(*closed)
+            shape = to_path([(path, part.hole) for path, part in zip(paths, pieces[label], strict=True)])
             ax.add_patch(PathPatch(shape, facecolor=color, alpha=0.15, linewidth=0.0, zorder=1))
         for path in paths:
             ax.plot(*np.append(path, path[:1], 0).T, color=color, zorder=3, label=label or "edge of what is stable")
@@ -99,13 +96,6 @@ def region(
     ax.margins(0.04)
     ax.legend(handles=handles, loc="best")
     return ax
-
-
-def _wind(path: np.ndarray, hole: bool) -> np.ndarray:
-    """Holes run the other way round, so that they stay empty."""
-    x, y = path.T
-    turn = float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
-    return path if (turn > 0) != hole else path[::-1]
 
 
 def _passive_edge(scene: Scene) -> tuple[np.ndarray, np.ndarray]:

@@ -362,15 +362,13 @@ class Scene(SceneAnswers):
         """Simulate this device on a wall in time, with contact, friction, an encoder and a motor as wanted.
 
         Args:
-            stiffness: K in N/m; the scene's own wall where left out.
-            virtual_damping: B in N s/m, likewise.
+            stiffness, virtual_damping: K in N/m and B in N s/m; the scene's own wall where left out.
             **options: those of `zwidth.simulate`, which this calls.
 
         Example:
             >>> import zwidth
             >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
-            >>> held = scene.simulate(25e3, 40, start_position=1e-4, coulomb=1.0, periods=500)
-            >>> zwidth.MotionKind(held.outcome).name
+            >>> zwidth.MotionKind(scene.simulate(25e3, 40, start_position=1e-4, coulomb=1.0).outcome).name
             'REST'
         """
         return simulate(self, stiffness, virtual_damping, **options)
