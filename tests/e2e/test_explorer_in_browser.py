@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import re
 import signal
@@ -305,9 +306,9 @@ def run_apart(function, *arguments, **keywords):
 
 
 async def converse(server, messages, origin=None):
-    """Open the page's socket with its own ticket, say something, and return how it was closed."""
+    """Open the page's socket with its own ticket, say something, and wait until it is closed."""
     from tornado.httpclient import HTTPRequest
-    from tornado.websocket import websocket_connect
+    from tornado.websocket import WebSocketClosedError, websocket_connect
 
     text = server.get()[2]
     ticket = json.loads(re.findall(r'id="start">(.*?)</script>', text)[0])["items"][0]["token"]
@@ -316,13 +317,14 @@ async def converse(server, messages, origin=None):
     socket = await websocket_connect(request, subprotocols=["bokeh", ticket])
     try:
         assert await asyncio.wait_for(socket.read_message(), PATIENCE) is not None
-        for message in messages:
-            await socket.write_message(message, binary=isinstance(message, bytes))
+        # It may be closed before the last of them is sent.
+        with contextlib.suppress(WebSocketClosedError):
+            for message in messages:
+                await socket.write_message(message, binary=isinstance(message, bytes))
         while await asyncio.wait_for(socket.read_message(), PATIENCE) is not None:
             pass
     finally:
         socket.close()
-    return socket.close_code
 
 
 def test_a_socket_of_another_origin_is_refused(server):
@@ -345,7 +347,9 @@ def test_a_socket_of_another_origin_is_refused(server):
     ids=["text", "bytes", "empty", "oversized", "deep"],
 )
 def test_a_malformed_message_ends_its_own_connection_alone(server, messages):
-    assert run_apart(converse, server, messages) is not None
+    # One that stays open is waited for in vain, which is an error. One that is dropped in the middle of a message has
+    # no closing code.
+    run_apart(converse, server, messages)
     assert server.get()[0] == 200
 
 
