@@ -41,7 +41,9 @@ from .fitting.buzz import BuzzPoint as BuzzPoint
 from .fitting.buzz import fit_buzz as fit_buzz
 from .fitting.device_fit import DeviceFit as DeviceFit
 from .fitting.device_fit import ErrorBar as ErrorBar
+from .fitting.device_fit import FittedMotion as FittedMotion
 from .fitting.device_fit import FurtherExperiment as FurtherExperiment
+from .fitting.device_fit import TriedModel as TriedModel
 from .fitting.log import fit_log as fit_log
 from .html_report.page import write_report as write_report
 from .kernel_cache import use_compilation_cache as use_compilation_cache

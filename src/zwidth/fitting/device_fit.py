@@ -38,6 +38,25 @@ class FurtherExperiment(NamedTuple):
     error_afterwards: float
 
 
+class FittedMotion(NamedTuple):
+    """One log beside its fit, a number a sample: times in s, forces in N, positions in m.
+
+    ``modelled`` is NaN at the first samples, whose past forces are unknown.
+    """
+
+    time: np.ndarray
+    force: np.ndarray
+    position: np.ndarray
+    modelled: np.ndarray
+
+
+class TriedModel(NamedTuple):
+    """A model of a log: what it has beside mass, damping and delay, and Schwarz's criterion less the least of all."""
+
+    parts: tuple[str, ...]
+    criterion: float
+
+
 @dataclass(frozen=True)
 class DeviceFit:
     """A device found from records of it.
@@ -55,6 +74,10 @@ class DeviceFit:
         status: of `zwidth.Status`: UNDECIDED where another device fits as well.
         next: the further experiment that narrows K_max most; None of a log.
         offset: constant force in N that the log asks for beside the commanded one; 0 where it asks for none.
+        friction: Coulomb friction in N that the log asks for, its error in ``errors`` then; 0 where it asks for none.
+        resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
+        motions: of a log, each with its fit, a `zwidth.FittedMotion`.
+        tried: of a log, the models that were compared, a `zwidth.TriedModel` each, the one kept first.
     """
 
     mass: float
@@ -70,6 +93,10 @@ class DeviceFit:
     status: int
     next: FurtherExperiment | None
     offset: float
+    friction: float
+    resolution: float
+    motions: tuple[FittedMotion, ...]
+    tried: tuple[TriedModel, ...]
     period: float
     velocity: Velocity
     # How many standard errors the intervals reach.
@@ -82,11 +109,10 @@ class DeviceFit:
 
     @property
     def intervals(self) -> dict[str, ErrorBar]:
-        """95 % intervals of mass, damping and delay by name, and of K_max as "stiffness_max"."""
-        values = [*((getattr(self, name), self.errors[name]) for name in NAMES)]
-        values.append((self.stiffness_max, self.stiffness_error))
-        bars = (ErrorBar(max(0.0, value - self.reach * s), value + self.reach * s) for value, s in values)
-        return dict(zip((*NAMES, "stiffness_max"), bars, strict=True))
+        """95 % intervals by name: of mass, damping, delay, friction where there is any, and of "stiffness_max"."""
+        errors = self.errors | {"stiffness_max": self.stiffness_error}
+        reaches = {name: (getattr(self, name), self.reach * error) for name, error in errors.items()}
+        return {name: ErrorBar(max(0.0, value - far), value + far) for name, (value, far) in reaches.items()}
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
@@ -101,6 +127,9 @@ class DeviceFit:
             "covariance": self.covariance.tolist(),
             "noise": list(self.noise) if isinstance(self.noise, tuple) else self.noise,
             "offset": self.offset,
+            "friction": self.friction,
+            "resolution": self.resolution,
+            "tried": [{"parts": list(model.parts), "criterion": model.criterion} for model in self.tried],
             "period": self.period,
             "doubts": list(self.doubts),
             "status": int(self.status),
@@ -147,15 +176,19 @@ class StiffnessEstimate:
         freedom: int | None = None,
         further: FurtherExperiment | None = None,
         offset: float = 0.0,
+        friction: tuple[float, float] = (0.0, 0.0),
+        resolution: float = 0.0,
+        motions: tuple[FittedMotion, ...] = (),
+        tried: tuple[TriedModel, ...] = (),
     ) -> DeviceFit:
-        """The result; ``freedom`` as for `reach_of`."""
+        """The result; ``friction`` with its error, ``freedom`` as for `reach_of`."""
         scene = self.scene
         errors = np.sqrt(np.diag(covariance)).tolist()
         return DeviceFit(
             mass=scene.device.mass,
             damping=scene.device.damping,
             delay=scene.timing.delay,
-            errors=dict(zip(NAMES, errors, strict=True)),
+            errors=dict(zip(NAMES, errors, strict=True)) | ({"friction": friction[1]} if friction[0] else {}),
             covariance=covariance,
             stiffness_max=self.value,
             stiffness_error=float(np.sqrt(self.gradient @ covariance @ self.gradient)),
@@ -165,6 +198,10 @@ class StiffnessEstimate:
             status=int(status),
             next=further,
             offset=offset,
+            friction=friction[0],
+            resolution=resolution,
+            motions=motions,
+            tried=tried,
             period=scene.timing.period,
             velocity=scene.velocity,
             reach=reach_of(freedom),

@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth._types import ArrayLike
 from zwidth.errors import InputError
-from zwidth.fitting.device_fit import MASS_OPEN, VAGUE, DeviceFit, StiffnessEstimate, in_si, scene_of
+from zwidth.fitting.device_fit import MASS_OPEN, VAGUE, DeviceFit, FittedMotion, StiffnessEstimate, in_si, scene_of
 from zwidth.fitting.moving import Recording, Recordings
 from zwidth.fitting.recordings import Log, read_logs
 from zwidth.formatting import plain, with_unit
@@ -118,7 +118,8 @@ def fit_log(
     return stiffest.conclude(
         covariance,
         noise=float(np.sqrt(variance)),
-        residuals=_place(residuals, logs, skip),
+        residuals=(rest := _place(residuals, logs, skip)),
+        motions=_beside(rest, logs, period),
         doubts=doubts,
         status=status,
         offset=float(theta[-1] / theta[0]) if better else 0.0,
@@ -247,6 +248,15 @@ def _doubts(values: np.ndarray, errors: np.ndarray, residuals: np.ndarray, logs:
             "small; look for friction, a compliance, a hand that holds the device, or coarse steps of the encoder"
         )
     return doubts
+
+
+def _beside(residuals: np.ndarray, logs: tuple[Log, ...], period: float) -> tuple[FittedMotion, ...]:
+    """Every log beside its fit."""
+    parts = np.split(residuals, np.cumsum([log.force.size for log in logs])[:-1])
+    return tuple(
+        FittedMotion(period * np.arange(rest.size), log.force, log.position, log.position - rest)
+        for log, rest in zip(logs, parts, strict=True)
+    )
 
 
 def _place(residuals: np.ndarray, logs: tuple[Log, ...], skip: int) -> np.ndarray:
