@@ -133,9 +133,10 @@ def _follow(
     first, a = phi_functions(delta * t), np.where(pieces.held, 0.0, push - pieces.way * friction)
     moved = first.phi1 * t * v + first.phi2 * t**2 * a
     by_speed, by_place = _derive(first, delta, t, v, a, force, pieces.way, pieces.held)
-    slow = first.c
+    # What sticks forgets its speed.
+    slow = np.where(pieces.held, 0.0, first.c)
     speed = np.where(turned, 0.0, a) - delta * end
-    again = t * first.phi1
+    again = np.where(pieces.held, 0.0, t * first.phi1)
     if turned.any():
         k = np.flatnonzero(turned)
         r, a_after = (length - t)[k], np.where(pieces.held_after, 0.0, push - pieces.way_after * friction)[k]
@@ -149,7 +150,6 @@ def _follow(
         again[k] += onward * slow[k]
         by_place[k] += after_place + onward[:, None] * by_speed[k]
         by_speed[k] = turn[:, None] * by_speed[k] + after_speed
-        slow = slow.copy()
         slow[k] *= turn
     # A part that lasts longer goes on as it ended.
     by_speed[:, 2], by_place[:, 2] = longer * speed, longer * end

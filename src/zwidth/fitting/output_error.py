@@ -61,10 +61,18 @@ class FittedModel:
         return MeasurementNoise(self.moved[0], self.variance, self.resolution)
 
     @cached_property
+    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The derivatives that are not 0, each of size 1; which, and their sizes. A mass that sticks forgets its v0."""
+        sizes = np.linalg.norm(self.moved[1], axis=0)
+        seen = np.flatnonzero(sizes)
+        return self.moved[1][:, seen] / sizes[seen], seen, sizes[seen]
+
+    @cached_property
     def conditioned(self) -> bool:
         """Whether the positions tell all numbers apart."""
-        sizes = np.linalg.norm(self.moved[1], axis=0)
-        return bool(np.all(sizes > 0)) and float(np.linalg.cond(self.moved[1] / sizes)) < _BLIND
+        columns, seen, _ = self.columns
+        needed = {0, 1, 2, *(self.model.find(part) for part in self.model.parts)}
+        return needed <= set(seen.tolist()) and float(np.linalg.cond(columns)) < _BLIND
 
     @cached_property
     def excess(self) -> float:
@@ -86,20 +94,21 @@ class FittedModel:
     @cached_property
     def covariance(self) -> np.ndarray:
         """Of theta: exact slopes, the encoder's correlated errors, and what else spreads the residuals."""
-        slopes = self.moved[1]
-        sizes = np.linalg.norm(slopes, axis=0)
-        # By the columns' own triangle, for their squares keep half of the digits.
-        inverse = np.linalg.pinv(slopes / sizes)
+        columns, seen, sizes = self.columns
+        # Not by the products of columns, which keep half of the digits.
+        inverse = np.linalg.pinv(columns)
         triangle = inverse @ inverse.T
-        spread = self.noise.spread(slopes / sizes)
-        return self.excess * (triangle @ spread @ triangle) / np.outer(sizes, sizes)
+        whole = np.zeros((self.theta.size, self.theta.size))
+        spread = triangle @ self.noise.spread(columns) @ triangle
+        whole[np.ix_(seen, seen)] = self.excess * spread / np.outer(sizes, sizes)
+        return whole
 
     @cached_property
     def inflation(self) -> float:
         """How many times white noise's are the variances of the parts beyond mass, damping and delay; 1 or more."""
-        sizes = np.linalg.norm(self.moved[1], axis=0)
-        inverse = np.linalg.pinv(self.moved[1] / sizes)
-        white = self.variance * np.sum(inverse**2, axis=1) / sizes**2
+        columns, seen, sizes = self.columns
+        white = np.ones(self.theta.size)
+        white[seen] = self.variance * np.sum(np.linalg.pinv(columns) ** 2, axis=1) / sizes**2
         those = [self.model.find(name) for name in self.model.parts]
         return max([1.0, *(np.diag(self.covariance) / white)[those].tolist()])
 
