@@ -17,6 +17,8 @@ from typing import Any
 import numpy as np
 
 from zwidth.errors import InputError, UnusableValueError
+from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.log import fit_log
 from zwidth.formatting import describe, suggestion
 from zwidth.quantities import POSITIVE
 from zwidth.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
@@ -204,7 +206,7 @@ def _pair_units(units: Mapping[str, str], resolution: Any) -> tuple[bool, float 
     turns = units["force"] != "" and TORQUE.in_base("1", 0, units["force"]) is not None
     step = None
     if resolution is not None:
-        step, angular = _read_step(resolution)
+        step, angular = read_step(resolution)
         if angular is not None and angular != turns:
             raise InputError(
                 f"resolution: got {describe(resolution)} with {_force_words(units['force'])}; "
@@ -226,7 +228,7 @@ def _force_words(unit: str) -> str:
     return f"a {'torque' if torque else 'force'} in {unit or 'N (no unit is given)'}"
 
 
-def _read_step(resolution: Any) -> tuple[float, bool | None]:
+def read_step(resolution: Any) -> tuple[float, bool | None]:
     """The step in SI units, and whether it is an angle; None of a number alone."""
     number = not isinstance(resolution, str) or looks_like_number(resolution)
     value = float(resolution) if isinstance(resolution, str) and number else resolution
@@ -265,3 +267,20 @@ def _read_numbers(
                     )
         read[name] = values
     return read
+
+
+def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:
+    """`zwidth.fit_log` of logs that are read, all of one axis.
+
+    Raises:
+        InputError: the logs are of different axes or encoders, or as `zwidth.fit_log` says.
+    """
+    if len({motion.rotary for motion in motions}) > 1:
+        raise InputError("logs: some are of an angle, others of a length; fit them apart")
+    steps = {motion.resolution for motion in motions}
+    if len(steps) > 1:
+        raise InputError("resolution: the logs have several; give all of them the same, or fit them apart")
+    times = [motion.time for motion in motions]
+    when = period if times[0] is None else times
+    positions, forces = [motion.position for motion in motions], [motion.force for motion in motions]
+    return fit_log(when, positions, forces, resolution=steps.pop(), **options)  # pyright: ignore[reportArgumentType]

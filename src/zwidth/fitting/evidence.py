@@ -110,15 +110,20 @@ def _draw_devices(fit: DeviceFit) -> np.ndarray:
 
 
 def tabulate_walls(
-    fit: DeviceFit, points: Sequence[BuzzPoint] = (), noise: Any = None, units: AxisUnits = LINEAR
+    fit: DeviceFit, points: Sequence[BuzzPoint] = (), units: AxisUnits = LINEAR
 ) -> dict[str, np.ndarray]:
-    """The stiffest wall, the one to set, and walls that buzzed with the error of their stiffness and their frequency."""
-    top, choice = fit.scene.max_stiffness(), choose_wall(fit)
-    share = 0.0 if noise is None else float(np.broadcast_to(noise, 2)[0])
-    rows = [("stiffest", float(top.stiffness), float(top.virtual_damping), np.nan, np.nan)]
-    rows += [] if choice is None else [("set", choice.stiffness, choice.virtual_damping, np.nan, np.nan)]
-    rows += [("buzzing", each.stiffness, each.virtual_damping, share * each.stiffness, each.frequency) for each in points]
+    """The stiffest wall, the one to set, and walls that buzzed: their errors, frequencies, and distances from the fit.
+
+    Distances are in units of the noise, stiffness and frequency apart.
+    """
+    top, choice, lost = fit.scene.max_stiffness(), choose_wall(fit), (np.nan,) * 4
+    rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *lost)]
+    rows += [] if choice is None else [("set", choice.stiffness, choice.virtual_damping, *lost)]
+    share = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan
+    for each, rest in zip(points, fit.residuals if points else (), strict=True):
+        rows.append(("buzzing", each.stiffness, each.virtual_damping, share * each.stiffness, each.frequency, *rest))
     kinds, *numbers = zip(*rows, strict=True)
     heads = (("stiffness", units.stiffness), ("virtual_damping", units.damping), ("stiffness_error", units.stiffness))
-    names = [header(*head) for head in (*heads, ("frequency", "Hz"))]
-    return {"kind": np.array(kinds)} | {name: np.array(part) for name, part in zip(names, numbers, strict=True)}
+    names = [header(*head) for head in (*heads, ("frequency", "Hz"))] + ["stiffness_residual", "frequency_residual"]
+    columns = {name: np.array(part, float) for name, part in zip(names, numbers, strict=True)}
+    return {"kind": np.array(kinds), **columns}
