@@ -1,23 +1,46 @@
-"""The motion of a damped mass under a recorded force that acts a delay later, held from sample to sample; exact.
+"""The motion of a damped, rubbing mass under a recorded force that acts a delay later, held in between; exact.
 
-With j periods since the first sample that counts, and in units of the period,
+In units of the period, with g = T^2/m, the velocity of a mass that moves in the direction s obeys
 
-    x_j = g R_j(delta, d) + x0 + v0 j phi1(delta j) + g f0 j^2 phi2(delta j),     g = T^2/m,
+    v' = -delta v + a,    a = g F(t - d) + o - s c,    o = g f0,    c = g F_c.
 
-R the answer of `zwidth.plant` to the forces. The recursion is run by SciPy's compiled filters, first the velocity's,
-then a sum, so that rounding grows with the samples and not with their square; nothing is compiled for a log's length,
-which JAX would do for seconds. Derivatives are exact: filters of the same kind.
+A period has two parts in which a is constant: until the delayed force changes, and afterwards. In a part the velocity
+tends to a/delta and so passes 0 once at most, where the mass turns, or sticks if ``|g F + o| <= c``. Hence a part is a
+piece before and a piece after that instant, each in closed form. So are the derivatives: the instant moves by minus
+the change of the velocity there over a. Only with friction are velocities found one after the other; all else are
+NumPy's and LAPACK's compiled recursions, for JAX would compile for seconds for a log's length.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import exp, expm1, log1p
+from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.numerics.phi import phi_functions
-from zwidth.plant import Plant, held_plant, split_delay
-from zwidth.stability.ridge_slopes import plant_slopes
+from zwidth.numerics.phi import PhiFunctions, phi_functions
+from zwidth.plant import split_delay
+
+
+class Pieces(NamedTuple):
+    """Every part of a period: velocities at its ends; where it turns, how long before; directions; what sticks."""
+
+    start: np.ndarray
+    end: np.ndarray
+    turned: np.ndarray
+    before: np.ndarray
+    way: np.ndarray
+    way_after: np.ndarray
+    held: np.ndarray
+    held_after: np.ndarray
+
+
+class Motion(NamedTuple):
+    """Positions and their derivatives in g, delta, d, x0, v0, o and c, (n, 7)."""
+
+    position: np.ndarray
+    slopes: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -32,103 +55,205 @@ class Recording:
         """Its first positions alone."""
         return Recording(self.force[: self.skip + count], self.position[:count], self.skip)
 
-    @property
-    def steps(self) -> np.ndarray:
-        """Periods since the first position."""
-        return np.arange(self.position.size, dtype=float)
-
-    def answer(self, delta: float, d: float) -> np.ndarray:
-        """R."""
-        whole, f = split_delay(np.float64(d))
-        plant = held_plant(np.float64(delta), f)
-        return np.cumsum(_decaying(self._push(plant, int(whole) + 1), plant.c))[self.skip :]
-
-    def answers(self, delta: float, d: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """R and its derivatives in delta and d."""
-        whole, f = split_delay(np.float64(d))
-        delta = np.float64(delta)
-        plant, (by_delta, by_f) = held_plant(delta, f), plant_slopes(delta, f)
-        turns = int(whole) + 1
-        speed = _decaying(self._push(plant, turns), plant.c)
-        late = np.concatenate([[0.0], speed[:-1]])
-        slower = _decaying(self._push(by_delta, turns) - plant.c * late, plant.c)
-        moved = _decaying(self._push(by_f, turns), plant.c)
-        speed, slower, moved = (np.cumsum(part)[self.skip :] for part in (speed, slower, moved))
-        return speed, slower, moved
-
-    def _push(self, plant: Plant, turns: int) -> np.ndarray:
-        """``(a2 + a1/z + a0/z^2) z^-turns`` of the forces."""
-        push = np.convolve(self.force, [plant.a2, plant.a1, plant.a0])
-        return np.concatenate([np.zeros(turns), push])[: self.force.size]
-
-    def drift(self, delta: float) -> tuple[np.ndarray, np.ndarray]:
-        """``j phi1(delta j)`` and its derivative in delta."""
-        at = phi_functions(delta * self.steps)
-        return self.steps * at.phi1, -(self.steps**2) * at.psi
-
-    def fall(self, delta: float) -> tuple[np.ndarray, np.ndarray]:
-        """``j^2 phi2(delta j)`` and its derivative in delta."""
-        j = self.steps
-        at = phi_functions(delta * j)
-        return j**2 * at.phi2, -(j**3) / 6.0 if delta == 0 else -(j**2) * at.gap / delta
+    def move(
+        self,
+        g: float,
+        delta: float,
+        d: float,
+        x0: float = 0.0,
+        v0: float = 0.0,
+        offset: float = 0.0,
+        friction: float = 0.0,
+    ) -> Motion:
+        """Where the mass is at the samples; ``offset`` is o, ``friction`` c."""
+        whole, f = (float(part) for part in split_delay(np.float64(d)))
+        now = self.skip + np.arange(self.position.size - 1) - int(whole)
+        force = np.stack([self.force[now - 1], self.force[now]], -1).ravel()
+        length, longer = np.tile([f, 1.0 - f], now.size), np.tile([1.0, -1.0], now.size)
+        push = g * force + offset
+        pieces = _rub(push, length, delta, v0, friction) if friction else _glide(push, length, delta, v0)
+        place, slopes = _follow(pieces, force, push, length, longer, delta, friction)
+        # Two parts a period.
+        place, slopes = place[1::2], slopes[1::2]
+        whole_slopes = np.zeros((self.position.size, 7))
+        whole_slopes[:, 3] = 1.0
+        whole_slopes[1:, [0, 1, 2, 4, 5, 6]] = slopes
+        return Motion(x0 + np.concatenate([[0.0], place]), whole_slopes)
 
 
-def _decaying(push: np.ndarray, c: float) -> np.ndarray:
-    """``v_k = c v_(k-1) + push_k``."""
-    from scipy.signal import lfilter
+def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pieces:
+    at = phi_functions(delta * length)
+    end = _recur(at.c, length * at.phi1 * push, v0)
+    start = np.concatenate([[v0], end[:-1]])
+    never, still = np.zeros(push.shape, bool), np.zeros_like(push)
+    return Pieces(start, end, never, length, still, still, never, never)
 
-    return np.asarray(lfilter([1.0], [1.0, -c], push))
+
+def _rub(push: np.ndarray, length: np.ndarray, delta: float, v0: float, friction: float) -> Pieces:
+    kinds = [(h, exp(-delta * h), -expm1(-delta * h) / delta if delta else h) for h in length[:2].tolist()]
+    ends, befores, ways, afters = [], [], [], []
+    v, way = v0, float(np.sign(v0))
+    for k, a in enumerate(push.tolist()):
+        h, c, rate = kinds[k % 2]
+        before = h
+        if way == 0.0 and abs(a) > friction:
+            way = 1.0 if a > 0 else -1.0
+        ways.append(way)
+        if way:
+            pull = a - way * friction
+            end = c * v + rate * pull
+            if end * way <= 0.0 and pull * way < 0.0 and h > 0.0:
+                before = -v / pull
+                before = min(log1p(delta * before) / delta if delta else before, h)
+                if abs(a) > friction:
+                    way, rest = -way, h - before
+                    end = (-expm1(-delta * rest) / delta if delta else rest) * (a - way * friction)
+                else:
+                    way, end = 0.0, 0.0
+            v = end
+        ends.append(v)
+        befores.append(before)
+        afters.append(way)
+    start, end = np.array([v0, *ends[:-1]]), np.array(ends)
+    way, way_after = np.array(ways), np.array(afters)
+    return Pieces(start, end, way != way_after, np.array(befores), way, way_after, way == 0, way_after == 0)
+
+
+def _follow(
+    pieces: Pieces,
+    force: np.ndarray,
+    push: np.ndarray,
+    length: np.ndarray,
+    longer: np.ndarray,
+    delta: float,
+    friction: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """The way gone at the end of every part, and its derivatives in g, delta, d, v0, o and c."""
+    v, end, turned, t = pieces.start, pieces.end, pieces.turned, pieces.before
+    first, a = phi_functions(delta * t), np.where(pieces.held, 0.0, push - pieces.way * friction)
+    moved = first.phi1 * t * v + first.phi2 * t**2 * a
+    by_speed, by_place = _derive(first, delta, t, v, a, force, pieces.way, pieces.held)
+    slow = first.c
+    speed = np.where(turned, 0.0, a) - delta * end
+    again = t * first.phi1
+    if turned.any():
+        k = np.flatnonzero(turned)
+        r, a_after = (length - t)[k], np.where(pieces.held_after, 0.0, push - pieces.way_after * friction)[k]
+        second = phi_functions(delta * r)
+        moved[k] += second.phi2 * r**2 * a_after
+        after_speed, after_place = _derive(
+            second, delta, r, 0.0 * r, a_after, force[k], pieces.way_after[k], pieces.held_after[k]
+        )
+        speed[k] += a_after
+        turn, onward = speed[k] / a[k], end[k] / a[k]
+        again[k] += onward * slow[k]
+        by_place[k] += after_place + onward[:, None] * by_speed[k]
+        by_speed[k] = turn[:, None] * by_speed[k] + after_speed
+        slow = slow.copy()
+        slow[k] *= turn
+    # A part that lasts longer goes on as it ended.
+    by_speed[:, 2], by_place[:, 2] = longer * speed, longer * end
+    begin = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    speeds = _recur(slow, by_speed, begin)
+    speeds = np.concatenate([begin[None], speeds[:-1]])
+    return np.cumsum(moved), np.cumsum(again[:, None] * speeds + by_place, axis=0)
+
+
+def _derive(
+    at: PhiFunctions,
+    delta: float,
+    t: np.ndarray,
+    v: np.ndarray,
+    a: np.ndarray,
+    force: np.ndarray,
+    way: np.ndarray,
+    held: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """How the velocity and the place at the end of a piece move with g, delta, -, -, o and c, the start held."""
+    free = np.where(held, 0.0, 1.0)
+    by = np.stack([force * free, 0.0 * t, 0.0 * t, 0.0 * t, free, -way * free], -1)
+    by_speed, by_place = (t * at.phi1)[:, None] * by, (t**2 * at.phi2)[:, None] * by
+    by_speed[:, 1] = -t * (at.c * v + t * at.psi * a)
+    # -phi2'.
+    bend = np.where(delta * t == 0, 1.0 / 6.0, at.gap / np.where(delta * t == 0, 1.0, delta * t))
+    by_place[:, 1] = -(t**2) * (at.psi * v + t * bend * a)
+    return by_speed, by_place
+
+
+def _recur(factor: np.ndarray, added: np.ndarray, begin: float | np.ndarray) -> np.ndarray:
+    """``y_k = factor_k y_(k-1) + added_k``."""
+    from scipy.linalg.lapack import dtbtrs  # pyright: ignore[reportAttributeAccessIssue]  (made at import)
+
+    band = np.ones((2, factor.size))
+    band[1, :-1] = -factor[1:]
+    right = np.array(added, dtype=float)
+    right[0] += factor[0] * begin
+    return dtbtrs(band, right.reshape(factor.size, -1), uplo="L", diag="U")[0].reshape(right.shape)
 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Several logs of one device; theta is ``(g, delta, d)``, for each log x0 and v0, and g f0 where there is one."""
+    """Several logs of one device; theta is ``(g, delta, d)``, for each log x0 and v0, then o and c where asked for."""
 
     logs: tuple[Recording, ...]
-    with_offset: bool
+    parts: tuple[str, ...]
 
     @property
     def measured(self) -> np.ndarray:
         """All positions that count."""
         return np.concatenate([log.position for log in self.logs])
 
-    def columns(self, delta: float, d: float) -> np.ndarray:
-        """What the positions are sums of, but for R's derivatives: (n, 1 + 2 logs + offset)."""
-        blocks = []
-        for k, log in enumerate(self.logs):
-            block = np.zeros((log.position.size, 1 + 2 * len(self.logs) + self.with_offset))
-            block[:, 0], block[:, 1 + 2 * k], block[:, 2 + 2 * k] = log.answer(delta, d), 1.0, log.drift(delta)[0]
-            if self.with_offset:
-                block[:, -1] = log.fall(delta)[0]
-            blocks.append(block)
-        return np.concatenate(blocks)
-
-    def project(self, delta: float, d: float) -> tuple[np.ndarray, float]:
-        """The best theta for this damping and delay, and its sum of squares."""
-        columns = self.columns(delta, d)
-        sizes = np.linalg.norm(columns, axis=0)
-        scaled = columns / np.where(sizes > 0, sizes, 1.0)
-        # Half of the digits are enough to start from.
-        values = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ self.measured, rcond=None)[0]
-        rest = self.measured - scaled @ values
-        values = values / np.where(sizes > 0, sizes, 1.0)
-        return np.concatenate([values[:1], [delta, d], values[1:]]), float(rest @ rest)
+    @property
+    def size(self) -> int:
+        """How many numbers theta has."""
+        return 3 + 2 * len(self.logs) + len(self.parts)
 
     def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives in theta."""
-        g, delta, d = theta[:3]
+        extras = {name: float(theta[self.find(name)]) for name in self.parts}
         places, slopes = [], []
         for k, log in enumerate(self.logs):
-            (answer, by_delta, by_d), (drift, drift_slope) = log.answers(delta, d), log.drift(delta)
-            x0, v0 = theta[3 + 2 * k : 5 + 2 * k]
-            slope = np.zeros((answer.size, theta.size))
-            slope[:, 0], slope[:, 1], slope[:, 2] = answer, g * by_delta + v0 * drift_slope, g * by_d
-            slope[:, 3 + 2 * k], slope[:, 4 + 2 * k] = 1.0, drift
-            place = g * answer + x0 + v0 * drift
-            if self.with_offset:
-                fall, fall_slope = log.fall(delta)
-                place, slope[:, -1] = place + theta[-1] * fall, fall
-                slope[:, 1] += theta[-1] * fall_slope
-            places.append(place)
+            own = [3 + 2 * k, 4 + 2 * k]
+            moved = log.move(*map(float, theta[:3]), *map(float, theta[own]), **extras)
+            slope = np.zeros((log.position.size, self.size))
+            into = [0, 1, 2, *own, *(self.find(name) for name in self.parts)]
+            slope[:, into] = moved.slopes[:, [0, 1, 2, 3, 4, *(5 + PARTS.index(name) for name in self.parts)]]
+            places.append(moved.position)
             slopes.append(slope)
         return np.concatenate(places), np.concatenate(slopes)
+
+    def find(self, part: str) -> int:
+        """Where a part's number stands in theta."""
+        return 3 + 2 * len(self.logs) + self.parts.index(part)
+
+    def project(self, delta: float, d: float) -> tuple[np.ndarray, float]:
+        """The best theta without friction for this damping and delay, and its sum of squares."""
+        theta = np.zeros(self.size)
+        theta[:3] = 0.0, delta, d
+        linear = [k for k in range(self.size) if k not in (1, 2)]
+        values, squares = _combine(self.predict(theta)[1][:, linear], self.measured)
+        theta[linear] = values
+        return theta, squares
+
+    def scale(self, theta: np.ndarray) -> tuple[np.ndarray, float]:
+        """The same motion in another size: g with o and c, and v0, at their best, and the sum of squares."""
+        place, slopes = self.predict(theta)
+        starts = [3 + 2 * k for k in range(len(self.logs))]
+        origin = slopes[:, starts] @ theta[starts]
+        values, squares = _combine(np.column_stack([place - origin, slopes[:, starts]]), self.measured)
+        found = theta * values[0]
+        found[1:3], found[starts] = theta[1:3], values[1:]
+        return found, squares
+
+
+# What a log may ask for beside mass, damping and delay, as `Recording.move` names it.
+PARTS = ("offset", "friction")
+
+
+def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, float]:
+    """Least squares to half of the digits, which are enough to start from, and its sum of squares."""
+    sizes = np.linalg.norm(columns, axis=0)
+    scaled = columns / np.where(sizes > 0, sizes, 1.0)
+    values = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ wanted, rcond=None)[0]
+    rest = wanted - scaled @ values
+    return values / np.where(sizes > 0, sizes, 1.0), float(rest @ rest)

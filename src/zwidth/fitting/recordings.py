@@ -17,6 +17,8 @@ from zwidth.parts.checks import check_number
 _UNEVEN, _SAME = 0.05, 1e-5
 # Positions beyond the past forces.
 _FEWEST = 20
+# Samples that a stretch at one end lasts before it is suspected; a force of so many values varies, as a share.
+_STUCK, _MANY = 25, 0.1
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,7 @@ class Log:
         return Recording(self.force, self.position[skip:], skip)
 
 
-def read_logs(time: Any, position: Any, force: Any) -> tuple[tuple[Log, ...], float]:
+def read_logs(time: Any, position: Any, force: Any, resample: bool = False) -> tuple[tuple[Log, ...], float]:
     """The logs and their period."""
     several = isinstance(position, list | tuple) and len(position) > 0 and np.ndim(position[0]) == 1
     positions, forces = (position, force) if several else ([position], [force])
@@ -45,7 +47,7 @@ def read_logs(time: Any, position: Any, force: Any) -> tuple[tuple[Log, ...], fl
         raise InputError(
             f"time, position, force: got {len(times)}, {len(positions)} and {len(forces)} logs; give each log all three"
         )
-    read = [_read(*parts) for parts in zip(times, positions, forces, strict=True)]
+    read = [_read(*parts, resample) for parts in zip(times, positions, forces, strict=True)]
     periods = [period for _, period in read]
     if np.ptp(periods) > _SAME * periods[0]:
         raise InputError(
@@ -55,7 +57,7 @@ def read_logs(time: Any, position: Any, force: Any) -> tuple[tuple[Log, ...], fl
     return tuple(log for log, _ in read), float(np.mean(periods))
 
 
-def _read(time: Any, position: Any, force: Any) -> tuple[Log, float]:
+def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Log, float]:
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
@@ -67,6 +69,8 @@ def _read(time: Any, position: Any, force: Any) -> tuple[Log, float]:
         bad = np.flatnonzero(~np.isfinite(array))
         if bad.size:
             raise InputError(f"{name}: {bad.size} samples are no numbers, the first is sample {bad[0]}; leave them out")
+    if clock is not None and resample:
+        clock, x, f = _resample(clock, x, f)
     period = check_number("time", time, "s", low_open=True) if clock is None else _period(clock)
     if np.ptp(f) == 0:
         raise InputError(
@@ -77,12 +81,17 @@ def _read(time: Any, position: Any, force: Any) -> tuple[Log, float]:
     return Log(f, x), period
 
 
-def _period(clock: np.ndarray) -> float:
-    """The mean step of even times."""
+def _refuse_backwards(clock: np.ndarray) -> None:
     steps = np.diff(clock)
     if steps.min() <= 0:
         k = int(np.argmin(steps))
         raise InputError(f"time: it does not grow from sample {k} to {k + 1}; sort the samples, drop double ones")
+
+
+def _period(clock: np.ndarray) -> float:
+    """The mean step of even times."""
+    _refuse_backwards(clock)
+    steps = np.diff(clock)
     period = float((clock[-1] - clock[0]) / (clock.size - 1))
     late = clock - clock[0] - period * np.arange(clock.size)
     # Against the middle of them, for the first sample may be the late one.
@@ -92,6 +101,46 @@ def _period(clock: np.ndarray) -> float:
         raise InputError(
             f"time: samples are not even: steps from {with_unit(float(steps.min()), 's')} to "
             f"{with_unit(float(steps.max()), 's')}, sample {worst} {plain(100 * abs(late[worst]) / period, 2)} % of a "
-            "period off; record at even times, fill what is missing, or give the period in place of the times"
+            "period off; record at even times, give the period in place of the times, or ask to resample"
         )
     return period
+
+
+def _resample(clock: np.ndarray, x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """At even times of the median step: positions on straight lines, forces held."""
+    _refuse_backwards(clock)
+    period = float(np.median(np.diff(clock)))
+    even = clock[0] + period * np.arange(int((clock[-1] - clock[0]) / period * (1 + 1e-12)) + 1)
+    held = np.searchsorted(clock, even + 1e-9 * period, side="right") - 1
+    return even, np.interp(even, clock, x), f[held]
+
+
+def find_stretches(log: Log) -> list[str]:
+    """What hints at an end stop, a saturated sensor, or a saturated motor, a sentence each."""
+    doubts = []
+    for end, way in ((log.position.max(), 1.0), (log.position.min(), -1.0)):
+        first, last = _longest_run((log.position == end) & (log.force * way > 0))
+        if last - first >= _STUCK:
+            doubts.append(
+                f"the position stays at {with_unit(end, 'm', 4)} from sample {first} to {last - 1} though the force "
+                "pushes on: an end stop, a saturated sensor, or friction that holds; leave such stretches out"
+            )
+    for end in (log.force.max(), log.force.min()):
+        at_end = log.force == end
+        first, last = _longest_run(at_end)
+        inside = np.unique(log.force[~at_end]).size
+        if inside > _MANY * at_end.size and last - first >= _STUCK:
+            doubts.append(
+                f"the force stays at {with_unit(end, 'N', 4)} from sample {first} to {last - 1} and varies elsewhere: "
+                "is that what the motor gave, or where it saturates? Log the force that is given"
+            )
+    return doubts
+
+
+def _longest_run(marked: np.ndarray) -> tuple[int, int]:
+    """First and one past the last of the longest run of marked samples."""
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], marked.astype(np.int8), [0]])))
+    if not ends.size:
+        return 0, 0
+    k = int(np.argmax(ends[1::2] - ends[::2]))
+    return int(ends[2 * k]), int(ends[2 * k + 1])

@@ -146,13 +146,28 @@ def test_units_off_by_a_thousand_are_doubted(scale, unit):
     assert any(f"in {unit}" in doubt for doubt in fit.doubts)
 
 
-def test_residuals_that_are_no_noise_are_doubted():
-    rng = np.random.default_rng(11)
-    force = 2.0 * steps_to_and_fro(rng, 600, 40)
-    scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD))
+@pytest.mark.parametrize("delay", [0.0, 1.4e-3])
+def test_friction_comes_back_from_a_simulated_motion(delay):
+    force = 2.0 * steps_to_and_fro(np.random.default_rng(11), 600, 40)
+    scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(period=PERIOD, delay=delay))
     rubbed = zwidth.simulate(scene, 0.0, 0.0, push_history=force, coulomb=0.3, periods=600).position[:600]
     fit = zwidth.fit_log(PERIOD, rubbed, force)
+    # A push acts at once: the loop's delay is of the wall's force.
+    np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 2.0, 0.3], rtol=EXACT)
+    assert fit.delay == pytest.approx(0.0, abs=EXACT)
+    assert fit.tried[0].parts == ("friction",)
+    assert (fit.doubts, fit.status) == ((), Status.OK)
+
+
+def test_a_compliance_is_doubted_and_a_hand_refused():
+    rng = np.random.default_rng(11)
+    force = steps_to_and_fro(rng, 600, 40)
+    swinging = lfilter([0.2], [1.0, -1.6, 0.8], force)
+    fit = zwidth.fit_log(PERIOD, move(0.1, 2.0, 1e-3, swinging) + 1e-6 * rng.standard_normal(600), force)
     assert any("no noise" in doubt for doubt in fit.doubts)
+    hand = np.cumsum(0.2 * rng.standard_normal(600))
+    with pytest.raises(InputError, match="something else pushes, as a hand"):
+        zwidth.fit_log(PERIOD, move(0.1, 2.0, 1e-3, force + hand), force)
 
 
 def test_a_delay_beyond_the_range_is_told():

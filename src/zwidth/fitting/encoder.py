@@ -1,0 +1,82 @@
+"""What an encoder adds to a position, and how far estimates are off for it.
+
+An encoder of the step q reads q round(y/q) of y = x + n, n noise of the deviation sigma. Its error is a saw of y: over
+the unknown zero of the encoder, errors of two samples correlate as
+
+    E[e_i e_k] = sum_h w_h cos(2 pi h (x_i - x_k)/q),    w_h = q^2/(2 pi^2 h^2) exp(-(2 pi h sigma/q)^2),
+
+so samples of a slow motion err alike. Neither knows of n, so that the variance of a sample is sigma^2 + q^2/12.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+# Waves of the saw that are followed; the others are taken for white, 1.6 % of its variance.
+_WAVES, _LEAST = 40, 1e-6
+# How far positions may lie from whole steps, as a share of a step, and how many steps to a whole log at the most.
+_OFF, _MOST = 0.02, 1e7
+
+
+def find_resolution(position: np.ndarray) -> float:
+    """The step that all positions are whole numbers of, but for a common offset; 0 where there is none."""
+    steps = np.diff(np.unique(position))
+    if steps.size < 2:
+        return float(steps[0]) if steps.size else 0.0
+    step, span = float(steps.min()), float(np.ptp(position))
+    if span > _MOST * step:
+        return 0.0
+    # The smallest step is the least sure one: by ever longer ways.
+    for way in [*np.sort(steps)[:: max(1, steps.size // 50)].tolist(), span]:
+        step = way / max(1.0, np.round(way / step))
+    return step if fits_steps(position, step) else 0.0
+
+
+def fits_steps(position: np.ndarray, step: float) -> bool:
+    """Whether positions are whole numbers of a step, but for a common offset."""
+    ratios = (position - position[0]) / step
+    return bool(np.all(np.abs(ratios - np.round(ratios)) <= _OFF))
+
+
+@dataclass(frozen=True)
+class MeasurementNoise:
+    """Of positions that are where ``position`` says, of this variance a sample, read with steps of ``resolution``."""
+
+    position: np.ndarray
+    variance: float
+    resolution: float
+
+    def spread(self, slopes: np.ndarray) -> np.ndarray:
+        """``J^T C J`` for columns J, with C the covariance of the samples."""
+        plain = slopes.T @ slopes
+        total = self.variance * plain
+        for wave, weight in self._waves():
+            along = slopes.T @ wave
+            total = total + weight * (np.real(np.outer(along, along.conj())) - plain)
+        return total
+
+    def spread_of_sums(self, count: int) -> float:
+        """The mean square of sums of ``count`` neighbors."""
+        starts = np.arange(0, self.position.size - count + 1, count)
+        total = self.variance * count
+        for wave, weight in self._waves():
+            sums = np.add.reduceat(wave[: starts[-1] + count], starts)
+            total += weight * (float(np.mean(np.abs(sums) ** 2)) - count)
+        return total
+
+    def _waves(self) -> Iterator[tuple[np.ndarray, float]]:
+        """``e^(2 pi j h x/q)`` and w_h, as long as they count."""
+        if not self.resolution:
+            return
+        sigma = np.sqrt(max(0.0, self.variance / self.resolution**2 - 1.0 / 12.0))
+        turn = np.exp(2j * np.pi * (self.position / self.resolution))
+        wave = np.ones_like(turn)
+        for h in range(1, _WAVES + 1):
+            wave = wave * turn
+            weight = self.resolution**2 / (2.0 * (np.pi * h) ** 2) * np.exp(-((2.0 * np.pi * h * sigma) ** 2))
+            if weight < _LEAST * self.variance:
+                return
+            yield wave, float(weight)
