@@ -1,9 +1,10 @@
 #!/usr/bin/env python3
-"""Simulate the log that configs/fit.yaml is fitted to: `scripts/make_fit_log.py` writes configs/fit_log.csv.
+"""Simulate the records that configs/fit.yaml is fitted to: writes configs/fit_log.csv, prints walls that buzz.
 
 A light device with dry friction is pushed to and fro by steps of random length, at 1 kHz. The force acts 2.3 ms after
-it was commanded, which is no whole number of periods: the motion is simulated at a rate 10 times higher, in which it is,
-and every 10th position is read by the encoder.
+it was commanded, no whole number of periods: the motion is simulated at a rate 10 times higher, and every 10th position
+is read by the encoder. The walls are on the device's boundary, without its friction, each stiffness and frequency off
+by some 2 %.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ FILE = Path(__file__).resolve().parents[1] / "configs" / "fit_log.csv"
 MASS, DAMPING, FRICTION = 0.075, 0.6, 0.08  # kg, N s/m, N
 PERIOD, DELAY, RESOLUTION = 1e-3, 2.3e-3, 3e-5  # s, s, m
 SAMPLES, FORCE, FINER = 3000, 1.2, 10
+DAMPINGS, NOISE = (0.0, 8.0, 16.0, 24.0), 0.02  # N s/m, relative
 HOLDS = (30, 90)  # shortest and longest step, in samples
 
 
@@ -53,5 +55,17 @@ def make_log() -> str:
     return "\n".join(lines) + "\n"
 
 
+def list_walls() -> list[tuple[float, float, float]]:
+    """Stiffness in N/m, virtual damping in N s/m and frequency in Hz of walls at the onset of buzzing."""
+    rate = MASS / PERIOD
+    edge = zwidth.boundary_point(DAMPING / rate, DELAY / PERIOD, beta=np.array(DAMPINGS) / rate)
+    off = 1.0 + NOISE * np.random.default_rng(2006).standard_normal((2, len(DAMPINGS)))
+    numbers = edge.alpha * rate / PERIOD * off[0], edge.omega / (2 * np.pi * PERIOD) * off[1]
+    rounded = [[float(f"{value:.3g}") for value in column] for column in numbers]
+    return list(zip(rounded[0], DAMPINGS, rounded[1], strict=True))
+
+
 if __name__ == "__main__":
     FILE.write_text(make_log(), encoding="utf-8")
+    for stiffness, virtual_damping, frequency in list_walls():
+        print(f"- {{stiffness: {stiffness:g} N/m, virtual_damping: {virtual_damping:g}, frequency: {frequency:g} Hz}}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -101,7 +100,8 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
         ax.plot(time[thin], place[thin] * factor, color=style.GRAY, linewidth=2.4, alpha=0.55, label="measured")
         ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modelled")
         ax.set(ylabel=f"position  in {length}", xlim=(0.0, time[-1]))
-        ax.legend(loc="best", ncols=2)
+        ax.tick_params(labelbottom="residuals" not in panels)
+        _put_above(ax)
         count = np.unique(logs).size
         ax.set_title(f"the first of {count} logs" if count > 1 else "")
     if "residuals" in panels:
@@ -113,7 +113,7 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
             ax.axhline(end * factor, color=style.BLACK, linestyle=style.DASHED, linewidth=0.8, label="half a step")
         ax.set(xlabel=f"time  in {second}", ylabel=f"measured less\nmodelled  in {length}", xlim=(0.0, time[-1]))
         if step:
-            ax.legend(handles=[style.line("half a step of the encoder", style.DASHED, 0.8, style.BLACK)], loc="upper right")
+            _put_above(ax, [style.line("half a step of the encoder", style.DASHED, 0.8, style.BLACK)])
             ax.set_ylim(*style.span(*np.array([-1, 1]) * factor * max(0.62 * step, np.nanmax(np.abs(rest))), 0.12))
 
 
@@ -128,7 +128,14 @@ def _draw_correlation(ax: Axes, correlation: Table) -> None:
     largest = max(0.2, 1.25 * float(np.nanmax(np.abs(values), initial=0.0)))
     ax.set(xlabel=f"lag  in {second}", ylabel="autocorrelation\nof residuals", xlim=(0.0, far))
     ax.set_ylim(-largest, largest)
-    ax.annotate("within: 95 % of white noise", (0.99, 0.04), xycoords="axes fraction", ha="right", fontsize=8)
+    _put_above(ax)
+
+
+def _put_above(ax: Axes, handles: Any = None) -> None:
+    """A legend in one line above the panel, beside its letter."""
+    found = handles or ax.get_legend_handles_labels()[0]
+    place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
+    ax.legend(handles=found, ncols=len(found), columnspacing=1.2, **place)
 
 
 def _draw_onsets(ax: Axes, walls: Table) -> None:
@@ -140,10 +147,12 @@ def _draw_onsets(ax: Axes, walls: Table) -> None:
         ax.plot(damping, values, marker, color=color, markersize=4.5, label=name, zorder=3)
     ax.axhspan(-2.0, 2.0, color=style.GRAY, alpha=0.22, linewidth=0.0)
     ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
-    far = max(3.0, *(1.2 * float(np.nanmax(np.abs(buzzing[f"{name}_residual"]))) for name in ("stiffness", "frequency")))
+    far = max(
+        3.0, *(1.2 * float(np.nanmax(np.abs(buzzing[f"{name}_residual"]))) for name in ("stiffness", "frequency"))
+    )
     ax.set(ylim=(-far, far), xlabel=f"virtual damping  $B$  in {unit}", ylabel="walls less fit,\nin their noise")
     ax.margins(x=0.1)
-    ax.legend(loc="best", ncols=2)
+    _put_above(ax)
 
 
 def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
@@ -154,7 +163,8 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     for fit, (color, shade) in zip(fits, _FITS, strict=False):
         own = vars(fit)
         (K, _), (low, _), (up, _) = (
-            _column(own, name) for name in ("stiffness", "stiffness_low", "stiffness_high")  # pyright: ignore[reportArgumentType]
+            _column(own, name)
+            for name in ("stiffness", "stiffness_low", "stiffness_high")  # pyright: ignore[reportArgumentType]
         )
         B, damper = _column(own, "virtual_damping")  # pyright: ignore[reportArgumentType]
         ax.fill_betweenx(B, low * factor, up * factor, color=shade, alpha=0.4, linewidth=0.0, zorder=2)
@@ -162,44 +172,41 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown] * factor, color=shade, alpha=0.08, linewidth=0.0, zorder=1)
         ax.plot(K[shown] * factor, B[shown], color=color, label=f"boundary, {fit.fitted_to}", zorder=3)
-        handles.append(style.line(f"boundary of the fit{f' to {fit.fitted_to}' if len(fits) > 1 else ''}, 95 % band",
-                                  color=color))  # fmt: skip
+        handles.append(style.line(f"boundary with its 95 % band, {fit.fitted_to}", color=color))
         ax.set_ylabel(f"virtual damping  $B$  in {damper}")
     handles += _mark_walls(ax, walls, factor, unit)
-    ax.set(xlim=(0.0, 1.04 * max(float(high.max()), float(np.nanmax(every))) * factor), ylim=(0.0, None))
+    ax.set_xlim(0.0, 1.15 * max(float(high.max()), float(np.nanmax(every))) * factor)
+    # Room for the legend.
+    ax.set_ylim(-0.05 * ax.dataLim.ymax, (1.1 + 0.05 * len(handles)) * ax.dataLim.ymax)
+    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
     ax.set_xlabel(f"stiffness  $K$  in {unit}")
-    style.legend(np.array([ax]), handles, outside=False)
-    ax.get_legend().set_loc("upper right")  # pyright: ignore[reportOptionalMemberAccess]
+    ax.legend(handles=handles, loc="upper right")
 
 
 def _mark_walls(ax: Axes, walls: Table, factor: float, unit: str) -> list[Any]:
     """The stiffest walls, those to set, and those that buzzed; returns entries of a legend."""
-    several = len(set(np.asarray(walls["fitted_to"])) - {""}) > 1
     handles = []
-    looks: Sequence[tuple[str, str, float, str]] = (
-        ("stiffest", "o", 4.5, "stiffest stable wall"),
-        ("set", "D", 5.0, "wall to set"),
-    )
-    for kind, marker, size, words in looks:
+    for kind, marker, size, words in (("stiffest", "o", 4.5, "stiffest wall"), ("set", "D", 5.0, "wall to set")):
         found = select(walls, kind=kind)
-        (K, _), (B, _) = _column(found, "stiffness"), _column(found, "virtual_damping")
-        if not K.size:
-            continue
+        (K, _), (B, damper) = _column(found, "stiffness"), _column(found, "virtual_damping")
         look = {"linestyle": "", "marker": marker, "markersize": size, "color": style.BLACK}
         ax.plot(K * factor, B, label=kind, zorder=5, **look)
-        handles.append(style.line(words, look.pop("linestyle"), **look))
-        if not several:
-            name = r"K_{\max}" if kind == "stiffest" else "K"
-            text = f"${name} = {K[0] * factor:.3g}$ {unit}\n$B = {B[0]:.3g}$"
-            ax.annotate(text, (K[0] * factor, B[0]), xytext=(-8, 0), ha="right", va="center", **_TEXT)
+        look.pop("linestyle")
+        if K.size:
+            text = f": $K = {K[0] * factor:.3g}$ {unit}, $B = {B[0]:.3g}$ {damper}" if K.size == 1 else ""
+            handles.append(style.line(words + text, "", **look))
     found = select(walls, kind="buzzing")
     (K, _), (B, _), (error, _), (frequency, _) = (
         _column(found, name) for name in ("stiffness", "virtual_damping", "stiffness_error", "frequency")
     )
     if K.size:
         look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}
-        ax.errorbar(K * factor, B, xerr=1.96 * error * factor, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
+        reach = 1.96 * error * factor
+        ax.errorbar(K * factor, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
+        middle = float(np.max(_column(select(walls, kind="stiffest"), "virtual_damping")[0]))
         for stiffness, damping, heard in zip(K * factor, B, frequency, strict=True):
-            ax.annotate(f"{heard:.3g} Hz", (stiffness, damping), xytext=(7, 5), color=style.VERMILION, **_TEXT)
-        handles.append(style.line("began to buzz", "", **look))
+            # Outside of the stable walls.
+            place = (11, -10) if damping < middle else (11, 5)
+            ax.annotate(f"{heard:.3g} Hz", (stiffness, damping), xytext=place, color=style.VERMILION, **_TEXT)
+        handles.append(style.line("began to buzz at this frequency", "", **look))
     return handles

@@ -1,6 +1,6 @@
 """Logs in CSV files: columns in any order, under any names, in any units, read into SI units.
 
-A file has a line of column names and a line a sample; what precedes the names and begins with # is a remark. Columns are
+A file has a line of column names and a line a sample; lines before the names that begin with # are remarks. Columns are
 separated by tabs, else semicolons, else commas: the first of these that the line of names holds. Where commas do not
 separate, they may be decimal signs.
 """

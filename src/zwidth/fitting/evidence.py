@@ -17,11 +17,24 @@ from zwidth.stability.boundary import boundary_point
 from zwidth.status import Status
 
 # Devices drawn from the covariance, dampings of the boundary, and how far beyond its end.
-_DRAWS, _ROWS, _BEYOND = 200, 121, 1.12
+_DRAWS, _ROWS, _BEYOND = 200, 121, 1.1
 # Lags of the autocorrelation, at most, and at most as a share of the samples.
 _LAGS, _SHARE = 60, 0.25
 # Of a normal distribution: 95 % lie within.
 _NORMAL = 1.959963984540054
+
+
+def gather_evidence(
+    fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (), units: AxisUnits = LINEAR
+) -> dict[str, dict[str, Any]]:
+    """Every table of a fit, as `zwidth.figures.draw_device_fit` takes them."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, table in (("boundary", trace_boundary(fit, units)), ("walls", tabulate_walls(fit, points, units))):
+        rows = next(iter(table.values())).size
+        found[name] = {"fitted_to": np.full(rows, source), **table}
+    if fit.motions:
+        found |= {"motion": tabulate_motions(fit, units), "correlation": correlate_residuals(fit)}
+    return found
 
 
 def tabulate_motions(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.ndarray]:
@@ -64,7 +77,8 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
     outlines = fit.scene.stable_region()
     if not outlines:
         raise InputError("scene: no wall of the fitted device is stable; measure again")
-    damping = np.linspace(0.0, _BEYOND * max(float(each.virtual_damping.max()) for each in outlines), _ROWS)
+    end = max(float(each.virtual_damping.max()) for each in outlines)
+    damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
     own = np.array([[fit.mass, fit.damping, fit.delay]])
     low, high = np.quantile(_limit_rows(fit, _draw_devices(fit), damping), [0.025, 0.975], axis=0)
     return {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import fields
 from typing import NamedTuple
@@ -81,7 +82,7 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         rows.append((Status(fit.status).name, f"do not rely on these numbers: {name_trouble(fit)}"))
     rows.append(("fitted to", source))
     for name in ("mass", "damping", "delay", "stiffness_max"):
-        rows.append((SYMBOLS[name], f"{units.spell(name, getattr(fit, name))} ({_between(fit, name, units)})"))
+        rows.append((SYMBOLS[name], f"{_spell(fit, name, units)} ({_between(fit, name, units)})"))
     rows += _explain_parts(fit, units)
     if isinstance(fit.noise, tuple):
         rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))
@@ -118,20 +119,37 @@ def list_doubts(fit: DeviceFit, units: AxisUnits) -> list[str]:
     return [doubt.replace("N s/m", ROTARY.damping).replace("N/m", ROTARY.stiffness) for doubt in doubts]
 
 
+def _spell(fit: DeviceFit, name: str, units: AxisUnits) -> str:
+    """A value with so many digits that its interval shows."""
+    return units.spell(name, getattr(fit, name), _count_digits(fit, name))
+
+
 def _between(fit: DeviceFit, name: str, units: AxisUnits) -> str:
-    low, high = (units.spell(name, end) for end in fit.intervals[name])
+    low, high = (units.spell(name, end, _count_digits(fit, name)) for end in fit.intervals[name])
     return f"95 % between {low} and {high}"
+
+
+def _count_digits(fit: DeviceFit, name: str) -> int:
+    value, bar = abs(getattr(fit, name)), fit.intervals[name]
+    known = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
+    return min(max(4, 2 + math.ceil(math.log10(known))), 9) if known > 0 and math.isfinite(known) else 4
 
 
 def _explain_parts(fit: DeviceFit, units: AxisUnits) -> Iterable[tuple[str, str]]:
     """What was compared beside mass, damping and delay, and why it was kept or left out."""
     found = {"friction": ("friction", fit.friction), "offset": ("constant force", fit.offset)}
-    for part in dict.fromkeys(part for model in fit.tried for part in model.parts):
+    tried = dict.fromkeys(part for model in fit.tried for part in model.parts)
+    if fit.tried and "friction" not in tried:
+        yield "friction", "none: no start of a fit with friction is better than the fit without"
+    for part in tried:
         kept = part in fit.tried[0].parts
         label, value = found.get(part, (part, 0.0))
         others = [model.criterion for model in fit.tried if (part in model.parts) != kept]
         worse = f"Schwarz's criterion is {plain(min(others), 3)} worse" if others else "nothing else was tried"
-        amount = units.spell("force", value, 3) + (f" ({_between(fit, part, units)})" if part in fit.intervals else "")
+        barred = part in fit.intervals
+        amount = (
+            _spell(fit, part, units) + f" ({_between(fit, part, units)})" if barred else units.spell("force", value)
+        )
         yield label, f"{amount}: kept, without it {worse}" if kept else f"left out, with it {worse}"
 
 
@@ -155,7 +173,9 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
         lines.append(f"  velocity: {{kind: {kind}, {inside}}} # as given")
     lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction:
-        lines.append(f"# For studies of kind simulate: coulomb: {fit.friction!r} N, {_between(fit, 'friction', units)}.")
+        lines.append(
+            f"# For studies of kind simulate: coulomb: {fit.friction!r} N, {_between(fit, 'friction', units)}."
+        )
     if fit.resolution:
         lines.append(f"# For studies of kind simulate: resolution: {fit.resolution!r} m.")
     return lines

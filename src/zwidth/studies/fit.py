@@ -8,7 +8,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator, PrivateAttr, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, PrivateAttr, WrapValidator
 
 from zwidth import figures
 from zwidth.config.device_table import find_file
@@ -20,7 +20,7 @@ from zwidth.errors import InputError
 from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
 from zwidth.fitting.device_fit import DeviceFit
-from zwidth.fitting.evidence import correlate_residuals, tabulate_motions, tabulate_walls, trace_boundary
+from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
 from zwidth.formatting import header, plain, with_unit
 from zwidth.status import Status
@@ -170,7 +170,10 @@ class FitStudy(ComputedStudy):
         strange = {"noise": "buzz", "max_delay": "log", "resample": "log"}
         for name, owner in strange.items():
             if name in raw and owner not in raw:
-                yield (name,), problem(f"got {name} without {owner}", f"it belongs to {owner}", "remove it", on_key=True)
+                yield (
+                    (name,),
+                    problem(f"got {name} without {owner}", f"it belongs to {owner}", "remove it", on_key=True),
+                )
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -215,15 +218,16 @@ class FitStudy(ComputedStudy):
             middle = f"_{each.name}" if len(fits) > 1 else ""
             text = "\n".join(write_scene(each.fit, each.source, units))
             documents[f"{self.name}{middle}_scene.yaml"] = text + "\n"
-        said = [(each, describe_fit(each.fit, each.source, units)) for each in fits]
-        answers = [" ".join(f"{label} = {text}" if label in _ANSWERS else f"{label}: {text}"
-                            for label, text in rows if label in _ANSWERS or label == "set") for _, rows in said]  # fmt: skip
-        notes = [f"{each.source}: {label}: {text}" for each, rows in said for label, text in rows
-                 if label not in _ANSWERS and label not in ("fitted to", "set")]  # fmt: skip
+        answers, notes = [], []
+        for each in fits:
+            rows = describe_fit(each.fit, each.source, units)
+            answers.append(", ".join(f"{label} = {text}" for label, text in rows if label in _ANSWERS))
+            answers += [f"set {text}" for label, text in rows if label == "set"]
+            told = (*_ANSWERS, "fitted to", "set")
+            notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in told]
         notes += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
-        drawn = {name: evidence.get(name) for name in ("motion", "correlation")}
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
-        draw = partial(figures.draw_device_fit, evidence["boundary"], evidence["walls"], step=step, **drawn)
+        draw = partial(figures.draw_device_fit, **evidence, step=step)
         return Outcome(
             table=stack([_tabulate(each, units) for each in fits]),
             figures={"": draw},
@@ -255,14 +259,9 @@ _ANSWERS = ("m", "b", "t_d", "K_max")
 
 def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
     """What the fits rest on."""
-    boundaries, walls, found = [], [], {}
-    for each in fits:
-        named = {"fitted_to": each.source}
-        boundaries.append({**named, **trace_boundary(each.fit, units)})
-        walls.append({**named, **tabulate_walls(each.fit, each.points, units)})
-        if each.fit.motions:
-            found |= {"motion": tabulate_motions(each.fit, units), "correlation": correlate_residuals(each.fit)}
-    return {**found, "boundary": stack(boundaries), "walls": stack(walls)}
+    found = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
+    below = {name: stack([tables[name] for tables in found]) for name in ("boundary", "walls")}
+    return {**found[0], **below}
 
 
 def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
