@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -155,56 +155,66 @@ def _draw_onsets(ax: Axes, walls: Table) -> None:
     _put_above(ax)
 
 
+class _Scales(NamedTuple):
+    """Factors and units of the axes of walls."""
+
+    stiffness: float
+    spring: str
+    damping: float
+    damper: str
+
+
 def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     """The stable walls: B over K."""
-    (every, unit), (high, _) = _column(walls, "stiffness"), _column(boundary, "stiffness_high")
-    factor, unit = style.si_unit(float(np.nanmax(every)), unit)
-    fits, handles = curves(boundary, "fitted_to"), []
-    for fit, (color, shade) in zip(fits, _FITS, strict=False):
+    (every, spring), (high, _) = _column(walls, "stiffness"), _column(boundary, "stiffness_high")
+    dampings, damper = _column(boundary, "virtual_damping")
+    to = _Scales(*style.si_unit(float(np.nanmax(every)), spring), *style.si_unit(float(dampings.max()), damper))
+    handles = []
+    for fit, (color, shade) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
         own = vars(fit)
-        (K, _), (low, _), (up, _) = (
-            _column(own, name)
-            for name in ("stiffness", "stiffness_low", "stiffness_high")  # pyright: ignore[reportArgumentType]
-        )
-        B, damper = _column(own, "virtual_damping")  # pyright: ignore[reportArgumentType]
-        ax.fill_betweenx(B, low * factor, up * factor, color=shade, alpha=0.4, linewidth=0.0, zorder=2)
+        K, low, up = (_column(own, name)[0] * to.stiffness for name in ("stiffness", "stiffness_low", "stiffness_high"))
+        B = _column(own, "virtual_damping")[0] * to.damping
+        ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {fit.fitted_to}")
+        # Up to where it meets K = 0.
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
-        ax.fill_betweenx(B[shown], 0.0, K[shown] * factor, color=shade, alpha=0.08, linewidth=0.0, zorder=1)
-        ax.plot(K[shown] * factor, B[shown], color=color, label=f"boundary, {fit.fitted_to}", zorder=3)
+        ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
+        ax.plot(K[shown], B[shown], color=color, label=f"boundary, {fit.fitted_to}", zorder=3)
         handles.append(style.line(f"boundary with its 95 % band, {fit.fitted_to}", color=color))
-        ax.set_ylabel(f"virtual damping  $B$  in {damper}")
-    handles += _mark_walls(ax, walls, factor, unit)
-    ax.set_xlim(0.0, 1.15 * max(float(high.max()), float(np.nanmax(every))) * factor)
+    handles += _mark_walls(ax, walls, to)
+    ax.set_xlim(0.0, 1.15 * max(float(high.max()), float(np.nanmax(every))) * to.stiffness)
     # Room for the legend.
-    ax.set_ylim(-0.05 * ax.dataLim.ymax, (1.1 + 0.05 * len(handles)) * ax.dataLim.ymax)
+    highest = float(dampings.max()) * to.damping
+    ax.set_ylim(-0.05 * highest, (1.05 + 0.05 * len(handles)) * highest)
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-    ax.set_xlabel(f"stiffness  $K$  in {unit}")
+    ax.set(xlabel=f"stiffness  $K$  in {to.spring}", ylabel=f"virtual damping  $B$  in {to.damper}")
     ax.legend(handles=handles, loc="upper right")
 
 
-def _mark_walls(ax: Axes, walls: Table, factor: float, unit: str) -> list[Any]:
+def _mark_walls(ax: Axes, walls: Table, to: _Scales) -> list[Any]:
     """The stiffest walls, those to set, and those that buzzed; returns entries of a legend."""
-    handles = []
-    for kind, marker, size, words in (("stiffest", "o", 4.5, "stiffest wall"), ("set", "D", 5.0, "wall to set")):
+    handles, kinds = [], {}
+    for kind in ("stiffest", "set", "buzzing"):
         found = select(walls, kind=kind)
-        (K, _), (B, damper) = _column(found, "stiffness"), _column(found, "virtual_damping")
-        look = {"linestyle": "", "marker": marker, "markersize": size, "color": style.BLACK}
-        ax.plot(K * factor, B, label=kind, zorder=5, **look)
-        look.pop("linestyle")
+        kinds[kind] = (
+            found,
+            _column(found, "stiffness")[0] * to.stiffness,
+            _column(found, "virtual_damping")[0] * to.damping,
+        )
+    for kind, marker, size, words in (("stiffest", "o", 4.5, "stiffest wall"), ("set", "D", 5.0, "wall to set")):
+        _, K, B = kinds[kind]
+        look = {"marker": marker, "markersize": size, "color": style.BLACK}
+        ax.plot(K, B, linestyle="", label=kind, zorder=5, **look)
         if K.size:
-            text = f": $K = {K[0] * factor:.3g}$ {unit}, $B = {B[0]:.3g}$ {damper}" if K.size == 1 else ""
+            text = f": $K = {K[0]:.3g}$ {to.spring}, $B = {B[0]:.3g}$ {to.damper}" if K.size == 1 else ""
             handles.append(style.line(words + text, "", **look))
-    found = select(walls, kind="buzzing")
-    (K, _), (B, _), (error, _), (frequency, _) = (
-        _column(found, name) for name in ("stiffness", "virtual_damping", "stiffness_error", "frequency")
-    )
+    found, K, B = kinds["buzzing"]
     if K.size:
         look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}
-        reach = 1.96 * error * factor
-        ax.errorbar(K * factor, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
-        middle = float(np.max(_column(select(walls, kind="stiffest"), "virtual_damping")[0]))
-        for stiffness, damping, heard in zip(K * factor, B, frequency, strict=True):
+        reach = 1.96 * _column(found, "stiffness_error")[0] * to.stiffness
+        ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
+        middle = float(np.max(kinds["stiffest"][2]))
+        for stiffness, damping, heard in zip(K, B, _column(found, "frequency")[0], strict=True):
             # Outside of the stable walls.
             place = (11, -10) if damping < middle else (11, 5)
             ax.annotate(f"{heard:.3g} Hz", (stiffness, damping), xytext=place, color=style.VERMILION, **_TEXT)

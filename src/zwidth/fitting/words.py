@@ -82,7 +82,8 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         rows.append((Status(fit.status).name, f"do not rely on these numbers: {name_trouble(fit)}"))
     rows.append(("fitted to", source))
     for name in ("mass", "damping", "delay", "stiffness_max"):
-        rows.append((SYMBOLS[name], f"{_spell(fit, name, units)} ({_between(fit, name, units)})"))
+        symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS[name]
+        rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})"))
     rows += _explain_parts(fit, units)
     if isinstance(fit.noise, tuple):
         rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))

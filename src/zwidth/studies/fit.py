@@ -8,7 +8,8 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator, PrivateAttr, WrapValidator
+from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WrapValidator
+from pydantic_core import CoreSchema
 
 from zwidth import figures
 from zwidth.config.device_table import find_file
@@ -104,6 +105,15 @@ def _read_logs(raw: Any, handler: Any) -> Any:
     return (raw,) if isinstance(raw, LogSection) else members("logs")(raw, handler)
 
 
+class _OneOrSeveral:
+    """Lets an editor's check take one entry for a list of it."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        several = handler(schema)
+        return {"anyOf": [several["items"], several]}
+
+
 class BuzzSection(Strict):
     """A wall at the onset of buzzing."""
 
@@ -137,7 +147,7 @@ class FitStudy(ComputedStudy):
 
     kind: Literal["fit"]
 
-    log: Annotated[tuple[LogSection, ...], WrapValidator(_read_logs)] | None = None
+    log: Annotated[tuple[LogSection, ...], WrapValidator(_read_logs), _OneOrSeveral] | None = None
     """A log of free motion under a commanded force, or a list of logs of one device; give this, buzz, or both."""
 
     buzz: Annotated[tuple[BuzzSection, ...], WrapValidator(members("walls"))] | None = None
@@ -254,7 +264,7 @@ class FitStudy(ComputedStudy):
         return fits
 
 
-_ANSWERS = ("m", "b", "t_d", "K_max")
+_ANSWERS = ("m", "J", "b", "t_d", "K_max")
 
 
 def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
