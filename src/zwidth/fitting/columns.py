@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +35,11 @@ _NAMES = {
     "force": ("force", "f", "torque", "tau"),
 }
 _SEPARATORS = ("\t", ";", ",")
+_MOST_BYTES = 2**28
 _HEADER = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LoggedMotion:
     """Columns of one log in SI units.
 
@@ -55,6 +56,12 @@ class LoggedMotion:
     force: np.ndarray
     resolution: float | None
     rotary: bool
+
+    def __eq__(self, other: object) -> bool:
+        """Whether all numbers are the same."""
+        return isinstance(other, LoggedMotion) and all(
+            np.array_equal(getattr(self, part.name), getattr(other, part.name)) for part in fields(self)
+        )
 
 
 def read_log(
@@ -101,6 +108,11 @@ def read_log(
 def _read_lines(file: Path) -> list[tuple[int, list[str]]]:
     """The line of names and those of samples, each with its number, cells without blanks around them."""
     try:
+        # A pipe would be waited for.
+        if not file.is_file():
+            raise InputError(f"{file}: {'it is no file' if file.exists() else 'no such file'}; check the path")
+        if file.stat().st_size > _MOST_BYTES:
+            raise InputError(f"{file}: it has more than {_MOST_BYTES >> 20} MiB; fit a part of it")
         text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise InputError(f"{file}: it is no text in UTF-8; save it as CSV in UTF-8") from None

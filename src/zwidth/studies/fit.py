@@ -93,7 +93,8 @@ class LogSection(Strict):
 def _digest(name: Any) -> str:
     """Of a file's bytes; "" where it cannot be read."""
     try:
-        return hashlib.sha256(find_file(name).read_bytes()).hexdigest() if isinstance(name, str) else ""
+        file = find_file(name) if isinstance(name, str) else None
+        return hashlib.sha256(file.read_bytes()).hexdigest() if file is not None and file.is_file() else ""
     except (OSError, ValueError):
         return ""
 
@@ -192,9 +193,13 @@ class FitStudy(ComputedStudy):
             try:
                 motions.append(section.read(section.time is not None or self.period is None))
             except InputError as error:
-                path, what = locate_refusal(error)
+                # File names and headers may hold anything.
+                text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))
+                path, what = locate_refusal(InputError(text))
                 known = len(path) == 1 and path[0] in LogSection.model_fields
-                yield ("log", k, *(path if known else ("csv",))), (what if known else problem(str(error)))
+                # A single log is written without a list around it.
+                place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
+                yield (*place, *(path if known else ("csv",))), (what if known else problem(text))
         self._motions = tuple(motions)
         if any(motion.rotary for motion in motions) and self.buzz:
             what = "got walls in N/m beside a log of an angle"
@@ -231,9 +236,12 @@ class FitStudy(ComputedStudy):
         answers, notes = [], []
         for each in fits:
             rows = describe_fit(each.fit, each.source, units)
+            told = (*_ANSWERS, "fitted to", "set")
+            if each.fit.status != Status.OK:
+                label, text = rows[0]
+                told, answers = (*told, label), [*answers, f"{label}: {text}"]
             answers.append(", ".join(f"{label} = {text}" for label, text in rows if label in _ANSWERS))
             answers += [f"set {text}" for label, text in rows if label == "set"]
-            told = (*_ANSWERS, "fitted to", "set")
             notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in told]
         notes += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)

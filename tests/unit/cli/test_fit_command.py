@@ -163,4 +163,4 @@ def test_a_figure_needs_a_folder(tmp_path):
 def test_a_missing_file_is_an_input_error():
     result = CliRunner().invoke(cli, ["fit", "nowhere.csv"])
     assert isinstance(result.exception, zwidth.InputError)
-    assert "nowhere.csv: No such file" in str(result.exception)
+    assert "nowhere.csv: no such file" in str(result.exception)
