@@ -22,7 +22,7 @@ _UNITS = {
     "virtual_damping": ("N s/m", "N m s/rad"),
     "frequency": ("Hz",),
 }
-_FITS = ((style.BLUE, style.SKY), (style.GREEN, style.GREEN))
+_FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
 _ROWS = ("position", "residuals", "autocorrelation", "walls")
 
 
@@ -145,7 +145,7 @@ def _draw_onsets(ax: Axes, walls: Table) -> None:
     for name, marker, color in (("stiffness", "o", style.VERMILION), ("frequency", "s", style.BLUE)):
         values = np.asarray(buzzing[f"{name}_residual"])
         ax.plot(damping, values, marker, color=color, markersize=4.5, label=name, zorder=3)
-    ax.axhspan(-2.0, 2.0, color=style.GRAY, alpha=0.22, linewidth=0.0)
+    ax.axhspan(-1.96, 1.96, color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 %")
     ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
     far = max(
         3.0, *(1.2 * float(np.nanmax(np.abs(buzzing[f"{name}_residual"]))) for name in ("stiffness", "frequency"))
@@ -168,9 +168,11 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     """The stable walls: B over K."""
     (every, spring), (high, _) = _column(walls, "stiffness"), _column(boundary, "stiffness_high")
     dampings, damper = _column(boundary, "virtual_damping")
-    to = _Scales(*style.si_unit(float(np.nanmax(every)), spring), *style.si_unit(float(dampings.max()), damper))
+    stiffness, spring = style.si_unit(float(np.nanmax(every)), spring)
+    damping, damper = style.si_unit(float(dampings.max()), damper)
+    to = _Scales(stiffness, spring, damping, damper)
     handles = []
-    for fit, (color, shade) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
+    for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
         own = vars(fit)
         K, low, up = (_column(own, name)[0] * to.stiffness for name in ("stiffness", "stiffness_low", "stiffness_high"))
         B = _column(own, "virtual_damping")[0] * to.damping
@@ -179,13 +181,13 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
-        ax.plot(K[shown], B[shown], color=color, label=f"boundary, {fit.fitted_to}", zorder=3)
-        handles.append(style.line(f"boundary with its 95 % band, {fit.fitted_to}", color=color))
+        ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {fit.fitted_to}", zorder=3)
+        handles.append(style.line(f"boundary with its 95 % band, {fit.fitted_to}", dash, color=color))
     handles += _mark_walls(ax, walls, to)
     ax.set_xlim(0.0, 1.15 * max(float(high.max()), float(np.nanmax(every))) * to.stiffness)
     # Room for the legend.
     highest = float(dampings.max()) * to.damping
-    ax.set_ylim(-0.05 * highest, (1.05 + 0.05 * len(handles)) * highest)
+    ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
     ax.set(xlabel=f"stiffness  $K$  in {to.spring}", ylabel=f"virtual damping  $B$  in {to.damper}")
     ax.legend(handles=handles, loc="upper right")

@@ -236,14 +236,13 @@ class FitStudy(ComputedStudy):
         answers, notes = [], []
         for each in fits:
             rows = describe_fit(each.fit, each.source, units)
-            told = (*_ANSWERS, "fitted to", "set")
-            if each.fit.status != Status.OK:
-                label, text = rows[0]
-                told, answers = (*told, label), [*answers, f"{label}: {text}"]
-            answers.append(", ".join(f"{label} = {text}" for label, text in rows if label in _ANSWERS))
-            answers += [f"set {text}" for label, text in rows if label == "set"]
-            notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in told]
-        notes += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
+            said = dict(rows)
+            trouble = [f"{label}: {text}" for label, text in rows[:1] if each.fit.status != Status.OK]
+            device = ", ".join(f"{label} = {said[label].partition(' (')[0]}" for label in _DEVICE if label in said)
+            answers += [*trouble, f"{device}, fitted to {each.source}", f"K_max = {said['K_max']}"]
+            answers += [f"set {said['set']}"] if "set" in said else []
+            notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in _LABELS]
+        answers += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
         draw = partial(figures.draw_device_fit, **evidence, step=step)
         return Outcome(
@@ -272,7 +271,9 @@ class FitStudy(ComputedStudy):
         return fits
 
 
-_ANSWERS = ("m", "J", "b", "t_d", "K_max")
+# Labels of what a device is, and of all that is told in answers.
+_DEVICE = ("m", "J", "b", "t_d", "friction")
+_LABELS = ("m", "J", "b", "t_d", "K_max", "set", "fitted to")
 
 
 def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
@@ -304,5 +305,7 @@ def _compare(one: DeviceFit, other: DeviceFit) -> str:
     # Exact records would leave nothing to divide by.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
     far = float(apart @ np.linalg.solve(spread + np.diag(floor), apart))
-    words = f"a squared distance of {plain(far, 3)} standard deviations; 95 % of equal devices stay below {_CHANCE}"
+    words = (
+        f"squared, they are {plain(far, 3)} apart in units of their errors; 95 % of equal devices stay below {_CHANCE}"
+    )
     return f"log and buzzing walls agree: {words}" if far <= _CHANCE else f"log and buzzing walls do NOT agree: {words}"

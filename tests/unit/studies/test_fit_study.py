@@ -4,6 +4,7 @@ import csv
 import importlib
 import io
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,15 +24,20 @@ HEARD = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]
 LOG = "version: 1\nname: a\nstudies:\n  - kind: fit\n    name: f\n"
 
 
+def only_study(config) -> Any:
+    (study,) = config.studies
+    return study
+
+
 def study_of(**keys):
     given = {"kind": "fit", "name": "f", **keys}
-    return read_mapping({"version": 1, "name": "a", "studies": [given]}, Config).studies[0]
+    return only_study(read_mapping({"version": 1, "name": "a", "studies": [given]}, Config))
 
 
 @pytest.fixture(scope="module")
 def both():
     """The study of configs/fit.yaml."""
-    return load_config(ROOT / "configs" / "fit.yaml").studies[0].compute(None, True)
+    return only_study(load_config(ROOT / "configs" / "fit.yaml")).compute(None, True)
 
 
 @pytest.fixture
@@ -43,7 +49,7 @@ def script(monkeypatch):
 def test_the_records_of_the_example_are_what_the_script_makes(script):
     assert script.make_log() == script.FILE.read_text(encoding="utf-8")
     assert script.FILE.stat().st_size < 100_000
-    study = load_config(ROOT / "configs" / "fit.yaml").studies[0]
+    study = only_study(load_config(ROOT / "configs" / "fit.yaml"))
     assert [(wall.stiffness, wall.virtual_damping, wall.frequency) for wall in study.buzz] == script.list_walls()
     assert study.noise == script.NOISE
 
@@ -64,7 +70,7 @@ def test_the_intervals_of_the_example_hold_the_true_device(both, script):
     assert both.table["friction_low_N"][0] < script.FRICTION < both.table["friction_high_N"][0]
     assert np.isnan(both.table["friction_N"][1])
     assert both.table["resolution_m"].tolist() == [script.RESOLUTION, 0.0]
-    assert "log and buzzing walls agree" in both.notes[-1]
+    assert "log and buzzing walls agree" in both.answer[-1]
 
 
 def test_the_figure_shows_what_the_tables_hold(both):
@@ -107,7 +113,7 @@ def test_the_scene_can_be_run(both, tmp_path):
     for name in ("log", "buzz"):
         file = tmp_path / f"{name}.yaml"
         file.write_text(both.documents[f"device_{name}_scene.yaml"], encoding="utf-8")
-        assert load_config(file).studies[0].device.mass == both.table["mass_kg"][int(name == "buzz")]
+        assert only_study(load_config(file)).device.mass == both.table["mass_kg"][int(name == "buzz")]
 
 
 def test_walls_alone_are_fitted_as_in_python():
@@ -116,8 +122,9 @@ def test_walls_alone_are_fitted_as_in_python():
     for name, head in (("mass", "mass_kg"), ("delay", "delay_s"), ("stiffness_max", "stiffness_max_N_per_m")):
         assert outcome.table[head].tolist() == [getattr(expected, name)]
     assert outcome.table["mass_error_kg"].tolist() == [expected.errors["mass"]]
-    assert outcome.answer[0].startswith("m = 99.98 g (95 % between")
-    assert outcome.answer[1].startswith("set K = 14.9")
+    assert outcome.answer[0].startswith("m = 99.98 g, b = 10.01 N s/m, t_d = ")
+    assert outcome.answer[1].startswith("K_max = 19.87 kN/m (95 % between ")
+    assert outcome.answer[2].startswith("set K = 14.9")
     assert any("measure next" in note for note in outcome.notes)
     assert len(outcome.figures[""]()) == 2
     assert list(outcome.documents) == ["f_boundary.csv", "f_walls.csv", "f_scene.yaml"]
@@ -134,7 +141,7 @@ def test_records_of_two_devices_do_not_agree(monkeypatch):
     monkeypatch.chdir(ROOT / "configs")
     log = {"csv": "fit_log.csv", "resolution": "0.03 mm"}
     outcome = study_of(log=log, buzz=WALLS, noise=0.02).compute(None, True)
-    assert "log and buzzing walls do NOT agree" in outcome.notes[-1]
+    assert "log and buzzing walls do NOT agree" in outcome.answer[-1]
 
 
 def test_several_logs_and_a_velocity_estimate(tmp_path):
@@ -147,7 +154,7 @@ def test_several_logs_and_a_velocity_estimate(tmp_path):
         "    velocity: {kind: low_pass, cutoff: 100 Hz}\n    max_delay: 5 ms\n",
         encoding="utf-8",
     )
-    study = load_config(file).studies[0]
+    study = only_study(load_config(file))
     assert (study.points, study.extent) == (3000, "2 logs")
     outcome = study.compute(None, True)
     assert outcome.table["fitted_to"].tolist() == ["0.csv and 1.csv"]
@@ -213,3 +220,15 @@ def test_a_period_beside_other_times_is_refused(monkeypatch):
     log = {"csv": "fit_log.csv", "resolution": "0.03 mm", "time": "time [ms]"}
     with pytest.raises(zwidth.InputError, match=r"the log's times are 1\.000 ms apart"):
         study_of(log=log, period="2 ms").compute(None, True)
+
+
+def test_the_doubts_on_the_page_are_those_that_are_told():
+    page = (ROOT / "docs" / "guides" / "my-log.md").read_text(encoding="utf-8")
+    told = [row.split("|")[1].strip() for row in page.partition("|---|---|---|\n")[2].splitlines()]
+    sources = (ROOT / "src" / "zwidth").glob("*/*.py")
+    code = " ".join(path.read_text(encoding="utf-8") for path in sources)
+    # A sentence may be broken over two lines of a text.
+    code = " ".join(code.replace('"', "").split()).replace(" f{", " {")
+    assert len(told) > 5
+    for words in told[1:]:
+        assert words.replace("a mass far", "far") in code, words
