@@ -114,7 +114,8 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
         ax.set(xlabel=f"time  in {second}", ylabel=f"measured less\nmodelled  in {length}", xlim=(0.0, time[-1]))
         if step:
             _put_above(ax, [style.line("half a step of the encoder", style.DASHED, 0.8, style.BLACK)])
-            ax.set_ylim(*style.span(*np.array([-1, 1]) * factor * max(0.62 * step, np.nanmax(np.abs(rest))), 0.12))
+            far = factor * max(0.62 * step, float(np.nanmax(np.abs(rest))))
+            ax.set_ylim(*style.span(-far, far, 0.12))
 
 
 def _draw_correlation(ax: Axes, correlation: Table) -> None:
