@@ -30,11 +30,11 @@ _ROWS = ("position", "residuals", "autocorrelation", "walls")
 def draw_device_fit(
     boundary: Table,
     walls: Table,
+    axes: style.AnyAxes | None = None,
     *,
     motion: Table | None = None,
     correlation: Table | None = None,
     step: float = 0.0,
-    axes: style.AnyAxes | None = None,
 ) -> np.ndarray:
     """Draw what a fit rests on and what follows: motion, residuals, their autocorrelation, and the stable walls.
 
@@ -47,10 +47,10 @@ def draw_device_fit(
             ``fitted_to``.
         walls: columns fitted_to, kind ("stiffest", "set" or "buzzing"), stiffness, its error, virtual_damping,
             frequency; and stiffness_residual and frequency_residual of those that buzzed.
+        axes: Axes of yours, one a panel.
         motion: columns log, time, position, modelled and residual, of a log.
         correlation: columns lag, autocorrelation and band, of a log.
         step: of the encoder, to draw beside the residuals; 0 for none.
-        axes: Axes of yours, one a panel.
     """
     names = [*(_ROWS[:3] if motion is not None and correlation is not None else ())]
     names += ["walls"] if "buzzing" in np.asarray(walls["kind"]) else []
