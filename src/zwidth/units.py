@@ -70,6 +70,10 @@ ANGLE = Dimension(
     {"deg": math.pi / 180, "°": math.pi / 180, **dict.fromkeys(("rev", "turn", "turns"), 2 * math.pi)},
 )
 TORQUE = Dimension({"N m": 0, "mN m": -3, "kN m": 3, "N mm": -3, "mN mm": -6, "N cm": -2}, "50 mN m")
+ANGULAR_STIFFNESS = Dimension(
+    {"N m/rad": 0, "mN m/rad": -3}, "0.5 N m/rad", {"N m/deg": 180 / math.pi, "mN m/deg": 0.18 / math.pi}
+)
+ANGULAR_DAMPING = Dimension({"N m s/rad": 0, "mN m s/rad": -3}, "2 mN m s/rad")
 SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
 FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
 _OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, LENGTH, SPEED)}
@@ -147,6 +151,7 @@ def _canonical(unit: str) -> str:
     # Two characters look like the micro sign; this makes them one.
     unit = unicodedata.normalize("NFKC", unit)
     unit = re.sub(r"\s*/\s*", "/", unit)
+    unit = re.sub(r"N[\s*·⋅.]*m[\s*·⋅.]*(?=s/)", "N m ", unit)
     return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
 
 

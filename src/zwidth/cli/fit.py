@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
@@ -18,9 +18,15 @@ if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
     from zwidth.fitting.words import AxisUnits
 
-_WALL = {"K": "N/m", "B": "N s/m", "f": "Hz"}
 # A letter, "=", and all up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
+
+
+class HeardWall(NamedTuple):
+    """A wall at the onset of buzzing, and whether it is of a rotary axis; None where no unit says."""
+
+    point: tuple[float, float, float]
+    rotary: bool | None
 
 
 class WallType(click.ParamType):
@@ -30,20 +36,37 @@ class WallType(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parse one option."""
-        from zwidth.units import find_dimension, read_quantity
-
-        if isinstance(value, tuple):
+        if isinstance(value, HeardWall):
             return value
         found = dict(_ENTRY.findall(value.replace(",", " ")))
         if _ENTRY.sub("", value.replace(",", " ")).strip() or {"K", "f"} - set(found):
             self.fail(f"got {value!r}; write K, B and f, as 'K=3.2kN/m B=0 f=71Hz'", param, ctx)
-        numbers = {"B": 0.0}
+        numbers, kinds = {"B": 0.0}, set()
         for letter, text in found.items():
             try:
-                numbers[letter] = read_quantity(_as_number(text), find_dimension(_WALL[letter]))[0]
+                numbers[letter], rotary = _read_letter(letter, text)
             except UnusableValueError as error:
                 self.fail(f"{letter}: {error}", param, ctx)
-        return numbers["K"], numbers["B"], numbers["f"]
+            kinds |= set() if rotary is None else {rotary}
+        if len(kinds) > 1:
+            self.fail(f"got {value!r}; N/m goes with N s/m, N m/rad with N m s/rad", param, ctx)
+        return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
+
+
+def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
+    """A number in its SI unit, and whether the unit is of a rotary axis."""
+    from zwidth.units import ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPING, RATE, STIFFNESS, read_quantity
+
+    angular = {"K": ANGULAR_STIFFNESS, "B": ANGULAR_DAMPING}.get(letter)
+    linear = {"K": STIFFNESS, "B": DAMPING, "f": RATE}[letter]
+    number = _as_number(text)
+    try:
+        told = isinstance(number, str) and angular is not None
+        return read_quantity(number, linear)[0], False if told else None
+    except UnusableValueError:
+        if angular is None or not any(unit in text for unit in ("rad", "deg")):
+            raise
+        return read_quantity(number, angular)[0], True
 
 
 class ShareType(click.ParamType):
@@ -107,16 +130,21 @@ def fit(
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if figure is not None and figure.suffix not in (".png", ".svg", ".pdf"):
         raise click.UsageError(f"--figure: got {str(figure)!r}; name a file that ends with .png, .svg or .pdf")
-    units = LINEAR
+    units, points = LINEAR, ()
     if walls:
         for name, value in {**columns, "max-delay": max_delay, "resample": resample or None}.items():
             if value is not None:
                 raise click.UsageError(f"--{name} belongs to a LOG.csv")
         if period is None:
             raise click.UsageError("give --period")
-        from zwidth.fitting.buzz import fit_buzz
+        from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
-        found, source = fit_buzz(walls, period=period, velocity=velocity, noise=noise), f"{len(walls)} buzzing walls"
+        kinds = {wall.rotary for wall in walls} - {None}
+        if len(kinds) > 1:
+            raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
+        units = ROTARY if kinds == {True} else LINEAR
+        points = tuple(BuzzPoint(*wall.point) for wall in walls)
+        found, source = fit_buzz(points, period=period, velocity=velocity, noise=noise), f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
@@ -130,9 +158,9 @@ def fit(
         found = fit_motions(motions, period=period, velocity=velocity, max_delay=max_delay, resample=resample)
         source = " and ".join(log.name for log in logs)
     if figure is not None:
-        _draw(found, source, walls, units, figure)
+        _draw(found, source, points, units, figure)
     if as_json:
-        click.echo(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        click.echo(json.dumps({**found.as_dict(), "units": units._asdict()}, indent=2, allow_nan=False))
         return
     if as_yaml:
         click.echo("\n".join(write_scene(found, source, units)))
@@ -143,13 +171,12 @@ def fit(
         click.echo(row("wrote", str(figure)))
 
 
-def _draw(found: DeviceFit, source: str, walls: tuple[Any, ...], units: AxisUnits, file: Path) -> None:
+def _draw(found: DeviceFit, source: str, points: tuple[Any, ...], units: AxisUnits, file: Path) -> None:
     from zwidth import figures
-    from zwidth.fitting.buzz import BuzzPoint
     from zwidth.fitting.evidence import gather_evidence
 
     if not file.parent.is_dir():
         raise InputError(f"--figure: there is no folder {file.parent}; make it first")
-    evidence = gather_evidence(found, source, tuple(BuzzPoint(*wall) for wall in walls), units)
+    evidence = gather_evidence(found, source, points, units)
     drawn = figures.draw_device_fit(**evidence, step=found.resolution)
     figures.save(drawn, file.with_suffix(""), (file.suffix[1:],))

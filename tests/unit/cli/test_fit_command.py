@@ -78,6 +78,9 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, 
         (["--buzz", "K=1 B=2"], "write K, B and f"),
         (["--buzz", "K=1 B=2 f=3 g=4"], "got"),
         (["--buzz", "K=1kg f=3"], "K: got '1kg'"),
+        (["--buzz", "K=1 N/m B=2 N m s/rad f=3"], "N/m goes with N s/m"),
+        (["--buzz", "K=1 N/m f=3", "--buzz", "K=1Nm/rad f=3", "--period", "1 ms"], "fit them apart"),
+        (["--buzz", "K=1 furlong/rad f=3", "--period", "1 ms"], "the units allowed are N m/rad"),
         ([*WALLS, "--period", "1 ms", "--noise", "much"], "write a share"),
         (["LOG", "--time", "t", "--period", "1 ms"], "give one of --time and --period"),
         (["LOG", "--figure", "fit.txt"], "ends with .png"),
@@ -144,6 +147,18 @@ def test_a_rotary_axis_is_the_linear_one_in_other_units(tmp_path):
     assert "kg stands for kg m^2" in scene
     result = CliRunner().invoke(cli, ["fit", str(file), "--resolution", "0.03mm"])
     assert "a length belongs to a force" in str(result.exception)
+
+
+def test_walls_of_a_rotary_axis():
+    walls = ["--buzz", "K=6.846 N m/rad B=0 f=40.1Hz", "--buzz", "K=276.809mNm/deg B=18.7 mNms/rad f=68.6"]
+    options = ["--period", "1 ms", "--noise", "2%"]
+    found = json.loads(run(*walls, *options, "--json"))
+    expected = zwidth.fit_buzz([(6.846, 0.0, 40.1), (0.276809 * 180 / np.pi, 0.0187, 68.6)], period=1e-3, noise=0.02)
+    assert found["mass"] == pytest.approx(expected.mass, rel=1e-12)
+    assert found["units"]["stiffness"] == "N m/rad"
+    words = run(*walls, *options)
+    assert re.search(r"^J +1000 g cm\^2", words, re.MULTILINE)
+    assert "measure next          K at B = 80.4 mN m s/rad, near 7.55 N m/rad" in words
 
 
 def test_what_is_not_ok_is_told_first():
