@@ -185,7 +185,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {fit.fitted_to}", zorder=3)
         handles.append(style.line(f"boundary with its 95 % band, {fit.fitted_to}", dash, color=color))
     handles += _mark_walls(ax, walls, to)
-    ax.set_xlim(0.0, 1.15 * max(float(high.max()), float(np.nanmax(every))) * to.stiffness)
+    ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to.stiffness)
     # Room for the legend.
     highest = float(dampings.max()) * to.damping
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)

@@ -72,7 +72,7 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
     """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %.
 
     The band is pointwise: the quantiles of devices drawn from the covariance, with the reach of the fit's intervals,
-    by a fixed seed. A damping at which a device has no stable wall counts as 0.
+    by a fixed seed; NaN where the covariance is not known. A damping at which a device has no stable wall counts as 0.
     """
     outlines = fit.scene.stable_region()
     if not outlines:
@@ -80,7 +80,9 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
     end = max(float(each.virtual_damping.max()) for each in outlines)
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
     own = np.array([[fit.mass, fit.damping, fit.delay]])
-    low, high = np.quantile(_limit_rows(fit, _draw_devices(fit), damping), [0.025, 0.975], axis=0)
+    low = high = np.full(damping.size, np.nan)
+    if np.all(np.isfinite(fit.covariance)):
+        low, high = np.quantile(_limit_rows(fit, _draw_devices(fit), damping), [0.025, 0.975], axis=0)
     return {
         header("virtual_damping", units.damping): damping,
         header("stiffness", units.stiffness): _limit_rows(fit, own, damping)[0],

@@ -62,9 +62,9 @@ class WallChoice(NamedTuple):
 
 
 def choose_wall(fit: DeviceFit) -> WallChoice | None:
-    """The wall that the study ``recommend`` sets, or a softer one where K_max is not known as well; None for none."""
+    """The wall that the study ``recommend`` sets, softer where K_max is not known so well; None where the fit does not hold."""
     top = fit.scene.max_stiffness()
-    if top.status != Status.OK:
+    if fit.status != Status.OK or top.status != Status.OK:
         return None
     low = fit.intervals["stiffness_max"].low
     share = RECOMMENDED_SHARE * float(top.stiffness)

@@ -238,7 +238,8 @@ class FitStudy(ComputedStudy):
             rows = describe_fit(each.fit, each.source, units)
             said = dict(rows)
             trouble = [f"{label}: {text}" for label, text in rows[:1] if each.fit.status != Status.OK]
-            device = ", ".join(f"{label} = {said[label].partition(' (')[0]}" for label in _DEVICE if label in said)
+            labels = [label for label in _DEVICE if label in said and (label != "friction" or each.fit.friction)]
+            device = ", ".join(f"{label} = {said[label].partition(' (')[0]}" for label in labels)
             answers += [*trouble, f"{device}, fitted to {each.source}", f"K_max = {said['K_max']}"]
             answers += [f"set {said['set']}"] if "set" in said else []
             notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in _LABELS]
