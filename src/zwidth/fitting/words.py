@@ -62,7 +62,7 @@ class WallChoice(NamedTuple):
 
 
 def choose_wall(fit: DeviceFit) -> WallChoice | None:
-    """The wall that the study ``recommend`` sets, softer where K_max is not known so well; None where the fit does not hold."""
+    """What the study ``recommend`` sets, softer where K_max is not known so well; None of a fit that does not hold."""
     top = fit.scene.max_stiffness()
     if fit.status != Status.OK or top.status != Status.OK:
         return None

@@ -107,7 +107,8 @@ def test_a_band_that_is_not_known_is_not_drawn(heard):
     traced = trace_boundary(unknown)
     assert np.isnan(traced[LOW]).all()
     np.testing.assert_array_equal(traced[K], trace_boundary(heard)[K])
-    panels = figures.draw_device_fit(**gather_evidence(unknown, "walls"))
+    tables = gather_evidence(unknown, "walls")
+    panels = figures.draw_device_fit(tables["boundary"], tables["walls"])
     assert len(panels) == 1
 
 
