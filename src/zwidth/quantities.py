@@ -43,6 +43,8 @@ FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
 PERIODS = Range(1e-12, 1e9)
 RATES = Range(1e-9, 1e12)
 MAX_DELAY_PERIODS = 10_000.0
+# Stiffness of a recommended wall over that of the stiffest stable one.
+RECOMMENDED_SHARE = 0.75
 
 
 @dataclass(frozen=True)

@@ -27,15 +27,32 @@ _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?
 
 
 class Dimension(NamedTuple):
-    """The units of one kind of quantity, each with its power of ten over the base unit, which comes first."""
+    """The units of one kind of quantity, the base unit first, each with its power of ten over that.
 
-    units: dict[str, int]
+    Units that are no power of ten stand apart, with their factors.
+    """
+
+    powers: dict[str, int]
     example: str
+    factors: dict[str, float] = {}  # noqa: RUF012  (nobody writes into it)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their names."""
+        return (*self.powers, *self.factors)
 
     @property
     def base(self) -> str:
         """The SI unit that a number without a unit is in."""
-        return next(iter(self.units))
+        return next(iter(self.powers))
+
+    def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
+        """A number of a unit in the base unit; None for another dimension's unit."""
+        own = next((name for name in self.units if _canonical(name) == _canonical(unit)), None)
+        if own in self.factors:
+            return float(f"{mantissa}e{exponent}") * self.factors[own]
+        # Shifting the decimal exponent rounds once: 0.3 ms is exactly the float64 of 0.0003.
+        return None if own is None else float(f"{mantissa}e{exponent + self.powers[own]}")
 
 
 MASS = Dimension({"kg": 0, "g": -3, "mg": -6}, "0.1 kg")
@@ -47,6 +64,16 @@ DAMPING = Dimension(
 STIFFNESS = Dimension({"N/m": 0, "mN/m": -3, "kN/m": 3, "MN/m": 6, "N/mm": 3, "kN/mm": 6, "N/cm": 2}, "10 kN/m")
 FORCE = Dimension({"N": 0, "mN": -3, "kN": 3}, "0.2 N")
 LENGTH = Dimension({"m": 0, "cm": -2, "mm": -3, "um": -6, "µm": -6, "nm": -9}, "10 um")
+ANGLE = Dimension(
+    {"rad": 0, "mrad": -3},
+    "0.1 deg",
+    {"deg": math.pi / 180, "°": math.pi / 180, **dict.fromkeys(("rev", "turn", "turns"), 2 * math.pi)},
+)
+TORQUE = Dimension({"N m": 0, "mN m": -3, "kN m": 3, "N mm": -3, "mN mm": -6, "N cm": -2}, "50 mN m")
+ANGULAR_STIFFNESS = Dimension(
+    {"N m/rad": 0, "mN m/rad": -3}, "0.5 N m/rad", {"N m/deg": 180 / math.pi, "mN m/deg": 0.18 / math.pi}
+)
+ANGULAR_DAMPING = Dimension({"N m s/rad": 0, "mN m s/rad": -3}, "2 mN m s/rad")
 SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
 FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
 _OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, LENGTH, SPEED)}
@@ -124,12 +151,13 @@ def _canonical(unit: str) -> str:
     # Two characters look like the micro sign; this makes them one.
     unit = unicodedata.normalize("NFKC", unit)
     unit = re.sub(r"\s*/\s*", "/", unit)
-    return re.sub(r"N[\s*·⋅.]*s", "N s", unit)
+    unit = re.sub(r"N[\s*·⋅.]*m[\s*·⋅.]*(?=s/)", "N m ", unit)
+    return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
 
 
 def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, str]:
     """The number in the base unit and that unit, or the number and "periods"."""
-    units = (*dimension.units, *PERIOD_WORDS) if periods else tuple(dimension.units)
+    units = (*dimension.units, *PERIOD_WORDS) if periods else dimension.units
     names = ", ".join(units)
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
@@ -147,14 +175,12 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     mantissa, exponent, unit = match.groups()
     if periods and unit in PERIOD_WORDS:
         return float(f"{mantissa}e{exponent or 0}"), "periods"
-    powers = {_canonical(name): power for name, power in dimension.units.items()}
-    power = powers.get(_canonical(unit))
-    if power is None:
+    amount = dimension.in_base(mantissa, int(exponent or 0), unit)
+    if amount is None:
         raise UnusableValueError(
             f"got {describe(value)}", f"the units allowed are {names}", suggestion(unit, units, remedy)
         )
-    # Shifting the decimal exponent rounds once: 0.3 ms is exactly the float64 of 0.0003.
-    return float(f"{mantissa}e{int(exponent or 0) + power}"), dimension.base
+    return amount, dimension.base
 
 
 def read_quantity(

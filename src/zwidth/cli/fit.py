@@ -1,36 +1,32 @@
-"""`zwidth fit`: a device's mass, damping and delay from buzzing walls or from a log."""
+"""`zwidth fit`: a device's mass, damping and delay from buzzing walls or from logs."""
 
 from __future__ import annotations
 
 import json
 import re
-from dataclasses import fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
 from zwidth.cli.options import QuantityType, json_option, velocity_options
 from zwidth.cli.words import row
 from zwidth.errors import InputError, UnusableValueError
-from zwidth.formatting import plain, suggestion, with_unit
 from zwidth.quantities import POSITIVE
 
 if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
+    from zwidth.fitting.words import AxisUnits
 
-_UNITS = {"mass": "kg", "damping": "N s/m", "delay": "s", "stiffness_max": "N/m"}
-_SYMBOLS = {"mass": "m", "damping": "b", "delay": "t_d", "stiffness_max": "K_max"}
-_WALL = {"K": "N/m", "B": "N s/m", "f": "Hz"}
 # A letter, "=", and all up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
-_COLUMNS = {"time": "s", "position": "m", "force": "N"}
-_KINDS = {
-    "BackwardDifference": "backward_difference",
-    "WindowedDifference": "windowed_difference",
-    "LowPass": "low_pass",
-    "Butterworth": "butterworth",
-}
+
+
+class HeardWall(NamedTuple):
+    """A wall at the onset of buzzing, and whether it is of a rotary axis; None where no unit says."""
+
+    point: tuple[float, float, float]
+    rotary: bool | None
 
 
 class WallType(click.ParamType):
@@ -40,20 +36,37 @@ class WallType(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parse one option."""
-        from zwidth.units import find_dimension, read_quantity
-
-        if isinstance(value, tuple):
+        if isinstance(value, HeardWall):
             return value
         found = dict(_ENTRY.findall(value.replace(",", " ")))
         if _ENTRY.sub("", value.replace(",", " ")).strip() or {"K", "f"} - set(found):
             self.fail(f"got {value!r}; write K, B and f, as 'K=3.2kN/m B=0 f=71Hz'", param, ctx)
-        numbers = {"B": 0.0}
+        numbers, kinds = {"B": 0.0}, set()
         for letter, text in found.items():
             try:
-                numbers[letter] = read_quantity(_as_number(text), find_dimension(_WALL[letter]))[0]
+                numbers[letter], rotary = _read_letter(letter, text)
             except UnusableValueError as error:
                 self.fail(f"{letter}: {error}", param, ctx)
-        return numbers["K"], numbers["B"], numbers["f"]
+            kinds |= set() if rotary is None else {rotary}
+        if len(kinds) > 1:
+            self.fail(f"got {value!r}; N/m goes with N s/m, N m/rad with N m s/rad", param, ctx)
+        return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
+
+
+def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
+    """A number in its SI unit, and whether the unit is of a rotary axis."""
+    from zwidth.units import ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPING, RATE, STIFFNESS, read_quantity
+
+    angular = {"K": ANGULAR_STIFFNESS, "B": ANGULAR_DAMPING}.get(letter)
+    linear = {"K": STIFFNESS, "B": DAMPING, "f": RATE}[letter]
+    number = _as_number(text)
+    try:
+        told = isinstance(number, str) and angular is not None
+        return read_quantity(number, linear)[0], False if told else None
+    except UnusableValueError:
+        if angular is None or not any(unit in text for unit in ("rad", "deg")):
+            raise
+        return read_quantity(number, angular)[0], True
 
 
 class ShareType(click.ParamType):
@@ -78,149 +91,92 @@ def _as_number(text: str) -> float | str:
 
 
 @click.command()
-@click.argument("log", metavar="[LOG.csv]", required=False, type=click.Path(path_type=Path))
+@click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--buzz", "walls", type=WallType(), multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
-@click.option("--period", type=QuantityType("s", POSITIVE), help="T, in s; of a log in place of --time.")
+@click.option("--period", type=QuantityType("s", POSITIVE), help="T, in s; of logs in place of --time.")
 @click.option("--noise", type=ShareType(), help="Relative noise of K and f of buzzing walls, as 2%.")
-@click.option("--time", help="Column of the time in a log; COLUMN:ms where it is not in s.")
-@click.option("--position", help="Column of the position; COLUMN:mm where it is not in m.")
-@click.option("--force", help="Column of the commanded force; COLUMN:mN where it is not in N.")
+@click.option("--time", help="Column of the time: its header, or HEADER:ms. Found by its name where left out.")
+@click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts, :deg.")
+@click.option("--force", help="Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.")
+@click.option("--resolution", metavar="QUANTITY", help="One count of the encoder, as 0.03mm or 0.09deg.")
 @click.option("--max-delay", type=QuantityType("s", POSITIVE), help="Longest delay looked for in a log, in s.")
+@click.option("--resample", is_flag=True, help="Make uneven times of a log even, by interpolation.")
 @velocity_options
+@click.option("--figure", metavar="FILE.png", type=click.Path(path_type=Path), help="Draw what the fit rests on.")
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run`.")
 @json_option
 def fit(
-    log: Path | None,
+    logs: tuple[Path, ...],
     walls: tuple[Any, ...],
     period: float | None,
     noise: float | None,
-    time: str | None,
-    position: str | None,
-    force: str | None,
     max_delay: float | None,
+    resample: bool,
     velocity: Any,
+    figure: Path | None,
     as_yaml: bool,
     as_json: bool,
+    **columns: str | None,
 ) -> None:
     """Find a device's mass, damping and delay.
 
     With --buzz: from walls at which it began to buzz as K was raised, at two dampings or more, and the frequencies
-    heard. With LOG.csv: from its free motion under a force that a computer commanded.
+    heard. With LOG.csv: from its free motion under a force that a computer commanded, friction included; several logs
+    are of one device and have the same columns. Units stand in headers, as 'encoder [counts]', or behind a colon.
     """
-    if (log is None) == (not walls):
+    from zwidth.fitting.words import LINEAR, ROTARY, describe_fit, write_scene
+
+    if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
-    columns = {"time": time, "position": position, "force": force}
-    if log is None:
-        for name, value in (*columns.items(), ("max-delay", max_delay)):
+    if figure is not None and figure.suffix not in (".png", ".svg", ".pdf"):
+        raise click.UsageError(f"--figure: got {str(figure)!r}; name a file that ends with .png, .svg or .pdf")
+    units, points = LINEAR, ()
+    if walls:
+        for name, value in {**columns, "max-delay": max_delay, "resample": resample or None}.items():
             if value is not None:
                 raise click.UsageError(f"--{name} belongs to a LOG.csv")
         if period is None:
             raise click.UsageError("give --period")
-        from zwidth.fitting.buzz import fit_buzz
+        from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
-        found, source = fit_buzz(walls, period=period, velocity=velocity, noise=noise), f"{len(walls)} buzzing walls"
+        kinds = {wall.rotary for wall in walls} - {None}
+        if len(kinds) > 1:
+            raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
+        units = ROTARY if kinds == {True} else LINEAR
+        points = tuple(BuzzPoint(*wall.point) for wall in walls)
+        found, source = fit_buzz(points, period=period, velocity=velocity, noise=noise), f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
-        if position is None or force is None or (time is None) == (period is None):
-            raise click.UsageError("give --position, --force, and one of --time and --period")
-        from zwidth.fitting.log import fit_log
+        if columns["time"] is not None and period is not None:
+            raise click.UsageError("give one of --time and --period")
+        from zwidth.fitting.columns import fit_motions, read_log
 
-        read = _read_columns(log, {name: text for name, text in columns.items() if text is not None})
-        when = period if time is None else read["time"]
-        found = fit_log(when, read["position"], read["force"], velocity=velocity, max_delay=max_delay)
-        source = log.name
+        step = columns.pop("resolution")
+        motions = [read_log(log, columns, resolution=step, timed=period is None) for log in logs]
+        units = ROTARY if motions[0].rotary else LINEAR
+        found = fit_motions(motions, period=period, velocity=velocity, max_delay=max_delay, resample=resample)
+        source = " and ".join(log.name for log in logs)
+    if figure is not None:
+        _draw(found, source, points, units, figure)
     if as_json:
-        click.echo(json.dumps(found.as_dict(), indent=2, allow_nan=False))
+        click.echo(json.dumps({**found.as_dict(), "units": units._asdict()}, indent=2, allow_nan=False))
         return
-    for line in _configuration(found, source) if as_yaml else _lines(found, source):
-        click.echo(line)
+    if as_yaml:
+        click.echo("\n".join(write_scene(found, source, units)))
+        return
+    for label, text in describe_fit(found, source, units):
+        click.echo(row(label, text))
+    if figure is not None:
+        click.echo(row("wrote", str(figure)))
 
 
-def _read_columns(file: Path, columns: dict[str, str]) -> dict[str, list[float]]:
-    """Columns of a CSV file by name, in SI units."""
-    import csv
+def _draw(found: DeviceFit, source: str, points: tuple[Any, ...], units: AxisUnits, file: Path) -> None:
+    from zwidth import figures
+    from zwidth.fitting.evidence import gather_evidence
 
-    from zwidth.units import FORCE, LENGTH, TIME
-
-    try:
-        with open(file, encoding="utf-8-sig", newline="") as stream:
-            rows = list(csv.reader(stream))
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: is no text; give a CSV file") from None
-    heads = [name.strip() for name in rows[0]] if rows else []
-    read: dict[str, list[float]] = {}
-    for name, text in columns.items():
-        column, _, unit = (text, "", "") if text in heads else text.rpartition(":")
-        if column not in heads:
-            hint = suggestion(column, heads, f"it has {', '.join(heads)}" if heads else "it is empty")
-            raise InputError(f"--{name}: {file} has no column {column or text!r}; {hint}")
-        powers = {"time": TIME, "position": LENGTH, "force": FORCE}[name].units
-        unit = unit or _COLUMNS[name]
-        if unit not in powers:
-            raise InputError(f"--{name}: got the unit {unit!r}; allowed are {', '.join(powers)}")
-        at, read[name] = heads.index(column), []
-        for number, cells in enumerate(rows[1:], start=2):
-            if not cells:
-                continue
-            try:
-                read[name].append(float(cells[at]) * 10.0 ** powers[unit])
-            except (ValueError, IndexError):
-                got = repr(cells[at]) if at < len(cells) else "nothing"
-                raise InputError(f"{file}:{number}: got {got} under {column}; a number is needed") from None
-    return read
-
-
-def _amount(name: str, value: float) -> str:
-    return with_unit(value * 1e3, "g") if name == "mass" else with_unit(value, _UNITS[name])
-
-
-def _between(found: DeviceFit, name: str) -> str:
-    bar = found.intervals[name]
-    return f"95 % between {_amount(name, bar.low)} and {_amount(name, bar.high)}"
-
-
-def _lines(found: DeviceFit, source: str) -> list[str]:
-    """For people."""
-    from zwidth.status import Status
-
-    lines = [row("fitted to", source)]
-    for name, symbol in _SYMBOLS.items():
-        lines.append(row(symbol, f"{_amount(name, getattr(found, name))} ({_between(found, name)})"))
-    if isinstance(found.noise, tuple):
-        lines.append(row("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in found.noise)))
-    else:
-        lines.append(row("noise of the position", with_unit(found.noise, "m", 3)))
-    if found.offset:
-        lines.append(row("constant force", with_unit(found.offset, "N", 3)))
-    lines += [row("doubt", doubt) for doubt in found.doubts]
-    if found.status == Status.NOT_CONVERGED:
-        lines.append(row("doubt", Status.NOT_CONVERGED.message))
-    if found.next is not None:
-        step = found.next
-        lines.append(
-            row(
-                "measure next",
-                f"K at B = {with_unit(step.virtual_damping, 'N s/m', 3)}, near {with_unit(step.stiffness, 'N/m', 3)} "
-                f"and {with_unit(step.frequency, 'Hz', 3)}: K_max's standard error falls from "
-                f"{with_unit(found.stiffness_error, 'N/m', 2)} to {with_unit(step.error_afterwards, 'N/m', 2)}",
-            )
-        )
-    return lines
-
-
-def _configuration(found: DeviceFit, source: str) -> list[str]:
-    """A configuration whose every number says where it is from."""
-    name = "fitted_device"
-    lines = [f"# Fitted to {source}: {_between(found, 'stiffness_max')} for K_max."]
-    lines += [f"# Doubt: {doubt}" for doubt in found.doubts]
-    lines += ["version: 1", f"name: {name}", "scene:"]
-    values = {key: f"{getattr(found, key)!r} {_UNITS[key]}" for key in ("mass", "damping", "delay")}
-    lines += [f"  {key}: {text} # fitted, {_between(found, key)}" for key, text in values.items()]
-    lines.append(f"  period: {found.period!r} s # as given")
-    kind = _KINDS.get(type(found.velocity).__name__)
-    if kind not in (None, "backward_difference"):
-        given = {part.name: getattr(found.velocity, part.name) for part in fields(found.velocity)}
-        inside = ", ".join(f"{key}: {value}" for key, value in given.items() if value is not None)
-        lines.append(f"  velocity: {{kind: {kind}, {inside}}} # as given")
-    return [*lines, "studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
+    if not file.parent.is_dir():
+        raise InputError(f"--figure: there is no folder {file.parent}; make it first")
+    evidence = gather_evidence(found, source, points, units)
+    drawn = figures.draw_device_fit(**evidence, step=found.resolution)
+    figures.save(drawn, file.with_suffix(""), (file.suffix[1:],))

@@ -44,6 +44,11 @@ def files_relative_to(folder: Path) -> Iterator[None]:
         _folder.reset(token)
 
 
+def find_file(name: str) -> Path:
+    """A file that the configuration being read names."""
+    return _folder.get() / name
+
+
 @dataclass(frozen=True)
 class DeviceTable:
     """Rows of parameters."""
@@ -153,7 +158,7 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
 
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
     """The lines of a CSV file that hold something, with their numbers; the first one is the header."""
-    path = _folder.get() / name
+    path = find_file(name)
     try:
         if not path.is_file():
             raise problem(f"no such file: {printable(str(path))}", "names are relative to this file", "check the path")

@@ -3,6 +3,7 @@
 from .boundary import draw_boundary as draw_boundary
 from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines
+from .device_fit import draw_device_fit as draw_device_fit
 from .filters import draw_filter_noise as draw_filter_noise
 from .filters import draw_filters as draw_filters
 from .limit_cycle import draw_limit_cycle_curves as draw_limit_cycle_curves

@@ -33,6 +33,7 @@ _METHODS = {
     "design": "The stiffest wall, solved for the parameter to 1e-11.",
     "sweep": "Closed forms in float64; the same bits whatever the chunks and workers.",
     "simulate": "Matrix exponentials between events, instants of friction to the last bit; rounding alone.",
+    "fit": "Least squares with exact derivatives; the band of the boundary by 200 devices drawn from the covariance.",
     "limit_cycle": "Simulations, exact between samples, each judged by the end of what was simulated.",
 }
 

@@ -29,6 +29,7 @@ from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.compare import CompareStudy
 from zwidth.studies.design import DesignStudy
 from zwidth.studies.filters import FiltersStudy
+from zwidth.studies.fit import FitStudy
 from zwidth.studies.limit_cycle import LimitCycleStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
@@ -70,6 +71,7 @@ for _model in (
     DesignStudy,
     SimulateStudy,
     LimitCycleStudy,
+    FitStudy,
     SweepStudy,
 ):
     register(_model)

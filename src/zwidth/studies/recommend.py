@@ -16,6 +16,7 @@ from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.formatting import plain, with_unit
 from zwidth.parts.wall import VirtualWall
+from zwidth.quantities import RECOMMENDED_SHARE
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, add_si_columns, si_scales, stack
@@ -37,7 +38,7 @@ class RecommendStudy(ResponseStudy):
     device: PhysicalDevice
     """Device in SI units; the scene's where left out."""
 
-    stiffness_fraction: Fraction = 0.75
+    stiffness_fraction: Fraction = RECOMMENDED_SHARE
     """Stiffness of the recommended wall as a share of the maximum."""
 
     @classmethod

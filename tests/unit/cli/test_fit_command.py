@@ -1,6 +1,8 @@
 """`zwidth fit`: walls and logs as a shell gives them, and what it prints."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ import zwidth
 from zwidth.cli.commands import cli
 from zwidth.studies.document import load_config
 
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 WALLS = ["--buzz", "K=6.846kN/m B=0 f=40.1Hz", "--buzz", "K = 15.86 kN/m, B = 18.7, f = 68.6"]
 POINTS = [(6846.0, 0.0, 40.1), (15860.0, 18.7, 68.6)]
 
@@ -50,6 +53,8 @@ def test_a_log_in_millimeters_and_milliseconds(log):
     found = json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--force", "f", "--json"))
     np.testing.assert_allclose([found["mass"], found["damping"]], [0.1, 2.0], rtol=1e-6)
     assert found["delay"] == pytest.approx(0.0, abs=1e-9)
+    # Nothing but the name says which column the force is, and which are the others.
+    assert json.loads(run(log, "--time", "t:ms", "--position", "x:mm", "--json")) == found
     assert "fitted to             log.csv" in run(log, "--period", "1 ms", "--position", "x:mm", "--force", "f")
 
 
@@ -73,8 +78,14 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, 
         (["--buzz", "K=1 B=2"], "write K, B and f"),
         (["--buzz", "K=1 B=2 f=3 g=4"], "got"),
         (["--buzz", "K=1kg f=3"], "K: got '1kg'"),
+        (["--buzz", "K=1 N/m B=2 N m s/rad f=3"], "N/m goes with N s/m"),
+        (["--buzz", "K=1 N/m f=3", "--buzz", "K=1Nm/rad f=3", "--period", "1 ms"], "fit them apart"),
+        (["--buzz", "K=1 furlong/rad f=3", "--period", "1 ms"], "the units allowed are N m/rad"),
         ([*WALLS, "--period", "1 ms", "--noise", "much"], "write a share"),
-        (["LOG", "--position", "x"], "give --position, --force"),
+        (["LOG", "--time", "t", "--period", "1 ms"], "give one of --time and --period"),
+        (["LOG", "--figure", "fit.txt"], "ends with .png"),
+        ([*WALLS, "--period", "1 ms", "--resolution", "1mm"], "--resolution belongs to a LOG.csv"),
+        ([*WALLS, "--period", "1 ms", "--resample"], "--resample belongs to a LOG.csv"),
         (["LOG", "--noise", "1%"], "--noise belongs to --buzz"),
     ],
 )
@@ -89,7 +100,7 @@ def test_wrong_use_is_told(arguments, words, log):
     [
         (["--time", "t", "--position", "y", "--force", "f"], "has no column 'y'"),
         (["--time", "t", "--position", "x:furlong", "--force", "f"], "got the unit 'furlong'"),
-        (["--time", "t", "--position", "word", "--force", "f"], "bad.csv:3: got 'no' under word"),
+        (["--time", "t", "--position", "word", "--force", "f"], "bad.csv:3: got 'no' under 'word'; a number is needed"),
     ],
 )
 def test_columns_that_cannot_be_read_are_named(columns, words, tmp_path):
@@ -98,3 +109,74 @@ def test_columns_that_cannot_be_read_are_named(columns, words, tmp_path):
     result = CliRunner().invoke(cli, ["fit", str(file), *columns])
     assert isinstance(result.exception, zwidth.InputError)
     assert words in str(result.exception)
+
+
+def test_several_logs_in_counts_and_a_figure(tmp_path):
+    text = (CONFIGS / "fit_log.csv").read_text("utf-8")
+    head, lines = text.splitlines()[2], text.splitlines()[3:]
+    files = []
+    for k, part in enumerate((lines[:1500], lines[1500:])):
+        files.append(tmp_path / f"part{k}.csv")
+        files[-1].write_text("\n".join([head, *part]), encoding="utf-8")
+    words = run(*map(str, files), "--resolution", "0.03mm", "--figure", str(tmp_path / "fit.png"))
+    assert words.startswith("fitted to             part0.csv and part1.csv\n")
+    assert "kept, without it Schwarz's criterion is" in words
+    assert "constant force        left out" in words
+    assert (tmp_path / "fit.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(run(*map(str, files), "--position", "encoder [counts]", "--resolution", "0.03 mm", "--json"))
+    for name, true in (("mass", 0.075), ("damping", 0.6), ("delay", 2.3e-3), ("friction", 0.08)):
+        low, high = found["intervals"][name]
+        assert low < true < high
+        assert high - low < 0.02 * true
+
+
+def test_a_rotary_axis_is_the_linear_one_in_other_units(tmp_path):
+    text = (CONFIGS / "fit_log.csv").read_text("utf-8").replace("force [N]", "torque [Nm]")
+    file = tmp_path / "rotary.csv"
+    file.write_text(text, encoding="utf-8")
+    linear = json.loads(run(str(CONFIGS / "fit_log.csv"), "--resolution", "0.03mm", "--json"))
+    turned = json.loads(run(str(file), "--resolution", "0.03mrad", "--json"))
+    for name in ("mass", "damping", "delay", "friction", "stiffness_max"):
+        assert turned[name] == pytest.approx(linear[name], rel=1e-9)
+    words = run(str(file), "--resolution", "0.03mrad")
+    # 1 kg m^2 is 10^7 g cm^2.
+    assert re.search(r"^J +7500\d\d\.\d* g cm\^2 \(95 % between", words, re.MULTILINE)
+    assert "mN m s/rad" in words
+    assert "kN m/rad" in words
+    scene = run(str(file), "--resolution", "0.03mrad", "--yaml")
+    assert "kg stands for kg m^2" in scene
+    result = CliRunner().invoke(cli, ["fit", str(file), "--resolution", "0.03mm"])
+    assert "a length belongs to a force" in str(result.exception)
+
+
+def test_walls_of_a_rotary_axis():
+    walls = ["--buzz", "K=6.846 N m/rad B=0 f=40.1Hz", "--buzz", "K=276.809mNm/deg B=18.7 mNms/rad f=68.6"]
+    options = ["--period", "1 ms", "--noise", "2%"]
+    found = json.loads(run(*walls, *options, "--json"))
+    expected = zwidth.fit_buzz([(6.846, 0.0, 40.1), (0.276809 * 180 / np.pi, 0.0187, 68.6)], period=1e-3, noise=0.02)
+    assert found["mass"] == pytest.approx(expected.mass, rel=1e-12)
+    assert found["units"]["stiffness"] == "N m/rad"
+    words = run(*walls, *options)
+    assert re.search(r"^J +1000 g cm\^2", words, re.MULTILINE)
+    assert "measure next          K at B = 80.4 mN m s/rad, near 7.55 N m/rad" in words
+
+
+def test_what_is_not_ok_is_told_first():
+    arguments = [str(CONFIGS / "fit_log.csv"), "--resolution", "0.03mm", "--max-delay", "1 ms"]
+    first, second, *others = run(*arguments).splitlines()
+    assert not any(line.startswith("set ") for line in others)
+    assert first == "UNREACHABLE           do not rely on these numbers: the delay ends the range looked in"
+    assert second == "fitted to             fit_log.csv"
+    assert "# UNREACHABLE: do not rely on these numbers" in run(*arguments, "--yaml")
+
+
+def test_a_figure_needs_a_folder(tmp_path):
+    arguments = [*WALLS, "--period", "1 ms", "--figure", str(tmp_path / "nowhere" / "fit.png")]
+    result = CliRunner().invoke(cli, ["fit", *arguments])
+    assert "there is no folder" in str(result.exception)
+
+
+def test_a_missing_file_is_an_input_error():
+    result = CliRunner().invoke(cli, ["fit", "nowhere.csv"])
+    assert isinstance(result.exception, zwidth.InputError)
+    assert "nowhere.csv: no such file" in str(result.exception)

@@ -1,10 +1,23 @@
 """Quantities: every spelling of a unit, exact conversion, and spans in periods."""
 
+import math
+
 import pytest
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.units import quantity
-from zwidth.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Span
+from zwidth.units import (
+    ANGLE,
+    ANGULAR_DAMPING,
+    ANGULAR_STIFFNESS,
+    DAMPING,
+    MASS,
+    RATE,
+    STIFFNESS,
+    TIME,
+    TORQUE,
+    Span,
+)
 
 
 @pytest.mark.parametrize(
@@ -24,6 +37,17 @@ from zwidth.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Span
         (DAMPING, "3 mN s/mm", 3.0),
         (DAMPING, "3 mNs/m", 0.003),
         (DAMPING, "3 N s/mm", 3000.0),
+        (ANGLE, "3 mrad", 0.003),
+        (ANGLE, "90 deg", math.pi / 2),
+        (ANGLE, "-1.8e2°", -math.pi),
+        (ANGLE, "0.25 rev", math.pi / 2),
+        (TORQUE, "50 mNm", 0.05),
+        (TORQUE, "50 N·mm", 0.05),
+        (TORQUE, "5 Ncm", 0.05),
+        (ANGULAR_STIFFNESS, "5 Nm/rad", 5.0),
+        (ANGULAR_STIFFNESS, "1 mN m/deg", 0.18 / math.pi),
+        (ANGULAR_DAMPING, "5 mNms/rad", 0.005),
+        (ANGULAR_DAMPING, "5 N*m*s / rad", 5.0),
         (TIME, "1 ms", 0.001),
         (TIME, "0.3 ms", 0.0003),
         (TIME, "7 us", 7e-6),
@@ -59,6 +83,9 @@ def test_a_quantity_is_the_number_nearest_to_what_is_written(dimension, text, va
         (TIME, "1 Ms"),
         (STIFFNESS, "10 N s/m"),
         (DAMPING, "10 N m/s"),
+        (DAMPING, "10 N m s/m"),
+        (TORQUE, "10 N/m"),
+        (ANGLE, "10 m"),
     ],
 )
 def test_what_is_no_quantity(dimension, value):

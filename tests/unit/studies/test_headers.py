@@ -9,9 +9,18 @@ from zwidth.formatting import header
 from zwidth.studies import Config, load_config
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
-WORDS = {"label", "curve", "kind", "delay_model", "estimate", "parameter", "enough", "status", "piece"}
-COUNTS = {"number", "islands", "samples", "best"}
-SHARES = {"reserve", "stable_share", "stable_share_low", "stable_share_high"}
+WORDS = {"fitted_to", "label", "curve", "kind", "delay_model", "estimate", "parameter", "enough", "status", "piece"}
+COUNTS = {"log", "number", "islands", "samples", "best"}
+SHARES = {
+    "autocorrelation",
+    "band",
+    "stiffness_residual",
+    "frequency_residual",
+    "reserve",
+    "stable_share",
+    "stable_share_low",
+    "stable_share_high",
+}
 NORMALIZED = {"d", "delta", "omega", "alpha", "beta", "beta_lower", "beta_upper", "alpha_max"}
 NORMALIZED |= {"alpha_max_passive", "beta_passive"}
 PLAIN = WORDS | COUNTS | SHARES | NORMALIZED
@@ -30,7 +39,9 @@ FILTERS = {
 
 def cheap():
     """Studies of every kind that writes tables, those that take a second."""
-    configs = [load_config(CONFIGS / f"{name}.yaml") for name in ("quickstart", "compliance", "requirements", "paper")]
+    configs = [
+        load_config(CONFIGS / f"{name}.yaml") for name in ("quickstart", "compliance", "requirements", "paper", "fit")
+    ]
     scene = {"mass": 0.1, "period": 1e-3}
     configs.append(Config.model_validate({"version": 1, "name": "filters", "scene": scene, "studies": [FILTERS]}))
     for config in configs:

@@ -1,0 +1,225 @@
+"""A fitted device: its motion beside the measured one, what is left of it, and the boundary that follows."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from zwidth.figures import style
+from zwidth.figures.table import Table, curves, select
+from zwidth.formatting import header
+
+# Samples that one panel shows; of longer logs every n-th.
+_MOST = 4000
+_TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}
+_DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}
+_UNITS = {
+    **dict.fromkeys(("position", "modelled", "residual"), ("m", "rad")),
+    **dict.fromkeys(("time", "lag"), ("s",)),
+    "stiffness": ("N/m", "N m/rad"),
+    "virtual_damping": ("N s/m", "N m s/rad"),
+    "frequency": ("Hz",),
+}
+_FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
+_ROWS = ("position", "residuals", "autocorrelation", "walls")
+
+
+@style.house_style()
+def draw_device_fit(
+    boundary: Table,
+    walls: Table,
+    axes: style.AnyAxes | None = None,
+    *,
+    motion: Table | None = None,
+    correlation: Table | None = None,
+    step: float = 0.0,
+) -> np.ndarray:
+    """Draw what a fit rests on and what follows: motion, residuals, their autocorrelation, and the stable walls.
+
+    The last panel is the boundary with its 95 % band, the stiffest wall, the wall to set, and the walls that buzzed.
+    Before it stand the position measured and modelled, what is left of it, and how that is correlated, with the 95 %
+    band of white noise; and of walls that buzzed how far they lie from the fit, in units of their noise.
+
+    Args:
+        boundary: columns virtual_damping and stiffness with its low and high end, of one or several fits by the column
+            ``fitted_to``.
+        walls: columns fitted_to, kind ("stiffest", "set" or "buzzing"), stiffness, its error, virtual_damping,
+            frequency; and stiffness_residual and frequency_residual of those that buzzed.
+        axes: Axes of yours, one a panel.
+        motion: columns log, time, position, modelled and residual, of a log.
+        correlation: columns lag, autocorrelation and band, of a log.
+        step: of the encoder, to draw beside the residuals; 0 for none.
+    """
+    names = [*(_ROWS[:3] if motion is not None and correlation is not None else ())]
+    names += ["walls"] if "buzzing" in np.asarray(walls["kind"]) else []
+    panels = dict(zip([*names, "boundary"], _make_panels(axes, len(names)), strict=False))
+    if motion is not None and correlation is not None:
+        _draw_motion(panels, motion, step)
+        if "autocorrelation" in panels:
+            _draw_correlation(panels["autocorrelation"], correlation)
+    if "walls" in panels:
+        _draw_onsets(panels["walls"], walls)
+    if "boundary" in panels:
+        _draw_boundary(panels["boundary"], boundary, walls)
+    for ax, name in zip(panels.values(), "abcde", strict=False):
+        ax.set_title(f"({name})" + (f" {ax.get_title('left')}" if ax.get_title("left") else ""))
+    return np.array(list(panels.values()), dtype=object)
+
+
+def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
+    """So many panels below each other, and a high one to the right of them."""
+    if axes is not None:
+        return np.asarray(axes, dtype=object).ravel()[: rows + 1]
+    figure, _ = style.new_figure(8.8, max(3.6, 1.55 * rows + 0.7))
+    figure.clear()
+    shape = [[str(row), "right"] for row in range(rows)] or [["right"]]
+    found = figure.subplot_mosaic(shape, width_ratios=(1.0, 1.05) if rows else (1.0,))
+    return [*(found[str(row)] for row in range(rows)), found["right"]]
+
+
+def _column(table: Table, name: str) -> tuple[np.ndarray, str]:
+    """A column and its unit, of a linear axis or a rotary one."""
+    known = next(units for kind, units in _UNITS.items() if name.startswith(kind))
+    return next((np.asarray(table[header(name, unit)]), unit) for unit in known if header(name, unit) in table)
+
+
+def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
+    logs = np.asarray(motion["log"])
+    first = select(motion, log=logs[0])
+    thin = slice(None, None, max(1, -(-logs[logs == logs[0]].size // _MOST)))
+    (time, _), (place, unit), (model, _), (rest, _) = (
+        _column(first, name) for name in ("time", "position", "modelled", "residual")
+    )
+    clock, second = style.si_unit(float(time[-1] - time[0]), "s")
+    time = (time - time[0]) * clock
+    if "position" in panels:
+        ax = panels["position"]
+        factor, length = style.si_unit(float(np.ptp(place)), unit)
+        ax.plot(time[thin], place[thin] * factor, color=style.GRAY, linewidth=2.4, alpha=0.55, label="measured")
+        ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modelled")
+        ax.set(ylabel=f"position  in {length}", xlim=(0.0, time[-1]))
+        ax.tick_params(labelbottom="residuals" not in panels)
+        _put_above(ax)
+        count = np.unique(logs).size
+        ax.set_title(f"the first of {count} logs" if count > 1 else "")
+    if "residuals" in panels:
+        ax = panels["residuals"]
+        factor, length = style.si_unit(float(np.nanmax(np.abs(rest), initial=0.0)), unit)
+        ax.plot(time[thin], rest[thin] * factor, color=style.BLUE, label="residual", **_DOT)
+        ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
+        for end in (-0.5 * step, 0.5 * step) if step else ():
+            ax.axhline(end * factor, color=style.BLACK, linestyle=style.DASHED, linewidth=0.8, label="half a step")
+        ax.set(xlabel=f"time  in {second}", ylabel=f"measured less\nmodelled  in {length}", xlim=(0.0, time[-1]))
+        if step:
+            _put_above(ax, [style.line("half a step of the encoder", style.DASHED, 0.8, style.BLACK)])
+            far = factor * max(0.62 * step, float(np.nanmax(np.abs(rest))))
+            ax.set_ylim(*style.span(-far, far, 0.12))
+
+
+def _draw_correlation(ax: Axes, correlation: Table) -> None:
+    (lag, unit), band = _column(correlation, "lag"), np.asarray(correlation["band"])
+    factor, second = style.si_unit(float(lag[-1]), unit)
+    values = np.asarray(correlation["autocorrelation"])
+    far = lag[-1] * factor * 1.02
+    ax.axhspan(-band[0], band[0], color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 % of white noise")
+    ax.vlines(lag * factor, 0.0, values, color=style.BLUE, linewidth=1.1, label="autocorrelation")
+    ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
+    largest = max(0.2, 1.25 * float(np.nanmax(np.abs(values), initial=0.0)))
+    ax.set(xlabel=f"lag  in {second}", ylabel="autocorrelation\nof residuals", xlim=(0.0, far))
+    ax.set_ylim(-largest, largest)
+    _put_above(ax)
+
+
+def _put_above(ax: Axes, handles: Any = None) -> None:
+    """A legend in one line above the panel, beside its letter."""
+    found = handles or ax.get_legend_handles_labels()[0]
+    place = {"loc": "lower right", "bbox_to_anchor": (1.0, 0.97), "borderaxespad": 0.0}
+    ax.legend(handles=found, ncols=len(found), columnspacing=1.2, **place)
+
+
+def _draw_onsets(ax: Axes, walls: Table) -> None:
+    """How far walls that buzzed lie from the fit."""
+    buzzing = select(walls, kind="buzzing")
+    damping, unit = _column(buzzing, "virtual_damping")
+    for name, marker, color in (("stiffness", "o", style.VERMILION), ("frequency", "s", style.BLUE)):
+        values = np.asarray(buzzing[f"{name}_residual"])
+        ax.plot(damping, values, marker, color=color, markersize=4.5, label=name, zorder=3)
+    ax.axhspan(-1.96, 1.96, color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 %")
+    ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
+    far = max(
+        3.0, *(1.2 * float(np.nanmax(np.abs(buzzing[f"{name}_residual"]))) for name in ("stiffness", "frequency"))
+    )
+    ax.set(ylim=(-far, far), xlabel=f"virtual damping  $B$  in {unit}", ylabel="walls less fit,\nin their noise")
+    ax.margins(x=0.1)
+    _put_above(ax)
+
+
+class _Scales(NamedTuple):
+    """Factors and units of the axes of walls."""
+
+    stiffness: float
+    spring: str
+    damping: float
+    damper: str
+
+
+def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
+    """The stable walls: B over K."""
+    (every, spring), (high, _) = _column(walls, "stiffness"), _column(boundary, "stiffness_high")
+    dampings, damper = _column(boundary, "virtual_damping")
+    stiffness, spring = style.si_unit(float(np.nanmax(every)), spring)
+    damping, damper = style.si_unit(float(dampings.max()), damper)
+    to = _Scales(stiffness, spring, damping, damper)
+    handles = []
+    for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
+        own = vars(fit)
+        K, low, up = (_column(own, name)[0] * to.stiffness for name in ("stiffness", "stiffness_low", "stiffness_high"))
+        B = _column(own, "virtual_damping")[0] * to.damping
+        ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {fit.fitted_to}")
+        # Up to where it meets K = 0.
+        ends = np.flatnonzero(K > 0)
+        shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
+        ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
+        ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {fit.fitted_to}", zorder=3)
+        handles.append(style.line(f"boundary with its 95 % band, {fit.fitted_to}", dash, color=color))
+    handles += _mark_walls(ax, walls, to)
+    ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to.stiffness)
+    # Room for the legend.
+    highest = float(dampings.max()) * to.damping
+    ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
+    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
+    ax.set(xlabel=f"stiffness  $K$  in {to.spring}", ylabel=f"virtual damping  $B$  in {to.damper}")
+    ax.legend(handles=handles, loc="upper right")
+
+
+def _mark_walls(ax: Axes, walls: Table, to: _Scales) -> list[Any]:
+    """The stiffest walls, those to set, and those that buzzed; returns entries of a legend."""
+    handles, kinds = [], {}
+    for kind in ("stiffest", "set", "buzzing"):
+        found = select(walls, kind=kind)
+        kinds[kind] = (
+            found,
+            _column(found, "stiffness")[0] * to.stiffness,
+            _column(found, "virtual_damping")[0] * to.damping,
+        )
+    for kind, marker, size, words in (("stiffest", "o", 4.5, "stiffest wall"), ("set", "D", 5.0, "wall to set")):
+        _, K, B = kinds[kind]
+        look = {"marker": marker, "markersize": size, "color": style.BLACK}
+        ax.plot(K, B, linestyle="", label=kind, zorder=5, **look)
+        if K.size:
+            text = f": $K = {K[0]:.3g}$ {to.spring}, $B = {B[0]:.3g}$ {to.damper}" if K.size == 1 else ""
+            handles.append(style.line(words + text, "", **look))
+    found, K, B = kinds["buzzing"]
+    if K.size:
+        look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}
+        reach = 1.96 * _column(found, "stiffness_error")[0] * to.stiffness
+        ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
+        middle = float(np.max(kinds["stiffest"][2]))
+        for stiffness, damping, heard in zip(K, B, _column(found, "frequency")[0], strict=True):
+            # Outside of the stable walls.
+            place = (11, -10) if damping < middle else (11, 5)
+            ax.annotate(f"{heard:.3g} Hz", (stiffness, damping), xytext=place, color=style.VERMILION, **_TEXT)
+        handles.append(style.line("began to buzz at this frequency", "", **look))
+    return handles

@@ -1,0 +1,145 @@
+"""What a fit rests on, as tables to draw and to keep: motions and residuals, and the boundary with its band."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from zwidth.batching import FEW
+from zwidth.errors import InputError
+from zwidth.fitting.buzz import BuzzPoint
+from zwidth.fitting.device_fit import DeviceFit, scene_of
+from zwidth.fitting.words import LINEAR, AxisUnits, choose_wall
+from zwidth.formatting import header
+from zwidth.stability.boundary import boundary_point
+from zwidth.status import Status
+
+# Devices drawn from the covariance, dampings of the boundary, and how far beyond its end.
+_DRAWS, _ROWS, _BEYOND = 200, 121, 1.1
+# Lags of the autocorrelation, at most, and at most as a share of the samples.
+_LAGS, _SHARE = 60, 0.25
+# Of a normal distribution: 95 % lie within.
+_NORMAL = 1.959963984540054
+
+
+def gather_evidence(
+    fit: DeviceFit, source: str, points: Sequence[BuzzPoint] = (), units: AxisUnits = LINEAR
+) -> dict[str, dict[str, Any]]:
+    """Every table of a fit, as `zwidth.figures.draw_device_fit` takes them."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, table in (("boundary", trace_boundary(fit, units)), ("walls", tabulate_walls(fit, points, units))):
+        rows = next(iter(table.values())).size
+        found[name] = {"fitted_to": np.full(rows, source), **table}
+    if fit.motions:
+        found |= {"motion": tabulate_motions(fit, units), "correlation": correlate_residuals(fit)}
+    return found
+
+
+def tabulate_motions(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.ndarray]:
+    """Every sample of the logs: measured, modelled, and what is left."""
+    logs = [np.full(motion.time.size, k, int) for k, motion in enumerate(fit.motions, start=1)]
+    columns = {name: np.concatenate([getattr(motion, name) for motion in fit.motions])
+               for name in ("time", "force", "position", "modelled")}  # fmt: skip
+    length = units.position
+    return {
+        "log": np.concatenate(logs),
+        header("time", "s"): columns["time"],
+        header("force", units.force): columns["force"],
+        header("position", length): columns["position"],
+        header("modelled", length): columns["modelled"],
+        header("residual", length): columns["position"] - columns["modelled"],
+    }
+
+
+def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
+    """Autocorrelation of the residuals over the lag, all logs together, with the 95 % band of white noise."""
+    rests = [motion.position - motion.modelled for motion in fit.motions]
+    rests = [rest[np.isfinite(rest)] for rest in rests]
+    most = int(min(_LAGS, *(_SHARE * rest.size for rest in rests)))
+    lags = np.arange(1, most + 1)
+    products = np.array([sum(float(rest[k:] @ rest[: rest.size - k]) for rest in rests) for k in lags])
+    size, count = sum(float(rest @ rest) for rest in rests), sum(rest.size for rest in rests)
+    return {
+        header("lag", "s"): lags * fit.period,
+        "autocorrelation": products / size if size > 0 else np.full(most, np.nan),
+        "band": np.full(most, _NORMAL / np.sqrt(count)),
+    }
+
+
+def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.ndarray]:
+    """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %.
+
+    The band is pointwise: the quantiles of devices drawn from the covariance, with the reach of the fit's intervals,
+    by a fixed seed; NaN where the covariance is not known. A damping at which a device has no stable wall counts as 0.
+    """
+    outlines = fit.scene.stable_region()
+    if not outlines:
+        raise InputError("scene: no wall of the fitted device is stable; measure again")
+    end = max(float(each.virtual_damping.max()) for each in outlines)
+    damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
+    own = np.array([[fit.mass, fit.damping, fit.delay]])
+    low = high = np.full(damping.size, np.nan)
+    if np.all(np.isfinite(fit.covariance)):
+        low, high = np.quantile(_limit_rows(fit, _draw_devices(fit), damping), [0.025, 0.975], axis=0)
+    return {
+        header("virtual_damping", units.damping): damping,
+        header("stiffness", units.stiffness): _limit_rows(fit, own, damping)[0],
+        header("stiffness_low", units.stiffness): low,
+        header("stiffness_high", units.stiffness): high,
+    }
+
+
+def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Up to which stiffness every softer wall is stable, for devices (n, 3) and dampings; 0 where none is."""
+    if fit.scene.is_rigid:
+        # So few at a time that nothing is compiled.
+        few = FEW // damping.size
+        parts = [devices[k : k + few] for k in range(0, len(devices), few)]
+        return np.concatenate([_limit_rigid(part, fit.period, damping) for part in parts])
+    scenes = (scene_of(values, fit.period, fit.velocity) for values in devices)
+    first = np.array([scene.stable_stiffness(damping)[:, 0] for scene in scenes])
+    return np.where(first[..., 0] == 0, first[..., 1], 0.0)
+
+
+def _limit_rigid(devices: np.ndarray, period: float, damping: np.ndarray) -> np.ndarray:
+    mass, own, delay = devices.T[:, :, None]
+    rate = mass / period
+    row = boundary_point(own / rate, delay / period, beta=damping / rate)
+    return np.where(row.status == Status.OK, row.alpha * rate / period, 0.0)
+
+
+def _draw_devices(fit: DeviceFit) -> np.ndarray:
+    """Mass, damping and delay of devices as far from the fitted one as it may be off."""
+    normal = np.random.default_rng(0).standard_normal((_DRAWS, 3))
+    # Their mean and covariance are exactly 0 and 1, which so few are not by chance.
+    normal -= normal.mean(0)
+    normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / _DRAWS), normal.T).T
+    values = np.array([fit.mass, fit.damping, fit.delay])
+    sizes = np.sqrt(np.diag(fit.covariance))
+    scales = np.where(sizes > 0, sizes, 1.0)
+    share, axes = np.linalg.eigh(fit.covariance / np.outer(scales, scales))
+    moved = (fit.reach / _NORMAL) * normal @ (axes * np.sqrt(np.maximum(share, 0.0))).T * scales
+    mass = fit.mass * np.exp(moved[:, 0] / fit.mass)
+    return np.column_stack([mass, np.maximum(values[1:] + moved[:, 1:], 0.0)])
+
+
+def tabulate_walls(
+    fit: DeviceFit, points: Sequence[BuzzPoint] = (), units: AxisUnits = LINEAR
+) -> dict[str, np.ndarray]:
+    """The stiffest wall, the one to set, and walls that buzzed: their errors, frequencies, and distances from the fit.
+
+    Distances are in units of the noise, stiffness and frequency apart.
+    """
+    top, choice, lost = fit.scene.max_stiffness(), choose_wall(fit), (np.nan,) * 4
+    rows: list[tuple[Any, ...]] = [("stiffest", float(top.stiffness), float(top.virtual_damping), *lost)]
+    rows += [] if choice is None else [("set", choice.stiffness, choice.virtual_damping, *lost)]
+    share = fit.noise[0] if isinstance(fit.noise, tuple) else np.nan
+    for each, rest in zip(points, fit.residuals if points else (), strict=True):
+        rows.append(("buzzing", each.stiffness, each.virtual_damping, share * each.stiffness, each.frequency, *rest))
+    kinds, *numbers = zip(*rows, strict=True)
+    heads = (("stiffness", units.stiffness), ("virtual_damping", units.damping), ("stiffness_error", units.stiffness))
+    names = [header(*head) for head in (*heads, ("frequency", "Hz"))] + ["stiffness_residual", "frequency_residual"]
+    columns = {name: np.array(part, float) for name, part in zip(names, numbers, strict=True)}
+    return {"kind": np.array(kinds), **columns}

@@ -1,0 +1,182 @@
+"""A fit in words: for people, and as a configuration."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import fields
+from typing import NamedTuple
+
+from zwidth.fitting.device_fit import DeviceFit
+from zwidth.formatting import plain, with_unit
+from zwidth.quantities import RECOMMENDED_SHARE
+from zwidth.status import Status
+
+SYMBOLS = {"mass": "m", "damping": "b", "delay": "t_d", "friction": "f_c", "stiffness_max": "K_max"}
+_KINDS = {
+    "BackwardDifference": "backward_difference",
+    "WindowedDifference": "windowed_difference",
+    "LowPass": "low_pass",
+    "Butterworth": "butterworth",
+    "VelocityFilter": "filter",
+}
+# What a status says of a fit; the doubts say more.
+_TROUBLES = {
+    Status.NOT_CONVERGED: "the search ended before its aim",
+    Status.NO_BOUNDARY: "the walls do not lie on the edge of any device's stable set",
+    Status.UNDECIDED: "another device fits as well",
+    Status.UNREACHABLE: "the delay ends the range looked in",
+}
+_ROTARY_NOTE = "# A rotary axis: kg stands for kg m^2 (inertia), N s/m for N m s/rad, N/m for N m/rad, N for N m."
+
+
+class AxisUnits(NamedTuple):
+    """SI units of an axis."""
+
+    mass: str
+    damping: str
+    stiffness: str
+    force: str
+    position: str
+
+    def spell(self, name: str, value: float, digits: int = 4) -> str:
+        """A value of a fit for people."""
+        if name == "mass":
+            # What data sheets of rotors have.
+            turns = self is ROTARY
+            return f"{plain(1e7 * value, digits)} g cm^2" if turns else with_unit(1e3 * value, "g", digits)
+        units = {**self._asdict(), "delay": "s", "friction": self.force, "stiffness_max": self.stiffness}
+        return with_unit(value, units[name], digits)
+
+
+LINEAR = AxisUnits("kg", "N s/m", "N/m", "N", "m")
+ROTARY = AxisUnits("kg m^2", "N m s/rad", "N m/rad", "N m", "rad")
+
+
+class WallChoice(NamedTuple):
+    """A wall to set on a fitted device: N/m, N s/m, and why this one."""
+
+    stiffness: float
+    virtual_damping: float
+    why: str
+
+
+def choose_wall(fit: DeviceFit) -> WallChoice | None:
+    """What the study ``recommend`` sets, softer where K_max is not known so well; None of a fit that does not hold."""
+    top = fit.scene.max_stiffness()
+    if fit.status != Status.OK or top.status != Status.OK:
+        return None
+    low = fit.intervals["stiffness_max"].low
+    share = RECOMMENDED_SHARE * float(top.stiffness)
+    why = f"{100 * RECOMMENDED_SHARE:g} % of K_max"
+    if not share <= low:
+        share, why = low, "the low end of K_max, which is less than usual"
+    stable = share > 0 and bool(fit.scene.is_stable(share, top.virtual_damping))
+    return WallChoice(share, float(top.virtual_damping), why) if stable else None
+
+
+def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[tuple[str, str]]:
+    """Each line's label and its text, what is wrong first."""
+    rows = []
+    if fit.status != Status.OK:
+        rows.append((Status(fit.status).name, f"do not rely on these numbers: {name_trouble(fit)}"))
+    rows.append(("fitted to", source))
+    for name in ("mass", "damping", "delay", "stiffness_max"):
+        symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS[name]
+        rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})"))
+    rows += _explain_parts(fit, units)
+    if isinstance(fit.noise, tuple):
+        rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))
+    else:
+        rows.append(("noise of the position", units.spell("position", fit.noise, 3)))
+        if fit.resolution:
+            rows.append(("step of the encoder", units.spell("position", fit.resolution, 3)))
+    wall = choose_wall(fit)
+    if wall is not None:
+        K, B = units.spell("stiffness", wall.stiffness), units.spell("damping", wall.virtual_damping)
+        rows.append(("set", f"K = {K}, B = {B}: {wall.why}"))
+    rows += [("doubt", doubt) for doubt in list_doubts(fit, units)]
+    if fit.next is not None:
+        step = fit.next
+        B, K = units.spell("damping", step.virtual_damping, 3), units.spell("stiffness", step.stiffness, 3)
+        errors = (units.spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards))
+        text = f"K at B = {B}, near {K} and {with_unit(step.frequency, 'Hz', 3)}"
+        rows.append(("measure next", f"{text}: K_max's standard error falls from {' to '.join(errors)}"))
+    return rows
+
+
+def name_trouble(fit: DeviceFit) -> str:
+    """What the status of a fit says, "" where it is OK."""
+    status = Status(fit.status)
+    return "" if status == Status.OK else _TROUBLES.get(status, status.message)
+
+
+def list_doubts(fit: DeviceFit, units: AxisUnits) -> list[str]:
+    """The doubts of a fit in the units of its axis."""
+    if units is not ROTARY:
+        return list(fit.doubts)
+    # An inertia is far from the masses of devices, in whatever unit; what else is said names these units.
+    doubts = [doubt for doubt in fit.doubts if "far from any device" not in doubt]
+    return [doubt.replace("N s/m", ROTARY.damping).replace("N/m", ROTARY.stiffness) for doubt in doubts]
+
+
+def _spell(fit: DeviceFit, name: str, units: AxisUnits) -> str:
+    """A value with so many digits that its interval shows."""
+    return units.spell(name, getattr(fit, name), _count_digits(fit, name))
+
+
+def _between(fit: DeviceFit, name: str, units: AxisUnits) -> str:
+    low, high = (units.spell(name, end, _count_digits(fit, name)) for end in fit.intervals[name])
+    return f"95 % between {low} and {high}"
+
+
+def _count_digits(fit: DeviceFit, name: str) -> int:
+    value, bar = abs(getattr(fit, name)), fit.intervals[name]
+    known = value / (bar.high - bar.low) if bar.high > bar.low else 1.0
+    return min(max(4, 2 + math.ceil(math.log10(known))), 9) if known > 0 and math.isfinite(known) else 4
+
+
+def _explain_parts(fit: DeviceFit, units: AxisUnits) -> Iterable[tuple[str, str]]:
+    """What was compared beside mass, damping and delay, and why it was kept or left out."""
+    found = {"friction": ("friction", fit.friction), "offset": ("constant force", fit.offset)}
+    tried = dict.fromkeys(part for model in fit.tried for part in model.parts)
+    if fit.tried and "friction" not in tried:
+        yield "friction", "none: no start of a fit with friction is better than the fit without"
+    for part in tried:
+        kept = part in fit.tried[0].parts
+        label, value = found.get(part, (part, 0.0))
+        others = [model.criterion for model in fit.tried if (part in model.parts) != kept]
+        worse = f"Schwarz's criterion is {plain(min(others), 3)} worse" if others else "nothing else was tried"
+        barred = part in fit.intervals
+        amount = (
+            _spell(fit, part, units) + f" ({_between(fit, part, units)})" if barred else units.spell("force", value)
+        )
+        yield label, f"{amount}: kept, without it {worse}" if kept else f"left out, with it {worse}"
+
+
+def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[str]:
+    """A configuration for `zwidth run` in which every number says where it is from."""
+    lines = [f"# Fitted to {source}: {_between(fit, 'stiffness_max', units)} for K_max."]
+    if fit.status != Status.OK:
+        lines.append(f"# {Status(fit.status).name}: do not rely on these numbers: {name_trouble(fit)}.")
+    lines += [f"# Doubt: {doubt}" for doubt in list_doubts(fit, units)]
+    lines += [_ROTARY_NOTE] if units is ROTARY else []
+    lines += ["version: 1", "name: fitted_device", "scene:"]
+    # The configuration knows linear units alone.
+    for key, unit in (("mass", "kg"), ("damping", "N s/m"), ("delay", "s")):
+        lines.append(f"  {key}: {getattr(fit, key)!r} {unit} # fitted, {_between(fit, key, units)}")
+    lines.append(f"  period: {fit.period!r} s # as given")
+    kind = _KINDS.get(type(fit.velocity).__name__)
+    if kind not in (None, "backward_difference"):
+        given = {part.name: getattr(fit.velocity, part.name) for part in fields(fit.velocity)}
+        spelled = {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()}
+        inside = ", ".join(f"{key}: {value}" for key, value in spelled.items() if value is not None)
+        lines.append(f"  velocity: {{kind: {kind}, {inside}}} # as given")
+    lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
+    if fit.friction:
+        lines.append(
+            f"# For studies of kind simulate: coulomb: {fit.friction!r} N, {_between(fit, 'friction', units)}."
+        )
+    if fit.resolution:
+        lines.append(f"# For studies of kind simulate: resolution: {fit.resolution!r} m.")
+    return lines

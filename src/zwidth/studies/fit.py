@@ -1,0 +1,312 @@
+"""The fit study: a device's mass, damping and delay from logs, from walls that began to buzz, or from both."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from functools import partial
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WrapValidator
+from pydantic_core import CoreSchema
+
+from zwidth import figures
+from zwidth.config.device_table import find_file
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import Fraction, Strict, VirtualDamping, members, unit_schema
+from zwidth.config.parts import Frequency, Spring, Time, VelocityField, build_velocity, locate_refusal
+from zwidth.config.scenes import AnyScene
+from zwidth.errors import InputError
+from zwidth.fitting.buzz import BuzzPoint, fit_buzz
+from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
+from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.evidence import gather_evidence
+from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
+from zwidth.formatting import header, plain, with_unit
+from zwidth.status import Status
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
+from zwidth.units import LENGTH
+
+# Times of a log and the period may differ so much, as a share.
+_SAME_PERIOD = 1e-3
+# 95 % of chi-squared with three degrees of freedom, and of a normal distribution within so many standard deviations.
+_CHANCE, _NORMAL = 7.815, 1.96
+
+
+def _read_resolution(raw: Any) -> Any:
+    try:
+        read_step(raw)
+    except InputError as error:
+        raise locate_refusal(error)[1] from None
+    return raw
+
+
+Step = Annotated[float | str, BeforeValidator(_read_resolution), unit_schema(LENGTH, "rad", "deg")]
+
+
+class LogSection(Strict):
+    """One log: a CSV file and which of its columns is what."""
+
+    what: ClassVar[str] = "a log"
+
+    csv: str
+    """Name of the file, relative to the configuration."""
+
+    time: str | None = None
+    """Header of the column of times, or header:unit; found by its name where left out, not read where there is a
+    period."""
+
+    position: str | None = None
+    """Header of the column of positions, or header:unit; found by its name where left out."""
+
+    force: str | None = None
+    """Header of the column of commanded forces, or header:unit; found by its name where left out."""
+
+    resolution: Step | None = None
+    """One count of the encoder, a length or an angle; needed for positions in counts."""
+
+    sha256: str | None = None
+    """Digest of the file; another file is refused. Where left out it is the file's own, for the record."""
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        digest = _digest(raw.get("csv"))
+        return {**raw, "sha256": digest} if digest and "sha256" not in raw else raw
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        return "a log is a CSV file", "add 'csv: log.csv'"
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        digest = _digest(self.csv)
+        if digest and digest != self.sha256:
+            what = f"{self.csv} has another digest, {digest[:12]}..."
+            yield ("sha256",), problem(what, "it is the file that was fitted before", "remove sha256 if it may change")
+
+    def read(self, timed: bool) -> LoggedMotion:
+        """The columns; raises `InputError`."""
+        columns = {name: getattr(self, name) for name in ("time", "position", "force")}
+        return read_log(find_file(self.csv), columns, resolution=self.resolution, timed=timed)
+
+
+def _digest(name: Any) -> str:
+    """Of a file's bytes; "" where it cannot be read."""
+    try:
+        file = find_file(name) if isinstance(name, str) else None
+        return hashlib.sha256(file.read_bytes()).hexdigest() if file is not None and file.is_file() else ""
+    except (OSError, ValueError):
+        return ""
+
+
+def _read_logs(raw: Any, handler: Any) -> Any:
+    """One log, or a list of them."""
+    if isinstance(raw, dict):
+        return (LogSection.model_validate(raw),)
+    return (raw,) if isinstance(raw, LogSection) else members("logs")(raw, handler)
+
+
+class _OneOrSeveral:
+    """Lets an editor's check take one entry for a list of it."""
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        several = handler(schema)
+        return {"anyOf": [several["items"], several]}
+
+
+class BuzzSection(Strict):
+    """A wall at the onset of buzzing."""
+
+    what: ClassVar[str] = "a wall that buzzed"
+
+    stiffness: Spring
+    """K in N/m or with a unit, raised at this damping until the wall buzzed."""
+
+    virtual_damping: VirtualDamping = 0.0
+    """B in N s/m or with a unit."""
+
+    frequency: Frequency
+    """Of the buzz, in Hz or with a unit."""
+
+
+class _Fitted(NamedTuple):
+    """One of the fits of a study."""
+
+    name: str
+    source: str
+    fit: DeviceFit
+    points: tuple[BuzzPoint, ...] = ()
+
+
+class FitStudy(ComputedStudy):
+    """Mass, damping and delay of a device from records of it, and the walls that follow."""
+
+    what: ClassVar[str] = "a fit study"
+    from_scene: ClassVar[tuple[str, ...]] = ()
+    remedy_if_too_large: ClassVar[str] = "shorten the logs"
+
+    kind: Literal["fit"]
+
+    log: Annotated[tuple[LogSection, ...], WrapValidator(_read_logs), _OneOrSeveral] | None = None
+    """A log of free motion under a commanded force, or a list of logs of one device; give this, buzz, or both."""
+
+    buzz: Annotated[tuple[BuzzSection, ...], WrapValidator(members("walls"))] | None = None
+    """Walls at the onset of buzzing, two at least, of different dampings."""
+
+    period: Time | None = None
+    """Sampling period T in s or with a unit; of buzzing walls alone, or of logs in place of their times."""
+
+    noise: Fraction | None = None
+    """Relative noise of stiffness and frequency of buzzing walls; estimated where left out."""
+
+    max_delay: Time | None = None
+    """The longest delay looked for in logs, in s or with a unit; 20 periods where left out."""
+
+    resample: bool = False
+    """Whether uneven times of logs are made even by interpolation."""
+
+    velocity: VelocityField | None = None
+    """How the loop estimates its velocity; the difference of two samples where left out."""
+
+    _motions: tuple[LoggedMotion, ...] = PrivateAttr(default=())
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        if "log" not in raw and "buzz" not in raw:
+            allowed = "a device is found from logs or from walls that buzzed"
+            yield (), problem("log or buzz is missing", allowed, "add 'log: {csv: log.csv}'")
+        elif "log" not in raw and "period" not in raw:
+            yield ("period",), problem("missing", "walls that buzzed need the sampling period", "add 'period: 1 ms'")
+        strange = {"noise": "buzz", "max_delay": "log", "resample": "log"}
+        for name, owner in strange.items():
+            if name in raw and owner not in raw:
+                yield (
+                    (name,),
+                    problem(f"got {name} without {owner}", f"it belongs to {owner}", "remove it", on_key=True),
+                )
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        motions: list[LoggedMotion] = []
+        for k, section in enumerate(self.log or ()):
+            try:
+                motions.append(section.read(section.time is not None or self.period is None))
+            except InputError as error:
+                # File names and headers may hold anything.
+                text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))
+                path, what = locate_refusal(InputError(text))
+                known = len(path) == 1 and path[0] in LogSection.model_fields
+                # A single log is written without a list around it.
+                place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
+                yield (*place, *(path if known else ("csv",))), (what if known else problem(text))
+        self._motions = tuple(motions)
+        if any(motion.rotary for motion in motions) and self.buzz:
+            what = "got walls in N/m beside a log of an angle"
+            yield ("buzz",), problem(what, "both are of one axis", "fit them in two studies", on_key=True)
+
+    @property
+    def units(self) -> AxisUnits:
+        """SI units of the axis."""
+        return ROTARY if any(motion.rotary for motion in self._motions) else LINEAR
+
+    @property
+    def extent(self) -> str:
+        parts = [f"{len(self.log)} log{'' if len(self.log) == 1 else 's'}"] if self.log else []
+        return " and ".join(parts + ([f"{len(self.buzz)} walls that buzzed"] if self.buzz else []))
+
+    @property
+    def points(self) -> int:
+        return sum(motion.position.size for motion in self._motions) + len(self.buzz or ())
+
+    @property
+    def nbytes(self) -> int:
+        """Time, force, position, model, residual and number of the log a sample."""
+        return self.points * 48
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        """The fits as a table, their evidence as tables and a figure, and a configuration of each fitted device."""
+        fits, units = self._fit(), self.units
+        evidence = _gather(fits, units)
+        documents = {f"{self.name}_{name}.csv": csv_text(table) for name, table in evidence.items()}
+        for each in fits:
+            middle = f"_{each.name}" if len(fits) > 1 else ""
+            text = "\n".join(write_scene(each.fit, each.source, units))
+            documents[f"{self.name}{middle}_scene.yaml"] = text + "\n"
+        answers, notes = [], []
+        for each in fits:
+            rows = describe_fit(each.fit, each.source, units)
+            said = dict(rows)
+            trouble = [f"{label}: {text}" for label, text in rows[:1] if each.fit.status != Status.OK]
+            labels = [label for label in _DEVICE if label in said and (label != "friction" or each.fit.friction)]
+            device = ", ".join(f"{label} = {said[label].partition(' (')[0]}" for label in labels)
+            answers += [*trouble, f"{device}, fitted to {each.source}", f"K_max = {said['K_max']}"]
+            answers += [f"set {said['set']}"] if "set" in said else []
+            notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in _LABELS]
+        answers += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
+        step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
+        draw = partial(figures.draw_device_fit, **evidence, step=step)
+        return Outcome(
+            table=stack([_tabulate(each, units) for each in fits]),
+            figures={"": draw},
+            documents=documents,
+            answer=tuple(answers),
+            notes=tuple(notes),
+        )
+
+    def _fit(self) -> list[_Fitted]:
+        velocity, fits = build_velocity(self.velocity), []
+        period = self.period
+        if self.log:
+            options = {"max_delay": self.max_delay, "resample": self.resample}
+            found = fit_motions(self._motions, period=period, velocity=velocity, **options)
+            if period is not None and abs(found.period - period) > _SAME_PERIOD * period:
+                given, own = with_unit(period, "s"), with_unit(found.period, "s")
+                raise InputError(f"period: got {given}, and the log's times are {own} apart; remove it, or the times")
+            period = found.period
+            fits.append(_Fitted("log", " and ".join(section.csv for section in self.log), found))
+        if self.buzz:
+            walls = tuple(BuzzPoint(each.stiffness, each.virtual_damping, each.frequency) for each in self.buzz)
+            found = fit_buzz(walls, period=period, velocity=velocity, noise=self.noise)
+            fits.append(_Fitted("buzz", f"{len(walls)} buzzing walls", found, walls))
+        return fits
+
+
+# Labels of what a device is, and of all that is told in answers.
+_DEVICE = ("m", "J", "b", "t_d", "friction")
+_LABELS = ("m", "J", "b", "t_d", "K_max", "set", "fitted to")
+
+
+def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
+    """What the fits rest on."""
+    found = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
+    below = {name: stack([tables[name] for tables in found]) for name in ("boundary", "walls")}
+    return {**found[0], **below}
+
+
+def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
+    """One row: every number with its standard error and its 95 % interval."""
+    fit = each.fit
+    row: dict[str, Any] = {"fitted_to": each.source, "status": Status(fit.status).name}
+    of = {"mass": units.mass, "damping": units.damping, "delay": "s", "stiffness_max": units.stiffness}
+    of |= {"friction": units.force} if "friction" in fit.errors else {}
+    errors = fit.errors | {"stiffness_max": fit.stiffness_error}
+    for name, unit in of.items():
+        ends = fit.intervals[name]
+        numbers = {"": getattr(fit, name), "_error": errors[name], "_low": ends.low, "_high": ends.high}
+        row |= {header(name + end, unit): value for end, value in numbers.items()}
+    return row | {header("offset", units.force): fit.offset, header("resolution", units.position): fit.resolution}
+
+
+def _compare(one: DeviceFit, other: DeviceFit) -> str:
+    """Whether two fits of one device agree, by how far apart they are in their common covariance."""
+    values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
+    apart = values[0] - values[1]
+    spread = sum((fit.reach / _NORMAL) ** 2 * fit.covariance for fit in (one, other))
+    # Exact records would leave nothing to divide by.
+    floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
+    far = float(apart @ np.linalg.solve(spread + np.diag(floor), apart))
+    words = (
+        f"squared, they are {plain(far, 3)} apart in units of their errors; 95 % of equal devices stay below {_CHANCE}"
+    )
+    return f"log and buzzing walls agree: {words}" if far <= _CHANCE else f"log and buzzing walls do NOT agree: {words}"
