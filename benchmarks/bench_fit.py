@@ -73,7 +73,7 @@ def make_force(random: np.random.Generator, count: int) -> np.ndarray:
 def bound_errors(made: Made) -> dict[str, float]:
     """Least standard errors by Cramer and Rao, of the model that made the log; nothing where it cannot be told."""
     mass, damping, delay, friction, offset = made.truth
-    beyond = dict(zip(PARTS, (offset, friction), strict=True))
+    beyond: dict[str, float] = {PARTS[0]: offset, PARTS[1]: friction}
     parts = tuple(name for name in PARTS if beyond[name])
     model = Recordings((Recording(made.force, made.position[SKIP:], SKIP),), parts)
     g = PERIOD**2 / mass
@@ -172,8 +172,8 @@ def tell_choices(rows: list[dict[str, Any]]) -> str:
     return "\n".join([
         f"Friction is found in {share(rubs)} logs that have it, and in {share(smooth)} without; a constant force in",
         f"{share(pushed)} and {share(free)}. Refused: {len(rows) - len(fitted)}; with a doubt:",
-        f"{sum(row['doubted'] for row in fitted)}; with a status that is not OK: {sum(row['status'] != 0 for row in fitted)};",
-        f"logs that cannot tell friction from a constant force, not counted here: {untold}.",
+        f"{sum(row['doubted'] for row in fitted)}; with a status that is not OK:",
+        f"{sum(row['status'] != 0 for row in fitted)}; logs that cannot tell friction from a constant force, not counted here: {untold}.",
     ])  # fmt: skip
 
 
@@ -187,10 +187,11 @@ def report(count: int, processes: int) -> str:
         "",
         "Written by `benchmarks/bench_fit.py --write docs/fitting.md`.",
         "",
-        f"{count:,} random logs of 1,000 to 5,000 samples: devices of 30 g to 1 kg, delays of 0 to 5 periods, whole",
-        "and not; steps, chirps and random forces; 300 to 100,000 steps of the encoder over the way moved, noise of 0.15",
-        "to 3 steps; friction of 3 to 25 % of the effective force in a third, a constant force in a fifth. The bound is",
-        "that of Cramer and Rao for the model that made the log, with the noise and the encoder's q²/12 as white.",
+        f"{count:,} random logs of 1,000 to 5,000 samples: devices of 30 g to 1 kg, delays of 0 to 5 periods,",
+        "whole and not; steps, chirps and random forces; 300 to 100,000 steps of the encoder over the way",
+        "moved, noise of 0.15 to 3 steps; friction of 3 to 25 % of the effective force in a third, a constant",
+        "force in a fifth. The bound is that of Cramer and Rao for the model that made the log, with the",
+        "noise and the encoder's q²/12 as white.",
         "",
         *tabulate(noisy),
         "",
