@@ -53,10 +53,10 @@ def _cutoffs(onsets: Onsets) -> np.ndarray:
     """Places to look for a cut-off at: from a tenth of what was heard on, and the one given."""
     if not onsets.unknown_cutoff:
         return np.ones(1)
-    low = 0.1 * onsets.w.min() / (2 * np.pi * onsets.period)
-    places = np.geomspace(min(low, 0.1 * onsets.highest_cutoff), 0.98 * onsets.highest_cutoff, _CUTOFFS)
+    low, high = onsets.cutoffs
+    places = np.geomspace(min(100 * low, 0.1 * high), 0.98 * high, _CUTOFFS)
     given = getattr(onsets.velocity, "cutoff", None)
-    return places if given is None else np.sort(np.append(places, min(given, places[-1])))
+    return places if given is None else np.sort(np.append(places, np.clip(given, *places[[0, -1]])))
 
 
 def _solve(

@@ -73,7 +73,7 @@ def read_points(
     if unknown_cutoff and (len(table) < 3 or np.ptp(damped) <= near):
         raise InputError(
             f"points: {len(table)} walls, {damped.size} of them with B > 0, cannot tell m, b, t_d and the cut-off; "
-            "three are needed, at two dampings B > 0 at least: what is missing is a wall of another damping: raise K at "
+            "three are needed, at two dampings B > 0; what is missing is a wall of another damping: raise K at "
             f"B = {with_unit(table[:, 1].max() + 0.4 * unit, 'N s/m', 2)}, say, until it buzzes"
         )
     return table, doubts

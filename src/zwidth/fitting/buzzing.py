@@ -28,8 +28,9 @@ from zwidth.stability.ridge_slopes import plant_slopes
 _STEPS, _LONGEST, _ARRIVED, _FOUND = 40, 0.15, 1e-9, 1e-6
 # The step in ln cutoff of a difference of fourth order, and its weights.
 _STEP, _WEIGHTS = 1e-3, {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
-# No cut-off is looked for closer to half the sampling rate than this share of it.
-_HIGHEST = 0.99
+# No cut-off is looked for above this share of half the sampling rate, or below this one of the lowest frequency heard,
+# where a filter makes of the damper a spring.
+_HIGHEST, _LOWEST = 0.99, 1e-3
 
 
 class NeededAnswer:
@@ -93,10 +94,10 @@ class Onsets:
         return 4 if self.unknown_cutoff else 3
 
     @property
-    def highest_cutoff(self) -> float:
-        """The highest that is looked for, in Hz."""
-        coded: Any = self.velocity.coded_period if self.unknown_cutoff else None
-        return _HIGHEST * 0.5 / (self.period if coded is None else coded)
+    def cutoffs(self) -> tuple[float, float]:
+        """The lowest and the highest that are looked for, in Hz."""
+        coded = getattr(self.velocity, "coded_period", None) or self.period
+        return _LOWEST * float(self.w.min()) / (2 * np.pi * self.period), _HIGHEST * 0.5 / coded
 
     def velocity_at(self, theta: np.ndarray) -> Velocity:
         """The velocity estimate that is meant by theta."""
@@ -106,8 +107,8 @@ class Onsets:
         return self.velocity_at(theta).estimate(self.period) if self.unknown_cutoff else self._estimate
 
     def is_possible(self, theta: np.ndarray) -> bool:
-        """Whether there is a filter of this cut-off."""
-        return not self.unknown_cutoff or theta[3] < np.log(self.highest_cutoff)
+        """Whether a filter of this cut-off is looked for."""
+        return not self.unknown_cutoff or bool(np.log(self.cutoffs[0]) < theta[3] < np.log(self.cutoffs[1]))
 
     def follow(self, theta: np.ndarray) -> Followed:
         """The walls of theta at these dampings, w nearest to the measured ones."""

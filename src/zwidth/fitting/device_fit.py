@@ -153,7 +153,7 @@ class DeviceFit:
 
         Args:
             reliability: the share, between 0.5 and 1.
-            samples: how many devices are drawn, 100 to 100,000; left out, 4,000, or 1,000 with a velocity filter.
+            samples: how many devices are drawn, 100 to 100,000; left out, 8,000, or 1,000 with a velocity filter.
             seed: of the draws; equal seeds give equal walls.
 
         Returns:
