@@ -35,8 +35,8 @@ _BLIND = 1e6
 # An edge of the stable set lies between walls so much softer and stiffer.
 _BESIDE = 1e-6
 # Another device is as good where the sum of squares in units of the noise rises by less; worse than this by chance of
-# 1e-4 the points contradict each other.
-_AS_GOOD, _CHANCE = 5.99, 1e-4
+# 1e-4, or than this share where the noise is unknown, the points contradict each other.
+_AS_GOOD, _CHANCE, _ROUGH = 5.99, 1e-4, 0.1
 _ANGLES = 240
 # Relative noise that no record is better than, for telling exact points from equal ones.
 _EXACT = 1e-12
@@ -125,20 +125,27 @@ def fit_buzz(
             f"the walls contradict each other: they are {plain(np.sqrt(best.squares / freedom), 2)} times as far from "
             "this device as their noise explains; look for friction, a compliance or a hand that holds it"
         )
+    if not share and scale > _ROUGH**2:
+        doubts.append(
+            f"the walls contradict each other: no device comes closer to them than {plain(100 * np.sqrt(scale), 2)} %; "
+            "look for friction, a compliance, a hand that holds it, or a wrong period"
+        )
     slopes = weigh(onsets.follow(best.theta).slopes, weights)
-    _refuse_blind(slopes, best.theta, table)
+    _refuse_blind(slopes, best.theta, table, bool(equals))
     information = slopes.T @ slopes / scale
     values, by_theta = in_si(best.theta, period)
-    rivals = []
+    rivals: list[RivalDevice] = []
+    apart = [best.theta]
     for other in equals[1:]:
-        away = other.theta - best.theta
         # Not along the flat floor of the same valley.
-        if away @ information @ away > _AS_GOOD:
+        if all((away := other.theta - one) @ information @ away > _AS_GOOD for one in apart):
+            apart.append(other.theta)
             device, _ = in_si(other.theta, period)
-            doubts.append(f"another device fits as well: {_describe(device)}; add the experiment named next")
             stiffness = float(scene_of(device, period, velocity).max_stiffness().stiffness)
             rivals.append(RivalDevice(*device[:3].tolist(), stiffness, *device[3:].tolist()))
-            status = Status.UNDECIDED
+    if rivals:
+        status = Status.UNDECIDED
+        doubts.append(f"another device fits as well: {_describe(rivals[0])}; add the experiment named next")
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
     if covariance[0, 0] > (VAGUE * values[0]) ** 2:
         doubts.append(MASS_OPEN)
@@ -177,10 +184,12 @@ def _choose(
     return best, 1.0 if known_noise else max(best.squares / freedom, _EXACT**2), equals
 
 
-def _describe(values: np.ndarray) -> str:
-    mass, damping, delay, *cutoff = values
-    text = f"m = {with_unit(mass * 1e3, 'g')}, b = {with_unit(damping, 'N s/m')}, t_d = {with_unit(delay, 's')}"
-    return text + "".join(f", cut-off {with_unit(value, 'Hz')}" for value in cutoff)
+def _describe(device: RivalDevice) -> str:
+    cutoff = "" if device.cutoff is None else f", cut-off {with_unit(device.cutoff, 'Hz')}"
+    return (
+        f"m = {with_unit(device.mass * 1e3, 'g')}, b = {with_unit(device.damping, 'N s/m')}, "
+        f"t_d = {with_unit(device.delay, 's')}{cutoff}"
+    )
 
 
 def _at_edge(onsets: Onsets, fit: Candidate) -> bool:
@@ -203,10 +212,15 @@ def _unlikely(freedom: int) -> float:
     return float(chi2.isf(_CHANCE, freedom))
 
 
-def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray) -> None:
+def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_edge: bool) -> None:
     sizes = np.linalg.norm(slopes, axis=0)
     if not np.all(sizes > 0) or np.linalg.cond(slopes / sizes) > _BLIND:
         dampings = ", ".join(f"{value:g}" for value in np.unique(table[:, 1]))
+        if not on_edge:
+            raise InputError(
+                "points: no device has these walls on the edge of its stable set; check K, B, f and the period, and at "
+                "each B raise K from far below until the wall begins to buzz"
+            )
         names = "m, b and t_d" if theta.size == 3 else "m, b, t_d and the cut-off"
         raise InputError(
             f"points: walls of B = {dampings} N s/m cannot tell {names} apart"

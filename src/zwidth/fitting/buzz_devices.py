@@ -12,7 +12,10 @@ from zwidth.fitting.buzzing import Onsets
 # The dampings b T/m that are started from, the number of cut-offs, and how many of the dips.
 _DELTAS = np.concatenate([[0.0], np.geomspace(1e-4, 30.0, 45)])
 _CUTOFFS, _STARTS = 16, (6, 12)
-_NEARLY, _ARRIVED = 1e-4, 1e-12
+# Tolerances of a first look and of the end, and the evaluations they may take.
+_NEARLY, _ARRIVED, _MOST_STEPS = 1e-4, 1e-12, (100, 40)
+# After so many devices in a row without such walls there is no way back.
+_LOST = 8
 _NAMES = ("mass", "damping", "delay", "cut-off")
 
 
@@ -24,6 +27,10 @@ class Candidate(NamedTuple):
     residuals: np.ndarray
     held: tuple[str, ...]
     found: bool
+
+
+class _LostError(Exception):
+    """No device around has such walls."""
 
 
 def weigh(slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -38,12 +45,13 @@ def find_candidates(onsets: Onsets, weights: np.ndarray) -> list[Candidate]:
     longest = 1.2 * np.pi / float(onsets.w.max())
     for start in onsets.starts(_DELTAS, longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff]):
         near = _solve(onsets, weights, start, (), _NEARLY)
-        if any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found):
-            continue
-        free = _solve(onsets, weights, near.theta, ())
-        if min(free.theta[1:3]) >= 0:
-            found.append(free)
-            continue
+        if near.found:
+            if any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found):
+                continue
+            free = _solve(onsets, weights, near.theta, ())
+            if min(free.theta[1:3]) >= 0:
+                found.append(free)
+                continue
         ends = (_solve(onsets, weights, start, held) for held in ((1,), (2,), (1, 2)))
         found += [end for end in ends if min(end.theta[1:3]) >= 0]
     return sorted(found, key=lambda fit: (not fit.found, fit.squares))
@@ -68,8 +76,11 @@ def _solve(
     theta = start.copy()
     theta[list(held)] = 0.0
 
+    lost = 0
+
     @lru_cache(maxsize=1)  # The solver asks for values and slopes apart.
     def evaluate(values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+        nonlocal lost
         at = theta.copy()
         at[free] = values
         if onsets.is_possible(at):
@@ -80,22 +91,28 @@ def _solve(
         else:
             good = np.zeros(onsets.w.shape, bool)
             ratios, walls = 0.0, None
+        lost = 0 if good.all() else lost + 1
+        if lost > _LOST:
+            raise _LostError
         # Where no such wall is found, as wrong as can be, and flat.
         ratios = np.where(good[:, None], ratios, 10.0)
         slopes = np.where(good[:, None, None], walls.slopes if walls else 0.0, np.zeros((1, 2, onsets.unknowns)))
         return at, ratios * weights, weigh(slopes, weights)[:, free], bool(good.all())
 
-    found = least_squares(
-        lambda x: evaluate(tuple(x))[1].ravel(),
-        theta[free],
-        lambda x: evaluate(tuple(x))[2],  # pyright: ignore[reportArgumentType]  (a function or a name)
-        method="lm",
-        x_scale="jac",
-        xtol=tolerance,
-        ftol=tolerance,
-        gtol=tolerance,
-        max_nfev=200,
-    )
-    at, residuals, _, good = evaluate(tuple(found.x))
     names = tuple(_NAMES[k] for k in held)
+    try:
+        found = least_squares(
+            lambda x: evaluate(tuple(x))[1].ravel(),
+            theta[free],
+            lambda x: evaluate(tuple(x))[2],  # pyright: ignore[reportArgumentType]  (a function or a name)
+            method="lm",
+            x_scale="jac",
+            xtol=tolerance,
+            ftol=tolerance,
+            gtol=tolerance,
+            max_nfev=_MOST_STEPS[tolerance == _NEARLY],
+        )
+    except _LostError:
+        return Candidate(theta, np.inf, np.full((onsets.w.size, 2), np.nan), names, False)
+    at, residuals, _, good = evaluate(tuple(found.x))
     return Candidate(at, float((residuals**2).sum()), -residuals, names, good)

@@ -25,7 +25,7 @@ from zwidth.stability.ridge_slopes import plant_slopes
 
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share
 # beyond which w was not found.
-_STEPS, _LONGEST, _ARRIVED, _FOUND = 40, 0.15, 1e-9, 1e-6
+_STEPS, _LONGEST, _ARRIVED, _FOUND = 25, 0.15, 1e-9, 1e-6
 # The step in ln cutoff of a difference of fourth order, and its weights.
 _STEP, _WEIGHTS = 1e-3, {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
 # No cut-off is looked for above this share of half the sampling rate, or below this one of the lowest frequency heard,
