@@ -32,6 +32,8 @@ def read_points(
     points: Iterable[Any], period: float, copies_count_once: bool, unknown_cutoff: bool
 ) -> tuple[np.ndarray, list[str]]:
     """The walls as an array, and doubts; an impossible one is refused, and so are walls that cannot tell a device."""
+    if not isinstance(points, Iterable) or isinstance(points, str | dict):
+        raise InputError(f"points: got {points!r}; give walls, each (K in N/m, B in N s/m, f in Hz)")
     rows = []
     for k, point in enumerate(points):
         try:

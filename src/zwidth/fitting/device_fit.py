@@ -166,9 +166,11 @@ class DeviceFit:
             InputError: a share, a number of samples or a seed that there cannot be.
 
         Numerics:
-            ln m, b, t_d (and ln cutoff) normal with the fit's covariance, or Student's t where the noise was estimated;
-            draws of negative b or t_d are drawn again. A rigid device: rows and columns in closed form, K to 0.1 %, in
-            about 0.1 s. With a filter: boundaries on a grid of frequencies, judged by eigenvalues, in some seconds.
+            ln m, b, t_d (and 1/cutoff) normal with the fit's covariance, or Student's t where the noise was estimated;
+            draws of negative ones are drawn again. A rigid device: rows and columns in closed form, K to 0.1 %, in
+            about 0.1 s; of 20,000 other devices of 69 fits each, 98.5 to 99.2 % bore it, and of 2 % more stiffness at
+            most 91.4 % at any B. With a filter: boundaries on a grid of frequencies, judged by eigenvalues, in some
+            seconds.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section V (the stable set). Kotz, Nadarajah 2004 (the t distribution).

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from zwidth._types import Array
 from zwidth.batching import FEW
 from zwidth.design.tolerances import borne_by
 from zwidth.errors import InputError
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 _SAMPLES, _FILTERED_SAMPLES, _MOST_SAMPLES = 8000, 1000, 100_000
 # Rounds of draws; where most are impossible, the estimate says nothing.
 _ROUNDS = 50
+# In parts of the sampling rate.
+_HIGHEST = 0.499
 # K is known to this share, and is 0 where it is less than that share of what each device bears at its best B.
 _CLOSE, _NOTHING = 1e-3, 1e-4
 # Below the edge of the device that binds.
@@ -84,28 +87,30 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
 def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
     """Mass, damping, delay (and cut-off) of possible devices around the estimate, a row each; None if few are possible.
 
-    Mass and cut-off are drawn by their logarithms: what walls and logs tell of a mass is a share of it.
+    The mass is drawn by its logarithm, for what walls and logs tell of it is a share; of a filter its time constant is.
     """
-    values = np.array([fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])], float)
-    by_log = np.array([True, False, False, True])[: values.size]
-    center = np.where(by_log, np.log(np.where(by_log, values, 1.0)), values)
-    units = np.where(by_log, values, 1.0)
-    covariance = fit.covariance / np.outer(units, units)
+    values = [fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])]
+    center = np.array([np.log(fit.mass), fit.damping, fit.delay, *(1.0 / value for value in values[3:])])
+    slopes = np.array([1.0 / fit.mass, 1.0, 1.0, *(-1.0 / value**2 for value in values[3:])])
+    covariance = fit.covariance * np.outer(slopes, slopes)
     # Of very different units: by correlations.
     errors = np.sqrt(np.diag(covariance))
     sizes, sides = np.linalg.eigh(covariance / np.outer(errors, errors))
     root = errors[:, None] * sides * np.sqrt(np.maximum(sizes, 0.0))
     generator = np.random.default_rng(seed)
-    highest = np.array([np.inf, np.inf, np.inf, 0.5 / fit.period])[: values.size]
-    kept = np.zeros((0, values.size))
+    coded = getattr(fit.velocity, "coded_period", None) or fit.period
+    kept = np.zeros((0, len(values)))
     for _ in range(_ROUNDS):
-        spread = generator.standard_normal((count, values.size))
+        spread = generator.standard_normal((count, len(values)))
         if fit.freedom is not None:
             spread /= np.sqrt(generator.chisquare(fit.freedom, count) / fit.freedom)[:, None]
-        with np.errstate(over="ignore"):
-            some = center + spread @ root.T
-            some = np.where(by_log, np.exp(some), some)
-        kept = np.concatenate([kept, some[np.all((some >= 0) & (some < highest), 1)]])
+        some = center + spread @ root.T
+        some = some[np.all(some[:, 1:] >= 0, 1)]
+        with np.errstate(over="ignore", divide="ignore"):
+            some[:, 0] = np.exp(some[:, 0])
+            # Faster filters than half the sampling rate do nothing.
+            some[:, 3:] = np.minimum(1.0 / some[:, 3:], _HIGHEST / coded)
+        kept = np.concatenate([kept, some])
         if len(kept) >= count:
             return kept[:count]
     return None
@@ -188,11 +193,11 @@ class _FilteredDevices:
             self.f = np.stack([one.velocity.estimate(self.period).jet(at).value for one in some])
             self.q = NeededAnswer(delta[:, None], d[:, None]).jet(at).value
             # At z = -1 both are real.
-            self.q[:, -1], self.f[:, -1] = self.q[:, -1].real, self.f[:, -1].real
+            self.q[:, -1], self.f[:, -1] = np.real(self.q[:, -1]), np.real(self.f[:, -1])
             self.ends = self._first(self.q * self.f.conj(), self.q / self.f) * self.rate
 
     @staticmethod
-    def _first(turning: np.ndarray, value: np.ndarray) -> np.ndarray:
+    def _first(turning: Array, value: Array) -> np.ndarray:
         """The smallest real part > 0 of ``value`` where ``turning`` is real; inf where there is none."""
         left, right = turning.imag[:, :-1], turning.imag[:, 1:]
         share = np.where(left == right, 0.0, left / (left - right))
@@ -207,7 +212,7 @@ class _FilteredDevices:
         top = borne_by(self.ends, reliability)
         if not np.isfinite(top):
             top = float(np.max(self.ends, where=np.isfinite(self.ends), initial=0.0))
-        width, found = top / (_DAMPINGS - 1), {}
+        width, found, damping = top / (_DAMPINGS - 1), {}, 0.0
         tried = np.linspace(0.0, top, _DAMPINGS)
         for _ in range(1 + _TIMES):
             found |= {damping: borne_by(self._row_ends(damping), reliability) for damping in tried.tolist()}

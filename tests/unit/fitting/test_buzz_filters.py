@@ -19,7 +19,7 @@ def scene_with(velocity, mass=0.1, damping=5.0, delay=0.7e-3):
 
 def walls_of(scene, shares):
     """Walls at which stability first ends as K rises, at shares of the way along the boundary with B > 0."""
-    omega = np.linspace(20, 3000, 1500)
+    omega = np.linspace(20, 3000, 6000)
     walls = scene.boundary(omega)
     points = np.stack([walls.stiffness, walls.virtual_damping, omega / (2 * np.pi)], -1)
     points = points[(points[:, 0] > 0) & (points[:, 1] >= 0)]
@@ -41,7 +41,7 @@ def test_exact_walls_give_the_cut_off_back(velocity):
     guess = type(velocity)(cutoff=40, order=velocity.order)
     fit = zwidth.fit_buzz(walls_of(scene, (0.0, 0.4, 0.9)), period=PERIOD, velocity=guess, unknown_cutoff=True)
     assert_found(fit, scene)
-    assert fit.cutoff == fit.velocity.cutoff == pytest.approx(velocity.cutoff, rel=EXACT)
+    assert fit.cutoff == pytest.approx(velocity.cutoff, rel=EXACT)
     assert fit.stiffness_max == pytest.approx(float(scene.max_stiffness().stiffness), rel=EXACT)
 
 
@@ -57,10 +57,8 @@ def test_the_error_of_the_stiffest_wall_holds_that_of_the_cut_off():
     free = zwidth.fit_buzz(walls, period=PERIOD, velocity=FILTERS[0], unknown_cutoff=True, noise=0.02)
     known = zwidth.fit_buzz(walls, period=PERIOD, velocity=FILTERS[0], noise=0.02)
     assert set(free.errors) == {"mass", "damping", "delay", "cutoff"}
-    low, high = free.intervals["cutoff"]
-    assert (low + high) / 2 == pytest.approx(150) and high - low == pytest.approx(
-        2 * free.reach * free.errors["cutoff"]
-    )
+    far = free.reach * free.errors["cutoff"]
+    assert free.intervals["cutoff"] == (pytest.approx(150 - far), pytest.approx(150 + far))
     assert free.as_dict()["cutoff"] == free.cutoff
     assert np.all(np.diag(free.covariance)[:3] > np.diag(known.covariance))
     # The gradient of K_max by differences of K_max alone.
@@ -80,13 +78,14 @@ def test_the_error_of_the_stiffest_wall_holds_that_of_the_cut_off():
 def test_noisy_walls_leave_the_cut_off_within_what_they_claim():
     scene, rng = scene_with(FILTERS[0]), np.random.default_rng(2)
     walls, away = walls_of(scene, (0.0, 0.3, 0.6, 0.9)), []
-    for _ in range(8):
+    for _ in range(6):
         noisy = walls.copy()
         noisy[:, [0, 2]] *= 1 + 0.01 * rng.standard_normal((4, 2))
         fit = zwidth.fit_buzz(noisy, period=PERIOD, velocity=FILTERS[0], unknown_cutoff=True, noise=0.01)
+        assert fit.cutoff is not None
         away.append((fit.cutoff - 150) / fit.errors["cutoff"])
-    # The chance that 8 squares of a normal number add up to less, or to more, is 1e-4 each.
-    assert 0.2 < np.square(away).sum() < 31.8
+    # The chance that 6 squares of a normal number add up to less, or to more, is 1e-4 each.
+    assert 0.16 < np.square(away).sum() < 27.9
 
 
 @pytest.mark.parametrize(
@@ -107,7 +106,7 @@ def test_walls_that_cannot_tell_the_cut_off_are_refused(shares, words):
 
 @pytest.mark.parametrize("velocity", [None, zwidth.WindowedDifference(samples=4)])
 def test_only_a_low_pass_has_a_cut_off(velocity):
-    with pytest.raises(InputError, match="velocity: got .* no cut-off"):
+    with pytest.raises(InputError, match=r"velocity: got .* no cut-off"):
         zwidth.fit_buzz([(1e3, 0, 40)], period=PERIOD, velocity=velocity, unknown_cutoff=True)
 
 

