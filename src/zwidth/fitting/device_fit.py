@@ -181,7 +181,7 @@ class DeviceFit:
             >>> fit = zwidth.fit_buzz(heard, period="1 ms", noise=0.02)
             >>> wall = fit.safe_wall()
             >>> print(f"{wall.stiffness / 1e3:.1f} of {fit.stiffness_max / 1e3:.1f} kN/m")
-            18.6 of 20.0 kN/m
+            19.0 of 19.9 kN/m
         """
         from zwidth.fitting.safe_wall import find_safe_wall
 
