@@ -34,7 +34,10 @@ class ErrorBar(NamedTuple):
 
 
 class FurtherExperiment(NamedTuple):
-    """Raise K at this damping until the wall buzzes: N s/m, the N/m and Hz expected, and K_max's error afterwards."""
+    """Raise K at this damping until the wall buzzes: N s/m, the N/m and Hz expected, and K_max's error afterwards.
+
+    That error is NaN where K_max is.
+    """
 
     virtual_damping: float
     stiffness: float
@@ -282,7 +285,7 @@ class StiffnessEstimate:
             residuals=residuals,
             doubts=tuple(doubts),
             status=int(status),
-            next=further,
+            next=further and further._replace(error_afterwards=known * further.error_afterwards),
             offset=offset,
             friction=friction[0],
             resolution=resolution,

@@ -18,6 +18,7 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import FEW
 from zwidth.design.tolerances import borne_by
+from zwidth.domain import SI_RANGE, device_status
 from zwidth.errors import InputError
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.device_fit import scene_of
@@ -44,7 +45,9 @@ _CLOSE, _NOTHING = 1e-3, 1e-4
 # Below the edge of the device that binds.
 _BELOW = 1e-9
 # Frequencies: of slow loops, evenly, and more for each period of delay; dampings, then refined so often.
-_SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD, _DAMPINGS, _REFINED, _TIMES = 1e-4, 60, 400, 60, 33, 9, 3
+_SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD, _DAMPINGS, _REFINED, _TIMES = 1e-4, 60, 400, 40, 33, 9, 3
+# The longest delay looked at, in periods, and for each period of the estimated one.
+_FARTHEST = (20.0, 1.5)
 # Judged at K and at this share of it; how many devices eigenvalues may judge otherwise than the grid.
 _SOFTER, _ASTRAY = (1.0, 0.5, 0.1), 2e-3
 
@@ -183,14 +186,21 @@ class _FilteredDevices:
     """Devices with any velocity filter, by their boundaries on a grid of frequencies; only B >= 0 counts."""
 
     def __init__(self, drawn: np.ndarray, scene: Scene, unknown_cutoff: bool) -> None:
-        self.period, self.rate = scene.timing.period, drawn[:, 0] / scene.timing.period
-        delta, d = drawn[:, 1] / self.rate, drawn[:, 2] / self.period
-        self.scenes = [scene_of(values, self.period, scene.velocity) for values in drawn]
-        even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max()))[1:]
-        at = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
-        some = self.scenes if unknown_cutoff else self.scenes[:1]
+        self.period = scene.timing.period
         with np.errstate(all="ignore"):
-            self.f = np.stack([one.velocity.estimate(self.period).jet(at).value for one in some])
+            rate, d = drawn[:, 0] / self.period, drawn[:, 2] / self.period
+            known = device_status(drawn[:, 1] / rate, d) == Status.OK
+        known &= (drawn[:, 0] > SI_RANGE[0]) & (drawn[:, 0] < SI_RANGE[1]) & (d < _FARTHEST[0] + _FARTHEST[1] * scene.d)
+        # Beyond what is looked at nothing is believed to be borne.
+        self.others = np.zeros(np.count_nonzero(~known))
+        drawn, self.rate, d = drawn[known], rate[known], d[known]
+        delta = drawn[:, 1] / self.rate
+        self.scenes = [scene_of(values, self.period, scene.velocity) for values in drawn]
+        even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
+        at = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
+        some = self.scenes if unknown_cutoff else [scene]
+        with np.errstate(all="ignore"):
+            self.f = np.array([one.velocity.estimate(self.period).jet(at).value for one in some])
             self.q = NeededAnswer(delta[:, None], d[:, None]).jet(at).value
             # At z = -1 both are real.
             self.q[:, -1], self.f[:, -1] = np.real(self.q[:, -1]), np.real(self.f[:, -1])
@@ -209,13 +219,13 @@ class _FilteredDevices:
 
     def find(self, reliability: float) -> tuple[float, float]:
         """K and B, both 0 where there is none."""
-        top = borne_by(self.ends, reliability)
+        top = self._borne_by(self.ends, reliability)
         if not np.isfinite(top):
             top = float(np.max(self.ends, where=np.isfinite(self.ends), initial=0.0))
         width, found, damping = top / (_DAMPINGS - 1), {}, 0.0
         tried = np.linspace(0.0, top, _DAMPINGS)
         for _ in range(1 + _TIMES):
-            found |= {damping: borne_by(self._row_ends(damping), reliability) for damping in tried.tolist()}
+            found |= {damping: self._borne_by(self._row_ends(damping), reliability) for damping in tried.tolist()}
             damping = max(found, key=lambda one: found[one])
             tried = np.clip(np.linspace(damping - width, damping + width, _REFINED), 0.0, top)
             width /= 0.5 * (_REFINED - 1)
@@ -231,7 +241,11 @@ class _FilteredDevices:
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
         """Of the devices on which the wall and softer ones of its damping are stable, by eigenvalues."""
-        return float(np.mean([_bears(scene, stiffness, virtual_damping) for scene in self.scenes]))
+        borne = sum(_bears(scene, stiffness, virtual_damping) for scene in self.scenes)
+        return borne / (len(self.scenes) + self.others.size)
+
+    def _borne_by(self, limits: np.ndarray, reliability: float) -> float:
+        return borne_by(np.concatenate([limits, self.others]), reliability)
 
 
 def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:

@@ -201,6 +201,8 @@ def test_rivals_leave_a_stiffness_only_where_they_agree_on_it(seed, agree):
     if agree:
         assert abs(rival.stiffness_max - best) <= fit.stiffness_error
     assert np.isnan(fit.safe_wall().stiffness)
+    assert fit.next is not None
+    assert np.isfinite(fit.next.error_afterwards) == agree
     assert fit.as_dict()["rivals"][0]["mass"] == rival.mass
     assert fit.as_dict()["stiffness_max"] == (fit.stiffness_max if agree else None)
 

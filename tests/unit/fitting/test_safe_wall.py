@@ -64,6 +64,12 @@ def test_what_the_records_leave_open_leaves_nothing_to_render(fit):
     assert stiffness[2] < 0.05 * fit.stiffness_max
 
 
+@pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100)])
+def test_devices_beyond_all_bounds_bear_nothing(fit, velocity):
+    lost = replace(fit, covariance=1e8 * fit.covariance, freedom=1, velocity=velocity)
+    assert lost.safe_wall()[:2] == (0.0, 0.0)
+
+
 def test_another_route_to_the_same_wall(fit):
     # A window of one sample is the backward difference, of which this scene does not know the closed form.
     alike = replace(fit, velocity=zwidth.WindowedDifference(samples=1))
