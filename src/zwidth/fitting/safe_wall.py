@@ -96,8 +96,9 @@ def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
     center = np.array([np.log(fit.mass), fit.damping, fit.delay, *(1.0 / value for value in values[3:])])
     slopes = np.array([1.0 / fit.mass, 1.0, 1.0, *(-1.0 / value**2 for value in values[3:])])
     covariance = fit.covariance * np.outer(slopes, slopes)
-    # Of very different units: by correlations.
+    # Of very different units: by correlations. What is known exactly has none.
     errors = np.sqrt(np.diag(covariance))
+    errors = np.where(errors > 0, errors, 1.0)
     sizes, sides = np.linalg.eigh(covariance / np.outer(errors, errors))
     root = errors[:, None] * sides * np.sqrt(np.maximum(sizes, 0.0))
     generator = np.random.default_rng(seed)
