@@ -84,8 +84,8 @@ def fit_buzz(
         and f and four walls of 800 random devices, 10 % of the fits were UNDECIDED and 5 % refused; of the others, the
         intervals of m, b, t_d and K_max held the true value on 93.5, 94.4, 95.0 and 94.1 %, and that of K_max on 96 %
         of the 50 whose K_max spreads by 20 % more or less than its gradient says. With an unknown cut-off and five
-        walls of 389 devices (6 % UNDECIDED or refused), those of m, b, t_d, cut-off and K_max did on 95.6, 95.9, 96.2,
-        96.2 and 98.1 %.
+        walls of 305 devices (7 % UNDECIDED, 1 % refused), those of m, b, t_d, cut-off and K_max did on 95.7, 95.7,
+        96.1, 96.8 and 98.2 %.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section V (the boundary). Boggs, Rogers 1990 (errors in both coordinates).
