@@ -173,7 +173,8 @@ def tell_choices(rows: list[dict[str, Any]]) -> str:
         f"Friction is found in {share(rubs)} logs that have it, and in {share(smooth)} without; a constant force in",
         f"{share(pushed)} and {share(free)}. Refused: {len(rows) - len(fitted)}; with a doubt:",
         f"{sum(row['doubted'] for row in fitted)}; with a status that is not OK:",
-        f"{sum(row['status'] != 0 for row in fitted)}; logs that cannot tell friction from a constant force, not counted here: {untold}.",
+        f"{sum(row['status'] != 0 for row in fitted)}; logs that cannot tell friction from a constant force,",
+        f"not counted here: {untold}.",
     ])  # fmt: skip
 
 

@@ -102,8 +102,8 @@ def simulate_tolerances(
         low,
         high,
         reliability,
-        _borne_by(limits, reliability),
-        _borne_by(highest, reliability) if highest is not None else np.nan,
+        borne_by(limits, reliability),
+        borne_by(highest, reliability) if highest is not None else np.nan,
         drawn,
         labels,
     )
@@ -172,7 +172,7 @@ def _judge_each(scene: Scene, drawn: dict[str, np.ndarray], count: int) -> tuple
     return labels, limits, None
 
 
-def _borne_by(limits: np.ndarray, share: float) -> float:
+def borne_by(limits: np.ndarray, share: float) -> float:
     """The stiffness up to which a share of the devices is stable; 0 where too few are stable at all."""
     ordered = np.sort(np.where(np.isnan(limits), 0.0, limits))
     # The tolerance keeps 1 - 0.99 of 100 devices at one device.

@@ -50,6 +50,7 @@ def fit_log(
     max_delay: Any = None,
     resolution: Any = None,
     resample: bool = False,
+    rotary: bool = False,
 ) -> DeviceFit:
     """Find mass, damping and delay from a log of free motion under a force that a computer commands.
 
@@ -66,6 +67,8 @@ def fit_log(
             past force.
         resolution: step of the encoder, in m; found from the positions where left out; 0 for none.
         resample: whether uneven times are made even, of their median step: positions on straight lines, forces held.
+        rotary: whether the position is an angle in rad and the force a torque in N m; then mass is an inertia in kg m²,
+            damping in N m s/rad, and so on.
 
     Returns:
         DeviceFit: ``mass``, ``damping``, ``delay``, their ``errors`` and ``covariance``; ``friction`` and ``offset``, 0
@@ -117,7 +120,7 @@ def fit_log(
     by_theta = by_theta @ np.diag([-1.0 / theta[0], 1.0, 1.0])
     covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
-    doubts = odd + doubts + _doubt(values, np.sqrt(np.diag(covariance)), best, logs)
+    doubts = odd + doubts + _doubt(values, np.sqrt(np.diag(covariance)), best, logs, rotary)
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
@@ -186,10 +189,10 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
 
 
-def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...]) -> list[str]:
+def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tuple[Log, ...], rotary: bool) -> list[str]:
     mass, damping, delay = values
     doubts, residuals = [], best.residuals
-    if not _LIGHTEST <= mass <= _HEAVIEST:
+    if not rotary and not _LIGHTEST <= mass <= _HEAVIEST:
         slip = "the position may be in mm, or the force in kN" if mass < _LIGHTEST else "the force may be in mN"
         doubts.append(f"a mass of {with_unit(1e3 * mass, 'g')} is far from any device; {slip}: m, N and s are meant")
     if errors[0] > VAGUE * mass:

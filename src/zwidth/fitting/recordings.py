@@ -19,6 +19,8 @@ _UNEVEN, _SAME = 0.05, 1e-5
 _FEWEST = 20
 # Samples that a stretch at one end lasts before it is suspected; a force of so many values varies, as a share.
 _STUCK, _MANY = 25, 0.1
+# The longest step, in periods, over which positions are interpolated.
+_GAP = 2.5
 
 
 @dataclass(frozen=True)
@@ -109,7 +111,13 @@ def _period(clock: np.ndarray) -> float:
 def _resample(clock: np.ndarray, x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """At even times of the median step: positions on straight lines, forces held."""
     _refuse_backwards(clock)
-    period = float(np.median(np.diff(clock)))
+    steps = np.diff(clock)
+    period, longest = float(np.median(steps)), int(np.argmax(steps))
+    if steps[longest] > _GAP * period:
+        raise InputError(
+            f"time: a gap of {with_unit(float(steps[longest]), 's')} after sample {longest} cannot be made even; split "
+            "the log there, and give both"
+        )
     even = clock[0] + period * np.arange(int((clock[-1] - clock[0]) / period * (1 + 1e-12)) + 1)
     held = np.searchsorted(clock, even + 1e-9 * period, side="right") - 1
     return even, np.interp(even, clock, x), f[held]

@@ -1,0 +1,118 @@
+"""Devices that walls at the onset of buzzing are nearest to: least squares from many starts."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.fitting.buzzing import Onsets
+
+# The dampings b T/m that are started from, the number of cut-offs, and how many of the dips.
+_DELTAS = np.concatenate([[0.0], np.geomspace(1e-4, 30.0, 45)])
+_CUTOFFS, _STARTS = 16, (6, 12)
+# Tolerances of a first look and of the end, and the evaluations they may take.
+_NEARLY, _ARRIVED, _MOST_STEPS = 1e-4, 1e-12, (100, 40)
+# After so many devices in a row without such walls there is no way back.
+_LOST = 8
+_NAMES = ("mass", "damping", "delay", "cut-off")
+
+
+class Candidate(NamedTuple):
+    """A local best fit: theta, its sum of squares, residuals, what is held at 0, and whether all walls were found."""
+
+    theta: np.ndarray
+    squares: float
+    residuals: np.ndarray
+    held: tuple[str, ...]
+    found: bool
+
+
+class _LostError(Exception):
+    """No device around has such walls."""
+
+
+def weigh(slopes: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Derivatives of all residuals, a row each, in units of their noise."""
+    return (slopes * weights[:, None]).reshape(-1, slopes.shape[-1])
+
+
+def find_candidates(onsets: Onsets, weights: np.ndarray) -> list[Candidate]:
+    """Local best fits, the best first. Where damping or delay would be negative, it is held at 0."""
+    found: list[Candidate] = []
+    # Half a turn over the delay, and some more for noise.
+    longest = 1.2 * np.pi / float(onsets.w.max())
+    for start in onsets.starts(_DELTAS, longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff]):
+        near = _solve(onsets, weights, start, (), _NEARLY)
+        if near.found:
+            if any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found):
+                continue
+            free = _solve(onsets, weights, near.theta, ())
+            if min(free.theta[1:3]) >= 0:
+                found.append(free)
+                continue
+        ends = (_solve(onsets, weights, start, held) for held in ((1,), (2,), (1, 2)))
+        found += [end for end in ends if min(end.theta[1:3]) >= 0]
+    return sorted(found, key=lambda fit: (not fit.found, fit.squares))
+
+
+def _cutoffs(onsets: Onsets) -> np.ndarray:
+    """Places to look for a cut-off at: from a tenth of what was heard on, and the one given."""
+    if not onsets.unknown_cutoff:
+        return np.ones(1)
+    low, high = onsets.cutoffs
+    places = np.geomspace(min(100 * low, 0.1 * high), 0.98 * high, _CUTOFFS)
+    given = getattr(onsets.velocity, "cutoff", None)
+    return places if given is None else np.sort(np.append(places, np.clip(given, *places[[0, -1]])))
+
+
+def _solve(
+    onsets: Onsets, weights: np.ndarray, start: np.ndarray, held: tuple[int, ...], tolerance: float = _ARRIVED
+) -> Candidate:
+    from scipy.optimize import least_squares
+
+    free = [k for k in range(onsets.unknowns) if k not in held]
+    theta = start.copy()
+    theta[list(held)] = 0.0
+
+    lost = 0
+
+    @lru_cache(maxsize=1)  # The solver asks for values and slopes apart.
+    def evaluate(values: tuple[float, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray, bool]:
+        nonlocal lost
+        at = theta.copy()
+        at[free] = values
+        if onsets.is_possible(at):
+            with np.errstate(all="ignore"):
+                walls = onsets.follow(at)
+                ratios = np.stack([np.log(walls.kappa / onsets.kappa), np.log(walls.w / onsets.w)], -1)
+            good = walls.found & np.all(np.isfinite(ratios), -1) & np.all(np.isfinite(walls.slopes), (1, 2))
+        else:
+            good = np.zeros(onsets.w.shape, bool)
+            ratios, walls = 0.0, None
+        lost = 0 if good.all() else lost + 1
+        if lost > _LOST:
+            raise _LostError
+        # Where no such wall is found, as wrong as can be, and flat.
+        ratios = np.where(good[:, None], ratios, 10.0)
+        slopes = np.where(good[:, None, None], walls.slopes if walls else 0.0, np.zeros((1, 2, onsets.unknowns)))
+        return at, ratios * weights, weigh(slopes, weights)[:, free], bool(good.all())
+
+    names = tuple(_NAMES[k] for k in held)
+    try:
+        found = least_squares(
+            lambda x: evaluate(tuple(x))[1].ravel(),
+            theta[free],
+            lambda x: evaluate(tuple(x))[2],  # pyright: ignore[reportArgumentType]  (a function or a name)
+            method="lm",
+            x_scale="jac",
+            xtol=tolerance,
+            ftol=tolerance,
+            gtol=tolerance,
+            max_nfev=_MOST_STEPS[tolerance == _NEARLY],
+        )
+    except _LostError:
+        return Candidate(theta, np.inf, np.full((onsets.w.size, 2), np.nan), names, False)
+    at, residuals, _, good = evaluate(tuple(found.x))
+    return Candidate(at, float((residuals**2).sum()), -residuals, names, good)

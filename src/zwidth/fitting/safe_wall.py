@@ -1,0 +1,256 @@
+"""The stiffest wall that nearly all devices bear that records of one device allow.
+
+Raised from below: a device bears (K, B) where every softer wall of that B is stable as well. On a rigid device all rows
+and columns of the stable set are intervals (docs/theory/one-lobe.md), so that at each K the dampings that most devices
+bear are counted from the ends of their columns, and K is halved between what they bear and what they do not.
+
+With a velocity filter a row ends at its first crossing: the smallest K > 0 at which a pole reaches the unit circle,
+from K -> 0+, where it is stable for all B below the first that puts a pole on the circle there. Both are looked for on
+a grid of frequencies; eigenvalues then judge the wall on every device.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from zwidth._types import Array
+from zwidth.batching import FEW
+from zwidth.design.tolerances import borne_by
+from zwidth.domain import SI_RANGE, device_status
+from zwidth.errors import InputError
+from zwidth.fitting.buzzing import NeededAnswer
+from zwidth.fitting.device_fit import scene_of
+from zwidth.linear.polynomial import affine_polynomial
+from zwidth.linear_loop import circle
+from zwidth.parts.checks import check_whole
+from zwidth.scene import Scene
+from zwidth.stability.boundary import boundary_point
+from zwidth.stability.labels import is_stable
+from zwidth.stability.poles import companion
+from zwidth.stability.ridge import alpha_max
+from zwidth.status import Status
+
+if TYPE_CHECKING:
+    from zwidth.fitting.device_fit import DeviceFit
+
+_SAMPLES, _FILTERED_SAMPLES, _MOST_SAMPLES = 8000, 1000, 100_000
+# Rounds of draws; where most are impossible, the estimate says nothing.
+_ROUNDS = 50
+# In parts of the sampling rate.
+_HIGHEST = 0.499
+# K is known to this share, and is 0 where it is less than that share of what each device bears at its best B.
+_CLOSE, _NOTHING = 1e-3, 1e-4
+# Below the edge of the device that binds.
+_BELOW = 1e-9
+# Frequencies: of slow loops, evenly, and more for each period of delay; dampings, then refined so often.
+_SLOWEST, _SLOW, _EVEN, _EVEN_PER_PERIOD, _DAMPINGS, _REFINED, _TIMES = 1e-4, 60, 400, 40, 33, 9, 3
+# The longest delay looked at, in periods, and for each period of the estimated one.
+_FARTHEST = (20.0, 1.5)
+# Judged at K and at this share of it; how many devices eigenvalues may judge otherwise than the grid.
+_SOFTER, _ASTRAY = (1.0, 0.5, 0.1), 2e-3
+
+
+class SafeWall(NamedTuple):
+    """K in N/m, B in N s/m, the share of drawn devices that bear it, and the `zwidth.Status`, with NaN if not OK."""
+
+    stiffness: float
+    virtual_damping: float
+    share: float
+    status: int
+
+
+def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed: int) -> SafeWall:
+    """See `zwidth.DeviceFit.safe_wall`."""
+    if isinstance(reliability, bool | str) or not 0.5 <= reliability < 1:
+        raise InputError(f"reliability: got {reliability!r}; a share from 0.5 to below 1 is needed, as 0.99")
+    scene = fit.scene
+    usual = _SAMPLES if scene.is_rigid else _FILTERED_SAMPLES
+    count = usual if samples is None else check_whole("samples", samples, 100, _MOST_SAMPLES)
+    seed = check_whole("seed", seed, 0, 2**63 - 1)
+    if fit.status != Status.OK:
+        return SafeWall(np.nan, np.nan, np.nan, fit.status)
+    drawn = draw_devices(fit, count, seed)
+    if drawn is None:
+        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+    devices = (
+        _RigidDevices(drawn, fit.period) if scene.is_rigid else _FilteredDevices(drawn, scene, "cutoff" in fit.errors)
+    )
+    stiffness, virtual_damping = devices.find(reliability)
+    if stiffness == 0:
+        return SafeWall(0.0, 0.0, 1.0, int(Status.OK))
+    stiffness *= 1.0 - _BELOW
+    share = devices.share(stiffness, virtual_damping)
+    if share < reliability - _ASTRAY:
+        return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
+    return SafeWall(stiffness, virtual_damping, share, int(Status.OK))
+
+
+def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
+    """Mass, damping, delay (and cut-off) of possible devices around the estimate, a row each; None if few are possible.
+
+    The mass is drawn by its logarithm, for what walls and logs tell of it is a share; of a filter its time constant is.
+    """
+    values = [fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])]
+    center = np.array([np.log(fit.mass), fit.damping, fit.delay, *(1.0 / value for value in values[3:])])
+    slopes = np.array([1.0 / fit.mass, 1.0, 1.0, *(-1.0 / value**2 for value in values[3:])])
+    covariance = fit.covariance * np.outer(slopes, slopes)
+    # Of very different units: by correlations. What is known exactly has none.
+    errors = np.sqrt(np.diag(covariance))
+    errors = np.where(errors > 0, errors, 1.0)
+    sizes, sides = np.linalg.eigh(covariance / np.outer(errors, errors))
+    root = errors[:, None] * sides * np.sqrt(np.maximum(sizes, 0.0))
+    generator = np.random.default_rng(seed)
+    coded = getattr(fit.velocity, "coded_period", None) or fit.period
+    kept = np.zeros((0, len(values)))
+    for _ in range(_ROUNDS):
+        spread = generator.standard_normal((count, len(values)))
+        if fit.freedom is not None:
+            spread /= np.sqrt(generator.chisquare(fit.freedom, count) / fit.freedom)[:, None]
+        some = center + spread @ root.T
+        some = some[np.all(some[:, 1:] >= 0, 1)]
+        with np.errstate(over="ignore", divide="ignore"):
+            some[:, 0] = np.exp(some[:, 0])
+            # Faster filters than half the sampling rate do nothing.
+            some[:, 3:] = np.minimum(1.0 / some[:, 3:], _HIGHEST / coded)
+        kept = np.concatenate([kept, some])
+        if len(kept) >= count:
+            return kept[:count]
+    return None
+
+
+class _RigidDevices:
+    """Devices with the backward difference, by closed forms."""
+
+    def __init__(self, drawn: np.ndarray, period: float) -> None:
+        with np.errstate(all="ignore"):
+            self.rate, self.period = drawn[:, 0] / period, period
+            self.delta, self.d = drawn[:, 1] / self.rate, drawn[:, 2] / period
+
+    def find(self, reliability: float) -> tuple[float, float]:
+        """K and B, both 0 where there is none."""
+        best = _in_pieces(lambda delta, d: alpha_max(delta, d).alpha, self.delta, self.d)
+        low, high, damping = 0.0, borne_by(best * self.rate / self.period, reliability), 0.0
+        least = _NOTHING * high
+        while high > max((1.0 + _CLOSE) * low, least):
+            stiffness = 0.5 * (low + high)
+            tried = self._most_borne(stiffness)
+            borne = borne_by(self._row_ends(tried), reliability)
+            if borne > low:
+                low, damping = borne, tried
+            if borne < stiffness:
+                high = stiffness
+        return (low, damping) if low > least else (0.0, 0.0)
+
+    def _row_ends(self, damping: float) -> np.ndarray:
+        ends = _in_pieces(lambda delta, d, beta: boundary_point(delta, d, beta=beta).alpha, *self._with(damping))
+        return ends * self.rate / self.period
+
+    def _with(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        return self.delta, self.d, damping / self.rate
+
+    def _most_borne(self, stiffness: float) -> float:
+        """The middle of the dampings at which most devices bear this stiffness."""
+        alpha = stiffness * self.period / self.rate
+        sides = []
+        for side in ("lower", "upper"):
+            ends = _in_pieces(
+                lambda delta, d, alpha, side=side: boundary_point(delta, d, alpha=alpha, side=side).beta,
+                *(self.delta, self.d, alpha),
+            )
+            sides.append(ends * self.rate)
+        real = np.isfinite(sides[0]) & np.isfinite(sides[1])
+        places = np.concatenate([side[real] for side in sides])
+        if not places.size:
+            return 0.0
+        order = np.argsort(places, kind="stable")
+        borne = np.cumsum(np.repeat([1, -1], real.sum())[order])
+        first = int(np.argmax(borne))
+        return float(0.5 * (places[order][first] + places[order][first + 1]))
+
+    def share(self, stiffness: float, virtual_damping: float) -> float:
+        """Of the devices on which the wall is stable; softer ones are so with it."""
+        delta, d, beta = self._with(virtual_damping)
+        return float(_in_pieces(is_stable, stiffness * self.period / self.rate, beta, delta, d).mean())
+
+
+def _in_pieces(function: Any, *arrays: np.ndarray) -> np.ndarray:
+    """A function of arrays that is computed at once for few points and would be compiled for many."""
+    count = -(-arrays[0].size // FEW)
+    with np.errstate(all="ignore"):
+        pieces = zip(*(np.array_split(array, count) for array in arrays), strict=True)
+        return np.concatenate([np.asarray(function(*piece)) for piece in pieces])
+
+
+class _FilteredDevices:
+    """Devices with any velocity filter, by their boundaries on a grid of frequencies; only B >= 0 counts."""
+
+    def __init__(self, drawn: np.ndarray, scene: Scene, unknown_cutoff: bool) -> None:
+        self.period = scene.timing.period
+        with np.errstate(all="ignore"):
+            rate, d = drawn[:, 0] / self.period, drawn[:, 2] / self.period
+            known = device_status(drawn[:, 1] / rate, d) == Status.OK
+        known &= (drawn[:, 0] > SI_RANGE[0]) & (drawn[:, 0] < SI_RANGE[1]) & (d < _FARTHEST[0] + _FARTHEST[1] * scene.d)
+        # Beyond what is looked at nothing is believed to be borne.
+        self.others = np.zeros(np.count_nonzero(~known))
+        drawn, self.rate, d = drawn[known], rate[known], d[known]
+        delta = drawn[:, 1] / self.rate
+        self.scenes = [scene_of(values, self.period, scene.velocity) for values in drawn]
+        even = np.linspace(0.0, np.pi, int(_EVEN + _EVEN_PER_PERIOD * d.max(initial=0.0)))[1:]
+        at = circle(np.concatenate([np.geomspace(_SLOWEST, even[0], _SLOW)[:-1], even]))
+        some = self.scenes if unknown_cutoff else [scene]
+        with np.errstate(all="ignore"):
+            self.f = np.array([one.velocity.estimate(self.period).jet(at).value for one in some])
+            self.q = NeededAnswer(delta[:, None], d[:, None]).jet(at).value
+            # At z = -1 both are real.
+            self.q[:, -1], self.f[:, -1] = np.real(self.q[:, -1]), np.real(self.f[:, -1])
+            self.ends = self._first(self.q * self.f.conj(), self.q / self.f) * self.rate
+
+    @staticmethod
+    def _first(turning: Array, value: Array) -> np.ndarray:
+        """The smallest real part > 0 of ``value`` where ``turning`` is real; inf where there is none."""
+        left, right = turning.imag[:, :-1], turning.imag[:, 1:]
+        share = np.where(left == right, 0.0, left / (left - right))
+        between = value.real[:, :-1] + share * (value.real[:, 1:] - value.real[:, :-1])
+        crossed = (left * right <= 0) & (between > 0)
+        first = np.where(crossed, between, np.inf).min(1)
+        last = value.real[:, -1]
+        return np.where((last > 0) & np.isfinite(last), np.minimum(first, last), first)
+
+    def find(self, reliability: float) -> tuple[float, float]:
+        """K and B, both 0 where there is none."""
+        top = self._borne_by(self.ends, reliability)
+        if not np.isfinite(top):
+            top = float(np.max(self.ends, where=np.isfinite(self.ends), initial=0.0))
+        width, found, damping = top / (_DAMPINGS - 1), {}, 0.0
+        tried = np.linspace(0.0, top, _DAMPINGS)
+        for _ in range(1 + _TIMES):
+            found |= {damping: self._borne_by(self._row_ends(damping), reliability) for damping in tried.tolist()}
+            damping = max(found, key=lambda one: found[one])
+            tried = np.clip(np.linspace(damping - width, damping + width, _REFINED), 0.0, top)
+            width /= 0.5 * (_REFINED - 1)
+        return (found[damping], damping) if found[damping] > 0 else (0.0, 0.0)
+
+    def _row_ends(self, damping: float) -> np.ndarray:
+        wall = self.q - (damping / self.rate)[:, None] * self.f
+        with np.errstate(all="ignore"):
+            ends = self._first(wall, wall) * self.rate / self.period
+        # A slower crossing than the grid's slowest, or no end at all, is not believed.
+        real = (wall.imag[:, 0] < 0) & (damping < self.ends) & np.isfinite(ends)
+        return np.where(real, ends, 0.0)
+
+    def share(self, stiffness: float, virtual_damping: float) -> float:
+        """Of the devices on which the wall and softer ones of its damping are stable, by eigenvalues."""
+        borne = sum(_bears(scene, stiffness, virtual_damping) for scene in self.scenes)
+        return borne / (len(self.scenes) + self.others.size)
+
+    def _borne_by(self, limits: np.ndarray, reliability: float) -> float:
+        return borne_by(np.concatenate([limits, self.others]), reliability)
+
+
+def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:
+    D, N1, N2 = affine_polynomial(scene.loop)
+    alpha, beta = scene.normalize_walls(stiffness * np.array(_SOFTER), virtual_damping)
+    monic = (D + alpha[:, None] * N1 + beta * N2) / D[0]
+    return bool(np.all(np.abs(np.linalg.eigvals(companion(monic))) < 1.0))
