@@ -39,6 +39,14 @@ def _axes(ax: Axes | None, width: float = 5.6, height: float = 4.0) -> Axes:
     return style.panels(ax, 1, width, height)[0]
 
 
+def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[float, float]) -> Axes:
+    """Complex numbers in an Axes, with the unit circle."""
+    ax = _axes(ax, 4.4, 4.2)
+    ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.7))
+    ax.set(xlim=real, ylim=imaginary, xlabel="real part", ylabel="imaginary part", aspect="equal")
+    return ax
+
+
 def _units(scene: Scene, normalized: bool, largest: float = math.nan) -> tuple[tuple[float, float], tuple[str, str]]:
     """What stiffness and damping are divided by, and the labels of their axes."""
     if normalized:
@@ -186,8 +194,7 @@ def nyquist(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Ax
         [np.geomspace(1e-4 * half, 0.05 * half, _FREQUENCIES), np.linspace(0.05 * half, half, _FREQUENCIES)]
     )
     found = scene.frequency_response(stiffness, virtual_damping, hertz)
-    ax = _axes(ax, 4.4, 4.2)
-    ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.GRAY, linewidth=0.6))
+    ax = _complex_plane(ax, (-2.6, 1.6), (-2.2, 2.0))
     ax.plot(found.real, found.imag, color=style.BLUE, label="open loop $L$, up to half the sampling rate")
     size = np.abs(found)
     k = np.flatnonzero((size[:-1] > 1.0) != (size[1:] > 1.0))
@@ -195,8 +202,6 @@ def nyquist(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Ax
     crossing = found[k] + share * (found[k + 1] - found[k])
     ax.plot(crossing.real, crossing.imag, "o", color=style.BLUE, markersize=4.5, label="gain crossover")
     ax.plot(-1.0, 0.0, "x", color=style.VERMILION, markersize=7, markeredgewidth=1.8, label="$-1$")
-    ax.set(xlim=(-2.6, 1.6), ylim=(-2.2, 2.0), xlabel="real part", ylabel="imaginary part")
-    ax.set_aspect("equal")
     ax.legend(loc="lower right", fontsize=7)
     return ax
 
@@ -213,17 +218,14 @@ def poles(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Axes
     """
     found: Any = np.asarray(scene.poles(stiffness, virtual_damping)).ravel()
     outside = np.abs(found) >= 1.0
-    ax = _axes(ax, 4.4, 4.2)
-    ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.8))
+    reach = 1.15 * max(1.0, float(np.abs(found).max()))
+    ax = _complex_plane(ax, (-reach, reach), (-reach, reach))
     for mask, color, mark, words in (
         (~outside, style.BLUE, "x", "inside"),
         (outside, style.VERMILION, "D", "not inside"),
     ):
         if mask.any():
             ax.plot(found[mask].real, found[mask].imag, mark, color=color, markersize=6, label=f"poles {words}")
-    reach = 1.15 * max(1.0, float(np.abs(found).max()))
-    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="real part", ylabel="imaginary part")
-    ax.set_aspect("equal")
     ax.legend(loc="upper left", fontsize=7)
     return ax
 
