@@ -25,6 +25,7 @@ from zwidth._types import ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.figures import style
+from zwidth.figures.grid import logarithmic
 from zwidth.figures.region import to_path
 from zwidth.quantities import PARAMETERS
 from zwidth.scene import Scene
@@ -138,8 +139,8 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     known = PARAMETERS.get(parameter)
     words = f"{known.words}  ${known.symbol}$  in {known.unit}" if known else parameter
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
-    if grid.size > 2 and np.all(grid > 0) and np.allclose(np.diff(np.log(grid)), np.log(grid[1] / grid[0])):
-        ax.set_xscale("log")
+    if logarithmic(grid):
+        style.use_logarithmic(ax, "x", float(grid.min()), float(grid.max()))
     ax.margins(x=0.0)
     return ax
 
