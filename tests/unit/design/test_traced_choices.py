@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from compiling import QUICKLY
+from compiling import SOON
 from zwidth import fastest_damping, fastest_wall, most_robust_damping
 from zwidth.stability.curve import column, lobe, peak
 from zwidth.stability.devices import ANY
@@ -36,7 +36,7 @@ def same(left, right):
 def test_jit_and_vmap_agree_with_direct_calls(question, direct, x64):
     assert direct.status.tolist() == [Status.OK, Status.OK, Status.NO_BOUNDARY]
     # A function of one point inside vmap inside jit; beside it the same of whole arrays would compile for as long.
-    mapped = jax.jit(jax.vmap(lambda alpha, delta: question(alpha, delta, D)), compiler_options=QUICKLY)(ALPHA, DELTA)
+    mapped = jax.jit(jax.vmap(lambda alpha, delta: question(alpha, delta, D)), compiler_options=SOON)(ALPHA, DELTA)
     same(mapped, direct)
     assert mapped.beta.dtype == np.float64
 
@@ -63,7 +63,7 @@ def test_the_choice_is_certified_and_lies_between_unstable_walls(direct):
 
 
 def test_a_search_has_no_derivative(question, x64):
-    slope = jax.jit(jax.grad(lambda alpha: question(alpha, 0.1, D).achieved), compiler_options=QUICKLY)
+    slope = jax.jit(jax.grad(lambda alpha: question(alpha, 0.1, D).achieved), compiler_options=SOON)
     assert np.isnan(slope(0.05))
 
 
@@ -78,7 +78,7 @@ def test_mixed_degrees_in_one_compiled_function(x64):
     # Eigenvalues of two sizes in one program.
     d = np.array([0.0, 1.0, 0.0, 0.5])
     alpha = np.array([0.1, 0.05, 0.2, 0.05])
-    choice = jax.jit(lambda alpha: fastest_damping(alpha, 0.2, d), compiler_options=QUICKLY)(alpha)
+    choice = jax.jit(lambda alpha: fastest_damping(alpha, 0.2, d), compiler_options=SOON)(alpha)
     direct = fastest_damping(alpha, 0.2, d)
     same(choice, direct)
 
@@ -90,7 +90,7 @@ def test_walls_in_a_batch_and_inside_jit(x64):
     assert np.isnan(batch.spectral_radius[2])
     # (z - r)^3: the triple pole of the undamped wall.
     assert batch.spectral_radius[0] == pytest.approx(4 ** (1 / 3) - 1, abs=2e-5)
-    traced = jax.jit(jax.vmap(lambda delta: fastest_wall(delta, 0.0)), compiler_options=QUICKLY)(delta)
+    traced = jax.jit(jax.vmap(lambda delta: fastest_wall(delta, 0.0)), compiler_options=SOON)(delta)
     np.testing.assert_allclose(traced.spectral_radius, batch.spectral_radius, atol=1e-5)
     np.testing.assert_allclose(traced.alpha, batch.alpha, atol=1e-3)
     assert np.all(zwidth.is_stable(batch.alpha[:2], batch.beta[:2], delta[:2], 0.0, method="certified"))
