@@ -14,8 +14,8 @@ FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--
 
 
 @contextmanager
-def open_page(**context: Any) -> Iterator[Any]:
-    """A page with ``asked``, the addresses it asked for outside of this machine, and ``complaints``."""
+def open_browser() -> Iterator[Any]:
+    """A browser, which takes a second to start; while it runs, this thread has an event loop."""
     path = shutil.which("chromium")
     if path is None:
         if os.environ.get("CI"):
@@ -25,11 +25,19 @@ def open_page(**context: Any) -> Iterator[Any]:
 
     with sync_playwright() as player:
         browser = player.chromium.launch(executable_path=path, args=[*FLAGS, "--disable-sync", "--no-first-run"])
-        page: Any = browser.new_context(**context).new_page()
-        page.asked, page.complaints = [], []
-        here = ("http://127.0.0.1", "ws://127.0.0.1", "file:", "data:", "blob:")
-        page.on("request", lambda request: page.asked.append(request.url) if not request.url.startswith(here) else None)
-        page.on("console", lambda told: page.complaints.append(told.text) if told.type == "error" else None)
-        page.on("pageerror", lambda error: page.complaints.append(str(error)))
-        yield page
+        yield browser
         browser.close()
+
+
+@contextmanager
+def open_page(browser: Any, **context: Any) -> Iterator[Any]:
+    """A page, apart from all others, with ``asked``, its addresses outside of this machine, and ``complaints``."""
+    own = browser.new_context(**context)
+    page: Any = own.new_page()
+    page.asked, page.complaints = [], []
+    here = ("http://127.0.0.1", "ws://127.0.0.1", "file:", "data:", "blob:")
+    page.on("request", lambda request: page.asked.append(request.url) if not request.url.startswith(here) else None)
+    page.on("console", lambda told: page.complaints.append(told.text) if told.type == "error" else None)
+    page.on("pageerror", lambda error: page.complaints.append(str(error)))
+    yield page
+    own.close()

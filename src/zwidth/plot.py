@@ -25,6 +25,7 @@ from zwidth._types import ArrayLike
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
 from zwidth.figures import style
+from zwidth.figures.grid import logarithmic
 from zwidth.figures.region import to_path
 from zwidth.quantities import PARAMETERS
 from zwidth.scene import Scene
@@ -37,6 +38,14 @@ _FREQUENCIES = 2000
 
 def _axes(ax: Axes | None, width: float = 5.6, height: float = 4.0) -> Axes:
     return style.panels(ax, 1, width, height)[0]
+
+
+def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[float, float]) -> Axes:
+    """Complex numbers in an Axes, with the unit circle."""
+    ax = _axes(ax, 4.4, 4.2)
+    ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.7))
+    ax.set(xlim=real, ylim=imaginary, xlabel="real part", ylabel="imaginary part", aspect="equal")
+    return ax
 
 
 def _units(scene: Scene, normalized: bool, largest: float = math.nan) -> tuple[tuple[float, float], tuple[str, str]]:
@@ -130,8 +139,8 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     known = PARAMETERS.get(parameter)
     words = f"{known.words}  ${known.symbol}$  in {known.unit}" if known else parameter
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
-    if grid.size > 2 and np.all(grid > 0) and np.allclose(np.diff(np.log(grid)), np.log(grid[1] / grid[0])):
-        ax.set_xscale("log")
+    if logarithmic(grid):
+        style.use_logarithmic(ax, "x", float(grid.min()), float(grid.max()))
     ax.margins(x=0.0)
     return ax
 
@@ -186,8 +195,7 @@ def nyquist(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Ax
         [np.geomspace(1e-4 * half, 0.05 * half, _FREQUENCIES), np.linspace(0.05 * half, half, _FREQUENCIES)]
     )
     found = scene.frequency_response(stiffness, virtual_damping, hertz)
-    ax = _axes(ax, 4.4, 4.2)
-    ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.GRAY, linewidth=0.6))
+    ax = _complex_plane(ax, (-2.6, 1.6), (-2.2, 2.0))
     ax.plot(found.real, found.imag, color=style.BLUE, label="open loop $L$, up to half the sampling rate")
     size = np.abs(found)
     k = np.flatnonzero((size[:-1] > 1.0) != (size[1:] > 1.0))
@@ -195,8 +203,6 @@ def nyquist(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Ax
     crossing = found[k] + share * (found[k + 1] - found[k])
     ax.plot(crossing.real, crossing.imag, "o", color=style.BLUE, markersize=4.5, label="gain crossover")
     ax.plot(-1.0, 0.0, "x", color=style.VERMILION, markersize=7, markeredgewidth=1.8, label="$-1$")
-    ax.set(xlim=(-2.6, 1.6), ylim=(-2.2, 2.0), xlabel="real part", ylabel="imaginary part")
-    ax.set_aspect("equal")
     ax.legend(loc="lower right", fontsize=7)
     return ax
 
@@ -213,17 +219,14 @@ def poles(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Axes
     """
     found: Any = np.asarray(scene.poles(stiffness, virtual_damping)).ravel()
     outside = np.abs(found) >= 1.0
-    ax = _axes(ax, 4.4, 4.2)
-    ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.8))
+    reach = 1.15 * max(1.0, float(np.abs(found).max()))
+    ax = _complex_plane(ax, (-reach, reach), (-reach, reach))
     for mask, color, mark, words in (
         (~outside, style.BLUE, "x", "inside"),
         (outside, style.VERMILION, "D", "not inside"),
     ):
         if mask.any():
             ax.plot(found[mask].real, found[mask].imag, mark, color=color, markersize=6, label=f"poles {words}")
-    reach = 1.15 * max(1.0, float(np.abs(found).max()))
-    ax.set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="real part", ylabel="imaginary part")
-    ax.set_aspect("equal")
     ax.legend(loc="upper left", fontsize=7)
     return ax
 

@@ -76,14 +76,8 @@ class Scene(SceneAnswers):
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
             self._move_up()
-        kinds = {
-            "device": Device,
-            "timing": Timing,
-            "wall": VirtualWall,
-            "velocity": Velocity,
-            "operator": Operator | None,
-        }
-        for name, kind in kinds.items():
+        kinds = {"device": Device, "timing": Timing, "wall": VirtualWall, "velocity": Velocity}
+        for name, kind in {**kinds, "operator": Operator | None}.items():
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {_EXAMPLES[name]}")

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from compiling import SOON
+from compiling import QUICKLY
 from contract.cases import CASES, OTHERS
 from zwidth.errors import InputError, TracedDelayError
 from zwidth.status import Status
@@ -241,8 +241,6 @@ def has_gradient(case):
     return case.derivatives is not None and not case.gradient_in
 
 
-# Compiled in a third of the time, to run once: XLA's simplifications and fusion, but little work on machine code.
-QUICKLY = {"xla_backend_optimization_level": 0, **SOON}
 TRACED = [case for case in CASES if not case.refuses_tracing]
 TRACEABLE = pytest.mark.parametrize("case", TRACED, ids=lambda case: case.name)
 SMOOTH = pytest.mark.parametrize("case", [case for case in TRACED if has_gradient(case)], ids=lambda case: case.name)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import http.server
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -86,13 +87,18 @@ def address(site):
     server.server_close()
 
 
-@contextmanager
-def read(width, scheme="light"):
-    """A page of one width and color scheme; in the end nothing may have gone wrong in it."""
-    with open_page(viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
-        yield page
-        assert page.asked == []
-        assert page.complaints == []
+@pytest.fixture
+def read(browser):
+    """Opens a page of one width and color scheme; in the end nothing may have gone wrong in it."""
+
+    @contextmanager
+    def opened(width, scheme="light"):
+        with open_page(browser, viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
+            yield page
+            assert page.asked == []
+            assert page.complaints == []
+
+    return opened
 
 
 def contrast(color, ground):
@@ -130,13 +136,16 @@ def test_names_are_links_and_examples_are_code(site):
     choose = (site / "how-to-choose.html").read_text(encoding="utf-8")
     assert 'href="reference/stability.html#zwidth.is_stable"' in choose
     pages = {page.name: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
+    scene = set(re.findall(r'id="zwidth\.Scene\.(\w+)"', pages["scene.html"]))
+    assert scene >= {"is_stable", "max_stiffness"}
+    assert not scene & {"border", "chain", "loop", "traced_boundary", "whole_delay"}
     # What Markdown makes of ">>>" that nobody has told it is an example.
     assert [name for name, text in pages.items() if "<blockquote" in text] == []
     assert pages["stability.html"].count('class="gp"') > 10
 
 
 @pytest.mark.parametrize("width", [WIDE, NARROW])
-def test_every_page_is_readable_and_asks_nobody_else(site, address, width):
+def test_every_page_is_readable_and_asks_nobody_else(site, address, read, width):
     pages = sorted(path.relative_to(site).as_posix() for path in site.rglob("*.html"))
     assert len(pages) > 30
     too_wide = []
@@ -149,7 +158,7 @@ def test_every_page_is_readable_and_asks_nobody_else(site, address, width):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_text_has_enough_contrast(address, scheme):
+def test_text_has_enough_contrast(address, read, scheme):
     faint, count = set(), 0
     with read(WIDE, scheme) as page:
         for name in ("index", "how-to-choose", "gallery", "guides/time", "reference/design"):
@@ -162,7 +171,7 @@ def test_text_has_enough_contrast(address, scheme):
     assert faint == set()
 
 
-def test_the_search_finds_a_function(address):
+def test_the_search_finds_a_function(address, read):
     with read(WIDE) as page:
         page.goto(address + "index.html")
         page.locator(".md-search__input").click()
@@ -176,7 +185,7 @@ def test_the_search_finds_a_function(address):
         page.wait_for_url("**/reference/boundary.html**")
 
 
-def test_the_palette_follows_the_reader(address):
+def test_the_palette_follows_the_reader(address, read):
     with read(WIDE, "dark") as page:
         page.goto(address + "index.html")
         scheme = page.locator("body")

@@ -68,9 +68,9 @@ def server(tmp_path_factory):
 
 
 @pytest.fixture
-def page(server):
+def page(server, browser):
     permissions = ["clipboard-read", "clipboard-write"]
-    with open_page(viewport={"width": 1280, "height": 1000}, permissions=permissions) as opened:
+    with open_page(browser, viewport={"width": 1280, "height": 1000}, permissions=permissions) as opened:
         opened.sockets = []
         opened.on("websocket", lambda socket: opened.sockets.append(socket.url))
         opened.goto(server.address)
@@ -232,8 +232,8 @@ def test_a_refused_value_is_said_and_the_page_goes_on(page):
 
 @pytest.mark.parametrize("width", [1280, 390])
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_it_fits_and_can_be_read(server, width, scheme):
-    with open_page(viewport={"width": width, "height": 900}, color_scheme=scheme) as opened:
+def test_it_fits_and_can_be_read(server, browser, width, scheme):
+    with open_page(browser, viewport={"width": width, "height": 900}, color_scheme=scheme) as opened:
         opened.goto(server.address)
         settle(opened)
         assert opened.evaluate("document.documentElement.scrollWidth") <= width
@@ -242,9 +242,9 @@ def test_it_fits_and_can_be_read(server, width, scheme):
         assert opened.complaints == []
 
 
-def test_when_the_server_ends_the_page_says_so(tmp_path):
+def test_when_the_server_ends_the_page_says_so(browser, tmp_path):
     ending = Server(tmp_path)
-    with open_page() as opened:
+    with open_page(browser) as opened:
         opened.goto(ending.address)
         settle(opened)
         out, err, code = ending.end()

@@ -21,10 +21,10 @@ STUDY = {
 
 
 @pytest.mark.parametrize("width, scheme", [(1280, "light"), (390, "dark")])
-def test_the_page_opens_from_the_disk(tmp_path, width, scheme):
+def test_the_page_opens_from_the_disk(browser, tmp_path, width, scheme):
     zwidth.run({"version": 1, "name": "example", "studies": [STUDY]}, out=tmp_path / "run")
     file = zwidth.write_report(tmp_path / "run")
-    with open_page(viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
+    with open_page(browser, viewport={"width": width, "height": 900}, color_scheme=scheme) as page:
         page.goto(file.as_uri())
         assert page.evaluate("document.documentElement.scrollWidth") <= width
         readout, slider = page.locator("output"), page.locator("input[type=range]")

@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 
 import zwidth
-from zwidth import plot
+from zwidth import figures, plot
 
 TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
 RIGID = zwidth.Scene(zwidth.Device(0.1, 10), TIMING)
@@ -53,6 +53,15 @@ def test_several_scenes_have_their_labels():
     legend = ax.get_legend()
     assert legend is not None
     assert {"difference", "low-pass"} <= {text.get_text() for text in legend.get_texts()}
+
+
+def test_a_ridge_over_equal_ratios_has_plain_numbers_within_a_decade():
+    ax = plot.ridge(RIGID, "damping", np.geomspace(2.0, 8.0, 5))
+    assert ax.get_xscale() == "log"
+    figures.style.figure_of(ax).draw_without_rendering()
+    words = [tick.get_text() for minor in (False, True) for tick in ax.xaxis.get_ticklabels(minor=minor)]
+    assert {word for word in words if word} >= {"2", "5"}
+    assert not any("$" in word for word in words)
 
 
 def test_a_ridge_is_the_stiffest_wall_at_every_value():

@@ -119,6 +119,9 @@ def draw_limit_cycle_curves(
     cycles = {name: values.swapaxes(1, 2) if turn else values for name, values in cycles.items()}
     buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
     factor, meter = style.si_unit(float(np.max(cycles["amplitude_m"], where=buzzes, initial=0.0)), "m")
+    # Panels of a row share the axis: ticks that fit all of them.
+    shown_amplitudes = cycles["amplitude_m"][buzzes] * factor
+    amplitudes = (float(shown_amplitudes.min(initial=np.inf)), float(shown_amplitudes.max(initial=0.0)))
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
     for row, (name, times, words) in enumerate(quantities):
@@ -130,8 +133,7 @@ def draw_limit_cycle_curves(
             for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
-                ax.set_yscale("log")
-                ax.yaxis.set_major_formatter(_PLAIN)
+                style.use_logarithmic(ax, "y", *amplitudes)
                 ax.set_title(labels[column] if len(labels) > 1 else "")
             else:
                 ax.set_xlabel(f"{_AXES[over][0]}  ${_AXES[over][1]}$  in {unit}")
@@ -162,6 +164,5 @@ def _scale_axes(ax: Axes, *values: np.ndarray) -> None:
     """The range and the spacing of the axes of parameters."""
     for axis, own in zip("xy", values, strict=False):
         if logarithmic(own):
-            getattr(ax, f"set_{axis}scale")("log")
-            getattr(ax, f"{axis}axis").set_major_formatter(_PLAIN)
+            style.use_logarithmic(ax, axis, float(own.min()), float(own.max()))
         getattr(ax, f"set_{axis}lim")(float(own.min()), float(own.max()))

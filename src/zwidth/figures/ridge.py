@@ -49,7 +49,7 @@ def _draw_panel(ax: Axes, table: Table, share: float) -> None:
     ax.set_ylim(0.0, 1.04 * highest)
     if grid.logarithmic(shown[0].delta):
         # The stiffest wall grows with the damping, over as many decades.
-        ax.set_xscale("log")
+        style.use_logarithmic(ax, "x", float(columns["delta"].min()), end)
         style.use_logarithmic(ax, "y", float(np.nanmin(columns["alpha_max"])), highest)
         ax.set_ylim(float(np.nanmin(columns["alpha_max"])), 1.2 * highest)
     named = held_or_all(shown)

@@ -55,7 +55,7 @@ class Border:
         held = b.borders(w)
         edges = []
         for start, stop in _runs(held, piece):
-            first, last = self._end(w, held, piece, start, -1), self._end(w, held, piece, stop, 1)
+            first, last = self._end(w, piece, start, -1), self._end(w, piece, stop, 1)
             at = np.unique(np.concatenate([[first], w[start : stop + 1], [last]]))
             curve = curve_at(b.loop, np.clip(at, 1e-300, np.pi))
             alpha, beta = curve.alpha.copy(), curve.beta.copy()
@@ -73,7 +73,7 @@ class Border:
             beta = q.slope[0].imag / f.slope[0].imag
             return float(q.value[0].real - beta * f.value[0].real), float(beta)
 
-    def _end(self, w: np.ndarray, held: np.ndarray, piece: np.ndarray, k: int, side: int) -> float:
+    def _end(self, w: np.ndarray, piece: np.ndarray, k: int, side: int) -> float:
         """Where a run of nodes on the edge ends beyond its last node ``k``."""
         after = k + side
         if not 0 <= after < w.size:

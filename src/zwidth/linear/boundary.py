@@ -53,7 +53,7 @@ class Boundary:
         """Lay out the curve."""
         w = nodes_of(loop)
         here = curve_at(loop, w)
-        w = np.unique(np.concatenate([w, find_dips(loop, w, here)]))
+        w = np.unique(np.concatenate([w, find_dips(w, here)]))
         here = curve_at(loop, w)
         vertical = zeros_of(loop, w, here.fall, "fall")
         touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]

@@ -81,7 +81,7 @@ def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) ->
         )
 
 
-def find_dips(loop: LinearLoop, w: np.ndarray, here: CurvePoints) -> np.ndarray:
+def find_dips(w: np.ndarray, here: CurvePoints) -> np.ndarray:
     """Nodes to add where d beta/dw keeps its sign from one node to the next but may not do so between them.
 
     The curve changes so little over a step that the slope is nearly a parabola there; where an end's tangent leads

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth._types import Array
+from zwidth.domain import WALL_RANGE, within
 from zwidth.linear.boundary import Boundary
 from zwidth.linear.chain import Chain, linear_loop
 from zwidth.linear.curve import nodes_of
@@ -162,13 +163,14 @@ def _is_first_loss(chain: Chain, alpha: float, beta: float, margin: float) -> bo
 
 
 def linear_margins(chain: Chain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> Margins:
-    """All margins of walls of one shape, periods and radians a period; NaN where a wall is not finite."""
+    """All margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
     stable = label_walls(boundary, alpha, beta)
+    inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
     loops: DelayedLoops | None = None
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
     for place in np.ndindex(alpha.shape):
         a, b, good = float(alpha[place]), float(beta[place]), bool(stable[place])
-        if not (np.isfinite(a) and np.isfinite(b)):
+        if not inside[place]:
             continue
         found = margins_of(OpenLoop.lay_out(boundary.loop, a, b, boundary.w), good)
         delay = 0.0

@@ -93,7 +93,9 @@ class OpenLoop(NamedTuple):
         step, sign = np.diff(w), np.sign(value[:-1])
         toward = (np.sign(value[1:]) == sign) & (sign * slope[:-1] < 0) & (sign * slope[1:] > 0)
         size, fall = np.abs(value), np.abs(slope)
-        lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
+        # At half the rate L may be 0: no tangent of its logarithm leads anywhere from there.
+        with np.errstate(invalid="ignore"):
+            lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
         k = np.flatnonzero(toward & (lowest < 0))
         low, high, sign = w[k], w[k + 1], sign[k]
         for _ in range(40 if k.size else 0):

@@ -70,9 +70,3 @@ def closed_loop_roots(loop: LinearLoop, alpha: float, beta: float) -> tuple[np.n
     if lag < 0:
         zeros, lag = np.concatenate([zeros, np.zeros(-lag)]), 0
     return zeros, poles, gain * loop.gain, lag
-
-
-def closed_loop_poles(loop: LinearLoop, alpha: float, beta: float) -> np.ndarray:
-    """All poles of one wall, as eigenvalues of the companion matrix."""
-    parts = affine_polynomial(loop)
-    return np.roots(parts.D + alpha * parts.N1 + beta * parts.N2)

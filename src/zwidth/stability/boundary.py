@@ -319,7 +319,7 @@ def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tupl
     upwards = ray.dbeta >= 0
     low, high = xp.where(upwards, row.x, 0.0), xp.where(upwards, curve.end, row.x)
     # Places even in the square of omega, in which the start of the lobe is straight.
-    square = _starts_straight(curve, xp)
+    square = _starts_straight(curve)
     first, last = xp.where(square, low * low, low), xp.where(square, high * high, high)
     share = along(np.linspace(0.0, 1.0, _PLACES + 1), first)
     even = first[..., None] + (last - first)[..., None] * share
@@ -355,7 +355,7 @@ def _first_crossing(ray: _Ray, row: RowEnd, curve: Lobe, creeping: bool) -> tupl
     return x, leaves, single & (last <= epsilon(x) ** 0.5 * x)
 
 
-def _starts_straight(curve: Lobe, xp: Any) -> Array:
+def _starts_straight(curve: Lobe) -> Array:
     if curve.is_short is not None:
         return ~curve.is_short
     return curve.end == curve.end if curve.short is None else curve.end != curve.end

@@ -37,7 +37,7 @@ def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -
         figures={} if not outlines else {"": partial(figures.draw_stable_set, outlines, tabulate_walls(label, marked))},
         documents={
             f"{stem}.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
-            f"{stem}.md": _describe(scene, found),
+            f"{stem}.md": _describe(found),
         },
         answer=spell_answer(found, scene.margins(wall.stiffness, wall.virtual_damping)),
         notes=tuple(notes),
@@ -101,7 +101,7 @@ def _known(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _describe(scene: Scene, found: dict[str, Any]) -> str:
+def _describe(found: dict[str, Any]) -> str:
     """The recommendation for a reader."""
     best, most = found["recommended"], found["maximum"]
 

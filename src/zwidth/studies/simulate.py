@@ -34,6 +34,7 @@ from zwidth.quantities import POSITIVE, Range
 from zwidth.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, si_scales, stack
+from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
 
 _POSITIVE = {"type": "number", "exclusiveMinimum": 0}
 Fractions = Annotated[Axis, PlainValidator(axis(POSITIVE)), SPELLED, axis_schema(_POSITIVE, _POSITIVE)]
@@ -105,20 +106,17 @@ class SimulateStudy(SimulatedStudy, Circumstances):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         filled = super().fill(raw, scene)
-        if scene.wall is not None and not {"walls", "stiffness_fraction", "device"} & set(raw):
+        if scene.wall is not None and "device" not in raw and not gives_walls(raw):
             filled["walls"] = [scene.wall]
         return filled
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        given = [key for key in raw if key in ("stiffness_fraction", "walls")]
-        if len(given) == 2:
-            allowed = "walls are shares of the maximum stiffness or given outright"
-            what = "stiffness_fraction and walls are both given"
-            yield (given[1],), problem(what, allowed, "remove one", on_key=True)
-        elif not given:
-            allowed = "the study needs a wall to meet"
-            yield (), problem("stiffness_fraction or walls is missing", allowed, "add 'stiffness_fraction: 0.75'")
+        return check_choice_of_walls(
+            raw,
+            both="walls are shares of the maximum stiffness or given outright",
+            neither="the study needs a wall to meet",
+        )
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -191,11 +189,6 @@ def wall_in_si(device: PhysicalDevice, wall: AnyWall) -> tuple[float, float]:
         return wall.stiffness, wall.virtual_damping
     stiffness, damping = si_scales(device)
     return wall.alpha * stiffness, wall.beta * damping
-
-
-def name_wall(stiffness: float, virtual_damping: float) -> str:
-    """A wall in words."""
-    return f"K = {with_unit(stiffness, 'N/m')}, B = {with_unit(virtual_damping, 'N s/m')}"
 
 
 def name_column(name: str, unit: str) -> str:

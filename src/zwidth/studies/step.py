@@ -34,6 +34,7 @@ from zwidth.quantities import Range
 from zwidth.response import step_response
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.outcome import ComputedStudy, Outcome, stack
+from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
 from zwidth.units import Span
 
 
@@ -136,20 +137,17 @@ class StepStudy(ResponseStudy):
         filled = {"delay_model": scene.delay_model, **raw}
         if "devices" not in raw:
             filled["devices"] = [scene.device]
-            if scene.wall is not None and "walls" not in raw and "stiffness_fraction" not in raw:
+            if scene.wall is not None and not gives_walls(raw):
                 filled["walls"] = [scene.wall]
         return filled
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        given = [key for key in raw if key in ("stiffness_fraction", "walls")]
-        if len(given) == 2:
-            allowed = "the wall is a share of the maximum stiffness or given outright"
-            what = "stiffness_fraction and walls are both given"
-            yield (given[1],), problem(what, allowed, "remove one", on_key=True)
-        elif not given:
-            allowed = "the study needs a wall to respond to"
-            yield (), problem("stiffness_fraction or walls is missing", allowed, "add 'stiffness_fraction: 0.75'")
+        return check_choice_of_walls(
+            raw,
+            both="the wall is a share of the maximum stiffness or given outright",
+            neither="the study needs a wall to respond to",
+        )
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -213,4 +211,4 @@ def _wall_text(device: AnyDevice, alpha: float, beta: float) -> str:
     if not isinstance(device, PhysicalDevice):
         return ""
     wall = device.to_scene().to_si(alpha=alpha, beta=beta)
-    return f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"
+    return name_wall(wall.stiffness, wall.virtual_damping)

@@ -187,7 +187,7 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
     disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
-    model = "device with parts, held delay" if study.with_parts else _model(_most_periods(study, grid))
+    model = "device with parts, held delay" if study.with_parts else _model(_most_periods(study))
     return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
@@ -291,7 +291,7 @@ def _disk_bits(outputs: tuple[str, ...]) -> int:
     return 1 + sum({"float64": 64, "bool": 1, "uint8": 1}[OUTPUTS[name].dtype] for name in outputs)
 
 
-def _most_periods(study: SweepStudy, grid: Grid) -> float:
+def _most_periods(study: SweepStudy) -> float:
     """The longest delay in periods."""
     given = study.axes.given
     if "d" in given:

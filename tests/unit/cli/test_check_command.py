@@ -174,15 +174,14 @@ def test_what_is_refused_names_the_option(arguments, message):
     assert message in result.output
 
 
-@pytest.mark.parametrize("name", [None, *PARTS])
-def test_a_check_needs_no_jax(name):
-    arguments = ["check", *WALL, *DEVICE, *RATE, *(PARTS[name][0] if name else [])]
+def test_a_check_needs_no_jax():
+    bare = ["check", *WALL, *DEVICE, *RATE]
     code = (
         "import sys\nfrom zwidth.cli.commands import cli\n"
-        f"cli.main(args={arguments!r}, standalone_mode=False)\nprint('jax' in sys.modules)"
+        f"for name, words in {[('bare', []), *((name, words) for name, (words, *_) in PARTS.items())]!r}:\n"
+        f"    cli.main(args=[*{bare!r}, *words], standalone_mode=False)\n    assert 'jax' not in sys.modules, name\n"
     )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.splitlines()[-1] == "False"
+    subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
 
 
 def test_the_ridge_of_a_scene_with_parts():

@@ -8,7 +8,7 @@ from mpmath import mpf
 
 import oracles
 import zwidth
-from compiling import SOON
+from compiling import QUICKLY
 from zwidth import passive_area, stable_area
 from zwidth.stability.poles import unstable_poles
 from zwidth.stability.region import Piece
@@ -67,7 +67,7 @@ def test_the_slope_of_the_area(x64):
     step = 1e-5
     delta = np.array([1.0 - step, 1.0 + step])
     area = stable_area(delta, 1.3)
-    slope = jax.jit(jax.grad(stable_area), compiler_options=SOON)
+    slope = jax.jit(jax.grad(stable_area), compiler_options=QUICKLY)
     assert float(slope(1.0, 1.3)) == pytest.approx((area[1] - area[0]) / (2 * step), rel=1e-8)
 
 
@@ -146,13 +146,13 @@ def adaptive_integral(function, low, high):
 
 def test_the_passive_area_in_single_precision():
     # Inside somebody's own jit the ambient precision holds; the triangle and the closed tip need no more.
-    assert float(jax.jit(passive_area, compiler_options=SOON)(0.5, 0.0)) == pytest.approx(0.5, rel=1e-5)
+    assert float(jax.jit(passive_area, compiler_options=QUICKLY)(0.5, 0.0)) == pytest.approx(0.5, rel=1e-5)
 
 
 def test_the_passive_area_with_a_traced_delay(x64):
     d = np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
     direct = passive_area(0.7, d)
-    area, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda d: passive_area(0.7, d))), compiler_options=SOON)(d)
+    area, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda d: passive_area(0.7, d))), compiler_options=QUICKLY)(d)
     np.testing.assert_allclose(area, direct, rtol=1e-14)
     # One bad entry leaves the others alone, to the last bit.
     spoiled = passive_area(0.7, np.where(np.arange(6) == 1, np.nan, d))

@@ -39,6 +39,18 @@ def test_a_legend_fits_the_size_that_is_wanted():
     assert style.figure_of(style.panels(None, 1, 6.4, 4.0)).get_size_inches().tolist() == [6.4, 4.0]
 
 
+@pytest.mark.parametrize("low, high", [(2.1, 4.9), (1.1, 1.9), (2.0, 8.0), (2.1, 10.4), (0.3, 40.0), (1e-3, 1e4)])
+def test_a_logarithmic_axis_has_plain_numbers(low, high):
+    (ax,) = style.panels(None, 1, 5.0, 3.0)
+    style.use_logarithmic(ax, "x", low, high)
+    ax.set_xlim(low, high)
+    style.figure_of(ax).draw_without_rendering()
+    ticks = [tick for minor in (False, True) for tick in ax.xaxis.get_ticklabels(minor=minor) if tick.get_text()]
+    shown = [tick for tick in ticks if low <= tick.get_position()[0] <= high]
+    assert 2 <= len(shown) <= 9
+    assert [float(tick.get_text()) for tick in shown] == pytest.approx([tick.get_position()[0] for tick in shown])
+
+
 @pytest.mark.parametrize("name", EVERY_FIGURE)
 def test_no_two_names_overlap(name):
     drawn = getattr(figures, name.split()[0])(*EVERY_FIGURE[name])

@@ -95,6 +95,19 @@ def test_an_undamped_device_answers_nothing_at_half_the_rate():
     assert abs(response[0]) < 1e-3
 
 
+def test_a_wall_whose_loop_is_zero_at_half_the_rate():
+    """The filter has a zero there, which a wall without stiffness shares."""
+    scene = zwidth.Scene(
+        zwidth.Device(0.1, 1.0), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.Butterworth(cutoff=120.0, order=1)
+    )
+    assert scene.frequency_response(0.0, 30.0, 500.0) == 0
+    found = scene.margins(0.0, 30.0)
+    factors, phases, distance = grid_margins(scene, 0.0, 30.0)
+    assert found.gain_margin == pytest.approx(factors[np.argmin(np.abs(np.log(factors)))], rel=1e-3)
+    assert abs(found.phase_margin) == pytest.approx(phases.min(), rel=1e-3)
+    assert 0.98 * distance <= found.modulus_margin <= distance * (1 + 1e-9)
+
+
 def test_an_unstable_wall():
     found = FILTERED.margins(60e3, 4.0)
     assert found.gain_margin < 1
@@ -123,11 +136,12 @@ def test_where_nothing_crosses():
     assert found.gain_margin > 1
 
 
-def test_rigid_scenes_and_walls_that_are_not_finite():
+def test_rigid_scenes_and_walls_out_of_range():
     scene = zwidth.Scene(zwidth.Device(0.1, 3.0), zwidth.Timing(1e-3, 1.5e-3))
     walls = scene.normalize_walls(np.array([500.0, 2e4]), 4.0)
     expected = zwidth.margins(*walls, scene.delta, scene.d)
     found = scene.margins([500.0, 2e4], 4.0)
     np.testing.assert_array_equal(found.gain_margin, expected.gain_margin)
     np.testing.assert_array_equal(found.delay_margin, expected.delay_margin * 1e-3)
-    assert all(np.isnan(part) for part in FILTERED.margins(np.nan))
+    for wall in ((np.nan, 0.0), (np.inf, 0.0), (1e-80, 0.0), (0.0, 1e160)):
+        assert all(np.isnan(part) for part in FILTERED.margins(*wall))

@@ -308,8 +308,7 @@ def test_a_ray_towards_zero_stiffness_meets_the_real_pole_at_one(ridge):
 
 
 def test_a_strongly_damped_device_is_bounded_by_a_pole_at_minus_one():
-    delta = np.full(DELTA.size, 10.0)
-    beta = np.full(DELTA.size, -1.0)
+    delta, beta = np.full(DELTA.size, 10.0), np.full(DELTA.size, -1.0)
     points = zwidth.boundary_point(delta, np.zeros(DELTA.size), beta=beta)
     with mp.workdps(60):
         c = mp.exp(-10)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from compiling import SOON
+from compiling import QUICKLY
 from zwidth import modulus_margin
 from zwidth.errors import InputError
 from zwidth.stability.crossover import stable_kernel
@@ -230,7 +230,7 @@ def test_traced(x64):
     def all_of(wall):
         return jax.numpy.stack(zwidth.margins(*wall))
 
-    along = jax.jit(lambda wall, side: jax.jvp(all_of, (wall,), (side,)), compiler_options=SOON)
+    along = jax.jit(lambda wall, side: jax.jvp(all_of, (wall,), (side,)), compiler_options=QUICKLY)
     for side in np.eye(4):
         values, slopes = along(wall, side)
         np.testing.assert_allclose(values, zwidth.margins(*wall), rtol=1e-9)
