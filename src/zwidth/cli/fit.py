@@ -102,6 +102,7 @@ def _as_number(text: str) -> float | str:
 @click.option("--max-delay", type=QuantityType("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Make uneven times of a log even, by interpolation.")
 @velocity_options
+@click.option("--unknown-cutoff", is_flag=True, help="Find the velocity's cut-off, too; needs --buzz at B > 0.")
 @click.option("--figure", metavar="FILE.png", type=click.Path(path_type=Path), help="Draw what the fit rests on.")
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run`.")
 @json_option
@@ -113,6 +114,7 @@ def fit(
     max_delay: float | None,
     resample: bool,
     velocity: Any,
+    unknown_cutoff: bool,
     figure: Path | None,
     as_yaml: bool,
     as_json: bool,
@@ -144,10 +146,13 @@ def fit(
             raise click.UsageError("--buzz: some walls are in N/m, others in N m/rad; fit them apart")
         units = ROTARY if kinds == {True} else LINEAR
         points = tuple(BuzzPoint(*wall.point) for wall in walls)
-        found, source = fit_buzz(points, period=period, velocity=velocity, noise=noise), f"{len(walls)} buzzing walls"
+        found = fit_buzz(points, period=period, velocity=velocity, noise=noise, unknown_cutoff=unknown_cutoff)
+        source = f"{len(walls)} buzzing walls"
     else:
         if noise is not None:
             raise click.UsageError("--noise belongs to --buzz; the noise of a log is found from it")
+        if unknown_cutoff:
+            raise click.UsageError("--unknown-cutoff belongs to --buzz; no velocity is estimated in a log")
         if columns["time"] is not None and period is not None:
             raise click.UsageError("give one of --time and --period")
         from zwidth.fitting.columns import fit_motions, read_log
@@ -177,6 +182,6 @@ def _draw(found: DeviceFit, source: str, points: tuple[Any, ...], units: AxisUni
 
     if not file.parent.is_dir():
         raise InputError(f"--figure: there is no folder {file.parent}; make it first")
-    evidence = gather_evidence(found, source, points, units)
+    evidence: dict[str, Any] = gather_evidence(found, source, points, units)
     drawn = figures.draw_device_fit(**evidence, step=found.resolution)
     figures.save(drawn, file.with_suffix(""), (file.suffix[1:],))

@@ -74,7 +74,7 @@ def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
         return np.asarray(axes, dtype=object).ravel()[: rows + 1]
     figure, _ = style.new_figure(8.8, max(3.6, 1.55 * rows + 0.7))
     figure.clear()
-    shape = [[str(row), "right"] for row in range(rows)] or [["right"]]
+    shape: Any = [[str(row), "right"] for row in range(rows)] or [["right"]]
     found = figure.subplot_mosaic(shape, width_ratios=(1.0, 1.05) if rows else (1.0,))
     return [*(found[str(row)] for row in range(rows)), found["right"]]
 

@@ -295,4 +295,4 @@ def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None,
     times = [motion.time for motion in motions]
     when = period if times[0] is None else times
     positions, forces = [motion.position for motion in motions], [motion.force for motion in motions]
-    return fit_log(when, positions, forces, resolution=steps.pop(), **options)  # pyright: ignore[reportArgumentType]
+    return fit_log(when, positions, forces, resolution=steps.pop(), rotary=motions[0].rotary, **options)  # pyright: ignore[reportArgumentType]

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 NAMES = ("mass", "damping", "delay")
 # Of the intervals.
 _CONFIDENCE = 0.95
+# Of standard errors, for differences.
+_STEP = 0.1
 # A standard error beyond this share leaves a value open.
 VAGUE = 0.5
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
@@ -138,6 +140,34 @@ class DeviceFit:
         """The estimated device with its timing and velocity estimate."""
         return scene_of((self.mass, self.damping, self.delay), self.period, self.velocity)
 
+    @cached_property
+    def virtual_damping(self) -> float:
+        """B in N s/m of the stiffest stable wall; NaN where ``stiffness_max`` is."""
+        return float(self.scene.max_stiffness().virtual_damping) if self.stiffness_max > 0 else np.nan
+
+    @cached_property
+    def virtual_damping_error(self) -> float:
+        """Standard error of that B, by differences along the axes of the covariance."""
+        values = [self.mass, self.damping, self.delay, *([self.cutoff] if "cutoff" in self.errors else [])]
+        errors = np.sqrt(np.diag(self.covariance))
+        if not np.isfinite(self.virtual_damping + errors.sum()):
+            return np.nan
+        scales = np.where(errors > 0, errors, 1.0)
+        sizes, axes = np.linalg.eigh(self.covariance / np.outer(scales, scales))
+        total = 0.0
+        for size, axis in zip(sizes, axes.T, strict=True):
+            step = _STEP * np.sqrt(max(size, 0.0)) * axis * scales
+            # Where damping or delay would be negative, to one side.
+            sides = [side for side in (-1.0, 1.0) if np.all(values + side * step >= 0)]
+            ends = [
+                scene_of(values + side * step, self.period, self.velocity).max_stiffness().virtual_damping
+                for side in sides
+            ]
+            if len(sides) == 1:
+                sides, ends = [0.0, *sides], [self.virtual_damping, *ends]
+            total += (float(ends[-1] - ends[0]) / (_STEP * (sides[-1] - sides[0]))) ** 2 if sides else np.nan
+        return float(np.sqrt(total))
+
     @property
     def intervals(self) -> dict[str, ErrorBar]:
         """95 % intervals by name: of what ``errors`` has, and of "stiffness_max"."""
@@ -198,7 +228,9 @@ class DeviceFit:
         return {
             **{name: getattr(self, name) for name in (*NAMES, *(["cutoff"] if "cutoff" in self.errors else []))},
             "stiffness_max": self.stiffness_max,
-            "errors": self.errors | {"stiffness_max": self.stiffness_error},
+            "virtual_damping": self.virtual_damping,
+            "errors": self.errors
+            | {"stiffness_max": self.stiffness_error, "virtual_damping": self.virtual_damping_error},
             "intervals": {name: list(bar) for name, bar in self.intervals.items()},
             "covariance": self.covariance.tolist(),
             "noise": list(self.noise) if isinstance(self.noise, tuple) else self.noise,

@@ -11,13 +11,14 @@ from zwidth.batching import FEW
 from zwidth.errors import InputError
 from zwidth.fitting.buzz import BuzzPoint
 from zwidth.fitting.device_fit import DeviceFit, scene_of
+from zwidth.fitting.safe_wall import draw_devices
 from zwidth.fitting.words import LINEAR, AxisUnits, choose_wall
 from zwidth.formatting import header
 from zwidth.stability.boundary import boundary_point
 from zwidth.status import Status
 
-# Devices drawn from the covariance, dampings of the boundary, and how far beyond its end.
-_DRAWS, _ROWS, _BEYOND = 200, 121, 1.1
+# Devices drawn around the estimate, dampings of the boundary, and how far beyond its end.
+_DRAWS, _DRAWS_WITH_PARTS, _ROWS, _BEYOND = 1000, 200, 121, 1.1
 # Lags of the autocorrelation, at most, and at most as a share of the samples.
 _LAGS, _SHARE = 60, 0.25
 # Of a normal distribution: 95 % lie within.
@@ -71,18 +72,19 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
 def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.ndarray]:
     """The stiffest stable wall at each damping B >= 0, and between which stiffnesses it lies with 95 %.
 
-    The band is pointwise: the quantiles of devices drawn from the covariance, with the reach of the fit's intervals,
-    by a fixed seed; NaN where the covariance is not known. A damping at which a device has no stable wall counts as 0.
+    The band is pointwise: the quantiles of devices drawn around the estimate, by a fixed seed; NaN where the records
+    leave the device open. A damping at which a device has no stable wall counts as 0.
     """
     outlines = fit.scene.stable_region()
     if not outlines:
         raise InputError("scene: no wall of the fitted device is stable; measure again")
     end = max(float(each.virtual_damping.max()) for each in outlines)
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
-    own = np.array([[fit.mass, fit.damping, fit.delay]])
+    own = np.array([[fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])]])
     low = high = np.full(damping.size, np.nan)
-    if np.all(np.isfinite(fit.covariance)):
-        low, high = np.quantile(_limit_rows(fit, _draw_devices(fit), damping), [0.025, 0.975], axis=0)
+    drawn = draw_devices(fit, _DRAWS if fit.scene.is_rigid else _DRAWS_WITH_PARTS, 0)
+    if drawn is not None:
+        low, high = np.quantile(_limit_rows(fit, drawn, damping), [0.025, 0.975], axis=0)
     return {
         header("virtual_damping", units.damping): damping,
         header("stiffness", units.stiffness): _limit_rows(fit, own, damping)[0],
@@ -92,7 +94,7 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
 
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
-    """Up to which stiffness every softer wall is stable, for devices (n, 3) and dampings; 0 where none is."""
+    """Up to which stiffness every softer wall is stable, for devices, a row each, and dampings; 0 where none is."""
     if fit.scene.is_rigid:
         # So few at a time that nothing is compiled.
         few = FEW // damping.size
@@ -104,25 +106,10 @@ def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.
 
 
 def _limit_rigid(devices: np.ndarray, period: float, damping: np.ndarray) -> np.ndarray:
-    mass, own, delay = devices.T[:, :, None]
+    mass, own, delay = devices.T[:3, :, None]
     rate = mass / period
     row = boundary_point(own / rate, delay / period, beta=damping / rate)
     return np.where(row.status == Status.OK, row.alpha * rate / period, 0.0)
-
-
-def _draw_devices(fit: DeviceFit) -> np.ndarray:
-    """Mass, damping and delay of devices as far from the fitted one as it may be off."""
-    normal = np.random.default_rng(0).standard_normal((_DRAWS, 3))
-    # Their mean and covariance are exactly 0 and 1, which so few are not by chance.
-    normal -= normal.mean(0)
-    normal = np.linalg.solve(np.linalg.cholesky(normal.T @ normal / _DRAWS), normal.T).T
-    values = np.array([fit.mass, fit.damping, fit.delay])
-    sizes = np.sqrt(np.diag(fit.covariance))
-    scales = np.where(sizes > 0, sizes, 1.0)
-    share, axes = np.linalg.eigh(fit.covariance / np.outer(scales, scales))
-    moved = (fit.reach / _NORMAL) * normal @ (axes * np.sqrt(np.maximum(share, 0.0))).T * scales
-    mass = fit.mass * np.exp(moved[:, 0] / fit.mass)
-    return np.column_stack([mass, np.maximum(values[1:] + moved[:, 1:], 0.0)])
 
 
 def tabulate_walls(

@@ -93,6 +93,8 @@ def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
     The mass is drawn by its logarithm, for what walls and logs tell of it is a share; of a filter its time constant is.
     """
     values = [fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])]
+    if not np.all(np.isfinite(fit.covariance)):
+        return None
     center = np.array([np.log(fit.mass), fit.damping, fit.delay, *(1.0 / value for value in values[3:])])
     slopes = np.array([1.0 / fit.mass, 1.0, 1.0, *(-1.0 / value**2 for value in values[3:])])
     covariance = fit.covariance * np.outer(slopes, slopes)

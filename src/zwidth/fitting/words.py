@@ -7,12 +7,19 @@ from collections.abc import Iterable
 from dataclasses import fields
 from typing import NamedTuple
 
-from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.device_fit import DeviceFit, RivalDevice
 from zwidth.formatting import plain, with_unit
 from zwidth.quantities import RECOMMENDED_SHARE
 from zwidth.status import Status
 
-SYMBOLS = {"mass": "m", "damping": "b", "delay": "t_d", "friction": "f_c", "stiffness_max": "K_max"}
+SYMBOLS = {
+    "mass": "m",
+    "damping": "b",
+    "delay": "t_d",
+    "cutoff": "f_c",
+    "friction": "F_c",
+    "stiffness_max": "K_max",
+}
 _KINDS = {
     "BackwardDifference": "backward_difference",
     "WindowedDifference": "windowed_difference",
@@ -45,7 +52,13 @@ class AxisUnits(NamedTuple):
             # What data sheets of rotors have.
             turns = self is ROTARY
             return f"{plain(1e7 * value, digits)} g cm^2" if turns else with_unit(1e3 * value, "g", digits)
-        units = {**self._asdict(), "delay": "s", "friction": self.force, "stiffness_max": self.stiffness}
+        units = {
+            **self._asdict(),
+            "delay": "s",
+            "cutoff": "Hz",
+            "friction": self.force,
+            "stiffness_max": self.stiffness,
+        }
         return with_unit(value, units[name], digits)
 
 
@@ -62,17 +75,14 @@ class WallChoice(NamedTuple):
 
 
 def choose_wall(fit: DeviceFit) -> WallChoice | None:
-    """What the study ``recommend`` sets, softer where K_max is not known so well; None of a fit that does not hold."""
-    top = fit.scene.max_stiffness()
-    if fit.status != Status.OK or top.status != Status.OK:
+    """What the study ``recommend`` sets, or what 99 % of the devices bear where that is less; None where none holds."""
+    safe = fit.safe_wall()
+    if safe.status != Status.OK or not safe.stiffness > 0:
         return None
-    low = fit.intervals["stiffness_max"].low
-    share = RECOMMENDED_SHARE * float(top.stiffness)
-    why = f"{100 * RECOMMENDED_SHARE:g} % of K_max"
-    if not share <= low:
-        share, why = low, "the low end of K_max, which is less than usual"
-    stable = share > 0 and bool(fit.scene.is_stable(share, top.virtual_damping))
-    return WallChoice(share, float(top.virtual_damping), why) if stable else None
+    share = RECOMMENDED_SHARE * fit.stiffness_max
+    if share <= safe.stiffness and fit.scene.is_stable(share, fit.virtual_damping):
+        return WallChoice(share, fit.virtual_damping, f"{100 * RECOMMENDED_SHARE:g} % of K_max")
+    return WallChoice(safe.stiffness, safe.virtual_damping, "what 99 % of the devices bear, less than usual")
 
 
 def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[tuple[str, str]]:
@@ -81,9 +91,14 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if fit.status != Status.OK:
         rows.append((Status(fit.status).name, f"do not rely on these numbers: {name_trouble(fit)}"))
     rows.append(("fitted to", source))
-    for name in ("mass", "damping", "delay", "stiffness_max"):
+    names = ("mass", "damping", "delay", *(["cutoff"] if "cutoff" in fit.errors else []), "stiffness_max")
+    for name in names:
         symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS[name]
-        rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})"))
+        known = math.isfinite(getattr(fit, name))
+        rows.append((symbol, f"{_spell(fit, name, units)} ({_between(fit, name, units)})" if known else "open"))
+    if math.isfinite(fit.virtual_damping):
+        B, error = (units.spell("damping", value) for value in (fit.virtual_damping, fit.virtual_damping_error))
+        rows.append(("at B", f"{B} (standard error {error})"))
     rows += _explain_parts(fit, units)
     if isinstance(fit.noise, tuple):
         rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))
@@ -91,7 +106,11 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         rows.append(("noise of the position", units.spell("position", fit.noise, 3)))
         if fit.resolution:
             rows.append(("step of the encoder", units.spell("position", fit.resolution, 3)))
-    wall = choose_wall(fit)
+    rows += [("or as well", _spell_rival(rival, units)) for rival in fit.rivals]
+    safe, wall = fit.safe_wall(), choose_wall(fit)
+    if safe.status == Status.OK:
+        bound = f"K = {units.spell('stiffness', safe.stiffness)}, B = {units.spell('damping', safe.virtual_damping)}"
+        rows.append(("safe wall", f"{bound}: stable on 99 % of the devices that these records allow"))
     if wall is not None:
         K, B = units.spell("stiffness", wall.stiffness), units.spell("damping", wall.virtual_damping)
         rows.append(("set", f"K = {K}, B = {B}: {wall.why}"))
@@ -99,9 +118,12 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if fit.next is not None:
         step = fit.next
         B, K = units.spell("damping", step.virtual_damping, 3), units.spell("stiffness", step.stiffness, 3)
-        errors = (units.spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards))
+        errors = [units.spell("stiffness", error, 2) for error in (fit.stiffness_error, step.error_afterwards)]
         text = f"K at B = {B}, near {K} and {with_unit(step.frequency, 'Hz', 3)}"
-        rows.append(("measure next", f"{text}: K_max's standard error falls from {' to '.join(errors)}"))
+        falls = math.isfinite(fit.stiffness_error + step.error_afterwards)
+        rows.append(
+            ("measure next", text + (f": K_max's standard error falls from {' to '.join(errors)}" if falls else ""))
+        )
     return rows
 
 
@@ -115,9 +137,14 @@ def list_doubts(fit: DeviceFit, units: AxisUnits) -> list[str]:
     """The doubts of a fit in the units of its axis."""
     if units is not ROTARY:
         return list(fit.doubts)
-    # An inertia is far from the masses of devices, in whatever unit; what else is said names these units.
-    doubts = [doubt for doubt in fit.doubts if "far from any device" not in doubt]
-    return [doubt.replace("N s/m", ROTARY.damping).replace("N/m", ROTARY.stiffness) for doubt in doubts]
+    return [doubt.replace("N s/m", ROTARY.damping).replace("N/m", ROTARY.stiffness) for doubt in fit.doubts]
+
+
+def _spell_rival(rival: RivalDevice, units: AxisUnits) -> str:
+    parts = {SYMBOLS[name]: units.spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
+    parts |= {} if rival.cutoff is None else {SYMBOLS["cutoff"]: units.spell("cutoff", rival.cutoff)}
+    parts[SYMBOLS["stiffness_max"]] = units.spell("stiffness", rival.stiffness_max)
+    return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
 
 
 def _spell(fit: DeviceFit, name: str, units: AxisUnits) -> str:
@@ -126,6 +153,8 @@ def _spell(fit: DeviceFit, name: str, units: AxisUnits) -> str:
 
 
 def _between(fit: DeviceFit, name: str, units: AxisUnits) -> str:
+    if not math.isfinite(sum(fit.intervals[name])):
+        return "open"
     low, high = (units.spell(name, end, _count_digits(fit, name)) for end in fit.intervals[name])
     return f"95 % between {low} and {high}"
 
@@ -171,7 +200,8 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
         given = {part.name: getattr(fit.velocity, part.name) for part in fields(fit.velocity)}
         spelled = {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()}
         inside = ", ".join(f"{key}: {value}" for key, value in spelled.items() if value is not None)
-        lines.append(f"  velocity: {{kind: {kind}, {inside}}} # as given")
+        whence = "its cut-off fitted" if "cutoff" in fit.errors else "as given"
+        lines.append(f"  velocity: {{kind: {kind}, {inside}}} # {whence}")
     lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction:
         lines.append(
