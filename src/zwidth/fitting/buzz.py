@@ -216,9 +216,9 @@ def _edges(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> 
 
 
 def _unlikely(freedom: int) -> float:
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
-    return float(chi2.isf(_CHANCE, freedom))
+    return float(chdtri(freedom, _CHANCE))
 
 
 def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_edge: bool) -> None:

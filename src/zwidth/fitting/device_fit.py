@@ -342,7 +342,7 @@ def in_si(theta: Iterable[float], period: float) -> tuple[np.ndarray, np.ndarray
 
 def reach_of(freedom: int | None) -> float:
     """Standard errors to either side: of a known noise, or of one estimated with so many degrees of freedom."""
-    from scipy.stats import norm, t
+    from scipy.special import ndtri, stdtrit
 
     upper = 0.5 + 0.5 * _CONFIDENCE
-    return float(norm.ppf(upper) if freedom is None else t.ppf(upper, freedom))
+    return float(ndtri(upper) if freedom is None else stdtrit(freedom, upper))

@@ -80,7 +80,7 @@ class FittedModel:
 
         Over twice the cube root of the samples, as usual for errors of unknown kinship (Newey, West 1987).
         """
-        from scipy.stats import chi2
+        from scipy.special import chdtri
 
         size = int(2 * np.ceil(self.count ** (1 / 3)))
         starts = np.arange(0, self.count - size + 1, size)
@@ -89,7 +89,7 @@ class FittedModel:
         if not expected > 0:
             return 1.0
         found = float(np.mean(sums**2)) / expected
-        return found if found * starts.size > chi2.isf(_CHANCE, starts.size) else 1.0
+        return found if found * starts.size > chdtri(starts.size, _CHANCE) else 1.0
 
     @cached_property
     def covariance(self) -> np.ndarray:
