@@ -16,10 +16,11 @@ from zwidth.fitting.device_fit import (
     StiffnessEstimate,
     TriedModel,
     in_si,
+    reach_of,
     scene_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
-from zwidth.fitting.moving import PARTS
+from zwidth.fitting.moving import PARTS, Recordings
 from zwidth.fitting.output_error import FittedModel, fit_models
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
 from zwidth.formatting import plain, with_unit
@@ -37,6 +38,9 @@ _SEEN = 5.0
 _ALIKE = 1.5
 # So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
 _UNEXPLAINED, _SMOOTH = 0.01, 5.0
+# Criteria that differ by less are no strong evidence (Kass, Raftery 1995).
+_HARDLY_WORSE = 6.0
+_WORDS = {"offset": "a constant force", "friction": "friction"}
 # Smaller residuals, as a share of the way moved, are rounding.
 _EXACT = 1e-9
 
@@ -120,7 +124,12 @@ def fit_log(
     by_theta = by_theta @ np.diag([-1.0 / theta[0], 1.0, 1.0])
     covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
-    doubts = odd + doubts + _doubt(values, np.sqrt(np.diag(covariance)), best, logs, rotary)
+    doubts = (
+        odd
+        + doubts
+        + _doubt_choice(ranked, values, np.sqrt(np.diag(covariance)), period)
+        + _doubt(values, np.sqrt(np.diag(covariance)), best, logs, rotary)
+    )
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
@@ -140,6 +149,31 @@ def fit_log(
         motions=_beside(residuals, logs, period),
         tried=tuple(TriedModel(fitted.model.parts, criterion) for fitted, criterion in ranked),
     )
+
+
+def _doubt_choice(
+    ranked: list[tuple[FittedModel, float]], values: np.ndarray, errors: np.ndarray, period: float
+) -> list[str]:
+    """Models that explain the log hardly worse than the best, whose device is another one, a sentence each."""
+    kept, doubts = set(ranked[0][0].model.parts), []
+    for fitted, criterion in ranked[1:]:
+        if criterion > _HARDLY_WORSE or not fitted.theta[0] > 0:
+            continue
+        others = in_si((np.log(period**2 / fitted.theta[0]), fitted.theta[1], fitted.theta[2]), period)[0]
+        if np.all(np.abs(others - values) <= reach_of(None) * errors):
+            continue
+        change = [("without" if part in kept else "with") + f" {_WORDS[part]}" for part in _differ(kept, fitted)]
+        mass, damping, delay = others
+        doubts.append(
+            f"{' and '.join(change)} the log is explained nearly as well (Schwarz's criterion {plain(criterion, 2)} "
+            f"worse), by m = {with_unit(1e3 * mass, 'g')}, b = {with_unit(damping, 'N s/m')}, "
+            f"t_d = {with_unit(delay, 's')}; record longer"
+        )
+    return doubts
+
+
+def _differ(kept: set[str], fitted: FittedModel) -> list[str]:
+    return [part for part in PARTS if (part in kept) != (part in fitted.model.parts)]
 
 
 def _in_newton(best: FittedModel, part: str) -> tuple[float, float]:
@@ -168,7 +202,9 @@ def _find_step(resolution: Any, logs: tuple[Log, ...]) -> tuple[float, list[str]
 def _refuse_unmoved(best: FittedModel, period: float) -> None:
     """Raise `InputError` where the force explains nothing of the motion, the contrary of it, or too little."""
     model, theta, squares = best.model, best.theta, best.squares
-    alone = best.moved[1][:, 3 : 3 + 2 * len(model.logs)]
+    # What there would be without any force, not even friction.
+    count = 3 + 2 * len(model.logs)
+    alone = Recordings(model.logs, ()).predict(theta[:count])[1][:, 3:]
     sizes = np.linalg.norm(alone, axis=0)
     rest = model.measured - alone / sizes @ np.linalg.lstsq(alone / sizes, model.measured, rcond=None)[0]
     if float(rest @ rest) - squares <= _SEEN**2 * squares / model.measured.size:

@@ -19,6 +19,8 @@ _BEGINNING = 2500
 # Promised reductions of the squares that end the search, and that excuse a corner; steps; how they are damped.
 _ARRIVED, _NEARLY, _STEPS = 1e-12, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
+# Standard deviations of the noise that a slide is lost in.
+_WITHIN = 3.0
 # Columns worse conditioned than this do not tell the numbers apart; a relative error this small is rounding.
 _BLIND, _ROUNDING = 1e7, 1e-13
 # Sums of residuals that noise alone exceeds so rarely are of something else.
@@ -175,11 +177,33 @@ def _fit(model: Recordings, starts: list[np.ndarray], longest: float, resolution
         first = Recordings(tuple(log.begin(_BEGINNING) for log in model.logs), model.parts)
         start = min((_refine(first, start, longest, ()) for start in starts), key=lambda found: found[1])[0]
     best = _refine(model, start, longest, ())
+    still = _rest(model, *best[:2])
+    if still is not None:
+        resting = _refine(model, still, longest, ())
+        # A start at rest needs one number less.
+        count = model.measured.size
+        if not best[2] or count * np.log(resting[1] / best[1]) < np.log(count):
+            best = resting
     held: tuple[int, ...] = ()
     while any(best[0][k] < 0 for k in (1, 2)):
         held = tuple(k for k in (1, 2) if k in held or best[0][k] < 0)
         best = _refine(model, best[0], longest, held)
     return FittedModel(model, *best, resolution)
+
+
+def _rest(model: Recordings, theta: np.ndarray, squares: float) -> np.ndarray | None:
+    """Without the first speeds that friction stops within the noise: they hardly move the positions; None without any.
+
+    Beside such a speed the position's derivative is next to 0, and steps towards the best one hardly end.
+    """
+    speeds = 4 + 2 * np.arange(len(model.logs))
+    if PARTS[1] not in model.parts or not theta[-1] > 0:
+        return None
+    slid = theta[speeds] ** 2 / (2.0 * theta[-1])
+    idle = (slid > 0) & (slid < _WITHIN * np.sqrt(squares / model.measured.size))
+    still = theta.copy()
+    still[speeds[idle]] = 0.0
+    return still if idle.any() else None
 
 
 def _refine(

@@ -1,0 +1,53 @@
+"""An encoder's errors over its unknown zero, against encoders drawn, and the step that positions are made of."""
+
+import numpy as np
+import pytest
+
+from zwidth.fitting.encoder import MeasurementNoise, find_resolution, fits_steps
+
+STEP = 3e-5
+
+
+def slow_motion(count=400):
+    k = np.arange(count)
+    return 2e-4 * np.sin(0.01 * k) + 1e-6 * k
+
+
+def read(position, noise, random):
+    zero = random.uniform()
+    return STEP * (np.round(position / STEP + noise * random.standard_normal(position.size) + zero) - zero)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.1, 0.4])
+def test_errors_of_an_encoder_spread_as_drawn_ones(noise):
+    random, position = np.random.default_rng(2), slow_motion()
+    columns = np.column_stack([np.ones(400), np.linspace(-1, 1, 400), np.cos(0.02 * np.arange(400))]) / 20.0
+    errors = np.array([read(position, noise, random) - position for _ in range(4000)])
+    model = MeasurementNoise(position, (noise**2 + 1 / 12) * STEP**2, STEP)
+    drawn = errors @ columns
+    # A variance of 4,000 draws is known to 2.2 %.
+    np.testing.assert_allclose(np.diag(model.spread(columns)), drawn.var(0), rtol=0.1)
+    assert model.spread_of_sums(20) == pytest.approx(np.mean(errors.reshape(4000, 20, 20).sum(2) ** 2), rel=0.1)
+    if noise < 0.2:
+        # As white noise they would be far smaller.
+        white = MeasurementNoise(position, model.variance, 0.0)
+        assert np.diag(model.spread(columns))[0] > 1.8 * np.diag(white.spread(columns))[0]
+
+
+def test_the_step_is_found_in_positions():
+    random = np.random.default_rng(3)
+    position = read(slow_motion(), 0.5, random)
+    assert find_resolution(position) == pytest.approx(STEP, rel=1e-9)
+    # Another unit.
+    assert find_resolution(3.0 * position) == pytest.approx(3 * STEP, rel=1e-9)
+    assert find_resolution(slow_motion()) == 0.0
+    assert find_resolution(random.standard_normal(500)) == 0.0
+    assert find_resolution(np.full(10, 0.3)) == 0.0
+
+
+def test_positions_of_a_step_are_told_from_others():
+    position = read(slow_motion(), 0.5, np.random.default_rng(4))
+    assert fits_steps(position, STEP)
+    assert fits_steps(position, STEP / 3)
+    assert not fits_steps(position, 1.1 * STEP)
+    assert not fits_steps(slow_motion(), STEP)
