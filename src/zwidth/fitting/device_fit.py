@@ -218,7 +218,14 @@ class DeviceFit:
         """
         from zwidth.fitting.safe_wall import find_safe_wall
 
-        return find_safe_wall(self, reliability, samples, seed)
+        asked = (reliability, samples, seed)
+        return self._usual_safe_wall if asked == (0.99, None, 0) else find_safe_wall(self, *asked)
+
+    @cached_property
+    def _usual_safe_wall(self) -> SafeWall:
+        from zwidth.fitting.safe_wall import find_safe_wall
+
+        return find_safe_wall(self, 0.99, None, 0)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
