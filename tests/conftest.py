@@ -13,6 +13,9 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 
 # Set before anything imports matplotlib, and inherited by the programs that tests start.
 os.environ["MPLBACKEND"] = "Agg"
+# Processes test side by side: threads of one's small matrices would wait for a core that another has. Here a plugin of
+# pytest has loaded NumPy already; the processes that pytest-xdist starts inherit this in time.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Most of the time would go into compiling: the processes that run tests share what one of them has compiled.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "jax"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

@@ -12,7 +12,15 @@ from dataclasses import dataclass
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, PlainSerializer, PlainValidator, ValidationError, WithJsonSchema, create_model
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    PlainSerializer,
+    PlainValidator,
+    ValidationError,
+    WithJsonSchema,
+    create_model,
+)
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
@@ -61,6 +69,9 @@ class Axis:
 
 class _Spacing(Strict):
     """Base of the mappings below ``linear`` and ``log``."""
+
+    # No source has docstrings of their fields; pydantic would look for it in every frame, for all modules each time.
+    model_config = ConfigDict(use_attribute_docstrings=False)
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:

@@ -97,20 +97,29 @@ def test_physical_results_are_in_si_units(tmp_path):
     np.testing.assert_allclose(data.settling_time.sel(damping=10, stiffness=1000), -np.log(50) / np.log(radius) * 1e-3)
 
 
-MANY_ROWS = {"alpha": [0.1], "beta": {"linear": {"start": -0.1, "stop": 0.5, "num": 260}}, "delta": 0.3, "d": [0.5, 2]}
+# Of four dimensions, as `cut` knows walls.
+MANY_ROWS = {
+    "alpha": [0.1],
+    "beta": {"linear": {"start": -0.1, "stop": 0.5, "num": 260}},
+    "delta": [0.3],
+    "d": [0.5, 2],
+}
 
 
-@pytest.mark.parametrize("axes, target", [(FEW, 1), (FEW, 7), (MANY_ROWS, 11), (MANY_ROWS, 100)])
-def test_values_do_not_depend_on_chunks(tmp_path, monkeypatch, axes, target):
+@pytest.mark.parametrize("axes, targets", [(FEW, (1, 7)), (MANY_ROWS, (11, 100))])
+def test_values_do_not_depend_on_chunks(tmp_path, monkeypatch, axes, targets):
     # Each of the many chunks fills up one piece of every size.
     for size in ("_PIECE", "_WALL_PIECE"):
         monkeypatch.setattr(f"zwidth.sweep.compute.{size}", 64)
     config = config_of(study(axes=axes, outputs=(*WALLS, *DEVICES)))
     run_sweeps(config, tmp_path / "whole")
-    cut(monkeypatch, target, 2)
-    result = run_sweeps(config, tmp_path / "parts")
-    assert result.computed > 4
-    assert_same(tmp_path / "whole", tmp_path / "parts")
+    chunks = []
+    for target in targets:
+        with monkeypatch.context() as patch:
+            cut(patch, target, 2)
+            chunks.append(run_sweeps(config, tmp_path / f"parts of {target}").computed)
+        assert_same(tmp_path / "whole", tmp_path / f"parts of {target}")
+    assert chunks[0] > 2 * chunks[1] > 8
 
 
 def test_values_do_not_depend_on_workers(finished, tmp_path):
