@@ -154,7 +154,7 @@ def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
         held = [row["held"][name] for row in fitted if name in row["held"]]
         off = np.array([row["off"][name] for row in fitted if name in row["off"]])
         right = np.array([row["off"][name] for row in fitted if name in row["off"] and row["right"]])
-        sizes = " | | "
+        sizes = "| |"
         if off.size:
             sizes = " | ".join(f"{size:.2f}" for size in (rms(off), rms(right), np.median(np.abs(off)) / 0.6745))
         yield f"| {name} | {100 * np.mean(held):.1f} % of {len(held):,} | {sizes} |"

@@ -38,8 +38,8 @@ _SEEN = 5.0
 _ALIKE = 1.5
 # So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
 _UNEXPLAINED, _SMOOTH = 0.01, 5.0
-# Criteria that differ by less are no strong evidence (Kass, Raftery 1995).
-_HARDLY_WORSE = 6.0
+# Criteria that differ by less are weak evidence (Kass, Raftery 1995).
+_HARDLY_WORSE = 2.0
 _WORDS = {"offset": "a constant force", "friction": "friction"}
 # Smaller residuals, as a share of the way moved, are rounding.
 _EXACT = 1e-9
