@@ -128,5 +128,5 @@ def test_records_that_allow_any_mass_warn_of_nothing():
     # Warnings are errors here: two rough walls allow masses that are drawn as 0.
     fit = zwidth.fit_buzz([(1e3, 0.0, 20.0), (2e3, 8.0, 30.0)], period=1e-3)
     wall = fit.safe_wall()
-    assert wall.status == zwidth.Status.OK
+    assert wall.status == Status.OK
     assert 0 < wall.stiffness < fit.stiffness_max
