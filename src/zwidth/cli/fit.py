@@ -38,8 +38,9 @@ class WallType(click.ParamType):
         """Parse one option."""
         if isinstance(value, HeardWall):
             return value
-        found = dict(_ENTRY.findall(value.replace(",", " ")))
-        if _ENTRY.sub("", value.replace(",", " ")).strip() or {"K", "f"} - set(found):
+        entries = _ENTRY.findall(value.replace(",", " "))
+        found = dict(entries)
+        if _ENTRY.sub("", value.replace(",", " ")).strip() or {"K", "f"} - set(found) or len(found) < len(entries):
             self.fail(f"got {value!r}; write K, B and f, as 'K=3.2kN/m B=0 f=71Hz'", param, ctx)
         numbers, kinds = {"B": 0.0}, set()
         for letter, text in found.items():
@@ -130,6 +131,8 @@ def fit(
 
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
+    if as_json and as_yaml:
+        raise click.UsageError("give one of --json and --yaml")
     if figure is not None and figure.suffix not in (".png", ".svg", ".pdf"):
         raise click.UsageError(f"--figure: got {str(figure)!r}; name a file that ends with .png, .svg or .pdf")
     units, points = LINEAR, ()

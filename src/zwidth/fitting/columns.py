@@ -1,8 +1,8 @@
 """Logs in CSV files: columns in any order, under any names, in any units, read into SI units.
 
-A file has a line of column names and a line a sample; lines before the names that begin with # are remarks. Columns are
-separated by tabs, else semicolons, else commas: the first of these that the line of names holds. Where commas do not
-separate, they may be decimal signs.
+A file has a line of column names and a line a sample; lines before the names that begin with # are remarks, and so is
+the ``sep=;`` of spreadsheets. Columns are separated by tabs, else semicolons, else commas: the first of these that the
+line of names holds. Where commas do not separate, they may be decimal signs.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ _NAMES = {
 }
 _SEPARATORS = ("\t", ";", ",")
 _MOST_BYTES = 2**28
+_REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _HEADER = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
 
 
@@ -119,7 +120,7 @@ def _read_lines(file: Path) -> list[tuple[int, list[str]]]:
     except OSError as error:
         raise InputError(f"{file}: {error.strerror or error}; check the path") from None
     lines = text.splitlines()
-    first = next((k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")), None)
+    first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), None)
     if first is None:
         raise InputError(f"{file}: it is empty; a line of column names and a line a sample are needed")
     head = lines[first]

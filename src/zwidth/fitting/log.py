@@ -32,6 +32,8 @@ from zwidth.status import Status
 _LONGEST = 20
 # The masses of devices, in kg: outside a unit is suspected.
 _LIGHTEST, _HEAVIEST = 2e-3, 20.0
+# Fewer positions than this are explained by other devices as well, far outside of the errors.
+_FEW = 60
 # A slope of less than so many of its standard errors is none.
 _SEEN = 5.0
 # Sums of what the fit leaves may spread so many times more than noise's, before it is doubted.
@@ -221,7 +223,8 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
     if left > _UNEXPLAINED and best.excess > _SMOOTH:
         raise InputError(
             f"force: it leaves {plain(100 * np.sqrt(left), 2)} % of the motion unexplained, and that is smooth, not "
-            "noise: something else pushes, as a hand, a spring or gravity along the way; record the device left alone"
+            "noise: something else pushes, as a hand, a spring, a stop or gravity along the way, the motor gives less "
+            "than is commanded, or samples are missing; record every sample of the device left alone"
         )
 
 
@@ -229,10 +232,16 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
     mass, damping, delay = values
     doubts, residuals = [], best.residuals
     if not rotary and not _LIGHTEST <= mass <= _HEAVIEST:
-        slip = "the position may be in mm, or the force in kN" if mass < _LIGHTEST else "the force may be in mN"
+        light = "the position may be in mm, or the force in kN"
+        slip = light if mass < _LIGHTEST else "the force may be in mN, or the time in ms"
         doubts.append(f"a mass of {with_unit(1e3 * mass, 'g')} is far from any device; {slip}: m, N and s are meant")
     if errors[0] > VAGUE * mass:
         doubts.append(MASS_OPEN)
+    if best.count < _FEW:
+        doubts.append(
+            f"only {best.count} positions count, for those before serve as past force: so few may suit quite another "
+            "device, and the errors do not say so; record longer, or give a shorter max_delay"
+        )
     size = float(residuals @ residuals)
     if size <= _EXACT**2 * residuals.size * max(float(np.ptp(log.position)) for log in logs) ** 2:
         # Nothing but rounding is left.

@@ -52,7 +52,8 @@ class Recording:
     skip: int
 
     def begin(self, count: int) -> Recording:
-        """Its first positions alone."""
+        """So many first positions alone, counted from where the force first changes, for before that little is seen."""
+        count += max(0, int(np.argmax(self.force != self.force[0])) - self.skip)
         return Recording(self.force[: self.skip + count], self.position[:count], self.skip)
 
     def move(

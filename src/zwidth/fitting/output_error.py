@@ -59,8 +59,8 @@ class FittedModel:
 
     @property
     def noise(self) -> MeasurementNoise:
-        """That of its positions."""
-        return MeasurementNoise(self.moved[0], self.variance, self.resolution)
+        """That of its positions; at rest, x0 takes up an encoder's error, and the residuals show less than there is."""
+        return MeasurementNoise(self.moved[0], max(self.variance, self.resolution**2 / 12.0), self.resolution)
 
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

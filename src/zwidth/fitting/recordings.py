@@ -19,6 +19,8 @@ _UNEVEN, _SAME = 0.05, 1e-5
 _FEWEST = 20
 # Samples that a stretch at one end lasts before it is suspected; a force of so many values varies, as a share.
 _STUCK, _MANY = 25, 0.1
+# A step of so many usual ones lacks a sample.
+_MISSING = 1.5
 # The longest step, in periods, over which positions are interpolated.
 _GAP = 2.5
 
@@ -100,10 +102,16 @@ def _period(clock: np.ndarray) -> float:
     late = late - 0.5 * (late.max() + late.min())
     worst = int(np.argmax(np.abs(late)))
     if abs(late[worst]) > _UNEVEN * period:
+        k = int(np.argmax(steps))
         raise InputError(
             f"time: samples are not even: steps from {with_unit(float(steps.min()), 's')} to "
             f"{with_unit(float(steps.max()), 's')}, sample {worst} {plain(100 * abs(late[worst]) / period, 2)} % of a "
-            "period off; record at even times, give the period in place of the times, or ask to resample"
+            "period off; "
+            + (
+                f"some are missing after sample {k}: give what lies before and behind a gap as two logs"
+                if steps[k] > _MISSING * np.median(steps)
+                else "record at even times, give the period in place of the times, or ask to resample"
+            )
         )
     return period
 

@@ -150,11 +150,17 @@ class _RigidDevices:
         return ends * self.rate / self.period
 
     def _with(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return self.delta, self.d, damping / self.rate
+        with np.errstate(all="ignore"):
+            return self.delta, self.d, damping / self.rate
+
+    def _normalize(self, stiffness: float) -> np.ndarray:
+        # Where records allow nearly any mass, some are drawn that are 0.
+        with np.errstate(all="ignore"):
+            return stiffness * self.period / self.rate
 
     def _most_borne(self, stiffness: float) -> float:
         """The middle of the dampings at which most devices bear this stiffness."""
-        alpha = stiffness * self.period / self.rate
+        alpha = self._normalize(stiffness)
         sides = []
         for side in ("lower", "upper"):
             ends = _in_pieces(
@@ -174,7 +180,7 @@ class _RigidDevices:
     def share(self, stiffness: float, virtual_damping: float) -> float:
         """Of the devices on which the wall is stable; softer ones are so with it."""
         delta, d, beta = self._with(virtual_damping)
-        return float(_in_pieces(is_stable, stiffness * self.period / self.rate, beta, delta, d).mean())
+        return float(_in_pieces(is_stable, self._normalize(stiffness), beta, delta, d).mean())
 
 
 def _in_pieces(function: Any, *arrays: np.ndarray) -> np.ndarray:

@@ -23,7 +23,7 @@ from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_ste
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
-from zwidth.formatting import header, plain, with_unit
+from zwidth.formatting import describe, header, plain, with_unit
 from zwidth.status import Status
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
 from zwidth.units import LENGTH
@@ -101,6 +101,8 @@ def _digest(name: Any) -> str:
 
 def _read_logs(raw: Any, handler: Any) -> Any:
     """One log, or a list of them."""
+    if isinstance(raw, str):
+        raise problem(f"got {describe(raw)}", "a log is a CSV file and its columns", "write {csv: NAME.csv}")
     if isinstance(raw, dict):
         return (LogSection.model_validate(raw),)
     return (raw,) if isinstance(raw, LogSection) else members("logs")(raw, handler)
@@ -204,6 +206,22 @@ class FitStudy(ComputedStudy):
         if any(motion.rotary for motion in motions) and self.buzz:
             what = "got walls in N/m beside a log of an angle"
             yield ("buzz",), problem(what, "both are of one axis", "fit them in two studies", on_key=True)
+        for k, motion in enumerate(motions):
+            if motion.rotary != motions[0].rotary or motion.resolution != motions[0].resolution:
+                what = "got another axis, or another resolution, than of the first log"
+                yield ("log", k), problem(what, "all logs are of one device", "fit it in a study of its own")
+        for k, wall in enumerate(self.buzz or ()):
+            if self.period is not None and wall.frequency * self.period >= 0.5:
+                half = with_unit(0.5 / self.period, "Hz")
+                what = f"got {with_unit(wall.frequency, 'Hz')}"
+                allowed = f"it must lie below half the sampling rate, {half}"
+                yield ("buzz", k, "frequency"), problem(what, allowed, "check the frequency, or the period")
+        if self.buzz and len({wall.virtual_damping for wall in self.buzz}) < 2:
+            what = "got walls of one damping alone"
+            yield (
+                ("buzz",),
+                problem(what, "m, b and t_d need two", "add a wall of another virtual_damping", on_key=True),
+            )
 
     @property
     def units(self) -> AxisUnits:

@@ -27,6 +27,7 @@ READ = {
     ),
     "tabs": ("t [ms]\tx [mm]\tforce, filtered [N]\n0\t1.5\t.5\n1\t-2\t-1.25\n", {"force": "force, filtered"}, PLACE),
     "german": ("t [ms];x [mm];F [N]\n0;1,5;0,5\n1;-2,0;-1,25\n", {}, PLACE),
+    "a spreadsheet's separator": ("\ufeffsep=;\r\nt [ms];x [mm];F [N]\r\n0;1,5;0,5\r\n1;-2,0;-1,25\r\n", {}, PLACE),
     "remarks, blanks, mark": (
         "\ufeff# made by hand\n\n# twice\n t [ms] , x [mm] ,F\n0 ,1.5, .5\n\n1, -2 ,-1.25\n",
         {},

@@ -122,3 +122,11 @@ def test_the_error_of_the_stiffest_wall_is_that_of_drawn_devices(mass, damping, 
     stiffest = zwidth.max_stiffness(mass=drawn[:, 0], damping=drawn[:, 1], period=PERIOD, delay=drawn[:, 2])
     # A standard deviation of 20,000 is off by 0.5 %.
     assert np.std(stiffest) == pytest.approx(fit.stiffness_error, rel=0.02)
+
+
+def test_records_that_allow_any_mass_warn_of_nothing():
+    # Warnings are errors here: two rough walls allow masses that are drawn as 0.
+    fit = zwidth.fit_buzz([(1e3, 0.0, 20.0), (2e3, 8.0, 30.0)], period=1e-3)
+    wall = fit.safe_wall()
+    assert wall.status == Status.OK
+    assert 0 < wall.stiffness < fit.stiffness_max

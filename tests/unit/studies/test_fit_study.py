@@ -195,6 +195,17 @@ FAULTS = {
         "    buzz: [{stiffness: 1, frequency: 2}]\n    period: 1 ms\n    max_delay: 1 ms\n",
         "got max_delay without log",
     ),
+    "a name alone": ("    log: log.csv\n", "write {csv: NAME.csv}"),
+    "logs of two axes": ("    log: [{csv: log.csv}, {csv: turn.csv}]\n", "studies[0].log[1]: got another axis"),
+    "too fast": (
+        "    buzz: [{stiffness: 1, frequency: 2}, {stiffness: 2, virtual_damping: 1, frequency: 700}]\n"
+        "    period: 1 ms\n",
+        "studies[0].buzz[1].frequency: got 700.0 Hz; it must lie below half the sampling rate, 500.0 Hz",
+    ),
+    "one damping": (
+        "    buzz: [{stiffness: 1, frequency: 2}, {stiffness: 1.1, frequency: 2.1}]\n    period: 1 ms\n",
+        "studies[0].buzz: got walls of one damping alone",
+    ),
     "no frequency": ("    buzz: [{stiffness: 1}]\n    period: 1 ms\n", "frequency"),
     "angles and walls": (
         "    log: {csv: turn.csv}\n    buzz: [{stiffness: 1, frequency: 2}]\n    period: 1 ms\n",

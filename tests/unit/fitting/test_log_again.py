@@ -1,0 +1,130 @@
+"""Devices with friction fitted by another program as well, and logs that begin with a long rest or are short."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import tolerances
+import zwidth
+from zwidth.errors import InputError
+from zwidth.fitting.moving import Recording, Recordings
+from zwidth.fitting.output_error import FittedModel
+from zwidth.status import Status
+
+PERIOD, SKIP, STEP = 1e-3, 22, 3e-5
+
+
+def follow(mass, damping, delay, start, offset, friction, force, count):
+    """Positions of ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, from one stop to the next, in seconds.
+
+    The first position is of the time at which the last ``count`` forces begin.
+    """
+    whole = math.floor(delay / PERIOD)
+    spans = (delay - whole * PERIOD, (whole + 1) * PERIOD - delay)
+    x, v = start
+    places = [x]
+    for k in range(len(force) - count, len(force) - 1):
+        for part, left in enumerate(spans):
+            push = force[k - whole - 1 + part] + offset
+            while left > 0:
+                if v == 0 and abs(push) <= friction:
+                    break
+                pull = push - math.copysign(friction, v if v != 0 else push)
+                last, there = pull / damping, left
+                after = last + (v - last) * math.exp(-damping / mass * left)
+                if friction > 0 and v * after < 0:
+                    there, after = mass / damping * math.log1p(-damping * v / pull), 0.0
+                x += last * there + (v - last) * -math.expm1(-damping / mass * there) * mass / damping
+                v, left = after, left - there
+        places.append(x)
+    return np.array(places)
+
+
+def push_to_and_fro(rng, count):
+    pushes = [rng.uniform(0.5, 1) * np.repeat([1, -1, -1, 1], rng.integers(15, 45)) for _ in range(count // 30)]
+    return np.concatenate(pushes)[:count]
+
+
+def record(rng, force, *device):
+    """From rest, by an encoder."""
+    past = [*np.zeros(30), *force.tolist()]
+    mass, damping, delay, offset, friction = device
+    exact = follow(mass, damping, delay, (0.0, 0.0), offset, friction, past, force.size)
+    return STEP * np.round((exact + 0.2 * STEP * rng.standard_normal(force.size)) / STEP)
+
+
+@pytest.mark.parametrize(
+    "delay, offset, friction, parts",
+    [(2.3e-3, 0.0, 0.08, {"friction"}), (3e-3, 0.02, 0.15, {"friction", "offset"}), (0.7e-3, 0.03, 0.0, {"offset"})],
+)
+def test_another_program_finds_the_same_device_with_friction(delay, offset, friction, parts):
+    rng = np.random.default_rng(5)
+    force = push_to_and_fro(rng, 600)
+    position = record(rng, force, 0.075, 0.6, delay, offset, friction)
+    fit = zwidth.fit_log(PERIOD, position, force)
+    assert set(fit.tried[0].parts) == parts
+    measured, forces = position[SKIP:], force.tolist()
+
+    def rest(theta):
+        mass, damping, late, x0, v0 = map(float, theta[:5])
+        extra = dict(zip(sorted(parts, reverse=True), map(float, theta[5:]), strict=True))
+        model = follow(
+            mass, damping, late, (x0, v0), extra.get("offset", 0.0), extra.get("friction", 0.0), forces, measured.size
+        )
+        return (model - measured) / np.std(measured)
+
+    speed = (position[SKIP + 2] - position[SKIP - 2]) / (4 * PERIOD)
+    own = {"offset": 0.97 * offset, "friction": 1.02 * friction}
+    start = [0.0755, 0.594, delay + 5e-5, measured[0], speed, *(own[part] for part in sorted(parts, reverse=True))]
+    options = {"x_scale": np.maximum(np.abs(start), 1e-4), "xtol": 1e-14, "ftol": 1e-15, "gtol": 1e-15}
+    again = least_squares(rest, start, jac="3-point", **options).x
+    expected = [again[0], again[1], again[2], *again[5:]]
+    found = [fit.mass, fit.damping, fit.delay, *(getattr(fit, part) for part in sorted(parts, reverse=True))]
+    np.testing.assert_allclose(found, expected, rtol=tolerances.FIT_AGAIN.float64)
+
+
+def test_a_log_may_begin_with_a_long_rest():
+    rng = np.random.default_rng(1)
+    force = np.concatenate([np.zeros(2700), push_to_and_fro(rng, 400)])
+    position = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.08)
+    fit = zwidth.fit_log(PERIOD, position, force)
+    assert (fit.status, fit.doubts) == (Status.OK, ())
+    for name, true in {"mass": 0.075, "damping": 0.6, "delay": 2.3e-3, "friction": 0.08}.items():
+        assert abs(getattr(fit, name) - true) < 4 * fit.errors[name]
+
+
+@pytest.mark.parametrize("share", [0.5, 0.1, 0.01])
+def test_errors_know_the_encoder_where_residuals_hide_it(share):
+    # At rest the start takes up what the encoder errs: so little is left that its waves alone exceed it.
+    force = push_to_and_fro(np.random.default_rng(2), 200)
+    theta = np.array([PERIOD**2 / 0.075, PERIOD * 0.6 / 0.075, 2.3, 0.0, 0.0])
+    model = Recordings((Recording(force, np.zeros(178), SKIP),), ())
+    squares = [part * (178 - 5) * STEP**2 / 12 for part in (share, 1.0)]
+    few, usual = (np.diag(FittedModel(model, theta, size, True, STEP).covariance) for size in squares)
+    np.testing.assert_allclose(few, usual, rtol=1e-9)
+
+
+def test_few_positions_are_doubted():
+    rng = np.random.default_rng(0)
+    force = push_to_and_fro(rng, 120)
+    position = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0)
+    assert not any("positions count" in doubt for doubt in zwidth.fit_log(PERIOD, position, force).doubts)
+    fit = zwidth.fit_log(PERIOD, position[:70], force[:70])
+    assert any("only 48 positions count" in doubt for doubt in fit.doubts)
+
+
+def test_missing_samples_are_named():
+    rng = np.random.default_rng(0)
+    force = push_to_and_fro(rng, 120)
+    position, kept = record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0), np.arange(120) != 50
+    with pytest.raises(InputError, match="missing after sample 49: give what lies before and behind a gap as two logs"):
+        zwidth.fit_log(PERIOD * np.arange(120)[kept], position[kept], force[kept])
+
+
+def test_milliseconds_read_as_seconds_are_doubted():
+    rng = np.random.default_rng(0)
+    force = push_to_and_fro(rng, 300)
+    fit = zwidth.fit_log(1.0, record(rng, force, 0.075, 0.6, 2.3e-3, 0.0, 0.0), force)
+    assert any("the time in ms" in doubt for doubt in fit.doubts)
