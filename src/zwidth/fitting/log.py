@@ -145,6 +145,7 @@ def fit_log(
         residuals=residuals,
         doubts=doubts,
         status=status,
+        freedom=max(1, best.count - theta.size),
         offset=_in_newton(best, PARTS[0])[0],
         friction=_in_newton(best, PARTS[1]),
         resolution=step,

@@ -11,7 +11,7 @@ from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import PARTS, Recording, Recordings
 
 # Dampings b T/m and steps of the delay, in periods, that are started from, and how many of the best.
-_DELTAS, _STEP, _STARTS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0), 0.5, 3
+_DELTAS, _STEP, _STARTS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0), 1.0, 3
 # Friction as a share of the largest force, and the damping as a share of what it is without friction.
 _FRICTIONS, _DAMPINGS = (0.02, 0.1, 0.3), (1.0, 0.3, 0.03)
 # So many positions of each log choose the starts.
