@@ -126,12 +126,13 @@ def fit_log(
     by_theta = by_theta @ np.diag([-1.0 / theta[0], 1.0, 1.0])
     covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
-    doubts = (
-        odd
-        + doubts
-        + _doubt_choice(ranked, values, np.sqrt(np.diag(covariance)), period)
-        + _doubt(values, np.sqrt(np.diag(covariance)), best, logs, rotary)
-    )
+    errors = np.sqrt(np.diag(covariance))
+    doubts = [
+        *odd,
+        *doubts,
+        *_doubt_choice(ranked, values, errors, period),
+        *_doubt(values, errors, best, logs, rotary),
+    ]
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE

@@ -36,7 +36,7 @@ class Pieces(NamedTuple):
     held_after: np.ndarray
 
 
-class Course(NamedTuple):
+class ModelledMotion(NamedTuple):
     """Positions and their derivatives in g, delta, d, x0, v0, o and c, (n, 7)."""
 
     position: np.ndarray
@@ -65,7 +65,7 @@ class Recording:
         v0: float = 0.0,
         offset: float = 0.0,
         friction: float = 0.0,
-    ) -> Course:
+    ) -> ModelledMotion:
         """Where the mass is at the samples; ``offset`` is o, ``friction`` c."""
         whole, f = (float(part) for part in split_delay(np.float64(d)))
         now = self.skip + np.arange(self.position.size - 1) - int(whole)
@@ -79,7 +79,7 @@ class Recording:
         whole_slopes = np.zeros((self.position.size, 7))
         whole_slopes[:, 3] = 1.0
         whole_slopes[1:, [0, 1, 2, 4, 5, 6]] = slopes
-        return Course(x0 + np.concatenate([[0.0], place]), whole_slopes)
+        return ModelledMotion(x0 + np.concatenate([[0.0], place]), whole_slopes)
 
 
 def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pieces:
