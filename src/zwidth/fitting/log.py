@@ -127,12 +127,8 @@ def fit_log(
     covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
     errors = np.sqrt(np.diag(covariance))
-    doubts = [
-        *odd,
-        *doubts,
-        *_doubt_choice(ranked, values, errors, period),
-        *_doubt(values, errors, best, logs, rotary),
-    ]
+    doubts = odd + doubts + _doubt_choice(ranked, values, errors, period)
+    doubts += _doubt(values, errors, best, logs, rotary)
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
