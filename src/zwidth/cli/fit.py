@@ -161,7 +161,7 @@ def fit(
         from zwidth.fitting.columns import fit_motions, read_log
 
         step = columns.pop("resolution")
-        motions = [read_log(log, columns, resolution=step, timed=period is None) for log in logs]
+        motions = [read_log(log, columns, resolution=step, period=period) for log in logs]
         units = ROTARY if motions[0].rotary else LINEAR
         found = fit_motions(motions, period=period, velocity=velocity, max_delay=max_delay, resample=resample)
         source = " and ".join(log.name for log in logs)

@@ -19,7 +19,7 @@ import numpy as np
 from zwidth.errors import InputError, UnusableValueError
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.log import fit_log
-from zwidth.formatting import describe, suggestion
+from zwidth.formatting import describe, suggestion, with_unit
 from zwidth.quantities import POSITIVE
 from zwidth.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
 
@@ -36,6 +36,8 @@ _NAMES = {
 }
 _SEPARATORS = ("\t", ";", ",")
 _MOST_BYTES = 2**28
+# Periods that differ by more are two.
+_OTHER = 0.1
 _REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _HEADER = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
 
@@ -66,7 +68,7 @@ class LoggedMotion:
 
 
 def read_log(
-    file: str | Path, columns: Mapping[str, str | None], *, resolution: Any = None, timed: bool = True
+    file: str | Path, columns: Mapping[str, str | None], *, resolution: Any = None, period: float | None = None
 ) -> LoggedMotion:
     """Read the time, the position and the force of a log.
 
@@ -77,15 +79,15 @@ def read_log(
             found by its name.
         resolution: of the encoder, a length or an angle with its unit, for one count; a number is in m, or in rad with
             a torque.
-        timed: whether the time is read.
+        period: of the samples, in s, where the time is not to be read.
 
     Raises:
         InputError: a column is missing, or may be several; a unit is unknown; a cell holds no number; a length is
-            paired with a torque.
+            paired with a torque; a column of times with their unit contradicts the period.
     """
     lines = _read_lines(Path(file))
     heads = lines[0][1]
-    wanted = [name for name in QUANTITIES if timed or name != "time"]
+    wanted = [name for name in QUANTITIES if name != "time" or period is None]
     places = {name: _find_column(file, heads, name, columns.get(name)) for name in wanted}
     units = {name: _read_unit(name, unit) for name, (_, unit) in places.items()}
     taken = [at for at, _ in places.values()]
@@ -103,7 +105,29 @@ def read_log(
     for name in wanted:
         if units[name] not in COUNTS:
             numbers[name] = numbers[name] * _factor(name, units[name])
+    if period is not None:
+        _compare_period(file, lines, period)
     return LoggedMotion(numbers.get("time"), numbers["position"], numbers["force"], step, rotary)
+
+
+def _compare_period(file: str | Path, lines: list[tuple[int, list[str]]], period: float) -> None:
+    """Raise `InputError` where a column of times, in a unit that it says, is of another period than the one given."""
+    heads = [split_header(head) for head in lines[0][1]]
+    found = [(at, unit) for at, (name, unit) in enumerate(heads) if name.lower() in _NAMES["time"] and unit]
+    if len(found) != 1:
+        return
+    try:
+        factor = _factor("time", _read_unit("time", found[0][1]))
+        time = factor * _read_numbers(file, lines, {"time": found[0][0]})["time"]
+    except InputError:
+        # The period may be given for the times' sake.
+        return
+    step = float(time[-1] - time[0]) / max(1, time.size - 1)
+    if not abs(step - period) <= _OTHER * period:
+        raise InputError(
+            f"period: got {with_unit(period, 's')}, but the times in {file} are {with_unit(step, 's')} apart; leave "
+            "the period out, or correct one of them"
+        )
 
 
 def _read_lines(file: Path) -> list[tuple[int, list[str]]]:

@@ -84,10 +84,10 @@ class LogSection(Strict):
             what = f"{self.csv} has another digest, {digest[:12]}..."
             yield ("sha256",), problem(what, "it is the file that was fitted before", "remove sha256 if it may change")
 
-    def read(self, timed: bool) -> LoggedMotion:
+    def read(self, period: float | None) -> LoggedMotion:
         """The columns; raises `InputError`."""
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
-        return read_log(find_file(self.csv), columns, resolution=self.resolution, timed=timed)
+        return read_log(find_file(self.csv), columns, resolution=self.resolution, period=period)
 
 
 def _digest(name: Any) -> str:
@@ -193,7 +193,7 @@ class FitStudy(ComputedStudy):
         motions: list[LoggedMotion] = []
         for k, section in enumerate(self.log or ()):
             try:
-                motions.append(section.read(section.time is not None or self.period is None))
+                motions.append(section.read(self.period if section.time is None else None))
             except InputError as error:
                 # File names and headers may hold anything.
                 text = "".join(sign if sign.isprintable() else ascii(sign)[1:-1] for sign in str(error))

@@ -83,7 +83,17 @@ def test_a_resolution_stands_beside_a_position_that_is_a_length(tmp_path):
 
 
 def test_times_are_read_only_where_they_are_wanted(tmp_path):
-    assert read_log(write(tmp_path, "x,F\n0,7\n1,-3\n"), {}, timed=False).time is None
+    assert read_log(write(tmp_path, "x,F\n0,7\n1,-3\n"), {}, period=1e-3).time is None
+
+
+def test_a_period_that_the_times_contradict_is_refused(tmp_path):
+    log = write(tmp_path, "t [ms],x,F\n0,7,1\n2,-3,2\n4,-3,2\n")
+    with pytest.raises(InputError, match=r"period: got 1\.000 ms, but the times in .* are 2\.000 ms apart"):
+        read_log(log, {}, period=1e-3)
+    assert read_log(log, {}, period=2.1e-3).time is None
+    # Without a unit they may be anything, and a broken column is why one gives the period.
+    for text in ("t,x,F\n0,7,1\n2,-3,2\n", "t [ms],x,F\n0,7,1\nbad,-3,2\n"):
+        assert read_log(write(tmp_path, text), {}, period=1e-3).time is None
 
 
 REFUSED = {
