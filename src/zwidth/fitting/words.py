@@ -183,6 +183,13 @@ def _explain_parts(fit: DeviceFit, units: AxisUnits) -> Iterable[tuple[str, str]
         yield label, f"{amount}: kept, without it {worse}" if kept else f"left out, with it {worse}"
 
 
+def _write(fit: DeviceFit, name: str) -> str:
+    """A value to a thousandth of its standard error: further digits differ from machine to machine."""
+    value, error = getattr(fit, name), fit.errors[name]
+    digits = 4 + math.ceil(math.log10(abs(value) / error)) if error > 0 and value else 12
+    return repr(float(f"{value:.{min(max(digits, 4), 12)}g}"))
+
+
 def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[str]:
     """A configuration for `zwidth run` in which every number says where it is from."""
     lines = [f"# Fitted to {source}: {_between(fit, 'stiffness_max', units)} for K_max."]
@@ -193,7 +200,7 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     lines += ["version: 1", "name: fitted_device", "scene:"]
     # The configuration knows linear units alone.
     for key, unit in (("mass", "kg"), ("damping", "N s/m"), ("delay", "s")):
-        lines.append(f"  {key}: {getattr(fit, key)!r} {unit} # fitted, {_between(fit, key, units)}")
+        lines.append(f"  {key}: {_write(fit, key)} {unit} # fitted, {_between(fit, key, units)}")
     lines.append(f"  period: {fit.period!r} s # as given")
     kind = _KINDS.get(type(fit.velocity).__name__)
     if kind not in (None, "backward_difference"):
@@ -205,7 +212,7 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction:
         lines.append(
-            f"# For studies of kind simulate: coulomb: {fit.friction!r} N, {_between(fit, 'friction', units)}."
+            f"# For studies of kind simulate: coulomb: {_write(fit, 'friction')} N, {_between(fit, 'friction', units)}."
         )
     if fit.resolution:
         lines.append(f"# For studies of kind simulate: resolution: {fit.resolution!r} m.")

@@ -66,7 +66,11 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, 
     file = tmp_path / "fitted.yaml"
     file.write_text(text, encoding="utf-8")
     assert load_config(file).name == "fitted_device"
-    assert f"mass: {json.loads(run(*WALLS, '--period', '1 ms', '--json', *more))['mass']!r} kg" in text
+    fitted = json.loads(run(*WALLS, "--period", "1 ms", "--json", *more))
+    for name in ("mass", "damping", "delay"):
+        written = float(re.findall(rf"{name}: (\S+) ", text)[0])
+        # Digits beyond a thousandth of the error say nothing.
+        assert abs(written - fitted[name]) <= 1e-3 * fitted["errors"][name]
 
 
 @pytest.mark.parametrize(
