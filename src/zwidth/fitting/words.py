@@ -103,7 +103,7 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if isinstance(fit.noise, tuple):
         rows.append(("noise of K and f", " and ".join(f"{plain(100 * share, 2)} %" for share in fit.noise)))
     else:
-        rows.append(("noise of the position", units.spell("position", fit.noise, 3)))
+        rows.append(("position noise", units.spell("position", fit.noise, 3)))
         if fit.resolution:
             rows.append(("step of the encoder", units.spell("position", fit.resolution, 3)))
     rows += [("or as well", _spell_rival(rival, units)) for rival in fit.rivals]
