@@ -7,16 +7,9 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from zwidth.explorer.controls import Controls
-from zwidth.parts.velocity import BackwardDifference
+from zwidth.parts.velocity import VELOCITY_KINDS, BackwardDifference
 from zwidth.scene import Scene
 
-_KINDS = {
-    "BackwardDifference": "backward_difference",
-    "WindowedDifference": "windowed_difference",
-    "LowPass": "low_pass",
-    "Butterworth": "butterworth",
-    "VelocityFilter": "filter",
-}
 _SCRIPT = """\
 import matplotlib.pyplot as plt
 import zwidth
@@ -55,7 +48,7 @@ def _section(controls: Controls) -> dict[str, Any]:
     scene: Scene = controls.scene
     found = _given(scene.timing) | _given(scene.wall)
     if scene.velocity != BackwardDifference():
-        found["velocity"] = {"kind": _KINDS[type(scene.velocity).__name__], **_given(scene.velocity)}
+        found["velocity"] = {"kind": VELOCITY_KINDS[type(scene.velocity).__name__], **_given(scene.velocity)}
     parts = {"operator": scene.operator, "coupling": scene.device.coupling}
     found |= {name: _given(part) for name, part in parts.items() if part is not None}
     return {"mass": scene.device.mass, "damping": scene.device.damping} | found

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
 from zwidth.formatting import plain, with_unit
+from zwidth.parts.velocity import VELOCITY_KINDS
 from zwidth.quantities import RECOMMENDED_SHARE
 from zwidth.status import Status
 
@@ -19,13 +20,6 @@ SYMBOLS = {
     "cutoff": "f_c",
     "friction": "F_c",
     "stiffness_max": "K_max",
-}
-_KINDS = {
-    "BackwardDifference": "backward_difference",
-    "WindowedDifference": "windowed_difference",
-    "LowPass": "low_pass",
-    "Butterworth": "butterworth",
-    "VelocityFilter": "filter",
 }
 # What a status says of a fit; the doubts say more.
 _TROUBLES = {
@@ -202,7 +196,7 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     for key, unit in (("mass", "kg"), ("damping", "N s/m"), ("delay", "s")):
         lines.append(f"  {key}: {_write(fit, key)} {unit} # fitted, {_between(fit, key, units)}")
     lines.append(f"  period: {fit.period!r} s # as given")
-    kind = _KINDS.get(type(fit.velocity).__name__)
+    kind = VELOCITY_KINDS.get(type(fit.velocity).__name__)
     if kind not in (None, "backward_difference"):
         given = {part.name: getattr(fit.velocity, part.name) for part in fields(fit.velocity)}
         spelled = {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()}

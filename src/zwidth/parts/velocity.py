@@ -20,6 +20,15 @@ from zwidth.xp import is_jax, namespace
 
 _LONGEST_WINDOW, _HIGHEST_ORDER, _LONGEST_ADAPTIVE = 1000, 8, 64
 
+# What a configuration calls the estimates that the linear loop knows.
+VELOCITY_KINDS = {
+    "BackwardDifference": "backward_difference",
+    "WindowedDifference": "windowed_difference",
+    "LowPass": "low_pass",
+    "Butterworth": "butterworth",
+    "VelocityFilter": "filter",
+}
+
 
 def _check_period(owner: Any) -> None:
     if owner.coded_period is not None:
