@@ -322,3 +322,52 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
     at_ends = np.array([1e-9, np.pi])
     found: Any = np.concatenate([needed(0.5 * (low + high)), needed(at_ends)])
     return found.real, float(np.median(np.abs(value)))
+
+
+def proved_column(scene: Any, stiffness: float, digits: int = 60) -> np.ndarray | None:
+    """The stable intervals of the damping at a stiffness, shape (n, 2), in balls; None where poles cannot be counted.
+
+    ``Im((D + K N1) conj N2) = 0`` on the circle is a polynomial in ``1 - cos w``: all its roots, without a curve or a
+    node, then poles counted between the dampings that they stand for.
+    """
+    before = flint.ctx.dps
+    try:
+        flint.ctx.dps = digits
+        device, spring, damper = ball_parts(scene)
+        fixed, moved = device + spring * _ball(stiffness), damper
+        count = max(fixed.length(), moved.length())
+        # Pairs of a filter's zeros at z = -1 are real factors on the circle: as multiple roots they would hide others.
+        pairs = scene.velocity.order // 2 if isinstance(scene.velocity, zwidth.Butterworth) else 0
+        turned = divmod(moved, flint.acb_poly([1, 2, 1]) ** pairs)[0] * flint.acb_poly([0] * pairs + [1])
+        a, b = ([part[k].real for k in range(count)] for part in (fixed, turned))
+        x = flint.arb_poly([0, 1])
+        sines, total = [flint.arb_poly([1]), 2 * (1 - x)], flint.arb_poly([0])
+        for k in range(1, count):
+            while len(sines) < k:
+                sines.append(2 * (1 - x) * sines[-1] - sines[-2])
+            total += sum((a[j + k] * b[j] - a[j] * b[j + k] for j in range(count - k)), _ball(0)) * sines[k - 1]
+        # Both ends may be rounding of 0.
+        parts = total.coeffs()
+        least = max(abs(part).abs_upper() for part in parts) * flint.arb(10) ** (12 - digits)
+        kept = [k for k, part in enumerate(parts) if not abs(part) < least]
+        roots = flint.acb_poly(parts[kept[0] : kept[-1] + 1]).roots(tol=10.0 ** (-digits // 2)) if len(kept) > 1 else []
+        real = [r.real for r in roots if abs(r.imag) < flint.arb(10) ** (-digits // 3) * abs(r)]
+        angles = [flint.acb(1 - y, (y * (2 - y)).sqrt()) for y in real if y > 0 and y < 2] + [
+            flint.acb(1),
+            flint.acb(-1),
+        ]
+        size = sum((abs(moved[k]) for k in range(count)), _ball(0))
+        known = [z for z in angles if not abs(moved(z)) < size * flint.arb(10) ** (-digits // 4)]
+        met = np.array(sorted(float(-(fixed(z) / moved(z)).real.mid()) for z in known))
+    except ValueError:
+        return None
+    finally:
+        flint.ctx.dps = before
+    reach = np.ptp(met) + np.abs(met).max() + 1e-300
+    ends = np.concatenate([[-np.inf], met, [np.inf]])
+    between = 0.5 * (np.concatenate([[met[0] - reach], met]) + np.concatenate([met, [met[-1] + reach]]))
+    outside = [count_outside(scene, stiffness, damping, digits) for damping in between.tolist()]
+    if None in outside:
+        return None
+    stable = np.array(outside) == 0
+    return np.stack([ends[:-1][stable], ends[1:][stable]], -1)

@@ -10,6 +10,8 @@ from typing import Any
 
 import pytest
 
+from waiting import LONGEST
+
 FLAGS = ("--no-sandbox", "--disable-gpu", "--disable-background-networking", "--disable-component-update")
 
 
@@ -25,8 +27,10 @@ def open_browser() -> Iterator[Any]:
 
     with sync_playwright() as player:
         browser = player.chromium.launch(executable_path=path, args=[*FLAGS, "--disable-sync", "--no-first-run"])
-        yield browser
-        browser.close()
+        try:
+            yield browser
+        finally:
+            browser.close()
 
 
 @contextmanager
@@ -34,10 +38,13 @@ def open_page(browser: Any, **context: Any) -> Iterator[Any]:
     """A page, apart from all others, with ``asked``, its addresses outside of this machine, and ``complaints``."""
     own = browser.new_context(**context)
     page: Any = own.new_page()
+    page.set_default_timeout(1e3 * LONGEST)
     page.asked, page.complaints = [], []
     here = ("http://127.0.0.1", "ws://127.0.0.1", "file:", "data:", "blob:")
     page.on("request", lambda request: page.asked.append(request.url) if not request.url.startswith(here) else None)
     page.on("console", lambda told: page.complaints.append(told.text) if told.type == "error" else None)
     page.on("pageerror", lambda error: page.complaints.append(str(error)))
-    yield page
-    own.close()
+    try:
+        yield page
+    finally:
+        own.close()

@@ -3,6 +3,7 @@
 JAX keeps its default precision: the library's float64 must not depend on anyone's settings.
 """
 
+import gc
 import os
 import signal
 from pathlib import Path
@@ -25,6 +26,9 @@ import jax
 import pytest
 from hypothesis import HealthCheck, settings
 
+from leftovers import what_is_open
+from waiting import wait_for
+
 # Silent broadcasting across ranks hides transposed axes.
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
@@ -44,6 +48,16 @@ settings.load_profile("zwidth")
 def pytest_configure(config: pytest.Config) -> None:
     """Most tests inside transformations keep JAX's default precision on purpose."""
     config.addinivalue_line("filterwarnings", "ignore::zwidth.errors.PrecisionWarning")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _nothing_is_left_open():
+    """What the tests of a file open they close, lest those of another be blamed for it."""
+    before = what_is_open()
+    yield
+    if what_is_open().beyond(before):
+        gc.collect()
+    wait_for(lambda: not what_is_open().beyond(before), lambda: f"still open: {what_is_open().beyond(before)}")
 
 
 @pytest.fixture

@@ -59,17 +59,21 @@ def _settled_on_ramp(top: np.ndarray, bottom: np.ndarray, position: float, step:
     return (top.sum() * position - ages[0] @ top * step + ages[1] @ bottom * growth) / bottom.sum(), growth
 
 
-def velocity_program(scene: Any, position: float, velocity: float) -> Callable[[float], float]:
-    """The program's estimate, one measured position after the other; the past lies on a line."""
+def velocity_program(scene: Any, position: float, velocity: float, resolution: float = 0.0) -> Callable[[float], float]:
+    """The program's estimate, one measured position after the other; the past lies on a line, read like all else."""
+
+    def read(x: float) -> float:
+        return resolution * math.floor(x / resolution + 0.5) if resolution else x
+
     kind: Any = scene.velocity
     period = scene.timing.period
     coded = getattr(kind, "coded_period", None) or period
     if isinstance(kind, zwidth.VelocityFilter):
         top, bottom = np.array(kind.numerator), np.array(kind.denominator)
         top = np.append(np.zeros(bottom.size - top.size), top)
-        now, growth = _settled_on_ramp(top, bottom, position, velocity * period)
+        now, growth = _settled_on_ramp(top, bottom, read(position), velocity * period)
         order = bottom.size - 1
-        seen = deque([position - velocity * period * age for age in range(1, order + 1)], maxlen=order)
+        seen = deque([read(position) - velocity * period * age for age in range(1, order + 1)], maxlen=order)
         said = deque([now - growth * age for age in range(1, order + 1)], maxlen=order)
 
         def direct(x: float) -> float:
@@ -80,7 +84,7 @@ def velocity_program(scene: Any, position: float, velocity: float) -> Callable[[
 
         return direct
     window = kind.samples if isinstance(kind, zwidth.WindowedDifference) else 1
-    past = deque([position - velocity * period * age for age in range(1, window + 1)], maxlen=window)
+    past = deque([read(position - velocity * period * age) for age in range(1, window + 1)], maxlen=window)
 
     def difference(x: float) -> float:
         quotient = (x - past[-1]) / (window * coded)
@@ -143,7 +147,7 @@ def integrate(
     period, late = scene.timing.period, float(scene.d)
     n = bodies.count
     state = np.repeat([float(position), float(velocity)], n)
-    estimate = velocity_program(scene, position, velocity)
+    estimate = velocity_program(scene, position, velocity, resolution)
     instants = np.arange(periods + 1) + (0.0 if jitter_samples is None else np.asarray(jitter_samples))
     distances: dict[str, float] = {}
     events: list[tuple[float, str]] = []

@@ -11,6 +11,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from waiting import LONGEST
 from zwidth import run
 from zwidth.cli import main
 from zwidth.studies.document import Config
@@ -134,7 +135,7 @@ def main_of(*arguments):
 
 def zwidth(*arguments, **options):
     """Run the command line to its end."""
-    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=300, **options)
+    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=LONGEST, **options)
 
 
 def start(*arguments, **options):
@@ -176,6 +177,30 @@ def killed_once_on_2(path, family, index):
         mark.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     perform(path, family, index)
+
+
+def disturb(path, number):
+    """Send the scheduler a signal, once it has heard of the chunks before."""
+    time.sleep(0.5)
+    os.kill(int((Path(path).parents[1] / "pid").read_text(encoding="utf-8")), number)
+
+
+def killing_the_scheduler_on_2(path, family, index):
+    """The scheduler dies while chunk 2 is computed."""
+    if index == 2:
+        disturb(path, signal.SIGKILL)
+    perform(path, family, index)
+
+
+def stopping_the_scheduler_on_2(path, family, index):
+    """The scheduler falls silent while chunk 2 is computed."""
+    if index == 2:
+        disturb(path, signal.SIGSTOP)
+    perform(path, family, index)
+
+
+def doing_nothing(path, family, index):
+    """A chunk that is called done, and of which nothing is kept."""
 
 
 def interrupted_on_2(path, family, index):

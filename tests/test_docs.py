@@ -13,6 +13,8 @@ from typing import Any
 import jax
 import pytest
 
+from waiting import LONGEST
+
 ROOT = Path(__file__).resolve().parent.parent
 DOCS = ROOT / "docs"
 PAGES = sorted(DOCS.rglob("*.md"))
@@ -106,7 +108,7 @@ def test_the_script_sets_up_and_builds_strictly(tmp_path):
         program.write_text(f'#!/bin/sh\necho "{program.name} $*" >> "{calls}"\ncat >> "{calls}"\n', encoding="utf-8")
         program.chmod(0o755)
     command = [tmp_path / "scripts" / "docs", "--site-dir", "elsewhere"]
-    subprocess.run(command, cwd=os.sep, check=True, stdin=subprocess.DEVNULL, timeout=60)
+    subprocess.run(command, cwd=os.sep, check=True, stdin=subprocess.DEVNULL, timeout=LONGEST)
     assert calls.read_text(encoding="utf-8").splitlines() == [
         "setup docs",
         "mkdocs build --strict --config-file - --site-dir elsewhere",

@@ -14,6 +14,7 @@ import yaml
 from packaging.requirements import Requirement
 
 import zwidth
+from waiting import LONGEST
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -57,7 +58,7 @@ def project_files():
 def run_python(code):
     """Run code in a fresh interpreter, since this one has long since imported everything."""
     result = subprocess.run(
-        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False, timeout=300
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False, timeout=LONGEST
     )
     assert result.returncode == 0, result.stderr
     return result.stdout

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import os
+import platform
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
+
+from waiting import LONGEST
 
 ROOT = Path(__file__).resolve().parent.parent
 QUICK = ROOT / "tests" / "quick.txt"
@@ -54,7 +57,7 @@ def stand_in(path, calls, more=""):
 def project(tmp_path):
     """A project with the real scripts, whose programs only write down how they are called."""
     root = tmp_path / "project"
-    for name in ("test", "test-versions"):
+    for name in ("test", "test-versions", "test-processors"):
         (root / "scripts").mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / "scripts" / name, root / "scripts")
     (root / "pyproject.toml").write_text("# as at first\n", encoding="utf-8")
@@ -76,7 +79,7 @@ def calls_of(root, script, *arguments, cwd=None, path=None):
     environment = {**os.environ, "PATH": f"{path}{os.pathsep}{os.environ['PATH']}"} if path else None
     command = [root / "scripts" / script, *arguments]
     done = subprocess.run(
-        command, cwd=cwd or root, env=environment, capture_output=True, text=True, check=False, timeout=60
+        command, cwd=cwd or root, env=environment, capture_output=True, text=True, check=False, timeout=LONGEST
     )
     lines = calls.read_text(encoding="utf-8").splitlines() if calls.exists() else []
     return done.returncode, [line.split() for line in lines]
@@ -146,6 +149,18 @@ def test_versions_are_installed_once_and_tested_every_time(project, which, resol
     assert calls_of(project, "test-versions", which, "-x") == (0, [["setup", "dev"], tested])
     (project / "pyproject.toml").write_text("# another bound\n", encoding="utf-8")
     assert made in calls_of(project, "test-versions", which, "-x")[1]
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the script tries processors of one family")
+def test_every_processor_is_tried_even_when_one_fails(project):
+    calls = project.parent / "calls"
+    held = f"echo ${{XLA_FLAGS##*=}} $OPENBLAS_CORETYPE >> '{calls}'; [ $OPENBLAS_CORETYPE != Haswell ]\n"
+    stand_in(project / ".venv" / "bin" / "pytest", calls, held)
+    code, called = calls_of(project, "test-processors", "-x")
+    tested = ["pytest", *ON_EVERY_CORE, "@tests/quick.txt", "tests/test_readme.py", "tests/test_docs.py", "-x"]
+    assert (code, called[0]) == (1, ["setup", "test"])
+    assert called[1::2] == [tested, tested]
+    assert called[2::2] == [["AVX2", "Haswell"], ["SSE4_2", "Nehalem"]]
 
 
 @pytest.mark.parametrize("which, again", [("oldest", 0), ("newest", 1)])

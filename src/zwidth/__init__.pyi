@@ -44,7 +44,6 @@ from .fitting.device_fit import ErrorBar as ErrorBar
 from .fitting.device_fit import FittedMotion as FittedMotion
 from .fitting.device_fit import FurtherExperiment as FurtherExperiment
 from .fitting.device_fit import RivalDevice as RivalDevice
-from .fitting.device_fit import TriedModel as TriedModel
 from .fitting.log import fit_log as fit_log
 from .fitting.safe_wall import SafeWall as SafeWall
 from .html_report.page import write_report as write_report

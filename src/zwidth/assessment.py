@@ -10,24 +10,29 @@ from typing import Any
 import numpy as np
 
 from zwidth.errors import InputError
-from zwidth.linear.columns import stable_dampings
 from zwidth.linear.passivity import has_condition
 from zwidth.linear.poles import is_marginal
 from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.decay import decay_rate
-from zwidth.stability.labels import is_stable
-from zwidth.stability.margins import margins
-from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.proved import outermost_poles
 from zwidth.stability.ridge import RidgeKind, alpha_max
 from zwidth.status import Status
 
 _POLE_ACCURACY = 1e-9
+_MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
+
+
+class _AsDict:
+    """Fields as plain numbers."""
+
+    def as_dict(self: Any) -> dict[str, Any]:
+        """The fields as plain JSON values, None in place of NaN and infinities."""
+        return {name: _plain(value) for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
-class Assessment:
+class Assessment(_AsDict):
     """What `assess` finds; SI units unless a symbol is Greek. NaN where a quantity does not exist."""
 
     alpha: float  # the normalized wall, device and delay
@@ -41,8 +46,8 @@ class Assessment:
     stiffness_limit: float  # the stiffest stable K at this B, in N/m
     virtual_damping_lower: float  # the ends of the stable B at this K, in N s/m
     virtual_damping_upper: float
-    passive: bool  # at this delay
-    passivity_margin: float  # the physical damping in excess of what a passive wall needs, in N s/m
+    passive: bool  # at this delay, whatever the hand
+    passivity_margin: float  # the device's damping in excess of what a passive wall needs, in N s/m
     alpha_max: float  # the stiffest stable wall of this device
     beta_at_max: float
     stiffness_max: float  # the same in N/m and N s/m
@@ -57,13 +62,9 @@ class Assessment:
     gain_crossover: float  # where the first two are taken, in Hz
     phase_crossover: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """The fields as plain JSON values, None in place of NaN and infinities."""
-        return {name: _plain(value) for name, value in asdict(self).items()}
-
 
 @dataclass(frozen=True)
-class SceneAssessment:
+class SceneAssessment(_AsDict):
     """What `assess` finds of a scene with a filter, a compliance or a hand; SI units, NaN for what does not exist."""
 
     stable: bool  # every pole lies strictly inside the unit circle
@@ -87,10 +88,6 @@ class SceneAssessment:
     gain_crossover: float  # in Hz
     phase_crossover: float
 
-    def as_dict(self) -> dict[str, Any]:
-        """The fields as plain JSON values, None in place of NaN and infinities."""
-        return {name: _plain(value) for name, value in asdict(self).items()}
-
 
 def _plain(value: Any) -> Any:
     if isinstance(value, tuple):
@@ -110,7 +107,7 @@ def assess(scene: Scene) -> Assessment | SceneAssessment:
         hand behind a spring a SceneAssessment, in SI units alone, with every stable interval.
 
     Raises:
-        InputError: the scene's delay model is "fractional_power".
+        InputError: the scene's delay model is "fractional_power", or it has no wall.
 
     References:
         Hulin, Preusche, Hirzinger 2006, sections V to VIII.
@@ -126,7 +123,20 @@ def assess(scene: Scene) -> Assessment | SceneAssessment:
         raise InputError(
             f"delay_model: got {scene.timing.delay_model!r}, which has no poles; use 'held' to judge a single wall"
         )
-    return _assess_rigid(scene) if scene.is_rigid else _assess_parts(scene)
+    stands, best, known = scene.margins(), scene.max_stiffness(), has_condition(scene.device)
+    margin = float(scene.passivity_margin()) if known else math.nan
+    shared: dict[str, Any] = {
+        "stable": bool(scene.is_stable()),
+        "stiffness_max": float(best.stiffness),
+        "virtual_damping_at_max": float(best.virtual_damping),
+        "ridge_kind": RidgeKind(int(best.kind)).name.lower() if best.status == Status.OK else "none",
+        "passive": margin > 0 if known else None,
+        "passivity_margin": margin,
+        **{name: float(getattr(stands, name)) for name in _MARGINS},
+    }
+    if scene.is_rigid:
+        return Assessment(**shared, **_judge_rigid(scene))
+    return SceneAssessment(**shared, **_judge_parts(scene, float(best.frequency)))
 
 
 def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str, Any]]:
@@ -171,81 +181,49 @@ def _record(name: str | int, scene: Scene) -> dict[str, Any]:
     return head | own | verdict
 
 
-def _assess_rigid(scene: Scene) -> Assessment:
+def _judge_rigid(scene: Scene) -> dict[str, Any]:
+    """What the closed forms give of a rigid scene alone: normalized numbers, one interval of each kind."""
     alpha, beta, delta, d = (float(value) for value in scene.normalized)
-    period = scene.timing.period
-    spring = scene.mass / period**2
-    damper = scene.mass / period
-    hertz = 1.0 / (2.0 * math.pi * period)
+    units, period = scene.units, scene.timing.period
     rate = float(decay_rate(alpha, beta, delta, d))
-    stands = margins(alpha, beta, delta, d)
     ridge = alpha_max(delta, d)
     row = boundary_point(delta, d, beta=beta)
     lower, upper = _column(alpha, delta, d)
-    margin = float(passivity_margin(alpha, beta, delta, d))
-    return Assessment(
-        alpha=alpha,
-        beta=beta,
-        delta=delta,
-        d=d,
-        stable=bool(is_stable(alpha, beta, delta, d)),
+    return {
+        "alpha": alpha,
+        "beta": beta,
+        "delta": delta,
+        "d": d,
         # The row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
-        marginal=alpha == 0 and float(row.alpha) > 0,
-        spectral_radius=math.exp(-rate),
-        decay_rate=rate / period,
-        stiffness_limit=float(row.alpha) * spring,
-        virtual_damping_lower=lower * damper,
-        virtual_damping_upper=upper * damper,
-        passive=margin > 0,
-        passivity_margin=margin * damper,
-        alpha_max=float(ridge.alpha),
-        beta_at_max=float(ridge.beta),
-        stiffness_max=float(ridge.alpha) * spring,
-        virtual_damping_at_max=float(ridge.beta) * damper,
-        ridge_kind=RidgeKind(int(ridge.kind)).name.lower(),
-        time_constant=math.inf if rate == 0 else period / rate,
-        frequency=_slowest_turn(alpha, beta, delta, d) * hertz,
-        gain_margin=float(stands.gain_margin),
-        phase_margin=float(stands.phase_margin),
-        delay_margin=float(stands.delay_margin) * period,
-        modulus_margin=float(stands.modulus_margin),
-        gain_crossover=float(stands.gain_crossover) * hertz,
-        phase_crossover=float(stands.phase_crossover) * hertz,
-    )
+        "marginal": alpha == 0 and float(row.alpha) > 0,
+        "spectral_radius": math.exp(-rate),
+        "decay_rate": rate / period,
+        "stiffness_limit": float(row.alpha) * units.stiffness,
+        "virtual_damping_lower": lower * units.virtual_damping,
+        "virtual_damping_upper": upper * units.virtual_damping,
+        "alpha_max": float(ridge.alpha),
+        "beta_at_max": float(ridge.beta),
+        "time_constant": math.inf if rate == 0 else period / rate,
+        "frequency": _slowest_turn(alpha, beta, delta, d) / (2.0 * math.pi * period),
+    }
 
 
-def _assess_parts(scene: Scene) -> SceneAssessment:
-    stiffness, damping = scene.wall.stiffness, scene.wall.virtual_damping
-    units = scene.units
-    slowest = scene.pole_table(stiffness, damping)
-    best = scene.max_stiffness()
-    column = stable_dampings(scene.traced_boundary, stiffness / units.stiffness) * units.virtual_damping
-    marginal = is_marginal(scene.loop, stiffness / units.stiffness, damping / units.virtual_damping)
+def _judge_parts(scene: Scene, frequency: float) -> dict[str, Any]:
+    """The same of a scene with parts: every stable interval, and the slowest of all poles."""
+    alpha, beta = (float(value) for value in scene.normalize_walls())
+    slowest = scene.pole_table()
+    marginal = is_marginal(scene.loop, alpha, beta)
     constant = math.inf if marginal else float(slowest.time_constant[0])
-    stands = scene.margins(stiffness, damping)
-    known = has_condition(scene.device)
-    return SceneAssessment(
-        stable=bool(scene.is_stable(stiffness, damping)),
-        marginal=marginal,
-        spectral_radius=1.0 if marginal else float(scene.spectral_radius(stiffness, damping)),
-        decay_rate=1.0 / constant if constant else math.inf,
-        stable_stiffness=_as_pairs(scene.stable_stiffness(damping)),
-        stable_damping=_as_pairs(column),
-        stiffness_max=float(best.stiffness),
-        virtual_damping_at_max=float(best.virtual_damping),
-        ridge_kind=RidgeKind(int(best.kind)).name.lower() if best.status == Status.OK else "none",
-        ridge_frequency=float(best.frequency),
-        time_constant=constant,
-        frequency=0.0 if marginal else float(slowest.frequency[0]),
-        passive=bool(scene.is_passive(stiffness, damping)) if known else None,
-        passivity_margin=float(scene.passivity_margin(stiffness, damping)) if known else math.nan,
-        gain_margin=float(stands.gain_margin),
-        phase_margin=float(stands.phase_margin),
-        delay_margin=float(stands.delay_margin),
-        modulus_margin=float(stands.modulus_margin),
-        gain_crossover=float(stands.gain_crossover),
-        phase_crossover=float(stands.phase_crossover),
-    )
+    return {
+        "marginal": marginal,
+        "spectral_radius": 1.0 if marginal else float(scene.spectral_radius()),
+        "decay_rate": 1.0 / constant if constant else math.inf,
+        "stable_stiffness": _as_pairs(scene.stable_stiffness()),
+        "stable_damping": _as_pairs(scene.stable_damping()),
+        "ridge_frequency": frequency,
+        "time_constant": constant,
+        "frequency": 0.0 if marginal else float(slowest.frequency[0]),
+    }
 
 
 def _as_pairs(intervals: np.ndarray) -> tuple[tuple[float, float], ...]:

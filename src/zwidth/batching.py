@@ -58,6 +58,8 @@ def refuse_masked(name: str, value: ArrayLike) -> None:
 def as_float64(name: str, value: ArrayLike) -> np.ndarray:
     """Convert one concrete argument to float64, or say what is wrong with it."""
     refuse_masked(name, value)
+    if is_traced(value):
+        raise InputError(f"{name}: got a value that JAX traces; give numbers, outside of jit, vmap and grad")
     try:
         array = np.asarray(value)
         if array.dtype.kind in "OSUcVmM":

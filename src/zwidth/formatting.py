@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -34,9 +35,33 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
 
 
+def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
+    """Two ends, with a unit or plain, with as many digits as it takes to tell different ones apart."""
+
+    def spell(end: float, digits: int) -> str:
+        return with_unit(end, unit, digits) if unit else plain(end, digits)
+
+    texts = [(spell(low, digits), spell(high, digits)) for digits in range(4, 18)]
+    return next((pair for pair in texts if pair[0] != pair[1]), texts[0])
+
+
 def header(name: str, unit: str) -> str:
     """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
     return name if unit in ("", "1", "sampling periods") else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
+
+
+def to_cell(value: Any) -> Any:
+    """A value as a cell of CSV: a text that a spreadsheet would run as a formula has an apostrophe before it."""
+    return f"'{value}" if isinstance(value, str) and _FORMULA.match(value) else value
+
+
+def from_cell(cell: str) -> str:
+    """The text that `to_cell` made a cell of."""
+    return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
+
+
+# Also in the wide forms that East Asian programs take for the same; with apostrophes of its own a text gets one more.
+_FORMULA = re.compile(r"'*\s*[=+\-@\uff1d\uff0b\uff0d\uff20\t\r\n]")
 
 
 def describe(value: Any) -> str:

@@ -27,6 +27,7 @@ from zwidth.errors import InputError
 from zwidth.figures import style
 from zwidth.figures.grid import logarithmic
 from zwidth.figures.region import to_path
+from zwidth.parts.wall import resolve_wall
 from zwidth.quantities import PARAMETERS
 from zwidth.scene import Scene
 from zwidth.simulation.result import Motion
@@ -147,17 +148,23 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
 
 @style.house_style()
 def step(
-    scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Axes | None = None, *, periods: int = 100
+    scene: Scene,
+    stiffness: float | None = None,
+    virtual_damping: float | None = None,
+    ax: Axes | None = None,
+    *,
+    periods: int = 100,
 ) -> Axes:
     """Draw the response of the device, in contact with a wall, to a force of 1 N on it, at the samples.
 
     Args:
         scene: the scene.
-        stiffness: K of the wall in N/m.
+        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
         virtual_damping: B in N s/m.
         ax: an Axes of yours.
         periods: how many sampling periods.
     """
+    stiffness, virtual_damping = resolve_wall(scene.wall, stiffness, virtual_damping)
     loop = scene.state_space(stiffness, virtual_damping)
     state, positions = np.zeros(loop.A.shape[0]), np.empty(periods)
     for k in range(periods):
@@ -178,12 +185,14 @@ def step(
 
 
 @style.house_style()
-def nyquist(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Axes | None = None) -> Axes:
+def nyquist(
+    scene: Scene, stiffness: float | None = None, virtual_damping: float | None = None, ax: Axes | None = None
+) -> Axes:
     """Draw the open loop of a wall over frequency, with the point -1 that it must leave on its left.
 
     Args:
         scene: the scene.
-        stiffness: K of the wall in N/m.
+        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
         virtual_damping: B in N s/m.
         ax: an Axes of yours.
 
@@ -208,12 +217,14 @@ def nyquist(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Ax
 
 
 @style.house_style()
-def poles(scene: Scene, stiffness: float, virtual_damping: float = 0.0, ax: Axes | None = None) -> Axes:
+def poles(
+    scene: Scene, stiffness: float | None = None, virtual_damping: float | None = None, ax: Axes | None = None
+) -> Axes:
     """Draw the poles of the loop with a wall, in the unit circle.
 
     Args:
         scene: the scene.
-        stiffness: K of the wall in N/m.
+        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
         virtual_damping: B in N s/m.
         ax: an Axes of yours.
     """
@@ -240,6 +251,8 @@ def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ())
         ax: an Axes of yours.
         labels: a name for each of several, in their order.
     """
+    if not hasattr(found, "wall_force"):
+        raise InputError(f"found: got {type(found).__name__}; give what zwidth.simulate returns")
     if found.position is None or found.time is None:
         raise InputError("found: got a motion that was not recorded; simulate with record=True")
     rows = found.position.reshape(-1, found.position.shape[-1])

@@ -17,7 +17,6 @@ from zwidth.linear.boundary import Boundary
 from zwidth.linear.chain import Chain, chain_of, linear_loop
 from zwidth.linear.curve import curve_at
 from zwidth.linear.required import RequiredValue, require
-from zwidth.linear.rows import label_walls, stable_intervals
 from zwidth.linear.slopes import SceneSensitivities, differentiate
 from zwidth.linear.stiffest import StiffestWall, stiffest_wall
 from zwidth.linear_loop import LinearLoop
@@ -27,10 +26,9 @@ from zwidth.parts.operator import Operator
 from zwidth.parts.paths import list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
-from zwidth.parts.wall import VirtualWall
+from zwidth.parts.wall import NoWall, VirtualWall, resolve_wall
 from zwidth.simulation.result import Motion
 from zwidth.simulation.simulate import simulate
-from zwidth.stability.labels import StabilityMethod, is_stable
 
 _EXAMPLES = {
     "device": "zwidth.Device(mass=0.1, damping=10)",
@@ -55,7 +53,8 @@ class Scene(SceneAnswers):
     Args:
         device: mass and damping, rigid or with a coupling.
         timing: period and delay.
-        wall: the wall that `zwidth.assess` judges; the questions below are asked of any wall. It may be left out.
+        wall: the wall that `zwidth.assess` judges, and that the questions below mean where no other is named. It may be
+            left out.
         velocity: how the velocity is estimated; the backward difference by default.
         operator: the hand, None where nobody holds the device.
 
@@ -69,7 +68,7 @@ class Scene(SceneAnswers):
 
     device: Device
     timing: Timing
-    wall: VirtualWall = field(default_factory=lambda: VirtualWall(stiffness=0.0))
+    wall: VirtualWall = field(default_factory=NoWall)
     velocity: Velocity = field(default_factory=BackwardDifference)
     operator: Operator | None = None
 
@@ -89,7 +88,7 @@ class Scene(SceneAnswers):
             hand = fourth
         elif fourth != BackwardDifference():
             raise InputError(f"wall: got {estimate!r}, and {fourth!r} as the velocity as well; name parts that follow")
-        moved = {"wall": VirtualWall(stiffness=0.0), "velocity": estimate, "operator": hand}
+        moved = {"wall": NoWall(), "velocity": estimate, "operator": hand}
         for name, part in moved.items():
             object.__setattr__(self, name, part)
 
@@ -137,8 +136,13 @@ class Scene(SceneAnswers):
 
     @property
     def delta(self) -> float:
-        """Normalized damping of the device."""
+        """Normalized damping of the device, with that of a hand held rigidly."""
         return self.normalized.delta
+
+    @property
+    def own_delta(self) -> float:
+        """The same without the hand: what passivity, which is for any hand, counts on."""
+        return self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
 
     @property
     def d(self) -> float:
@@ -182,9 +186,12 @@ class Scene(SceneAnswers):
         """The edge of its stable set, normalized."""
         return Border(self.traced_boundary)
 
-    def normalize_walls(self, stiffness: ArrayLike, virtual_damping: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
-        """Walls in SI units as arrays of alpha and beta that broadcast."""
+    def normalize_walls(
+        self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
         units = self.units
+        stiffness, virtual_damping = resolve_wall(self.wall, stiffness, virtual_damping)
         both = as_float64("stiffness", stiffness), as_float64("virtual_damping", virtual_damping)
         try:
             np.broadcast_shapes(both[0].shape, both[1].shape)
@@ -195,46 +202,6 @@ class Scene(SceneAnswers):
             ) from error
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
-
-    def is_stable(
-        self, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
-    ) -> Array:
-        """Whether walls are stable: every pole strictly inside the unit circle.
-
-        Args:
-            stiffness: K in N/m.
-            virtual_damping: B in N s/m. Both broadcast.
-            method: as for `decide_stability`, which has the statuses as well.
-
-        Returns:
-            Boolean array of the broadcast shape, False for what is NaN.
-
-        Numerics:
-            Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
-            row (`zwidth.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
-            costs some microseconds and a stiffness next to nothing.
-        """
-        if method != "auto":
-            return self.decide_stability(stiffness, virtual_damping, method=method).stable
-        alpha, beta = self.normalize_walls(stiffness, virtual_damping)
-        if self.is_rigid:
-            return is_stable(alpha, beta, self.delta, self.d)
-        return label_walls(self.traced_boundary, alpha, beta)[()]
-
-    def stable_stiffness(self, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
-        """The stable intervals of the stiffness at a damping, several where there are several.
-
-        Args:
-            virtual_damping: B in N s/m, a number or an array.
-
-        Returns:
-            Array (n, 2) in N/m, or with the shape of the damping in front and NaN where a row has fewer intervals. The
-            ends are not stable themselves.
-        """
-        beta = as_float64("virtual_damping", virtual_damping) / self.units.virtual_damping
-        found = stable_intervals(self.traced_boundary, beta.reshape(-1))
-        both = np.stack(found, -1) * self.units.stiffness
-        return both.reshape(*beta.shape, *both.shape[1:])
 
     def boundary(self, omega: ArrayLike) -> WallSI:
         """The walls that put a pole pair on the unit circle at a frequency.
@@ -256,25 +223,30 @@ class Scene(SceneAnswers):
         """Closed outlines of the stable set, the largest first, islands and holes told apart.
 
         Returns:
-            A list of outlines with ``stiffness`` in N/m, ``virtual_damping`` in N s/m and ``hole``.
+            A list of outlines with ``stiffness`` in N/m, ``virtual_damping`` in N s/m, ``hole`` and ``island``, as
+            `islands` means it.
         """
         units = self.units
         return [
-            Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, piece.hole)
+            Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
             for piece in outlines(self.border)
         ]
 
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
-        """The stiffest stable wall, ``sup {K : some B is stable}``, and what binds it.
+        """The stiffest stable wall that soft ones lead to, and what binds it.
+
+        ``sup {K : some B is stable}`` over the pieces of the stable set that contain soft walls, down to K = 0: along a
+        path of stable walls K and B can rise to it. Walls apart from these are `islands`.
 
         Args:
             negative_damping: whether walls with B < 0 count. By default they do with the backward difference; behind a
-                filter a negative B is a lead compensator and no damper, and B >= 0 is meant.
+                filter a negative B is a lead compensator and no damper, and B >= 0 is meant. What is a piece does not
+                depend on it: a path may lead through B < 0.
 
         Returns:
             ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,
             of the higher one at a corner; ``kind``, a code of `zwidth.RidgeKind`; ``status`` of `zwidth.Status`, with
-            NaN where it is not 0: NO_BOUNDARY where no wall with K > 0 is stable.
+            NaN where it is not 0: NO_BOUNDARY where no such wall with K > 0 is stable.
 
         Numerics:
             Closed form for a rigid device. Otherwise the highest point of all edges of the stable set (50 to 150 ms),
@@ -299,13 +271,13 @@ class Scene(SceneAnswers):
 
         Returns:
             ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
-            "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, with NaN where it is
-            not 0. Whole numbers and coefficients of a filter have none. At zero they are those from the right, at a
-            whole delay both sides agree.
+            "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, NOT_CONVERGED where
+            one of them is NaN, as all are without a K_max. Whole numbers and coefficients of a filter have none. At
+            zero they are those from the right, at a whole delay both sides agree.
 
         Numerics:
-            Closed form for a rigid device; otherwise implicit derivatives, which JAX compiles for some seconds once for
-            all scenes of the same parts.
+            Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a
+            parameter: right to 1e-6, or where one is nearly 0, to 1e-11 of K_max over the parameter.
 
         Example:
             >>> import zwidth
@@ -356,7 +328,7 @@ class Scene(SceneAnswers):
         """Simulate this device on a wall in time, with contact, friction, an encoder and a motor as wanted.
 
         Args:
-            stiffness, virtual_damping: K in N/m and B in N s/m; the scene's own wall where left out.
+            stiffness, virtual_damping: K in N/m and B in N s/m; neither means the scene's own wall.
             **options: those of `zwidth.simulate`, which this calls.
 
         Example:

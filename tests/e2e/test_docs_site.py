@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from browser import open_page
+from waiting import LONGEST
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
@@ -59,7 +60,7 @@ def build(folder, site):
             capture_output=True,
             text=True,
             check=False,
-            timeout=200,
+            timeout=LONGEST,
         )
 
 
@@ -180,7 +181,7 @@ def test_the_search_finds_a_function(address, read):
             '.md-search-result__link[href*="reference/boundary.html"][href$="#zwidth.alpha_max"]'
         ).first
         # The index is built in the page, which takes long on a busy machine.
-        first.wait_for(timeout=90_000)
+        first.wait_for()
         first.click()
         page.wait_for_url("**/reference/boundary.html**")
 

@@ -9,7 +9,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 import urllib.error
 import urllib.request
 from concurrent.futures import ThreadPoolExecutor
@@ -21,11 +20,10 @@ from click.testing import CliRunner
 
 import zwidth
 from browser import open_page
+from waiting import LONGEST, wait_for
 from zwidth.cli.commands import cli
 
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
-# Long enough for the slowest machine; nothing waits for it to end.
-PATIENCE = 20.0
 
 
 class Server:
@@ -36,25 +34,29 @@ class Server:
         self.process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         out: Any = self.process.stdout
         line = out.readline()
-        assert line.startswith("http://127.0.0.1:"), self.process.communicate()
+        if not line.startswith("http://127.0.0.1:"):
+            self.process.kill()
+            pytest.fail(f"{line}{self.process.communicate()}")
         self.address = line.split()[0]
         self.host = self.address.split("/")[2]
 
     def end(self):
         self.process.send_signal(signal.SIGINT)
         try:
-            return (*self.process.communicate(timeout=PATIENCE), self.process.returncode)
+            return (*self.process.communicate(timeout=LONGEST), self.process.returncode)
         except subprocess.TimeoutExpired:
             self.process.kill()
+            self.process.communicate()
             raise
 
     def get(self, path="", **headers):
         request = urllib.request.Request(f"{self.address}{path}", headers=headers)
         try:
-            with urllib.request.urlopen(request, timeout=PATIENCE) as answer:
+            with urllib.request.urlopen(request, timeout=LONGEST) as answer:
                 return answer.status, answer.headers, answer.read().decode()
         except urllib.error.HTTPError as error:
-            return error.code, error.headers, error.read().decode()
+            with error:
+                return error.code, error.headers, error.read().decode()
 
 
 @pytest.fixture(scope="module")
@@ -82,16 +84,16 @@ def page(server, browser):
 
 def wait(page, condition):
     # Asked from here: the page's own policy lets nobody evaluate texts in it.
-    end = time.monotonic() + PATIENCE
-    while not page.evaluate(condition):
-        assert time.monotonic() < end, f"{condition}; {page.complaints}; {page.inner_text('header')}"
-        time.sleep(0.02)
+    wait_for(
+        lambda: page.evaluate(condition),
+        lambda: f"not {condition}; {page.complaints}; {page.inner_text('header')}",
+    )
 
 
 def settle(page):
     """Until everything that is shown belongs to what is set."""
-    time.sleep(0.2)
-    wait(page, "inputs !== null && answered === serial && !document.body.classList.contains('busy')"
+    wait(page, "inputs !== null && !scheduled && !rests && Object.keys(waiting).length === 0 && answered === serial"
+               " && !document.body.classList.contains('busy')"
                " && document.getElementById('verdict').dataset.text !== undefined")  # fmt: skip
 
 
@@ -282,7 +284,7 @@ def test_the_page_forbids_what_it_does_not_need(server):
 )
 def test_who_does_not_know_the_token_is_refused(server, address):
     with pytest.raises(urllib.error.HTTPError) as refusal:
-        urllib.request.urlopen(f"http://{server.host}{address}", timeout=PATIENCE)
+        urllib.request.urlopen(f"http://{server.host}{address}", timeout=LONGEST)
     with refusal.value:
         assert refusal.value.code == 403
 
@@ -316,12 +318,12 @@ async def converse(server, messages, origin=None):
     request = HTTPRequest(server.address.replace("http:", "ws:") + "ws", headers=headers)
     socket = await websocket_connect(request, subprotocols=["bokeh", ticket])
     try:
-        assert await asyncio.wait_for(socket.read_message(), PATIENCE) is not None
+        assert await asyncio.wait_for(socket.read_message(), LONGEST) is not None
         # It may be closed before the last of them is sent.
         with contextlib.suppress(WebSocketClosedError):
             for message in messages:
                 await socket.write_message(message, binary=isinstance(message, bytes))
-        while await asyncio.wait_for(socket.read_message(), PATIENCE) is not None:
+        while await asyncio.wait_for(socket.read_message(), LONGEST) is not None:
             pass
     finally:
         socket.close()
@@ -354,24 +356,26 @@ def test_a_malformed_message_ends_its_own_connection_alone(server, messages):
 
 
 def test_two_hundred_at_a_time_are_survived(server):
-    async def knock(k, opened):
-        reader, writer = opened
-        path = server.address.partition(server.host)[2] if k % 2 else "/nobody/"
-        writer.write(f"GET {path} HTTP/1.1\r\nHost: {server.host}\r\nConnection: close\r\n\r\n".encode())
-        answer = await asyncio.wait_for(reader.read(), PATIENCE)
-        writer.close()
-        return int(answer.split()[1])
+    async def knock(k, all_there):
+        reader, writer = await asyncio.open_connection(*server.host.split(":"))
+        try:
+            await all_there.wait()
+            path = server.address.partition(server.host)[2] if k % 2 else "/nobody/"
+            writer.write(f"GET {path} HTTP/1.1\r\nHost: {server.host}\r\nConnection: close\r\n\r\n".encode())
+            answer = await reader.read()
+            return int(answer.split()[1])
+        finally:
+            writer.close()
+            await writer.wait_closed()
 
     async def crowd():
-        doors = [asyncio.open_connection(*server.host.split(":")) for _ in range(200)]
-        doors = await asyncio.gather(*doors)
-        return await asyncio.gather(*(knock(k, door) for k, door in enumerate(doors)))
+        all_there = asyncio.Barrier(200)
+        async with asyncio.timeout(LONGEST), asyncio.TaskGroup() as group:
+            knocks = [group.create_task(knock(k, all_there)) for k in range(200)]
+        return [task.result() for task in knocks]
 
     codes = run_apart(crowd)
     assert set(codes[::2]) == {403}
     # Some get a page, the others are told that too many are open; later there is room again.
     assert set(codes[1::2]) <= {200, 503}
-    end = time.monotonic() + PATIENCE
-    while server.get()[0] != 200:
-        assert time.monotonic() < end
-        time.sleep(0.2)
+    wait_for(lambda: server.get()[0] == 200)

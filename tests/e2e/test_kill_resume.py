@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from sweeping import assert_same, flags, main_of, start, study, zwidth
+from waiting import LONGEST, wait_for
 
 # Few, for each of them costs the start of a program: scripts/kill_and_resume.py tries a hundred.
 MOMENTS = 3
@@ -39,16 +40,14 @@ def undisturbed(config, tmp_path_factory):
     started = time.monotonic()
     process = start("run", config, "--out", folder)
     begun = wait_for_chunks(process, folder, 1)
-    errors = process.communicate(timeout=300)[1]
+    errors = process.communicate(timeout=LONGEST)[1]
     assert process.returncode == 0, errors
     return folder, begun - started, time.monotonic() - begun
 
 
 def wait_for_chunks(process, folder, count):
     """The time at which a run has done some chunks, or is at its end."""
-    deadline = time.monotonic() + 240
-    while len(flags(folder)) < count and process.poll() is None and time.monotonic() < deadline:
-        time.sleep(0.005)
+    wait_for(lambda: len(flags(folder)) >= count or process.poll() is not None)
     return time.monotonic()
 
 
@@ -105,10 +104,7 @@ def test_a_parent_that_is_killed_takes_its_workers_along(config, undisturbed, tm
     wait_for_chunks(process, tmp_path, 2)
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
-    deadline = time.monotonic() + 60
-    while group_lives(process.pid) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not group_lives(process.pid)
+    wait_for(lambda: not group_lives(process.pid))
     result = zwidth("run", config, "--out", tmp_path, "--resume")
     assert result.returncode == 0, result.stderr
     assert_same(undisturbed[0], tmp_path)
@@ -172,7 +168,7 @@ def test_stopped_a_run_says_how_to_go_on(config, tmp_path, number, options):
     process = start("run", config, "--out", tmp_path / "an out", *options)
     wait_for_chunks(process, tmp_path / "an out", 1)
     os.killpg(process.pid, number) if number == signal.SIGINT else process.send_signal(number)
-    _, errors = process.communicate(timeout=60)
+    _, errors = process.communicate(timeout=LONGEST)
     assert process.returncode == 128 + number, errors
     again = shlex.join(["zwidth", "run", str(config), "--out", str(tmp_path / "an out"), "--resume", *options])
     assert errors.endswith(f"zwidth: stopped; what is done is kept, go on with: {again}\n")

@@ -11,6 +11,7 @@ import pytest
 import yaml
 
 from sweeping import AXES, assert_same, chunk_file, command, failing_on_2, flags, flip, main_of, study
+from waiting import LONGEST
 
 # A limit set between fork and exec would have Python code run in a copy of a process with JAX's threads.
 LIMITED = """
@@ -75,7 +76,7 @@ def test_no_room_for_a_file_ends_the_run_and_room_lets_it_go_on(tmp_path):
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
     environment["XDG_CACHE_HOME"] = str(tmp_path / "cache")
     words = [sys.executable, "-c", LIMITED, *command("run", config, "--out", out)]
-    result = subprocess.run(words, capture_output=True, text=True, check=False, timeout=300, env=environment)
+    result = subprocess.run(words, capture_output=True, text=True, check=False, timeout=LONGEST, env=environment)
     assert result.returncode == 1
     first, second = (line for line in result.stderr.splitlines() if line.startswith("zwidth:"))
     assert first.startswith(f"zwidth: out: {out}: ")

@@ -134,3 +134,33 @@ def test_parts_by_place():
         zwidth.Scene(DEVICE, TIMING, SLOW, zwidth.LowPass(cutoff=50))  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="as the velocity as well"):
         zwidth.Scene(DEVICE, TIMING, SLOW, HAND, HAND)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_hand_makes_no_wall_passive(seed):
+    # Colgate's condition by a dense scan: b > T/2 (1 - cos wT)^-1 Re[(1 - e^-jwT) H(e^jwT)] with b of the device alone.
+    rng = np.random.default_rng([seed, 7])
+    device, timing = zwidth.Device(0.1, rng.uniform(1, 40)), zwidth.Timing(1e-3, 1e-3 * int(rng.integers(0, 3)))
+    wall = zwidth.VirtualWall(10 ** rng.uniform(2, 4.5), rng.uniform(0, 40))
+    scene = zwidth.Scene(device, timing, wall, operator=zwidth.Operator(mass=rng.uniform(0.1, 1), damping=40))
+    w = np.linspace(1e-5, np.pi, 200_001)
+    z = np.exp(1j * w)
+    rendered = (wall.stiffness + wall.virtual_damping * (1 - 1 / z) / 1e-3) / z**scene.whole_delay
+    needed = float(np.max(0.5e-3 / (1 - np.cos(w)) * ((1 - 1 / z) * rendered).real))
+    verdict = zwidth.assess(scene)
+    assert verdict.passivity_margin == pytest.approx(device.damping - max(needed, 0.0), rel=1e-6, abs=1e-6)
+    assert verdict.passive == bool(scene.is_passive()) == (device.damping > needed)
+
+
+def test_the_device_s_own_damping_counts():
+    hand = zwidth.Operator(mass=0.5, damping=40)
+    scene = zwidth.Scene(DEVICE, TIMING, zwidth.VirtualWall(10e3, 5), operator=hand)
+    verdict = zwidth.assess(scene)
+    assert verdict.passivity_margin == pytest.approx(-2.5)
+    assert verdict.passive is False
+
+
+def test_a_scene_without_a_wall_has_none_to_judge():
+    with pytest.raises(InputError, match="the scene has no wall"):
+        zwidth.assess(zwidth.Scene(DEVICE, TIMING))
+    assert zwidth.assess_many([zwidth.Scene(DEVICE, TIMING)])[0]["status"] == "INVALID_INPUT"

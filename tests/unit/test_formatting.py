@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zwidth.formatting import plain, with_unit
+from zwidth.formatting import plain, tell_apart, with_unit
 
 
 @pytest.mark.parametrize(
@@ -52,3 +52,12 @@ def test_with_unit(value, text):
 
 def test_digits_are_those_asked_for():
     assert (plain(2 / 3, 2), with_unit(2 / 3, "s", 2), with_unit(996.0, "s", 2)) == ("0.67", "670 ms", "1.0 ks")
+
+
+def test_two_ends_that_differ_read_differently():
+    assert tell_apart(10.5953e3, 10.5961e3, "N/m") == ("10.595 kN/m", "10.596 kN/m")
+    assert tell_apart(1.0, 2.0) == ("1.000", "2.000")
+    assert tell_apart(3.0, 3.0, "N/m") == ("3.000 N/m", "3.000 N/m")
+    assert tell_apart(-float("inf"), 1.0, "N/m") == ("-infinite", "1.000 N/m")
+    low, high = tell_apart(1.0, 1.0 + 2.3e-16)
+    assert low != high

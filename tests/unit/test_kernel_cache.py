@@ -7,6 +7,7 @@ import warnings
 
 import pytest
 
+from waiting import LONGEST
 from zwidth.kernel_cache import mend_compilation_cache, use_compilation_cache
 
 PROGRAM = """
@@ -22,7 +23,12 @@ def test_half_an_entry_is_removed_without_a_word(tmp_path):
         environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
         environment["XDG_CACHE_HOME"] = str(tmp_path)
         result = subprocess.run(
-            [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True, timeout=120, env=environment
+            [sys.executable, "-c", PROGRAM],
+            capture_output=True,
+            text=True,
+            check=True,
+            timeout=LONGEST,
+            env=environment,
         )
         assert (result.stdout, result.stderr) == ("7.0\n", "")
         return sorted((tmp_path / "zwidth" / "jax").glob("*-cache"))
@@ -50,7 +56,7 @@ def test_it_may_be_asked_for_after_jax_was_imported(tmp_path):
     environment = {key: value for key, value in os.environ.items() if not key.startswith("JAX_")}
     environment["XDG_CACHE_HOME"] = str(tmp_path)
     result = subprocess.run(
-        [sys.executable, "-c", LATE], capture_output=True, text=True, check=True, timeout=120, env=environment
+        [sys.executable, "-c", LATE], capture_output=True, text=True, check=True, timeout=LONGEST, env=environment
     )
     assert result.stdout == "0 True True\n", result.stderr
 

@@ -45,13 +45,14 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     from zwidth.design.friction import friction_rule
     from zwidth.design.limits import limits_of
 
-    verdict, limits, notes = assess(scene), limits_of(scene), scene_words.coded_period_notes(scene)
+    verdict, limits, notes = assess(scene), limits_of(scene), scene_words.scene_notes(scene)
     rule = None
     if friction is not None or resolution is not None:
         device = {"damping": scene.damping, "period": scene.timing.period}
         rule = friction_rule(**device, friction=friction, resolution=resolution)
     if as_json:
         result = verdict.as_dict() | {"limits": [_without_nan(limit._asdict()) for limit in limits], "notes": notes}
+        result["islands"] = [island._asdict() for island in scene.islands()]
         if rule is not None:
             result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
         click.echo(json.dumps(result, indent=2, allow_nan=False))
@@ -151,7 +152,8 @@ def _print_part_ridge(scene: Any, as_json: bool) -> None:
             "frequency": float(wall.frequency),
             "kind": kind,
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
-            "notes": scene_words.coded_period_notes(scene),
+            "islands": [island._asdict() for island in scene.islands()],
+            "notes": scene_words.scene_notes(scene),
         }
         click.echo(json.dumps(result, indent=2, allow_nan=False))
         return
@@ -160,7 +162,7 @@ def _print_part_ridge(scene: Any, as_json: bool) -> None:
     click.echo(row("K_max", f"{with_unit(float(wall.stiffness), 'N/m')} ({kind.replace('_', ' ')} optimum)"))
     click.echo(row("B", with_unit(float(wall.virtual_damping), "N s/m")))
     click.echo(row("frequency", with_unit(float(wall.frequency), "Hz")))
-    for line in [*(slope.line() for slope in slopes), *(row("note", n) for n in scene_words.coded_period_notes(scene))]:
+    for line in [*(slope.line() for slope in slopes), *(row("note", n) for n in scene_words.scene_notes(scene))]:
         click.echo(line)
 
 

@@ -50,7 +50,7 @@ def check_lines(scene: Any, verdict: Any, limits: list[Any]) -> list[str]:
     rigid = isinstance(verdict, Assessment)
     lines = verdict_lines(scene, verdict) if rigid else scene_words.scene_verdict_lines(scene, verdict)
     lines += scene_words.limit_lines(limits)
-    return [click.unstyle(line) for line in [*lines, *(row("note", n) for n in scene_words.coded_period_notes(scene))]]
+    return [click.unstyle(line) for line in [*lines, *(row("note", n) for n in scene_words.scene_notes(scene))]]
 
 
 def slope_lines(scene: Any) -> list[str]:

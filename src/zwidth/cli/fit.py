@@ -101,7 +101,7 @@ def _as_number(text: str) -> float | str:
 @click.option("--force", help="Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.")
 @click.option("--resolution", metavar="QUANTITY", help="One count of the encoder, as 0.03mm or 0.09deg.")
 @click.option("--max-delay", type=QuantityType("s", POSITIVE), help="Longest delay looked for in a log, in s.")
-@click.option("--resample", is_flag=True, help="Make uneven times of a log even, by interpolation.")
+@click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
 @click.option("--unknown-cutoff", is_flag=True, help="Find the velocity's cut-off, too; needs --buzz at B > 0.")
 @click.option("--figure", metavar="FILE.png", type=click.Path(path_type=Path), help="Draw what the fit rests on.")

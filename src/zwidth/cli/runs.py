@@ -170,7 +170,9 @@ def _report_end(result: RunResult, command: str) -> None:
             click.echo(f"zwidth: chunk {chunk} failed: {error}", err=True)
         if not study.sweep:
             click.echo(f"zwidth: study {study.name!r} failed: {study.error}", err=True)
-    if result.failed and not result.interrupted:
+    if result.lost:
+        click.echo(f"zwidth: {result.lost}; what is done is kept, go on with: {command}", err=True)
+    elif result.failed and not result.interrupted:
         click.echo(f"zwidth: try again what failed with: {command}", err=True)
 
 
@@ -208,11 +210,16 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     if netcdf is None and table is None:
         raise click.UsageError("give --netcdf FILE or --csv FILE")
     from zwidth.sweep.export import to_csv, to_netcdf
+    from zwidth.sweep.store import find_store
 
+    missing = len(find_store(folder).missing())
     for write, file in ((to_netcdf, netcdf), (to_csv, table)):
         if file is not None:
             write(folder, file)
             click.echo(f"wrote {file}")
+    if missing:
+        text = "chunks are missing, their points have the status 255; 'zwidth run CONFIG --resume' computes them"
+        click.echo(f"zwidth: {folder}: {missing} {text}", err=True)
 
 
 class Slice(click.ParamType):

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from math import inf, isfinite
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from zwidth.cli.words import Slope, margin_lines, passivity_words, pole_words, row, stability_word
-from zwidth.formatting import plain, short, with_unit
+from zwidth.formatting import plain, short, tell_apart, with_unit
 
 if TYPE_CHECKING:
     from zwidth.assessment import SceneAssessment
@@ -84,7 +84,7 @@ def _distance(value: float, intervals: tuple[tuple[float, float], ...], unit: st
     """How far a value may move inside its stable interval, or where the stable ones are; all of them if several."""
     if not intervals:
         return f"no {name} is stable at this {other}"
-    ranges = " and ".join(f"{_end(low, unit)} to {_end(high, unit)}" for low, high in intervals)
+    ranges = " and ".join(" to ".join(tell_apart(*ends, unit)) for ends in intervals)
     inside = [(low, high) for low, high in intervals if low < value < high]
     if not inside:
         return f"stable is {name} from {ranges} (at this {other})"
@@ -92,12 +92,6 @@ def _distance(value: float, intervals: tuple[tuple[float, float], ...], unit: st
     moves = [f"fall by {with_unit(value - low, unit)}"] if isfinite(low) else []
     moves += [f"rise by {with_unit(high - value, unit)}"] if isfinite(high) else []
     return f"{name} may {' or '.join(moves)}: stable from {ranges} (at this {other})"
-
-
-def _end(value: float, unit: str) -> str:
-    if abs(value) == inf:
-        return plain(value)
-    return with_unit(value, unit)
 
 
 def limit_lines(limits: list[Limit]) -> list[str]:
@@ -140,6 +134,13 @@ def coded_period_notes(scene: Scene) -> list[str]:
         real = with_unit(cutoff * coded / period, "Hz")
         text += f", and the cut-off lies at {real} in place of {with_unit(cutoff, 'Hz')}"
     return [text]
+
+
+def scene_notes(scene: Scene) -> list[str]:
+    """What is remarkable of a scene beside its verdict."""
+    from zwidth.design.limits import describe_islands
+
+    return [*coded_period_notes(scene), *describe_islands(scene)]
 
 
 def part_slopes(scene: Scene) -> list[Slope]:

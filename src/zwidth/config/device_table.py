@@ -19,7 +19,7 @@ from zwidth.config.axes import SPELLED, Entry, read_entries
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.parameters import make_delay_readers
 from zwidth.config.units import make_entry_reader
-from zwidth.formatting import describe, resembling, suggestion
+from zwidth.formatting import describe, from_cell, resembling, suggestion
 from zwidth.quantities import PARAMETERS
 from zwidth.units import looks_like_number
 
@@ -230,7 +230,7 @@ def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, 
                 raise problem(f"{printable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
             cells.append((f"{printable(name)}, line {line}: {key}", row[index].strip()))
         if key == LABEL:
-            columns[key] = tuple(cell for _, cell in cells)
+            columns[key] = tuple(from_cell(cell) for _, cell in cells)
             continue
         entry, counts_periods = _cell_reader(key)
         columns[key] = tuple(_read_cell(entry, cell, unit, place) for place, cell in cells)

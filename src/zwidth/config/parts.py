@@ -40,8 +40,9 @@ SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such
 def locate_refusal(error: InputError) -> LocatedProblem:
     """What a part or a scene refuses, at the field that its message names."""
     field, _, text = str(error).partition(": ")
-    what, _, remedy = text.partition("; ")
-    return tuple(field.split(".")), problem(what, remedy)
+    what, _, rest = text.partition("; ")
+    allowed, _, remedy = rest.partition("; ")
+    return tuple(field.split(".")), problem(what, allowed, remedy)
 
 
 class PartSection(Strict):

@@ -108,6 +108,27 @@ def write_yaml(data: Mapping[str, Any]) -> str:
     return yaml.dump(data, Dumper=_Dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
 
 
+def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
+    """Every text that a file without faults has under a key: the value, and where it begins and ends in the file."""
+    found: dict[int, tuple[str, int, int]] = {}
+    nodes = [_Tree("", text).root]
+    while nodes:
+        node = nodes.pop()
+        if isinstance(node, yaml.SequenceNode):
+            nodes += node.value
+        for name, value in node.value if isinstance(node, yaml.MappingNode) else ():
+            scalar = value.value if isinstance(value, _Alias) else value
+            if name.value == key and isinstance(scalar, yaml.ScalarNode):
+                first, last = scalar.start_mark.index, scalar.end_mark.index
+                piece = text[first:last]
+                # Marks take in an anchor and the end of the line behind a folded text.
+                anchor = re.match(r"&\S+\s+", piece)
+                first += anchor.end() if anchor else 0
+                found[first] = (scalar.value, first, first + len(text[first:last].rstrip()))
+            nodes.append(value)
+    return list(found.values())
+
+
 def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
     """An error with a single fault."""
     line, column = place or (None, None)
@@ -259,8 +280,8 @@ class _Tree:
         self.keys: dict[FieldPath, tuple[int, int]] = {}
         self.faults: list[Fault] = []
         self._alias_nodes = 0
-        root = self._compose(text)
-        self.data = self._convert(root, ())
+        self.root = self._compose(text)
+        self.data = self._convert(self.root, ())
 
     def _compose(self, text: str) -> yaml.Node:
         """The one document of the file as PyYAML's nodes."""

@@ -166,8 +166,14 @@ class _PhysicalPlant(_OneKind):
 
     @property
     def delta(self) -> float:
-        """Normalized damping of the device."""
+        """Normalized damping of the device, with that of a hand held rigidly."""
         return float(self.to_scene().delta)
+
+    @property
+    def own_share(self) -> float:
+        """The part of delta that is the device's own, which alone makes walls passive for any hand."""
+        scene = self.to_scene()
+        return float(scene.own_delta / scene.delta) if scene.delta else 1.0
 
     @property
     def d(self) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from zwidth.errors import InputError
+from zwidth.formatting import tell_apart
 from zwidth.linear.stiffest import stiffest_wall
 from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scene import Scene
@@ -25,7 +26,7 @@ class Limit(NamedTuple):
 
 
 def limits_of(scene: Scene) -> list[Limit]:
-    """Say what limits the stiffest wall of a scene.
+    """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
     Each thing that the scene has is made ideal by itself: the filter (the plain difference of two samples instead),
     the delay (none), the sampling (64 times faster, or less where window and delay are long; both, and the filter, the
@@ -56,6 +57,18 @@ def limits_of(scene: Scene) -> list[Limit]:
         found.append(Limit(name, words, stiffness, stiffness / now))
     # NaN is larger than nothing.
     return sorted(found, key=lambda limit: (not limit.gain >= 0, -limit.gain))
+
+
+def describe_islands(scene: Scene) -> list[str]:
+    """A line for each island: stable walls that K_max does not count."""
+    lines = []
+    for island in scene.islands():
+        units = {"K": (island.stiffness, "N/m"), "B": (island.virtual_damping, "N s/m")}
+        ends = (f"{name} from {' to '.join(tell_apart(*ends, u))}" for name, (ends, u) in units.items())
+        lines.append(
+            f"an island of stable walls, {', '.join(ends)}: no stable softer walls lead to it, K_max leaves it out"
+        )
+    return lines
 
 
 def _stiffness(scene: Scene) -> float:

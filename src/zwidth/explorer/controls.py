@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from zwidth.errors import InputError
+from zwidth.linear.stiffest import choose_damping
 from zwidth.parts.coupling import Coupling
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
@@ -208,6 +209,6 @@ def read_controls(path: Path | None) -> Controls:
     if given.wall is None:
         # Well inside of the stable set, if there is one.
         best = controls.scene.max_stiffness()
-        wall = 0.5 * float(best.stiffness), float(best.virtual_damping)
-        wall = wall if isfinite(wall[0]) else (0.0, 0.0)
+        wall, half = (0.0, 0.0), 0.5 * float(best.stiffness)
+        wall = (half, choose_damping(controls.scene, best, half)) if isfinite(half) else wall
     return replace(controls, scene=replace(controls.scene, wall=VirtualWall(*wall))).check()

@@ -191,7 +191,7 @@ def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
     start = -_APPROACH * _IMPACT * scene.timing.period
     hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
     kind = MotionKind(int(hit.outcome))
-    end = "" if kind == MotionKind.UNCLEAR else f", {kind.name.lower()} at the end"
+    end = "" if kind in (MotionKind.UNCLEAR, MotionKind.INVALID) else f", {kind.name.lower()} at the end"
     words = f"(leaves it {int(hit.bounces)} times{end})"
     return hit.time, hit.position, hit.wall_force, words
 

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 from bokeh.application import Application
 from bokeh.application.handlers.function import FunctionHandler
@@ -24,7 +25,7 @@ from bokeh.server.views.session_handler import SessionHandler
 from tornado.httpserver import HTTPServer
 from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop
-from tornado.web import ErrorHandler, StaticFileHandler
+from tornado.web import ErrorHandler, RedirectHandler, RequestHandler, StaticFileHandler
 
 from zwidth.errors import InputError
 from zwidth.explorer.controls import CHOICES, SLIDERS, Controls
@@ -64,8 +65,9 @@ class GuardedServer(BokehTornado):
         )
         context = {"application_context": self.applications["/"], "bokeh_websocket_path": f"/{token}/ws"}
         pages = [
+            (rf"/{token}", RedirectHandler, {"url": f"/{token}/", "permanent": False}),
             (rf"/{token}/", PageHandler, context),
-            (rf"/{token}/assets/(.*)", StaticFileHandler, {"path": str(_ASSETS)}),
+            (rf"/{token}/assets/(.*)", AssetHandler, {"path": str(_ASSETS)}),
         ]
         self.add_handlers(".*", pages)
 
@@ -73,7 +75,8 @@ class GuardedServer(BokehTornado):
         """The handler of an address, that of errors for whoever does not know the token."""
         first, _, rest = request.path.lstrip("/").partition("/")
         known = hmac.compare_digest(first.encode("utf-8", "replace"), self.token.encode())
-        known = known and rest.partition("/")[0] in _SERVED
+        # No name of ours has other characters; the token alone, without a slash, leads to the page.
+        known = known and rest.partition("/")[0] in _SERVED and unquote(rest).isprintable()
         origin = request.headers.get("Origin", f"http://{self.host}")
         # Another host's name that leads here is another origin, too.
         if not known or request.host != self.host or origin != f"http://{self.host}":
@@ -81,8 +84,8 @@ class GuardedServer(BokehTornado):
         return super().find_handler(request, **keywords)
 
 
-class PageHandler(SessionHandler):
-    """The page itself: static text, and a session for its figures."""
+class _Closed(RequestHandler):
+    """What the browser is told of everything of ours."""
 
     def set_default_headers(self) -> None:
         """Nothing from elsewhere, nothing for elsewhere."""
@@ -90,6 +93,14 @@ class PageHandler(SessionHandler):
         self.set_header("Referrer-Policy", "no-referrer")
         self.set_header("X-Content-Type-Options", "nosniff")
         self.set_header("Cache-Control", "no-store")
+
+
+class AssetHandler(_Closed, StaticFileHandler):
+    """Our own scripts and styles."""
+
+
+class PageHandler(_Closed, SessionHandler):
+    """The page itself: static text, and a session for its figures."""
 
     async def get(self) -> None:
         """Open a page, unless too many are open."""

@@ -174,16 +174,16 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     to = _Scales(stiffness, spring, damping, damper)
     handles = []
     for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
-        own = vars(fit)
+        own, source = vars(fit), style.literal(fit.fitted_to)
         K, low, up = (_column(own, name)[0] * to.stiffness for name in ("stiffness", "stiffness_low", "stiffness_high"))
         B = _column(own, "virtual_damping")[0] * to.damping
-        ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {fit.fitted_to}")
+        ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
         # Up to where it meets K = 0.
         ends = np.flatnonzero(K > 0)
         shown = slice(max(int(ends[0]) - 1, 0), int(ends[-1]) + 2) if ends.size else slice(0)
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
-        ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {fit.fitted_to}", zorder=3)
-        handles.append(style.line(f"boundary with its 95 % band, {fit.fitted_to}", dash, color=color))
+        ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {source}", zorder=3)
+        handles.append(style.line(f"boundary with its 95 % band, {source}", dash, color=color))
     handles += _mark_walls(ax, walls, to)
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to.stiffness)
     # Room for the legend.
@@ -211,6 +211,8 @@ def _mark_walls(ax: Axes, walls: Table, to: _Scales) -> list[Any]:
         if K.size:
             text = f": $K = {K[0]:.3g}$ {to.spring}, $B = {B[0]:.3g}$ {to.damper}" if K.size == 1 else ""
             handles.append(style.line(words + text, "", **look))
+    if not kinds["set"][1].size:
+        handles.append(style.line("no wall to set: a doubt, or none holds", ""))
     found, K, B = kinds["buzzing"]
     if K.size:
         look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}

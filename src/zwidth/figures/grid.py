@@ -116,7 +116,7 @@ def panels(
 def spell(value: xarray.DataArray) -> str:
     """A single value of a parameter, with symbol and unit."""
     if value.name == "device":
-        return str(value.values)
+        return style.literal(value.values)
     unit = {"1": "", "sampling periods": "periods"}.get(value.attrs["units"], value.attrs["units"])
     unit = rf"\,\mathrm{{{unit.replace(' ', '~')}}}" if unit else ""
     return rf"${VARIABLES[str(value.name)].symbol} = {float(value):.4g}{unit}$"

@@ -68,7 +68,7 @@ def draw_limit_cycles(
             ends = (getattr(one, name) * scales[name][0] for name in (across, along))
             ax.plot(*ends, color=style.VERMILION, linewidth=1.2, label=f"linear, {one.number}", zorder=3)
         if len(labels) > 1:
-            ax.set_title(label)
+            ax.set_title(style.literal(label))
         _scale_axes(ax, x, y)
     names = [f"{_AXES[name][0]}  ${_AXES[name][1]}$  in {scales[name][1]}" for name in (across, along)]
     style.label_axes(panels, *names, once=axes is None)
@@ -134,7 +134,7 @@ def draw_limit_cycle_curves(
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
                 style.use_logarithmic(ax, "y", *amplitudes)
-                ax.set_title(labels[column] if len(labels) > 1 else "")
+                ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
                 ax.set_xlabel(f"{_AXES[over][0]}  ${_AXES[over][1]}$  in {unit}")
             if column == 0:

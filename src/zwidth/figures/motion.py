@@ -118,7 +118,7 @@ def _read_motions(table: Table) -> list[Any]:
     columns = {str(name): np.asarray(table[name]) for name in table}
     motions = curves({**columns, "number": np.cumsum(columns["time_s"] == 0.0)}, "number")
     for k, each in enumerate(motions):
-        each.label = str(each.label[0])
+        each.label = style.literal(each.label[0])
         each.look = {"color": style.DISTINCT[k % len(style.DISTINCT)], "linestyle": _STYLES[k % len(_STYLES)]}
     return motions
 

@@ -42,7 +42,7 @@ def draw_stable_set(outlines: Table, walls: Table, axes: style.AnyAxes | None = 
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
     ax.set(xlabel=f"stiffness  $K$  in {unit}", ylabel="virtual damping  $B$  in N s/m")
     ax.margins(0.04)
-    handles = [style.line(label, color=color) for label, color in colors.items() if len(labels) > 1]
+    handles = [style.line(style.literal(label), color=color) for label, color in colors.items() if len(labels) > 1]
     dashes = {"island": style.DASHED, "hole": style.DOTTED}
     handles += [style.line(name, dash) for name, dash in dashes.items() if name in pieces]
     if len(labels) > 1:

@@ -54,7 +54,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
         factor, length = style.si_unit(max(finals, default=0.0), "m")
     for each, color, dash in _assign_colors(responses):
-        text = rf"{each.label}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
+        text = rf"{style.literal(each.label)}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
         text += "" if each.settled else ", not settled"
         ax.plot(each.time * clock, each.position * factor, color=color, linestyle=dash, label=text, zorder=3)
         if np.isfinite(each.final_position):
@@ -91,7 +91,7 @@ def _assign_colors(responses: list[Any]) -> list[tuple[Any, Any, Any]]:
 def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
     """The force of the wall over time."""
     for each, color, _ in _assign_colors(responses):
-        label = f"wall_force, {each.label}"
+        label = f"wall_force, {style.literal(each.label)}"
         # Steps are too short for dashes: lightness has to do.
         ax.plot(each.time * clock, each.wall_force, color=color, linewidth=1.1, label=label, zorder=3)
     ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)

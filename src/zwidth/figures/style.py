@@ -142,6 +142,13 @@ def letter(axes: np.ndarray) -> None:
         ax.set_title(f"({title})")
 
 
+def literal(text: Any) -> str:
+    """A label of somebody's own as matplotlib writes it letter by letter, in legends too: no mathematics, no hiding."""
+    text = "".join(sign if sign.isprintable() or sign == "\n" else " " for sign in str(text)).replace("$", r"\$")
+    # Legends leave out what begins with an underscore: a space without width stands before it.
+    return f"\u200b{text}" if text.startswith("_") else text
+
+
 def label_axes(axes: np.ndarray, x: str, y: str, *, once: bool) -> None:
     """Name the axes of every panel, or once for all."""
     if once and len(axes) > 1:
@@ -166,8 +173,10 @@ def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: An
         drawn.remove()
         drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
     for text in drawn.get_texts() if share > 1.0 else ():
-        if "$" not in text.get_text():
-            text.set_text(fill(text.get_text(), max(int(0.9 * len(text.get_text()) / share), 12)))
+        bare = text.get_text().replace(r"\$", "")
+        if "$" not in bare:
+            plain = text.get_text().replace(r"\$", "$")
+            text.set_text(literal(fill(plain, max(int(0.9 * len(plain) / share), 12))))
 
 
 def use_logarithmic(ax: Axes, which: str, low: float, high: float, wide: float = 100.0) -> None:

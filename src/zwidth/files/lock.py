@@ -15,13 +15,14 @@ import errno
 import fcntl
 import os
 import socket
+import stat
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from zwidth.errors import StoreBusyError
+from zwidth.errors import InputError, StoreBusyError
 from zwidth.files.whole import check_folder
 
 FOLDER = ".locks"
@@ -46,7 +47,6 @@ def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None
         InputError: the folder cannot be made or written.
     """
     check_folder(folder)
-    (folder / FOLDER).mkdir(parents=True, exist_ok=True)
     with _opened(folder / FOLDER / "run") as run:
         if shard is None:
             if not _lock(run, fcntl.LOCK_EX):
@@ -84,7 +84,7 @@ def _busy(folder: Path, what: str) -> StoreBusyError:
     """Why a folder cannot be had, who has it, and what to do."""
     holders = []
     for path in sorted((folder / FOLDER).glob("*")):
-        with suppress(OSError), _opened(path) as file:
+        with suppress(OSError, InputError), _opened(path) as file:
             held = not _lock(file, fcntl.LOCK_SH, patience=0.0)
             holders += [_read(file)] if held and "process" in _read(file) else []
     more = f", and {len(holders) - 1} more" if len(holders) > 1 else ""
@@ -101,17 +101,33 @@ def _this_process() -> str:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[int]:
-    """A file to lock; made where it is missing, and closed, which frees it, when the block ends."""
-    path.parent.mkdir(parents=True, exist_ok=True)
+    """A file to lock; made where it is missing, and closed, which frees it, when the block ends.
+
+    Raises:
+        InputError: it may be a file elsewhere, which is not to be written.
+    """
     try:
-        file = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_NONBLOCK, 0o666)
     except PermissionError:
         # Another user's: to lock it, local file systems want no more than this.
-        file = os.open(path, os.O_RDONLY)
+        file = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError as error:
+        if error.errno not in (errno.ELOOP, errno.EISDIR, errno.ENXIO, errno.EEXIST, errno.ENOTDIR):
+            raise
+        raise _foreign(path) from error
     try:
+        found = os.fstat(file)
+        if path.parent.is_symlink() or not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+            raise _foreign(path)
         yield file
     finally:
         os.close(file)
+
+
+def _foreign(path: Path) -> InputError:
+    place = path.parent if path.parent.is_symlink() else path
+    return InputError(f"out: {place} is a link or no file of a run's own; remove it, or choose another folder")
 
 
 def _lock(file: int, how: int, patience: float | None = None) -> bool:

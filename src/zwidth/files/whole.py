@@ -8,7 +8,7 @@ import secrets
 import shutil
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from zwidth.errors import InputError
@@ -52,6 +52,11 @@ def check_folder(folder: Path) -> None:
         raise InputError(f"out: {folder} {where}, at least to you; choose another folder with --out DIR")
 
 
+def is_plain_name(name: str) -> bool:
+    """Whether a name is that of a file in a folder, and leads nowhere else."""
+    return Path(name).name == name and name not in ("", "..") and "\0" not in name
+
+
 def existing(folder: Path) -> Path:
     """The folder itself or the nearest path above it that exists."""
     folder = folder.absolute()
@@ -84,13 +89,18 @@ def write_whole(path: Path, data: bytes) -> None:
         os.replace(partial, path)
 
 
-def checksum(path: Path) -> int:
-    """The CRC-32 of a file; 0 where there is none."""
-    total = 0
+def content(path: Path) -> bytes:
+    """What a file holds; nothing where there is none."""
     try:
-        with open(path, "rb") as stream:
-            while block := stream.read(1 << 22):
-                total = zlib.crc32(block, total)
-    except FileNotFoundError:
-        return 0
+        return path.read_bytes()
+    except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+        return b""
+
+
+def checksum(path: Path) -> int:
+    """The CRC-32 of a file; -1, which is none, where there is no file or nothing in it."""
+    total = -1
+    with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError), open(path, "rb") as stream:
+        while block := stream.read(1 << 22):
+            total = zlib.crc32(block, max(total, 0))
     return total

@@ -14,6 +14,7 @@ from zwidth.fitting.buzz_points import BuzzPoint as BuzzPoint
 from zwidth.fitting.buzz_points import read_noise, read_points
 from zwidth.fitting.buzzing import NeededAnswer, Onsets
 from zwidth.fitting.device_fit import (
+    BEYOND,
     MASS_OPEN,
     VAGUE,
     DeviceFit,
@@ -161,7 +162,11 @@ def fit_buzz(
         if unknown_cutoff and covariance[3, 3] > (VAGUE * values[3]) ** 2:
             doubts.append("the cut-off is hardly determined: its standard error is more than half of it")
         if best.squares > _EXACT:
-            doubts += [f"the {name} is 0 at best: a negative one would fit better" for name in best.held]
+            doubts += [
+                f"the {name} is 0 at best: a negative one would fit better"
+                for name in best.held
+                if name != "delay" or _delay_beyond(slopes, best) < -BEYOND * np.sqrt(scale)
+            ]
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity), unknown_cutoff)
     further = _further(onsets, stiffest, best.theta, information, stiffest.gradient @ by_theta, weights**2 / scale)
     return stiffest.conclude(
@@ -213,6 +218,12 @@ def _at_edge(onsets: Onsets, fit: Candidate) -> bool:
 def _edges(scene: Scene, stiffness: np.ndarray, virtual_damping: np.ndarray) -> np.ndarray:
     softer = scene.is_stable(stiffness * (1 - _BESIDE), virtual_damping)
     return softer & ~scene.is_stable(stiffness * (1 + _BESIDE), virtual_damping)
+
+
+def _delay_beyond(slopes: np.ndarray, best: Candidate) -> float:
+    """Where the delay of the least squares would lie that is held at 0, in standard errors of walls of noise 1."""
+    inverse = np.linalg.pinv(slopes)[2]
+    return float(inverse @ best.residuals.ravel() / np.linalg.norm(inverse))
 
 
 def _unlikely(freedom: int) -> float:

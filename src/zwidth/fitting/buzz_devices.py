@@ -9,8 +9,9 @@ import numpy as np
 
 from zwidth.fitting.buzzing import Onsets
 
-# The dampings b T/m that are started from, the number of cut-offs, and how many of the dips.
-_DELTAS = np.concatenate([[0.0], np.geomspace(1e-4, 30.0, 45)])
+# The dampings b T/m that are started from where nothing buzzes slowly, the number of cut-offs, and how many of the
+# dips.
+_DELTAS = np.geomspace(1e-4, 30.0, 45)
 _CUTOFFS, _STARTS = 16, (6, 12)
 # Tolerances of a first look and of the end, and the evaluations they may take.
 _NEARLY, _ARRIVED, _MOST_STEPS = 1e-4, 1e-12, (100, 40)
@@ -43,7 +44,7 @@ def find_candidates(onsets: Onsets, weights: np.ndarray) -> list[Candidate]:
     found: list[Candidate] = []
     # Half a turn over the delay, and some more for noise.
     longest = 1.2 * np.pi / float(onsets.w.max())
-    for start in onsets.starts(_DELTAS, longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff]):
+    for start in onsets.starts(_dampings(onsets), longest, _cutoffs(onsets), _STARTS[onsets.unknown_cutoff]):
         near = _solve(onsets, weights, start, (), _NEARLY)
         if near.found:
             if any(np.allclose(near.theta, other.theta, 1e-2, 1e-2) for other in found):
@@ -55,6 +56,13 @@ def find_candidates(onsets: Onsets, weights: np.ndarray) -> list[Candidate]:
         ends = (_solve(onsets, weights, start, held) for held in ((1,), (2,), (1, 2)))
         found += [end for end in ends if min(end.theta[1:3]) >= 0]
     return sorted(found, key=lambda fit: (not fit.found, fit.squares))
+
+
+def _dampings(onsets: Onsets) -> np.ndarray:
+    """Places to look for a damping at: a wall of B = 0 buzzes near w^2 = delta/(d + 1/2), however slowly."""
+    ratio = _DELTAS[1] / _DELTAS[0]
+    more = np.ceil(np.log(_DELTAS[0] / (0.1 * float(onsets.w.min()) ** 2)) / np.log(ratio))
+    return np.concatenate([[0.0], _DELTAS[0] * ratio ** np.arange(-more, 0.0), _DELTAS])
 
 
 def _cutoffs(onsets: Onsets) -> np.ndarray:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from zwidth.formatting import with_unit
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
@@ -25,6 +27,10 @@ _CONFIDENCE = 0.95
 _STEP = 0.1
 # A standard error beyond this share leaves a value open.
 VAGUE = 0.5
+# Standard errors below 0 that nobody takes for a delay of 0 anymore; half of a true 0's errors go below.
+BEYOND = 3.0
+# Sampling periods of loops, in s: outside a unit is suspected.
+_QUICKEST, _SLOWEST = 5e-6, 0.02
 MASS_OPEN = "the mass is hardly determined: its standard error is more than half of it"
 
 
@@ -59,13 +65,6 @@ class FittedMotion(NamedTuple):
     modelled: np.ndarray
 
 
-class TriedModel(NamedTuple):
-    """A model of a log: what it has beside mass, damping and delay, and Schwarz's criterion less the least of all."""
-
-    parts: tuple[str, ...]
-    criterion: float
-
-
 class RivalDevice(NamedTuple):
     """Another device that fits as well: kg, N s/m, s, its K_max in N/m, its cut-off in Hz where that was unknown."""
 
@@ -90,15 +89,14 @@ class DeviceFit:
         noise: relative (K and f) of buzzing walls, of the position in m of a log; given, or estimated from residuals.
         residuals: measured less fitted, of buzzing walls an array (n, 2) in units of the noise of K and f, of a log in
             m, NaN where samples are left out.
-        doubts: what is odd about the records or about the estimate, a sentence each.
+        doubts: what is odd about the records or about the estimate, a sentence each; then there is no safe wall.
         status: of `zwidth.Status`: UNDECIDED where another device fits as well.
         rivals: those devices, a `zwidth.RivalDevice` each.
         next: the further experiment that narrows K_max most; None of a log.
-        offset: constant force in N that the log asks for beside the commanded one; 0 where it asks for none.
-        friction: Coulomb friction in N that the log asks for, its error in ``errors`` then; 0 where it asks for none.
+        offset: constant force in N beside the commanded one, of a log; its error in ``errors``.
+        friction: Coulomb friction in N, of a log; its error in ``errors``, NaN where the log leaves it open.
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
-        tried: of a log, the models that were compared, a `zwidth.TriedModel` each, the one kept first.
         period, velocity: of the loop; the velocity with the cut-off found where that was unknown.
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
@@ -119,11 +117,18 @@ class DeviceFit:
     friction: float
     resolution: float
     motions: tuple[FittedMotion, ...]
-    tried: tuple[TriedModel, ...]
     period: float
     velocity: Velocity
     freedom: int | None = None
     rivals: tuple[RivalDevice, ...] = ()
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether there is a doubt or a status: then no safe wall and no wall to set is given.
+
+        What a record shows beyond the model moved K_max up to 2.8 times, and most often where something was doubted.
+        """
+        return self.status != Status.OK or bool(self.doubts)
 
     @property
     def reach(self) -> float:
@@ -173,9 +178,11 @@ class DeviceFit:
         """95 % intervals by name: of what ``errors`` has, and of "stiffness_max"."""
         errors = self.errors | {"stiffness_max": self.stiffness_error}
         reaches = {name: (getattr(self, name), self.reach * error) for name, error in errors.items()}
-        # A NaN stays one.
+        # A NaN stays one; a constant force alone may be negative.
+        least = {"offset": -np.inf}
         return {
-            name: ErrorBar(float(np.maximum(0.0, value - far)), value + far) for name, (value, far) in reaches.items()
+            name: ErrorBar(float(np.maximum(least.get(name, 0.0), value - far)), value + far)
+            for name, (value, far) in reaches.items()
         }
 
     def safe_wall(self, reliability: float = 0.99, *, samples: int | None = None, seed: int = 0) -> SafeWall:
@@ -192,8 +199,8 @@ class DeviceFit:
         Returns:
             SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m; ``share``, of the drawn devices that
             bear it, counted by their poles' verdicts; ``status``, with NaN where it is not OK: that of the fit, or
-            UNDECIDED where the verdicts do not confirm the wall, or where hardly a drawn device is possible. K is 0,
-            and B with it, where no wall is borne by so many.
+            UNDECIDED under a doubt, where the verdicts do not confirm the wall, or where hardly a drawn device is
+            possible. K is 0, and B with it, where no wall is borne by so many.
 
         Raises:
             InputError: a share, a number of samples or a seed that there cannot be.
@@ -244,7 +251,6 @@ class DeviceFit:
             "offset": self.offset,
             "friction": self.friction,
             "resolution": self.resolution,
-            "tried": [{"parts": list(model.parts), "criterion": model.criterion} for model in self.tried],
             "period": self.period,
             "doubts": list(self.doubts),
             "status": int(self.status),
@@ -299,15 +305,14 @@ class StiffnessEstimate:
         status: int,
         freedom: int | None = None,
         further: FurtherExperiment | None = None,
-        offset: float = 0.0,
-        friction: tuple[float, float] = (0.0, 0.0),
+        parts: Mapping[str, tuple[float, float]] = MappingProxyType({}),
         resolution: float = 0.0,
         motions: tuple[FittedMotion, ...] = (),
-        tried: tuple[TriedModel, ...] = (),
         rivals: tuple[RivalDevice, ...] = (),
     ) -> DeviceFit:
-        """The result; ``friction`` with its error, ``freedom`` as for `reach_of`."""
+        """The result; ``parts`` are a log's offset and friction with their errors, ``freedom`` as for `reach_of`."""
         scene = self.scene
+        doubts = [*doubts, *_doubt_period(scene.timing.period)]
         errors = dict(zip((*NAMES, "cutoff"), np.sqrt(np.diag(covariance)).tolist(), strict=False))
         error = float(np.sqrt(self.gradient @ covariance @ self.gradient))
         agreed = bool(rivals) and all(abs(one.stiffness_max - self.value) <= error for one in rivals)
@@ -316,7 +321,7 @@ class StiffnessEstimate:
             mass=scene.device.mass,
             damping=scene.device.damping,
             delay=scene.timing.delay,
-            errors=errors | ({"friction": friction[1]} if friction[0] else {}),
+            errors=errors | {name: error for name, (_, error) in parts.items()},
             covariance=covariance,
             stiffness_max=known * self.value,
             stiffness_error=known * error,
@@ -325,16 +330,24 @@ class StiffnessEstimate:
             doubts=tuple(doubts),
             status=int(status),
             next=further and further._replace(error_afterwards=known * further.error_afterwards),
-            offset=offset,
-            friction=friction[0],
+            offset=parts["offset"][0] if parts else 0.0,
+            friction=parts["friction"][0] if parts else 0.0,
             resolution=resolution,
             motions=motions,
-            tried=tried,
             period=scene.timing.period,
             velocity=scene.velocity,
             freedom=freedom,
             rivals=rivals,
         )
+
+
+def _doubt_period(period: float) -> list[str]:
+    if _QUICKEST <= period <= _SLOWEST:
+        return []
+    slip = "in ms or us" if period > _SLOWEST else "in s"
+    return [
+        f"a sampling period of {with_unit(period, 's')} is far from any loop; the time may be {slip}: check its unit"
+    ]
 
 
 def in_si(theta: Iterable[float], period: float) -> tuple[np.ndarray, np.ndarray]:

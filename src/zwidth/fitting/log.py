@@ -9,19 +9,18 @@ import numpy as np
 from zwidth._types import ArrayLike
 from zwidth.errors import InputError
 from zwidth.fitting.device_fit import (
+    BEYOND,
     MASS_OPEN,
     VAGUE,
     DeviceFit,
     FittedMotion,
     StiffnessEstimate,
-    TriedModel,
     in_si,
-    reach_of,
     scene_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.moving import PARTS, Recordings
-from zwidth.fitting.output_error import FittedModel, fit_models
+from zwidth.fitting.output_error import LEAST, FittedModel, find_largest, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
 from zwidth.formatting import plain, with_unit
 from zwidth.parts.checks import check_number
@@ -31,7 +30,9 @@ from zwidth.status import Status
 # By default the longest delay, in periods.
 _LONGEST = 20
 # The masses of devices, in kg: outside a unit is suspected.
-_LIGHTEST, _HEAVIEST = 2e-3, 20.0
+_LIGHTEST, _HEAVIEST = 2e-3, 10.0
+# The longest way in m and the largest force in N of a device.
+_FARTHEST, _STRONGEST = 3.0, 1e3
 # Fewer positions than this are explained by other devices as well, far outside of the errors.
 _FEW = 60
 # A slope of less than so many of its standard errors is none.
@@ -40,9 +41,6 @@ _SEEN = 5.0
 _ALIKE = 1.5
 # So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
 _UNEXPLAINED, _SMOOTH = 0.01, 5.0
-# Criteria that differ by less are weak evidence (Kass, Raftery 1995).
-_HARDLY_WORSE = 2.0
-_WORDS = {"offset": "a constant force", "friction": "friction"}
 # Smaller residuals, as a share of the way moved, are rounding.
 _EXACT = 1e-9
 
@@ -61,7 +59,8 @@ def fit_log(
     """Find mass, damping and delay from a log of free motion under a force that a computer commands.
 
     ``m x'' + b x' = F(t - t_d) + f0 - F_c sign(x')``, the force held from sample to sample, least squares of the
-    positions. The constant force f0 and the friction F_c are kept only where the log asks for them.
+    positions. The constant force f0 and the friction F_c are always sought, and widen the errors of the others: left
+    out where a log hardly shows them, they would bias the rest by many standard errors.
 
     Args:
         time: of the samples in s, evenly spaced, or their period alone. With lists of arrays for all three, several
@@ -72,15 +71,17 @@ def fit_log(
         max_delay: the longest delay looked for, in s; 20 periods by default. So much of the beginning serves only as
             past force.
         resolution: step of the encoder, in m; found from the positions where left out; 0 for none.
-        resample: whether uneven times are made even, of their median step: positions on straight lines, forces held.
+        resample: whether times off by up to a quarter of a period are those of a clock that wavers: the samples are
+            taken as they are, even, with the period of all times; 5 % otherwise.
         rotary: whether the position is an angle in rad and the force a torque in N m; then mass is an inertia in kg m²,
             damping in N m s/rad, and so on.
 
     Returns:
-        DeviceFit: ``mass``, ``damping``, ``delay``, their ``errors`` and ``covariance``; ``friction`` and ``offset``, 0
-        where not kept, and ``tried``, the models compared; ``stiffness_max`` with ``stiffness_error``; ``intervals``,
-        95 %; ``noise`` of the position in m; ``residuals`` and ``motions``; ``doubts``, as of a unit or of residuals
-        that are no noise; ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED.
+        DeviceFit: ``mass``, ``damping``, ``delay``, their ``errors`` and ``covariance``; ``friction`` and ``offset``,
+        whose errors are NaN where the log leaves open how much is of which, as of a mass that slides one way only;
+        ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %; ``noise`` of the position in m; ``residuals``
+        and ``motions``; ``doubts``, as of a unit or of residuals that are no noise: then there is no safe wall;
+        ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the device runs away from its force, most
@@ -88,13 +89,15 @@ def fit_log(
 
     Numerics:
         Closed forms between samples, turns and sticking included, exact derivatives, Levenberg's and Marquardt's steps
-        in NumPy: a log of 10,000 samples takes some 0.5 s, and unlike in JAX nothing is compiled for its length. Models
-        are compared by Schwarz's criterion. Errors know that an encoder errs alike in neighboring samples; how often
-        the intervals hold the true device is measured in docs/fitting.md.
+        in NumPy: a log of 3,000 samples takes about half a second, and unlike in JAX nothing is compiled for its
+        length. Ever more friction is tried, from 0.1 to 50 % of the largest force, each from the one before. Errors
+        know that an encoder errs alike in neighboring samples; how often the intervals hold the true device is measured
+        in docs/fitting.md.
 
     References:
-        Ljung 1999, System Identification, section 4.2 (output error). Schwarz 1978, Annals of Statistics 6, 461-464.
-        Widrow, Kollar 2008, Quantization Noise (an encoder's error). Hulin, Preusche, Hirzinger 2006, eq. (9).
+        Ljung 1999, System Identification, section 4.2 (output error). Leeb, Poetscher 2005, Econometric Theory 21,
+        21-59 (intervals after a choice of models do not hold). Widrow, Kollar 2008, Quantization Noise (an encoder's
+        error). Hulin, Preusche, Hirzinger 2006, eq. (9).
 
     Example:
         >>> import numpy as np
@@ -107,14 +110,14 @@ def fit_log(
         100.0 g, 2.00 N s/m
     """
     velocity = BackwardDifference() if velocity is None else velocity
-    logs, period = read_logs(time, position, force, resample)
+    logs, period, wavers = read_logs(time, position, force, resample)
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s") / period
     skip = int(np.ceil(longest)) + 2
     recordings = tuple(log.recording(skip, k) for k, log in enumerate(logs))
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     step, odd = _find_step(resolution, logs)
-    ranked = fit_models(recordings, longest, step)
-    best, theta = ranked[0][0], ranked[0][0].theta
+    best = fit_model(recordings, longest, step)
+    theta = best.theta
     _refuse_unmoved(best, period)
     if not best.conditioned:
         raise InputError(
@@ -124,11 +127,12 @@ def fit_log(
     values, by_theta = in_si((np.log(period**2 / theta[0]), theta[1], theta[2]), period)
     # From g = T^2/m to ln m.
     by_theta = by_theta @ np.diag([-1.0 / theta[0], 1.0, 1.0])
-    covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T
+    # As T^2, T and T.
+    by_period = wavers * values * [2.0, 1.0, 1.0]
+    covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T + np.outer(by_period, by_period)
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
     errors = np.sqrt(np.diag(covariance))
-    doubts = odd + doubts + _doubt_choice(ranked, values, errors, period)
-    doubts += _doubt(values, errors, best, logs, rotary)
+    doubts = odd + doubts + _doubt(values, errors, best, logs, rotary)
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
@@ -143,48 +147,21 @@ def fit_log(
         doubts=doubts,
         status=status,
         freedom=max(1, best.count - theta.size),
-        offset=_in_newton(best, PARTS[0])[0],
-        friction=_in_newton(best, PARTS[1]),
+        parts={name: _in_newton(best, name) for name in PARTS},
         resolution=step,
         motions=_beside(residuals, logs, period),
-        tried=tuple(TriedModel(fitted.model.parts, criterion) for fitted, criterion in ranked),
     )
 
 
-def _doubt_choice(
-    ranked: list[tuple[FittedModel, float]], values: np.ndarray, errors: np.ndarray, period: float
-) -> list[str]:
-    """Models that explain the log hardly worse than the best, whose device is another one, a sentence each."""
-    kept, doubts = set(ranked[0][0].model.parts), []
-    for fitted, criterion in ranked[1:]:
-        if criterion > _HARDLY_WORSE or not fitted.theta[0] > 0:
-            continue
-        others = in_si((np.log(period**2 / fitted.theta[0]), fitted.theta[1], fitted.theta[2]), period)[0]
-        if np.all(np.abs(others - values) <= reach_of(None) * errors):
-            continue
-        change = [("without" if part in kept else "with") + f" {_WORDS[part]}" for part in _differ(kept, fitted)]
-        mass, damping, delay = others
-        doubts.append(
-            f"{' and '.join(change)} the log is explained nearly as well (Schwarz's criterion {plain(criterion, 2)} "
-            f"worse), by m = {with_unit(1e3 * mass, 'g')}, b = {with_unit(damping, 'N s/m')}, "
-            f"t_d = {with_unit(delay, 's')}; record longer"
-        )
-    return doubts
-
-
-def _differ(kept: set[str], fitted: FittedModel) -> list[str]:
-    return [part for part in PARTS if (part in kept) != (part in fitted.model.parts)]
-
-
 def _in_newton(best: FittedModel, part: str) -> tuple[float, float]:
-    """A force over the mass as a force, and its standard error; 0 where the model has none."""
-    if part not in best.model.parts:
-        return 0.0, 0.0
+    """A force over the mass as a force, and its standard error."""
     k, g = best.model.find(part), best.theta[0]
-    value = best.theta[k] / g
-    slope = np.zeros(best.theta.size)
-    slope[0], slope[k] = -value / g, 1.0 / g
-    return float(value), float(np.sqrt(slope @ best.covariance @ slope))
+    value, those = best.theta[k] / g, [0, k]
+    slope = np.array([-value / g, 1.0 / g])
+    error = float(np.sqrt(slope @ best.covariance[np.ix_(those, those)] @ slope))
+    # At the least that is looked for there is none.
+    none = part == PARTS[1] and value <= 2.0 * LEAST * find_largest(best.model)
+    return 0.0 if none else float(value), error
 
 
 def _find_step(resolution: Any, logs: tuple[Log, ...]) -> tuple[float, list[str]]:
@@ -233,6 +210,11 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
         light = "the position may be in mm, or the force in kN"
         slip = light if mass < _LIGHTEST else "the force may be in mN, or the time in ms"
         doubts.append(f"a mass of {with_unit(1e3 * mass, 'g')} is far from any device; {slip}: m, N and s are meant")
+    way, push = max(float(np.ptp(log.position)) for log in logs), find_largest(best.model)
+    if not rotary and way > _FARTHEST:
+        doubts.append(f"a way of {with_unit(way, 'm')} is far from any device; the position may be in mm: m is meant")
+    if not rotary and push > _STRONGEST:
+        doubts.append(f"a force of {with_unit(push, 'N')} is far from any device; it may be in mN: N is meant")
     if errors[0] > VAGUE * mass:
         doubts.append(MASS_OPEN)
     if best.count < _FEW:
@@ -241,7 +223,7 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
             "device, and the errors do not say so; record longer, or give a shorter max_delay"
         )
     size = float(residuals @ residuals)
-    if size <= _EXACT**2 * residuals.size * max(float(np.ptp(log.position)) for log in logs) ** 2:
+    if size <= _EXACT**2 * residuals.size * way**2:
         # Nothing but rounding is left.
         return doubts
     if damping == 0:
@@ -252,8 +234,11 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
             f"the damping is hardly seen, its standard error is {with_unit(errors[1], 'N s/m', 2)}; record longer than "
             f"these {span} samples, or let the device run faster"
         )
-    if delay == 0:
-        doubts.append("the delay is 0 at best: the position would have to precede the force to fit better")
+    if delay == 0 and (away := best.step_beyond(2)) < -BEYOND:
+        doubts.append(
+            f"the delay is 0 at best: the position would have to precede the force to fit better, by {plain(-away, 2)} "
+            "standard errors; is a column shifted?"
+        )
     if best.excess > _ALIKE:
         doubts.append(
             f"what the fit leaves is no noise, its sums spread {plain(np.sqrt(best.excess), 2)} times as far: the "

@@ -227,24 +227,32 @@ class Recordings:
         """Where a part's number stands in theta."""
         return 3 + 2 * len(self.logs) + self.parts.index(part)
 
-    def project(self, delta: float, d: float) -> tuple[np.ndarray, float]:
-        """The best theta without friction for this damping and delay, and its sum of squares."""
+    def try_delays(self, delta: float, longest: float) -> list[float]:
+        """Sums of squares left without friction by this damping and delays of 0, 1, ... periods.
+
+        One motion serves all: begun so much earlier, it differs by its start and by what a constant force does.
+        """
+        count = int(longest) + 1
+        more = count - 1
+        early = [Recording(log.force, np.zeros(log.position.size + more), log.skip - more) for log in self.logs]
+        theta = np.zeros(self.size)
+        theta[1] = delta
+        slopes = Recordings(tuple(early), self.parts).predict(theta)[1]
+        linear = [k for k in range(self.size) if k not in (1, 2)]
+        ends = np.cumsum([log.position.size for log in early])
+        squares = []
+        for d in range(count):
+            rows = [np.arange(end - log.position.size, end) - d for end, log in zip(ends, self.logs, strict=True)]
+            squares.append(_combine(slopes[np.concatenate(rows)][:, linear], self.measured)[1])
+        return squares
+
+    def project(self, delta: float, d: float) -> np.ndarray:
+        """The best theta without friction for this damping and delay."""
         theta = np.zeros(self.size)
         theta[:3] = 0.0, delta, d
         linear = [k for k in range(self.size) if k not in (1, 2)]
-        values, squares = _combine(self.predict(theta)[1][:, linear], self.measured)
-        theta[linear] = values
-        return theta, squares
-
-    def scale(self, theta: np.ndarray) -> tuple[np.ndarray, float]:
-        """The same motion in another size: g with o and c, and v0, at their best, and the sum of squares."""
-        place, slopes = self.predict(theta)
-        starts = [3 + 2 * k for k in range(len(self.logs))]
-        origin = slopes[:, starts] @ theta[starts]
-        values, squares = _combine(np.column_stack([place - origin, slopes[:, starts]]), self.measured)
-        found = theta * values[0]
-        found[1:3], found[starts] = theta[1:3], values[1:]
-        return found, squares
+        theta[linear] = _combine(self.predict(theta)[1][:, linear], self.measured)[0]
+        return theta
 
 
 # What a log may ask for beside mass, damping and delay, as `Recording.move` names it.

@@ -1,4 +1,8 @@
-"""Least squares of logged positions: for mass, damping and delay, and for each thing more that a log may ask for."""
+"""Least squares of logged positions: mass, damping and delay, and with them a constant force and friction.
+
+The two are always sought. A fit without them has smaller errors, but holds the device only where they are 0 indeed, and
+a log that hardly shows them cannot tell: left out by a criterion, they moved damping by up to 179 standard errors.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,16 @@ import numpy as np
 from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.fitting.moving import PARTS, Recording, Recordings
 
-# Dampings b T/m and steps of the delay, in periods, that are started from, and how many of the best.
-_DELTAS, _STEP, _STARTS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0), 1.0, 3
-# Friction as a share of the largest force, and the damping as a share of what it is without friction.
-_FRICTIONS, _DAMPINGS = (0.02, 0.1, 0.3), (1.0, 0.3, 0.03)
-# So many positions of each log choose the starts.
-_BEGINNING = 2500
-# Promised reductions of the squares that end the search, and that excuse a corner; steps; how they are damped.
-_ARRIVED, _NEARLY, _STEPS = 1e-12, 1e-6, 100
+# Dampings b T/m that are started from, how far delays of starts lie apart, in periods, and how many of the best.
+_DELTAS, _APART, _STARTS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0), 2, 3
+# Friction as shares of the largest force that are followed from below, by so many steps each; how many are kept; and
+# the least that is looked for, for at 0 its slope is not seen.
+_FRICTIONS, _FOLLOWED, _LEVELS, LEAST = np.geomspace(1e-3, 0.5, 8), 3, 3, 1e-12
+# So many positions of each log choose the starts, and so many the best of these.
+_GLIMPSE, _BEGINNING = 1200, 2500
+# Promised reductions of the squares that end the search, end it among starts, and excuse a corner; steps; how they are
+# damped.
+_ARRIVED, _CLOSE, _NEARLY, _STEPS = 1e-12, 1e-9, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
 # Standard deviations of the noise that a slide is lost in.
 _WITHIN = 3.0
@@ -63,18 +69,40 @@ class FittedModel:
         return MeasurementNoise(self.moved[0], max(self.variance, self.resolution**2 / 12.0), self.resolution)
 
     @cached_property
-    def columns(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The derivatives that are not 0, each of size 1; which, and their sizes. A mass that sticks forgets its v0."""
+    def columns(self) -> tuple[np.ndarray, np.ndarray]:
+        """The derivatives, each of size 1 or, as that in the v0 of a mass that sticks, 0; and their sizes."""
         sizes = np.linalg.norm(self.moved[1], axis=0)
-        seen = np.flatnonzero(sizes)
-        return self.moved[1][:, seen] / sizes[seen], seen, sizes[seen]
+        sizes = np.where(sizes > 0, sizes, 1.0)
+        return self.moved[1] / sizes, sizes
 
     @cached_property
+    def inverse(self) -> tuple[np.ndarray, np.ndarray]:
+        """The pseudo-inverse of the columns, and which numbers the positions leave open."""
+        left, values, right = np.linalg.svd(self.columns[0], full_matrices=False)
+        blind = values * _BLIND < values[0]
+        inverse = right[~blind].T / values[~blind] @ left[:, ~blind].T
+        return inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0)
+
+    @property
     def conditioned(self) -> bool:
-        """Whether the positions tell all numbers apart."""
-        columns, seen, _ = self.columns
-        needed = {0, 1, 2, *(self.model.find(part) for part in self.model.parts)}
-        return needed <= set(seen.tolist()) and float(np.linalg.cond(columns)) < _BLIND
+        """Whether the positions tell mass, damping and delay."""
+        return not self.inverse[1][:3].any()
+
+    def step_beyond(self, k: int) -> float:
+        """Where the least squares of what is held at its bound would lie, in standard errors from there."""
+        step = self.inverse[0][k] @ self.residuals / self.columns[1][k]
+        return float(step / np.sqrt(self.covariance[k, k]))
+
+    @property
+    def leaves_open(self) -> bool:
+        """Whether the positions do not tell friction from a constant force."""
+        return bool(self.inverse[1][-2:].all())
+
+    def explains_as_well(self, other: FittedModel) -> bool:
+        """Whether another model leaves less by no more than one number more would by chance, or than rounding."""
+        floor = self.count * (_ROUNDING * float(np.abs(self.model.measured).max())) ** 2
+        ratio = max(self.squares, floor) / max(other.squares, floor)
+        return self.count * np.log(ratio) < np.log(self.count)
 
     @cached_property
     def excess(self) -> float:
@@ -95,100 +123,93 @@ class FittedModel:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Of theta: exact slopes, the encoder's correlated errors, and what else spreads the residuals."""
-        columns, seen, sizes = self.columns
+        """Of theta: exact slopes, the encoder's correlated errors, and what else spreads the residuals; NaN if open."""
+        columns, sizes = self.columns
         # Not by the products of columns, which keep half of the digits.
-        inverse = np.linalg.pinv(columns)
+        inverse, blind = self.inverse
         triangle = inverse @ inverse.T
-        whole = np.zeros((self.theta.size, self.theta.size))
-        spread = triangle @ self.noise.spread(columns) @ triangle
-        whole[np.ix_(seen, seen)] = self.excess * spread / np.outer(sizes, sizes)
+        whole = self.excess * (triangle @ self.noise.spread(columns) @ triangle) / np.outer(sizes, sizes)
+        whole[blind], whole[:, blind] = np.nan, np.nan
         return whole
 
-    @cached_property
-    def inflation(self) -> float:
-        """How many times white noise's are the variances of the parts beyond mass, damping and delay; 1 or more."""
-        columns, seen, sizes = self.columns
-        white = np.ones(self.theta.size)
-        white[seen] = self.variance * np.sum(np.linalg.pinv(columns) ** 2, axis=1) / sizes**2
-        those = [self.model.find(name) for name in self.model.parts]
-        return max([1.0, *(np.diag(self.covariance) / white)[those].tolist()])
+
+def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: float) -> FittedModel:
+    """The device of the least squares, with a constant force and friction."""
+    model = Recordings(recordings, PARTS)
+    pushed = _choose(Recordings(recordings, PARTS[:1]), _start(recordings, longest), longest)
+    # The least friction that is looked for, behind a theta without.
+    pushed = np.append(pushed, LEAST * abs(pushed[0]) * find_largest(model))
+    both = _fit(model, _choose(model, _start_rubbing(model, pushed, longest), longest), longest, resolution)
+    # A mass that slides one way only and then rests: how much is of which stays open, and one of them is none.
+    rubbed = both.theta.copy()
+    rubbed[-2:] = 0.0, rubbed[-1] + abs(rubbed[-2])
+    for theta, none in ((rubbed, rubbed.size - 2), (pushed, rubbed.size - 1)):
+        simple = FittedModel(model, *_settle(model, theta, longest, (none,)), resolution)
+        if simple.leaves_open and simple.explains_as_well(both):
+            return simple
+    return both
 
 
-def fit_models(recordings: tuple[Recording, ...], longest: float, resolution: float) -> list[tuple[FittedModel, float]]:
-    """Every model with Schwarz's criterion less the least of all, that one first.
-
-    Where errors are alike from sample to sample, likelihoods count as many times less as these widen the error of what
-    is chosen (the c-hat of Burnham and Anderson 2002).
-    """
-    offset, friction = PARTS
-    pushed = _fit(Recordings(recordings, (offset,)), _start(recordings, longest), longest, resolution)
-    plainly = _fit(Recordings(recordings, ()), [pushed.theta[:-1]], longest, resolution)
-    found = [plainly, pushed]
-    starts = _start_rubbing(pushed)
-    if starts:
-        both = _fit(Recordings(recordings, (offset, friction)), starts, longest, resolution)
-        rubbed = _fit(Recordings(recordings, (friction,)), [np.delete(both.theta, -2)], longest, resolution)
-        found += [rubbed, both]
-    # What the positions do not tell apart from the rest is not asked for.
-    possible = [plainly, *(fitted for fitted in found[1:] if fitted.conditioned)]
-    count, floor = plainly.count, plainly.count * (_ROUNDING * float(np.abs(plainly.model.measured).max())) ** 2
-    inflation = possible[-1].inflation
-    criteria = [
-        count * np.log(max(fitted.squares, floor)) / inflation + fitted.theta.size * np.log(count)
-        for fitted in possible
-    ]
-    best = min(criteria)
-    ranked = sorted(zip(possible, criteria, strict=True), key=lambda pair: pair[1])
-    return [(fitted, float(criterion - best)) for fitted, criterion in ranked]
+def find_largest(model: Recordings) -> float:
+    """The largest force commanded."""
+    return max(float(np.abs(log.force).max()) for log in model.logs)
 
 
 def _start(recordings: tuple[Recording, ...], longest: float) -> list[np.ndarray]:
     """The best of a grid over damping and delay, where the rest is linear; by the beginnings of the logs."""
-    model = Recordings(tuple(log.begin(_BEGINNING) for log in recordings), PARTS[:1])
-    grid = [(delta, d) for delta in _DELTAS for d in np.arange(0.0, longest + 0.5 * _STEP, _STEP)]
-    starts: list[np.ndarray] = []
-    for theta, _ in sorted((model.project(*at) for at in grid), key=lambda found: found[1]):
-        if all(abs(theta[2] - other[2]) > 2 * _STEP or theta[1] != other[1] for other in starts):
-            starts.append(theta)
-    return starts[:_STARTS]
+    model = Recordings(tuple(log.begin(_GLIMPSE) for log in recordings), PARTS[:1])
+    grid = [(squares, delta, d) for delta in _DELTAS for d, squares in enumerate(model.try_delays(delta, longest))]
+    starts: list[tuple[float, int]] = []
+    for _, delta, d in sorted(grid):
+        if all(abs(d - other) > _APART or delta != of for of, other in starts):
+            starts.append((delta, d))
+    return [model.project(*start) for start in starts[:_STARTS]]
 
 
-def _start_rubbing(pushed: FittedModel) -> list[np.ndarray]:
-    """The best of some frictions and dampings, around what was found without friction."""
-    logs = pushed.model.logs
-    model = Recordings(tuple(log.begin(_BEGINNING) for log in logs), PARTS)
-    largest = max(float(np.abs(log.force).max()) for log in logs)
-    starts = []
+def _start_rubbing(model: Recordings, pushed: np.ndarray, longest: float) -> list[np.ndarray]:
+    """Next to no friction, and the best of ever more friction, each found from the one before."""
+    model = Recordings(tuple(log.begin(_BEGINNING) for log in model.logs), PARTS)
+    theta, largest = pushed, find_largest(model)
+    found = [(float(np.sum((model.measured - model.predict(theta)[0]) ** 2)), theta)]
     for share in _FRICTIONS:
-        for damping in _DAMPINGS:
-            theta = np.append(pushed.theta, pushed.theta[0] * largest * share)
-            theta[1] *= damping
-            scaled, squares = model.scale(theta)
-            if scaled[0] > 0 and scaled[-1] > 0:
-                starts.append((squares, scaled))
-    return [theta for _, theta in sorted(starts, key=lambda start: start[0])[:2]]
+        theta = theta.copy()
+        theta[-1] = abs(theta[0]) * largest * share
+        theta, squares, _ = _refine(model, theta, longest, (theta.size - 1,), _FOLLOWED)
+        found.append((squares, theta))
+    return [theta for _, theta in sorted(found, key=lambda start: start[0])[:_LEVELS]]
 
 
-def _fit(model: Recordings, starts: list[np.ndarray], longest: float, resolution: float) -> FittedModel:
-    """Least squares from several starts, by the beginnings of the logs first; neither damping nor delay is negative."""
-    start = starts[0]
-    if len(starts) > 1:
-        first = Recordings(tuple(log.begin(_BEGINNING) for log in model.logs), model.parts)
-        start = min((_refine(first, start, longest, ()) for start in starts), key=lambda found: found[1])[0]
-    best = _refine(model, start, longest, ())
+def _choose(model: Recordings, starts: list[np.ndarray], longest: float) -> np.ndarray:
+    """The start that leads to the least squares of the logs' beginnings, and where it leads to, nearly."""
+    first = Recordings(tuple(log.begin(_BEGINNING) for log in model.logs), model.parts)
+    found = (_refine(first, start, longest, (), arrived=_CLOSE) for start in starts)
+    return min(found, key=lambda found: found[1])[0]
+
+
+def _fit(model: Recordings, start: np.ndarray, longest: float, resolution: float) -> FittedModel:
+    """Least squares from a start, or at rest where that is as good."""
+    best = _settle(model, start, longest)
     still = _rest(model, *best[:2])
     if still is not None:
-        resting = _refine(model, still, longest, ())
+        resting = _settle(model, still, longest)
         # A start at rest needs one number less.
         count = model.measured.size
         if not best[2] or count * np.log(resting[1] / best[1]) < np.log(count):
             best = resting
-    held: tuple[int, ...] = ()
-    while any(best[0][k] < 0 for k in (1, 2)):
-        held = tuple(k for k in (1, 2) if k in held or best[0][k] < 0)
-        best = _refine(model, best[0], longest, held)
     return FittedModel(model, *best, resolution)
+
+
+def _settle(
+    model: Recordings, start: np.ndarray, longest: float, held: tuple[int, ...] = ()
+) -> tuple[np.ndarray, float, bool]:
+    """As `_refine`, with neither damping nor delay negative."""
+    best = _refine(model, start, longest, held)
+    while any(best[0][k] < 0 for k in (1, 2)):
+        negative = tuple(k for k in (1, 2) if best[0][k] < 0)
+        best[0][list(negative)] = 0.0
+        held = (*held, *negative)
+        best = _refine(model, best[0], longest, held)
+    return best
 
 
 def _rest(model: Recordings, theta: np.ndarray, squares: float) -> np.ndarray | None:
@@ -207,20 +228,28 @@ def _rest(model: Recordings, theta: np.ndarray, squares: float) -> np.ndarray | 
 
 
 def _refine(
-    model: Recordings, start: np.ndarray, longest: float, held: tuple[int, ...]
+    model: Recordings,
+    start: np.ndarray,
+    longest: float,
+    held: tuple[int, ...],
+    most: int = _STEPS,
+    arrived: float = _ARRIVED,
 ) -> tuple[np.ndarray, float, bool]:
-    """Levenberg and Marquardt's steps within bounds: theta, the sum of squares, and whether it is the least."""
+    """Levenberg and Marquardt's steps within bounds: theta, the sum of squares, and whether it is the least.
+
+    What is ``held`` stays as it starts.
+    """
     count = max(log.force.size for log in model.logs)
     low, high = np.full(start.size, -np.inf), np.full(start.size, np.inf)
     # A little beyond 0 the model goes on, so that an optimum at 0 is no corner.
     low[1], low[2], high[1], high[2] = -5.0 / count, -1.0, 50.0, longest
     if PARTS[1] in model.parts:
-        low[-1] = 0.0
-    low[list(held)] = high[list(held)] = 0.0
+        low[-1] = LEAST * abs(start[0]) * find_largest(model)
+    low[list(held)] = high[list(held)] = start[list(held)]
     theta, measured, damping = np.clip(start, low, high), model.measured, _EASY
     place, slopes = model.predict(theta)
     squares = float(np.sum((measured - place) ** 2))
-    for _ in range(_STEPS):
+    for _ in range(most):
         sizes = np.linalg.norm(slopes, axis=0)
         # Only what moves the positions moves, and nothing out of its bounds.
         fall = slopes.T @ (measured - place)
@@ -239,7 +268,7 @@ def _refine(
             trial_squares = float(np.sum((measured - trial_place) ** 2))
             if trial_squares < squares or damping > _STUBBORN:
                 break
-            if promised <= _ARRIVED * squares:
+            if promised <= arrived * squares:
                 return theta, squares, True
             damping = max(10.0 * damping, _EASY)
         if not trial_squares < squares:
@@ -247,6 +276,6 @@ def _refine(
             return theta, squares, promised <= _NEARLY * squares
         theta, place, slopes, squares, before = trial, trial_place, trial_slopes, trial_squares, squares
         damping = 0.0 if damping < _LIGHT else damping / 10.0
-        if before - squares <= _ARRIVED * before and promised <= _ARRIVED * before:
+        if before - squares <= arrived * before and promised <= arrived * before:
             return theta, squares, True
     return theta, squares, False

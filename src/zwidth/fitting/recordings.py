@@ -13,16 +13,16 @@ from zwidth.fitting.moving import Recording
 from zwidth.formatting import plain, with_unit
 from zwidth.parts.checks import check_number
 
-# How far a sample's time may lie from an even one, as a share of the period; how far periods of logs may differ.
-_UNEVEN, _SAME = 0.05, 1e-5
+# How far a sample's time may lie from an even one, as a share of the period, unasked and where a wavering clock is
+# asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.
+_UNEVEN, _WAVERING, _SAME = 0.05, 0.25, 1e-5
+_SURE = 5.0
 # Positions beyond the past forces.
 _FEWEST = 20
 # Samples that a stretch at one end lasts before it is suspected; a force of so many values varies, as a share.
 _STUCK, _MANY = 25, 0.1
 # A step of so many usual ones lacks a sample.
 _MISSING = 1.5
-# The longest step, in periods, over which positions are interpolated.
-_GAP = 2.5
 
 
 @dataclass(frozen=True)
@@ -42,8 +42,8 @@ class Log:
         return Recording(self.force, self.position[skip:], skip)
 
 
-def read_logs(time: Any, position: Any, force: Any, resample: bool = False) -> tuple[tuple[Log, ...], float]:
-    """The logs and their period."""
+def read_logs(time: Any, position: Any, force: Any, resample: bool = False) -> tuple[tuple[Log, ...], float, float]:
+    """The logs, their period, and its relative standard error."""
     several = isinstance(position, list | tuple) and len(position) > 0 and np.ndim(position[0]) == 1
     positions, forces = (position, force) if several else ([position], [force])
     times = time if several and isinstance(time, list | tuple) else [time] * len(positions)
@@ -52,20 +52,23 @@ def read_logs(time: Any, position: Any, force: Any, resample: bool = False) -> t
             f"time, position, force: got {len(times)}, {len(positions)} and {len(forces)} logs; give each log all three"
         )
     read = [_read(*parts, resample) for parts in zip(times, positions, forces, strict=True)]
-    periods = [period for _, period in read]
-    if np.ptp(periods) > _SAME * periods[0]:
+    periods = [period for _, period, _ in read]
+    error = max(error for *_, error in read)
+    if np.ptp(periods) > (_SAME + _SURE * error) * periods[0]:
         raise InputError(
             f"time: the logs have periods of {with_unit(min(periods), 's')} to {with_unit(max(periods), 's')}; fit "
             "them one by one"
         )
-    return tuple(log for log, _ in read), float(np.mean(periods))
+    return tuple(log for log, *_ in read), float(np.mean(periods)), error
 
 
-def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Log, float]:
+def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Log, float, float]:
     x, f = as_float64("position", position), as_float64("force", force)
     clock = None if isinstance(time, str) or np.ndim(time) == 0 else as_float64("time", time)
     given = {"position": x, "force": f} | ({} if clock is None else {"time": clock})
     shapes = {array.shape for array in given.values()}
+    if len(shapes) == 1 and x.shape == (1,):
+        raise InputError("got a single sample; a motion is fitted to many: record some seconds of it")
     if len(shapes) > 1 or x.ndim != 1 or x.size < 2:
         text = ", ".join(f"{name} {array.shape}" for name, array in given.items())
         raise InputError(f"shapes differ or are no single columns: {text}; give one number a sample in each")
@@ -73,62 +76,54 @@ def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Log, fl
         bad = np.flatnonzero(~np.isfinite(array))
         if bad.size:
             raise InputError(f"{name}: {bad.size} samples are no numbers, the first is sample {bad[0]}; leave them out")
-    if clock is not None and resample:
-        clock, x, f = _resample(clock, x, f)
-    period = check_number("time", time, "s", low_open=True) if clock is None else _period(clock)
+    if clock is None:
+        period, error = check_number("time", time, "s", low_open=True), 0.0
+    else:
+        period, error = _period(clock, resample)
     if np.ptp(f) == 0:
         raise InputError(
             f"force: it is {plain(f[0])} N all the time; command a force that changes, as steps to and fro"
         )
     if np.ptp(x) == 0:
         raise InputError("position: it never changes; check the column, and that nothing holds the device")
-    return Log(f, x), period
+    return Log(f, x), period, error
 
 
-def _refuse_backwards(clock: np.ndarray) -> None:
+def _period(clock: np.ndarray, wavering: bool) -> tuple[float, float]:
+    """The period of even samples whose times are read by a clock that wavers, and its standard error.
+
+    The line through all times: nothing between the samples is guessed, they are taken as they are.
+    """
     steps = np.diff(clock)
     if steps.min() <= 0:
         k = int(np.argmin(steps))
         raise InputError(f"time: it does not grow from sample {k} to {k + 1}; sort the samples, drop double ones")
-
-
-def _period(clock: np.ndarray) -> float:
-    """The mean step of even times."""
-    _refuse_backwards(clock)
-    steps = np.diff(clock)
-    period = float((clock[-1] - clock[0]) / (clock.size - 1))
-    late = clock - clock[0] - period * np.arange(clock.size)
+    count = np.arange(clock.size) - 0.5 * (clock.size - 1)
+    square = float(count @ count)
+    # Times to 12 digits have a period of as many.
+    period = float(f"{count @ clock / square:.12g}")
+    late = clock - clock.mean() - period * count
+    error = float(np.sqrt(late @ late / max(1, clock.size - 2) / square))
     # Against the middle of them, for the first sample may be the late one.
     late = late - 0.5 * (late.max() + late.min())
     worst = int(np.argmax(np.abs(late)))
-    if abs(late[worst]) > _UNEVEN * period:
+    if abs(late[worst]) > (_WAVERING if wavering else _UNEVEN) * period:
         k = int(np.argmax(steps))
+        if steps[k] > _MISSING * np.median(steps):
+            remedy = f"some are missing after sample {k}: give what lies before and behind a gap as two logs"
+        elif abs(late[worst]) > _WAVERING * period:
+            remedy = "which sample is whose cannot be told; record at even times"
+        else:
+            remedy = (
+                "record at even times; if only the clock that read them wavers, give the period in place of the times, "
+                "or ask to resample"
+            )
         raise InputError(
             f"time: samples are not even: steps from {with_unit(float(steps.min()), 's')} to "
             f"{with_unit(float(steps.max()), 's')}, sample {worst} {plain(100 * abs(late[worst]) / period, 2)} % of a "
-            "period off; "
-            + (
-                f"some are missing after sample {k}: give what lies before and behind a gap as two logs"
-                if steps[k] > _MISSING * np.median(steps)
-                else "record at even times, give the period in place of the times, or ask to resample"
-            )
+            f"period off; {remedy}"
         )
-    return period
-
-
-def _resample(clock: np.ndarray, x: np.ndarray, f: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """At even times of the median step: positions on straight lines, forces held."""
-    _refuse_backwards(clock)
-    steps = np.diff(clock)
-    period, longest = float(np.median(steps)), int(np.argmax(steps))
-    if steps[longest] > _GAP * period:
-        raise InputError(
-            f"time: a gap of {with_unit(float(steps[longest]), 's')} after sample {longest} cannot be made even; split "
-            "the log there, and give both"
-        )
-    even = clock[0] + period * np.arange(int((clock[-1] - clock[0]) / period * (1 + 1e-12)) + 1)
-    held = np.searchsorted(clock, even + 1e-9 * period, side="right") - 1
-    return even, np.interp(even, clock, x), f[held]
+    return period, error / period
 
 
 def find_stretches(log: Log) -> list[str]:

@@ -69,8 +69,8 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     usual = _SAMPLES if scene.is_rigid else _FILTERED_SAMPLES
     count = usual if samples is None else check_whole("samples", samples, 100, _MOST_SAMPLES)
     seed = check_whole("seed", seed, 0, 2**63 - 1)
-    if fit.status != Status.OK:
-        return SafeWall(np.nan, np.nan, np.nan, fit.status)
+    if fit.is_doubted:
+        return SafeWall(np.nan, np.nan, np.nan, fit.status if fit.status != Status.OK else int(Status.UNDECIDED))
     drawn = draw_devices(fit, count, seed)
     if drawn is None:
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))

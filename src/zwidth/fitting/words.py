@@ -31,6 +31,9 @@ _TROUBLES = {
 _ROTARY_NOTE = "# A rotary axis: kg stands for kg m^2 (inertia), N s/m for N m s/rad, N/m for N m/rad, N for N m."
 
 
+NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
+
+
 class AxisUnits(NamedTuple):
     """SI units of an axis."""
 
@@ -51,6 +54,7 @@ class AxisUnits(NamedTuple):
             "delay": "s",
             "cutoff": "Hz",
             "friction": self.force,
+            "offset": self.force,
             "stiffness_max": self.stiffness,
         }
         return with_unit(value, units[name], digits)
@@ -69,7 +73,10 @@ class WallChoice(NamedTuple):
 
 
 def choose_wall(fit: DeviceFit) -> WallChoice | None:
-    """What the study ``recommend`` sets, or what 99 % of the devices bear where that is less; None where none holds."""
+    """What the study ``recommend`` sets, or what 99 % of the devices bear where that is less.
+
+    None where none holds, and under a doubt, by `DeviceFit.safe_wall`.
+    """
     safe = fit.safe_wall()
     if safe.status != Status.OK or not safe.stiffness > 0:
         return None
@@ -105,6 +112,8 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if safe.status == Status.OK:
         bound = f"K = {units.spell('stiffness', safe.stiffness)}, B = {units.spell('damping', safe.virtual_damping)}"
         rows.append(("safe wall", f"{bound}: stable on 99 % of the devices that these records allow"))
+    if fit.is_doubted:
+        rows.append(("no wall", NO_WALL))
     if wall is not None:
         K, B = units.spell("stiffness", wall.stiffness), units.spell("damping", wall.virtual_damping)
         rows.append(("set", f"K = {K}, B = {B}: {wall.why}"))
@@ -160,27 +169,20 @@ def _count_digits(fit: DeviceFit, name: str) -> int:
 
 
 def _explain_parts(fit: DeviceFit, units: AxisUnits) -> Iterable[tuple[str, str]]:
-    """What was compared beside mass, damping and delay, and why it was kept or left out."""
-    found = {"friction": ("friction", fit.friction), "offset": ("constant force", fit.offset)}
-    tried = dict.fromkeys(part for model in fit.tried for part in model.parts)
-    if fit.tried and "friction" not in tried:
-        yield "friction", "none: no start of a fit with friction is better than the fit without"
-    for part in tried:
-        kept = part in fit.tried[0].parts
-        label, value = found.get(part, (part, 0.0))
-        others = [model.criterion for model in fit.tried if (part in model.parts) != kept]
-        worse = f"Schwarz's criterion is {plain(min(others), 3)} worse" if others else "nothing else was tried"
-        barred = part in fit.intervals
-        amount = (
-            _spell(fit, part, units) + f" ({_between(fit, part, units)})" if barred else units.spell("force", value)
-        )
-        yield label, f"{amount}: kept, without it {worse}" if kept else f"left out, with it {worse}"
+    """Friction and constant force of a log."""
+    for part, label in (("friction", "friction"), ("offset", "constant force")):
+        if part in fit.errors:
+            known = math.isfinite(fit.errors[part])
+            bar = _between(fit, part, units) if known else "open: this log does not tell friction from a constant force"
+            yield label, f"{_spell(fit, part, units)} ({bar})"
 
 
 def _write(fit: DeviceFit, name: str) -> str:
     """A value to a thousandth of its standard error: further digits differ from machine to machine."""
     value, error = getattr(fit, name), fit.errors[name]
-    digits = 4 + math.ceil(math.log10(abs(value) / error)) if error > 0 and value else 12
+    if not (error > 0 and value):
+        return repr(float(f"{value:.12g}"))
+    digits = 4 + math.floor(math.log10(abs(value))) - math.floor(math.log10(error))
     return repr(float(f"{value:.{min(max(digits, 4), 12)}g}"))
 
 
@@ -203,8 +205,11 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
         inside = ", ".join(f"{key}: {value}" for key, value in spelled.items() if value is not None)
         whence = "its cut-off fitted" if "cutoff" in fit.errors else "as given"
         lines.append(f"  velocity: {{kind: {kind}, {inside}}} # {whence}")
-    lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
-    if fit.friction:
+    if fit.is_doubted:
+        lines += [f"studies: [] # {NO_WALL}"]
+    else:
+        lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
+    if fit.friction and math.isfinite(fit.errors["friction"]):
         lines.append(
             f"# For studies of kind simulate: coulomb: {_write(fit, 'friction')} N, {_between(fit, 'friction', units)}."
         )

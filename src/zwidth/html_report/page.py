@@ -14,7 +14,7 @@ from typing import Any
 
 from zwidth.errors import StoreError
 from zwidth.files.whole import write_whole
-from zwidth.runs.record import CONFIG_FILE, Record
+from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.store import SUFFIX, open_dataset
 
 FILE = "report.html"
@@ -51,7 +51,7 @@ def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | N
         The file.
 
     Raises:
-        StoreError: the folder holds no run, or nothing of it is done.
+        StoreError: the folder holds no run, nothing of it is done, or something of it is damaged or missing.
 
     References:
         West, Barth, Veditz 2016, Content Security Policy Level 2 (W3C).
@@ -70,11 +70,26 @@ def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | N
     if not record.exists:
         raise StoreError(f"{where}: holds no run (no run.json); name the folder that zwidth run has written")
     done = [entry for entry in record.content["studies"] if entry.get("state") == "done"]
-    if not done:
+    if not done and not record.damaged:
         raise StoreError(f"{where}: no study of the run is done; go on with it by zwidth run CONFIG --resume")
+    _check(record, done)
     target = where / FILE if out is None else Path(os.fsdecode(out))
     write_whole(target, _page(where, record.content, done).encode())
     return target
+
+
+def _check(record: Record, done: list[dict[str, Any]]) -> None:
+    """Refuse files that are not what the run has written; stores are checked where they are read."""
+    faults = [f"{RUN_FILE} is damaged"] if record.damaged else []
+    for entry in () if record.damaged else done:
+        faults += record.faults(entry["name"])
+        stores = [file for file in entry["files"] if file.endswith(SUFFIX)]
+        faults += [f"{store} is missing" for store in stores if not (record.folder / store).is_dir()]
+    config, own = record.folder / CONFIG_FILE, record.content.get("config_file") == CONFIG_FILE
+    if own and not record.damaged and file_hash(config) != record.content["config_sha256"]:
+        faults.append(f"{CONFIG_FILE} is {'damaged' if config.exists() else 'missing'}")
+    if faults:
+        raise StoreError(f"{record.folder}: {', '.join(faults)}; 'zwidth run CONFIG --resume' makes it again")
 
 
 def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> str:
@@ -116,8 +131,11 @@ def _section(where: Path, entry: dict[str, Any]) -> str:
 def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
     """Figures, slices and tables of a study."""
     for file in sorted(entry.get("files", {})):
-        path = where / Path(file).name
-        if file.endswith(".svg") and path.is_file():
+        # The record holds plain names; what a link leads to may be anybody's.
+        path = where / file
+        if path.is_symlink():
+            yield f'<p class="soft">{escape(file)} is a link, and not shown.</p>'
+        elif file.endswith(".svg") and path.is_file():
             data = base64.b64encode(path.read_bytes()).decode()
             text = f"Figure {Path(file).stem} of the study {entry['name']}"
             yield (
@@ -127,10 +145,12 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
         elif file == "published.json" and path.is_file():
             yield _published(json.loads(path.read_text(encoding="utf-8")))
     store = where / f"{entry['name']}{SUFFIX}"
-    if store.is_dir():
+    if store.is_dir() and not store.is_symlink():
         from zwidth.html_report.slices import find_slices
 
         with open_dataset(store) as data:
+            if not data.attrs["complete"]:
+                raise StoreError(f"{store}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
             yield from find_slices(data)
 
 
@@ -152,13 +172,14 @@ def _reproduce(where: Path, content: dict[str, Any]) -> str:
         for name, version in content["versions"].items()
     )
     path = where / CONFIG_FILE
-    text = path.read_text(encoding="utf-8") if path.is_file() else ""
+    text = path.read_text(encoding="utf-8") if path.is_file() and not path.is_symlink() else ""
+    beside = f" Beside it goes the folder <code>{INPUTS}</code> of the run." if content.get("inputs") else ""
     config = f'<h3>Configuration</h3><pre tabindex="0">{escape(text)}</pre>' if text else ""
     digest = escape(str(content.get("config_sha256", "")))
     return (
         '<section><h2 id="again">How to compute it again</h2>'
         "<p>Save the configuration below as <code>config.yaml</code>, install these versions, and run "
-        "<code>zwidth run config.yaml</code>. The same versions give the same numbers.</p>"
+        f"<code>zwidth run config.yaml</code>.{beside} The same versions give the same numbers.</p>"
         f'<p class="soft">SHA-256 of the configuration: {digest}</p>'
         + _scrolling("Versions", f"<tbody>{versions}</tbody>")
         + f"{config}</section>"

@@ -3,7 +3,7 @@
 (() => {
   const VIRIDIS = ["440154", "482878", "3e4a89", "31688e", "26828e", "1f9e89", "35b779", "6dcd59", "b4de2c", "fde725"]
     .map((hex) => [0, 2, 4].map((k) => parseInt(hex.slice(k, k + 2), 16)));
-  const spell = (value) => Number(value.toPrecision(5)).toString();
+  const spell = (value) => typeof value === "string" ? value : Number(value.toPrecision(5)).toString();
 
   function color(share) {
     const place = Math.min(Math.max(share, 0), 1) * (VIRIDIS.length - 1), k = Math.min(Math.floor(place), VIRIDIS.length - 2);

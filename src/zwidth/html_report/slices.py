@@ -81,7 +81,9 @@ def _spread(size: int, most: int) -> np.ndarray:
 
 def _axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:
     along = values[dim]
-    return {"name": _words(dim), "unit": _unit(along), "values": np.asarray(along.values, float).tolist()}
+    labels = along.dtype.kind not in "biuf"
+    steps = [str(label) for label in along.values] if labels else np.asarray(along.values, float).tolist()
+    return {"name": _words(dim), "unit": "" if labels else _unit(along), "values": steps}
 
 
 def _unit(values: xarray.DataArray) -> str:

@@ -1,4 +1,4 @@
-"""What a scene answers beside its verdicts, in SI units: poles, state space, frequency response."""
+"""What a scene answers of its walls, in SI units: labels, poles, margins, passivity, state space, responses."""
 
 from __future__ import annotations
 
@@ -11,14 +11,18 @@ from zwidth.batching import as_float64
 from zwidth.errors import InputError, check_choice
 from zwidth.linear import state_space
 from zwidth.linear.chain import Chain
+from zwidth.linear.columns import stable_dampings
 from zwidth.linear.delay_margin import linear_margins
 from zwidth.linear.margins import answer
 from zwidth.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
+from zwidth.linear.pieces import Island
 from zwidth.linear.poles import all_poles, log_size
 from zwidth.linear.radius import spectral_radius as linear_radius
-from zwidth.linear.rows import label_walls
+from zwidth.linear.rows import label_walls, stable_intervals
+from zwidth.linear.stiffest import list_islands
 from zwidth.linear_loop import LinearLoop, circle
-from zwidth.stability.labels import STABILITY_METHODS, Stability, StabilityMethod, decide_stability
+from zwidth.parts.wall import resolve_wall
+from zwidth.stability.labels import STABILITY_METHODS, Stability, StabilityMethod, decide_stability, is_stable
 from zwidth.stability.margins import Margins, margins
 from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.poles import poles
@@ -102,9 +106,12 @@ def _in_si(chain: Chain, loop: state_space.Matrices, period: float, mass: float,
 
 
 class SceneAnswers:
-    """The questions of `zwidth.Scene` that go beyond verdicts; of the scene they need its parts, loop and boundary."""
+    """The questions of `zwidth.Scene` about walls; of the scene they need its parts, loop and boundary.
 
-    def poles(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> np.ndarray:
+    Without a stiffness and a damping each means the scene's own wall (`zwidth.parts.wall.resolve_wall`).
+    """
+
+    def poles(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> np.ndarray:
         """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
 
         Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
@@ -115,12 +122,16 @@ class SceneAnswers:
             return poles(alpha, beta, self.delta, self.d)
         return 1.0 + all_poles(self.loop, alpha, beta)
 
-    def pole_table(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> PoleTable:
+    def pole_table(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> PoleTable:
         """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         return tabulate_poles(self.loop, alpha, beta, self.timing.period)
 
-    def spectral_radius(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+    def spectral_radius(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> Array:
         """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
 
         From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
@@ -132,7 +143,29 @@ class SceneAnswers:
         found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
         return found.reshape(alpha.shape)[()]
 
-    def state_space(self: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> StateSpace:
+    def islands(self: Any, *, negative_damping: bool | None = None) -> list[Island]:
+        """The islands: pieces of the stable set that no path of stable walls leads to from soft ones.
+
+        A wall on an island is stable, but as its stiffness falls it becomes unstable before it is soft, whatever B does
+        meanwhile. It does not count for `max_stiffness`.
+
+        Args:
+            negative_damping: as for `max_stiffness`; False leaves out islands that lie in B <= 0.
+
+        Returns:
+            A list, the stiffest first; ``stiffness`` in N/m and ``virtual_damping`` in N s/m are pairs, the least and
+            the largest of the island. Empty for a rigid scene, whose stable walls are one piece.
+
+        Example:
+            >>> import zwidth
+            >>> timing, window = zwidth.Timing(period=1e-3, delay=1e-3), zwidth.WindowedDifference(samples=24)
+            >>> (island,) = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=window).islands()
+            >>> print("{:.0f} to {:.0f} N/m".format(*island.stiffness))
+            7537 to 9037 N/m
+        """
+        return list_islands(self, negative_damping)
+
+    def state_space(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
         """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
 
         Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
@@ -140,21 +173,93 @@ class SceneAnswers:
         wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
         return closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
 
-    def open_loop(self: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> StateSpace:
+    def open_loop(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
         """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
         wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
         return open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
 
-    def frequency_response(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike, frequency: ArrayLike) -> Array:
+    def frequency_response(
+        self: Any,
+        stiffness: ArrayLike | None = None,
+        virtual_damping: ArrayLike | None = None,
+        frequency: ArrayLike | None = None,
+    ) -> Array:
         """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
 
         All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
         """
+        if frequency is None:
+            raise InputError("frequency: none is given; give frequencies in Hz, up to half the sampling rate")
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         return respond(self.loop, alpha, beta, frequency, self.timing.period)
 
+    def is_stable(
+        self: Any,
+        stiffness: ArrayLike | None = None,
+        virtual_damping: ArrayLike | None = None,
+        *,
+        method: StabilityMethod = "auto",
+    ) -> Array:
+        """Whether walls are stable: every pole strictly inside the unit circle.
+
+        Args:
+            stiffness: K in N/m.
+            virtual_damping: B in N s/m. Both broadcast; neither means the scene's own wall.
+            method: as for `decide_stability`, which has the statuses as well.
+
+        Returns:
+            Boolean array of the broadcast shape, False for what is NaN.
+
+        Raises:
+            InputError: it is not said which wall is meant. K alone, with B = 0, is meant where the scene has no wall.
+
+        Numerics:
+            Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
+            row (`zwidth.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
+            costs some microseconds and a stiffness next to nothing.
+        """
+        if method != "auto":
+            return self.decide_stability(stiffness, virtual_damping, method=method).stable
+        alpha, beta = self.normalize_walls(stiffness, virtual_damping)
+        if self.is_rigid:
+            return is_stable(alpha, beta, self.delta, self.d)
+        return label_walls(self.traced_boundary, alpha, beta)[()]
+
+    def stable_stiffness(self: Any, virtual_damping: ArrayLike | None = None) -> np.ndarray:
+        """The stable intervals of the stiffness at a damping, several where there are several.
+
+        Args:
+            virtual_damping: B in N s/m, a number or an array; that of the scene's own wall where left out, 0 without.
+
+        Returns:
+            Array (n, 2) in N/m, or with the shape of the damping in front and NaN where a row has fewer intervals. The
+            ends are not stable themselves.
+        """
+        damping = self.wall.virtual_damping if virtual_damping is None else virtual_damping
+        beta = as_float64("virtual_damping", damping) / self.units.virtual_damping
+        found = stable_intervals(self.traced_boundary, beta.reshape(-1))
+        both = np.stack(found, -1) * self.units.stiffness
+        return both.reshape(*beta.shape, *both.shape[1:])
+
+    def stable_damping(self: Any, stiffness: float | None = None) -> np.ndarray:
+        """The stable intervals of the virtual damping at one stiffness, several where there are several.
+
+        Args:
+            stiffness: K in N/m; that of the scene's own wall where left out.
+
+        Returns:
+            Array (n, 2) in N s/m. The ends are not stable themselves.
+        """
+        stiffness = resolve_wall(self.wall, None, None)[0] if stiffness is None else stiffness
+        alpha, _ = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, 0.0)))
+        return stable_dampings(self.traced_boundary, alpha) * self.units.virtual_damping
+
     def decide_stability(
-        self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0, *, method: StabilityMethod = "auto"
+        self: Any,
+        stiffness: ArrayLike | None = None,
+        virtual_damping: ArrayLike | None = None,
+        *,
+        method: StabilityMethod = "auto",
     ) -> Stability:
         """Labels of walls with a status and what decided each, as `zwidth.decide_stability` has them.
 
@@ -170,8 +275,8 @@ class SceneAnswers:
         if method == "certified":
             from zwidth.linear.certified import decide_walls
 
-            walls = np.broadcast_arrays(np.asarray(stiffness, float), np.asarray(virtual_damping, float))
-            stable, status = decide_walls(self, *walls)
+            walls = [np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping)]
+            stable, status = decide_walls(self, *np.broadcast_arrays(*walls))
             used = Method.CERTIFIED
         elif method == "companion":
             with np.errstate(invalid="ignore"):
@@ -180,7 +285,9 @@ class SceneAnswers:
             stable, used = label_walls(self.traced_boundary, alpha, beta), Method.CROSSOVER
         return Stability(stable[()], status[()], np.full(alpha.shape, used, np.int32)[()])
 
-    def passivity_margin(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+    def passivity_margin(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> Array:
         """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is not finite.
 
         Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
@@ -190,17 +297,16 @@ class SceneAnswers:
         """
         check_has_condition(self.device)
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        delta = self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
         if self.is_rigid:
-            return passivity_margin(alpha, beta, delta, self.d) * self.units.virtual_damping
+            return passivity_margin(alpha, beta, self.own_delta, self.d) * self.units.virtual_damping
         condition = PassivityCondition.derive(self.chain.estimate, self.d)
-        return (passivity_margins(condition, alpha, beta, delta) * self.units.virtual_damping)[()]
+        return (passivity_margins(condition, alpha, beta, self.own_delta) * self.units.virtual_damping)[()]
 
-    def is_passive(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Array:
+    def is_passive(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> Array:
         """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
         return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
 
-    def margins(self: Any, stiffness: ArrayLike, virtual_damping: ArrayLike = 0.0) -> Margins:
+    def margins(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> Margins:
         """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
 
         Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
@@ -226,21 +332,21 @@ class SceneAnswers:
         )
 
 
-def to_control(scene: Any, stiffness: float = 0.0, virtual_damping: float = 0.0) -> control.StateSpace:
+def to_control(scene: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> control.StateSpace:
     """Return the closed loop of a scene and a wall as a model of python-control.
 
     From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.
 
     Args:
         scene: a `zwidth.Scene`.
-        stiffness: K of the wall in N/m, one number.
+        stiffness: K of the wall in N/m, one number; the scene's own wall where neither is given.
         virtual_damping: B of the wall in N s/m, one number.
 
     Returns:
         control.StateSpace with ``dt`` the sampling period; states in m, m/s and N.
 
     Raises:
-        InputError: python-control is not installed.
+        InputError: python-control is not installed; it is not said which wall is meant.
 
     References:
         Fuller, Greiner, Moore, Murray, van Paassen, Yorke 2021 (python-control).
@@ -260,6 +366,9 @@ def to_control(scene: Any, stiffness: float = 0.0, virtual_damping: float = 0.0)
 
 def one_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
     """The numbers of a single wall."""
-    if alpha.size != 1 or not (np.isfinite(alpha).all() and np.isfinite(beta).all()):
+    if alpha.size != 1:
         raise InputError(f"stiffness, virtual_damping: got shape {alpha.shape}; one wall of finite numbers is needed")
+    for name, value in (("stiffness", alpha), ("virtual_damping", beta)):
+        if not np.isfinite(value).all():
+            raise InputError(f"{name}: got {value.item():g}; a finite number is needed")
     return float(alpha.reshape(())), float(beta.reshape(()))

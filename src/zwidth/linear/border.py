@@ -12,6 +12,7 @@ import numpy as np
 from zwidth.linear.boundary import Boundary
 from zwidth.linear.crossing_lines import CrossingLine
 from zwidth.linear.curve import curve_at, zeros_of
+from zwidth.linear.pieces import Island, StablePieces
 from zwidth.linear_loop import circle
 from zwidth.numerics.roots import false_position
 
@@ -26,6 +27,8 @@ _SHARES = np.arange(1, 32) / 32.0
 _LINE_POINTS, _BEYOND = 257, 0.05
 # Lines whose slopes differ by less, as a share, do not meet.
 _PARALLEL = 1e-12
+# Dampings of corners that differ by less, as a share, are one.
+_SAME = 1e-12
 
 
 class Edge(NamedTuple):
@@ -89,7 +92,7 @@ class Border:
         """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
         b = self.boundary
         inside, outside = _narrow(b.borders, inside, outside, 1)
-        own = int(np.searchsorted([arc.first for arc in b.arcs], inside, side="right")) - 1
+        own = int(b.arc_at(np.array(inside)))
 
         def gaps(w: np.ndarray) -> np.ndarray:
             here = curve_at(b.loop, w)
@@ -115,6 +118,45 @@ class Border:
             if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
                 return w
         return _narrow(b.borders, inside, outside, _ROUNDS)[0]
+
+    @cached_property
+    def pieces(self) -> StablePieces:
+        """The pieces that these edges enclose; what counts as soft is decided where edges pass alpha = 0."""
+        b = self.boundary
+        turns = np.array([(arc.first, arc.beta[np.argmin(arc.w)]) for arc in b.arcs]).reshape(-1, 2)
+        found = [np.array([beta for _, beta, _ in self.line_meetings()])]
+        for edge in self.curved:
+            found.append(edge.beta[[0, -1]])
+            found.append(turns[(turns[:, 0] > edge.w[0]) & (turns[:, 0] < edge.w[-1]), 1])
+            k = np.flatnonzero((edge.alpha[1:] > 0) != (edge.alpha[:-1] > 0))
+            found.append(edge.beta[k])
+        corners = np.unique(np.concatenate(found))
+        zeros = np.array([line.q / line.f for line in b.lines if line.f != 0.0])
+        within = zeros[(zeros > corners.min(initial=np.inf)) & (zeros < corners.max(initial=-np.inf))]
+        corners = np.union1d(corners[np.isfinite(corners)], within)
+        apart = np.diff(corners, prepend=-np.inf) > _SAME * np.abs(corners)
+        return StablePieces(b, corners[apart])
+
+    def piece_of(self, edge: Edge) -> int:
+        """The piece that an edge borders, -1 where rows do not see it."""
+        b, k = self.boundary, edge.w.size // 2
+        if edge.line >= 0:
+            return self.pieces.piece_at(float(edge.beta.mean()), len(b.arcs) + edge.line)
+        return self.pieces.piece_at(float(edge.beta[k]), int(b.arc_at(edge.w[k])))
+
+    def islands(self, least: float) -> list[Island]:
+        """The pieces without soft walls, with walls of alpha > 0 and beta > ``least``, the stiffest first."""
+        extents = self.pieces.extents()
+        for edge in (*self.curved, *self.straight) if extents else ():
+            piece = self.piece_of(edge)
+            if piece in extents:
+                walls = np.stack([edge.alpha, edge.beta])
+                low, high = extents[piece]
+                extents[piece] = np.minimum(low, walls.min(1)), np.maximum(high, walls.max(1))
+        ends = [np.stack(extent, 1) for extent in extents.values()]
+        found = [Island(*(tuple(pair.tolist()) for pair in both)) for both in ends]
+        found = [one for one in found if one.stiffness[1] > 0 and one.virtual_damping[1] > least]
+        return sorted(found, key=lambda one: -one.stiffness[1])
 
     @cached_property
     def straight(self) -> list[Edge]:
@@ -198,11 +240,12 @@ def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:
 
 
 class Outline(NamedTuple):
-    """One closed outline of the stable set; a hole where unstable walls lie inside."""
+    """One closed outline of the stable set; a hole where unstable walls lie inside, an island where no soft ones do."""
 
     stiffness: np.ndarray
     virtual_damping: np.ndarray
     hole: bool
+    island: bool  # of a piece without soft walls
 
     @property
     def area(self) -> float:
@@ -218,9 +261,10 @@ def outlines(border: Border) -> list[Outline]:
         return []
     scale = np.array([max(np.ptp(np.concatenate([e[k] for e in edges])), 1e-300) for k in (1, 2)])
     paths = [np.stack([e.alpha, e.beta], -1) for e in edges]
+    main = [border.pieces.is_main(border.piece_of(edge)) for edge in edges]
     loops = []
     while paths:
-        path = paths.pop()
+        path, soft = paths.pop(), main.pop()
         while True:
             gaps = [
                 (float(np.abs((path[-1] - other[end]) / scale).max()), k, end)
@@ -233,10 +277,10 @@ def outlines(border: Border) -> list[Outline]:
             gap, k, end = min(gaps)
             if gap > 1e-3:
                 break
-            other = paths.pop(k)
+            other, soft = paths.pop(k), soft | main.pop(k)
             path = np.concatenate([path, (other if end == 0 else other[::-1])[1:]])
-        loops.append(path)
-    found = [Outline(path[:, 0], path[:, 1], False) for path in loops]
+        loops.append((path, soft))
+    found = [Outline(path[:, 0], path[:, 1], False, not soft) for path, soft in loops]
     found.sort(key=lambda outline: -outline.area)
     return [o._replace(hole=_inside(found, k) % 2 == 1) for k, o in enumerate(found)]
 

@@ -53,7 +53,7 @@ class Boundary:
         """Lay out the curve."""
         w = nodes_of(loop)
         here = curve_at(loop, w)
-        w = np.unique(np.concatenate([w, find_dips(w, here)]))
+        w = np.unique(np.concatenate([w, find_dips(w, here.turn)]))
         here = curve_at(loop, w)
         vertical = zeros_of(loop, w, here.fall, "fall")
         touched = [p for p in circle_zeros(loop) if np.all(np.abs(vertical - p) > 1e-7)]
@@ -85,6 +85,10 @@ class Boundary:
             out.w[:, place] = line.w
             out.leaving[:, place] = line.leaving(beta)
         return out
+
+    def arc_at(self, w: np.ndarray) -> np.ndarray:
+        """The arc that an angle lies on."""
+        return np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
 
     @property
     def _fixed(self) -> list[float]:
@@ -159,7 +163,7 @@ class Boundary:
     def borders(self, w: np.ndarray) -> np.ndarray:
         """Whether the stable set lies on one side of the curve at each angle (V18)."""
         here = curve_at(self.loop, w)
-        own = np.searchsorted([arc.first for arc in self.arcs], w, side="right") - 1
+        own = self.arc_at(w)
         # By the arc: next to z = -1 the slope at one angle may be rounding.
         leaves = np.array([arc.leaving for arc in self.arcs])[own] > 0
         finite = np.isfinite(here.alpha) & np.isfinite(here.beta)

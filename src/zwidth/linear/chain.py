@@ -141,7 +141,7 @@ def _position(body: int, sensor: int) -> list[tuple[int, float]]:
     return [(0, 1.0), *between]
 
 
-def _flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
+def flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
     """``e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
     phi1 = _matrix_phi1(rate * time)
     # e^A - 1 = A phi1(A) keeps the digits of slow motions.
@@ -152,16 +152,16 @@ def _matrix_phi1(rate: Any) -> Any:
     """``phi1(A) = 1 + A/2! + A^2/3! + ...``."""
     if namespace(rate) is not np:
         return _traced_phi1(rate)
-    return _known_phi1(rate.tobytes(), len(rate))
+    return _known_phi1(rate.tobytes(), len(rate), rate.dtype.char)
 
 
 @lru_cache(maxsize=64)
-def _known_phi1(rate: bytes, size: int) -> np.ndarray:
+def _known_phi1(rate: bytes, size: int, kind: str) -> np.ndarray:
     """Kept, for the same chain is asked at many delays and its motion over a whole period hangs on none of them."""
     from scipy.linalg import expm
 
     # The exponential of [[A, 1], [0, 0]] holds it.
-    top = np.concatenate([np.frombuffer(rate).reshape(size, size), np.eye(size)], axis=1)
+    top = np.concatenate([np.frombuffer(rate, kind).reshape(size, size), np.eye(size)], axis=1)
     return expm(np.concatenate([top, np.zeros((size, 2 * size))], axis=0))[:size, size:]
 
 
@@ -206,9 +206,9 @@ def respond(chain: Chain) -> Sampled | Plant:
 def sampled(chain: Chain) -> Sampled:
     """Discretize exactly."""
     rate, push = rates(chain)
-    psi, full = _flow(rate, push, 1.0)
+    psi, full = flow(rate, push, 1.0)
     fraction = chain.d - chain.whole
-    late = None if _is_zero(fraction) else _flow(rate, push, 1.0 - fraction)[1]
+    late = None if _is_zero(fraction) else flow(rate, push, 1.0 - fraction)[1]
     return Sampled(psi, full, late)
 
 

@@ -2,32 +2,51 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 
 from zwidth.linear.boundary import Boundary
-from zwidth.linear.curve import curve_at, zeros_of
+from zwidth.linear.curve import curve_at, find_dips, zeros_of
 from zwidth.linear.rows import label_walls
+from zwidth.numerics.roots import bisect, newton
 
-# Halvings of a step between two nodes: to the last digit of its angle.
-_HALVINGS = 60
-# How near to the column a point of the curve is on it, of what its alpha is a difference of.
-_MEETS = 1e-6
+# How near to an angle where the curve has no point of its own it is looked at, as a share of the way to a node.
+_PROBE = 1e-6
+_MOST_STEPS = 120
+# How far beside an end, as a share of it, walls must have the labels of the intervals that it parts: their rounding is
+# that of a row, which may cross where a column hardly moves.
+_BESIDE = 1e-7
 
 
 def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     """Where a column is stable: array (intervals, 2) of beta, ascending.
 
     Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
-    nodes once its extremes are among them; the walls between two such dampings share the label of one of them.
+    nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
+    whose own neighbors contradict that is sought by labels alone.
     """
     met = np.unique(np.concatenate([_on_curve(boundary, alpha), _on_lines(boundary, alpha)]))
     met = met[np.isfinite(met)]
     if not np.isfinite(alpha) or not met.size:
         return np.zeros((0, 2))
+
+    def label(beta: np.ndarray) -> np.ndarray:
+        return label_walls(boundary, np.full(beta.size, alpha), beta)
+
     reach = np.ptp(met) + np.abs(met).max() + 1.0
-    ends = np.concatenate([[-np.inf], met, [np.inf]])
     between = 0.5 * (np.concatenate([[met[0] - reach], met]) + np.concatenate([met, [met[-1] + reach]]))
-    stable = label_walls(boundary, np.full(between.size, alpha), between)
+    stable = label(between)
+    k = np.flatnonzero(stable[1:] != stable[:-1])
+    room = np.minimum(met[k] - between[k], between[k + 1] - met[k])
+    beside = np.minimum(_BESIDE * np.abs(met[k]), 0.5 * room)
+    wrong = (label(met[k] - beside) != stable[k]) | (label(met[k] + beside) != stable[k + 1])
+    k, low, high = k[wrong], between[:-1][k[wrong]], between[1:][k[wrong]]
+    # Twice: the last digit of a long way is not that of an end near 0.
+    for _ in range(2 if k.size else 0):
+        met[k] = bisect(lambda beta: label(beta) == stable[k], low, high)
+        low, high = met[k] - 1e-12 * (high - low), met[k] + 1e-12 * (high - low)
+    ends = np.concatenate([[-np.inf], met, [np.inf]])
     return np.stack([ends[:-1][stable], ends[1:][stable]], -1)
 
 
@@ -37,24 +56,28 @@ def _on_lines(boundary: Boundary, alpha: float) -> np.ndarray:
 
 def _on_curve(boundary: Boundary, alpha: float) -> np.ndarray:
     loop = boundary.loop
-    tops = zeros_of(loop, boundary.w, curve_at(loop, boundary.w).alpha_slope, "alpha_slope")
-    lows, highs, rising = [], [], []
-    for arc in boundary.arcs:
-        order = np.argsort(arc.w)
-        w, height = arc.w[order], arc.alpha[order]
-        inside = tops[(tops > w[0]) & (tops < w[-1])]
-        w, height = np.append(w, inside), np.append(height, curve_at(loop, inside).alpha if inside.size else inside)
-        order = np.argsort(w, kind="stable")
-        w, above = w[order], height[order] > alpha
-        k = np.flatnonzero(above[1:] != above[:-1])
-        lows.append(w[k])
-        highs.append(w[k + 1])
-        rising.append(above[k + 1])
-    low, high, up = (np.concatenate(parts) for parts in (lows, highs, rising))
-    for _ in range(_HALVINGS if low.size else 0):
-        middle = 0.5 * (low + high)
-        beyond = (curve_at(loop, middle).alpha > alpha) == up
-        low, high = np.where(beyond, low, middle), np.where(beyond, middle, high)
-    found = curve_at(loop, 0.5 * (low + high))
-    # Where the curve jumps through infinity it does not meet the column.
-    return found.beta[np.abs(found.alpha - alpha) <= _MEETS * (found.size + abs(alpha))]
+    # Where the curve has no point of its own: it meets a line there, or runs to infinity in stiffness or damping.
+    limits = dict.fromkeys([0.0, np.pi, *boundary.infinite.tolist()], np.nan)
+    limits |= {line.w: line.q - line.meeting * line.f for line in boundary.lines}
+    slope = curve_at(loop, boundary.w).alpha_slope
+    tops = zeros_of(loop, boundary.w, slope, "alpha_slope")
+    nodes = np.unique(np.concatenate([boundary.w, tops, find_dips(boundary.w, slope)]))
+    pieces, heights = [], []
+    for a, b in pairwise(sorted(limits)):
+        inner = nodes[(nodes > a) & (nodes < b)]
+        inner = inner if inner.size else np.array([0.5 * (a + b)])
+        # Towards an end at infinity the curve is looked at no further than this.
+        probes = a + _PROBE * (inner[0] - a), b - _PROBE * (b - inner[-1])
+        inner = np.concatenate([probes[:1], inner, probes[1:]])
+        pieces.append(np.concatenate([[a], inner, [b]]))
+        heights.append(np.concatenate([[limits[a]], curve_at(loop, inner).alpha, [limits[b]]]))
+    w, above = np.concatenate(pieces), np.concatenate(heights) - alpha
+    k = np.flatnonzero(np.isfinite(above[1:] + above[:-1]) & ((above[1:] > 0) != (above[:-1] > 0)))
+    sign = np.where(above[k + 1] > 0, 1.0, -1.0)
+
+    def rise(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        curve = curve_at(loop, at)
+        return sign * (curve.alpha - alpha), sign * curve.alpha_slope
+
+    with np.errstate(all="ignore"):
+        return curve_at(loop, newton(rise, w[k], w[k + 1], 0.5 * (w[k] + w[k + 1]), _MOST_STEPS)[0]).beta

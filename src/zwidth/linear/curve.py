@@ -81,13 +81,12 @@ def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) ->
         )
 
 
-def find_dips(w: np.ndarray, here: CurvePoints) -> np.ndarray:
-    """Nodes to add where d beta/dw keeps its sign from one node to the next but may not do so between them.
+def find_dips(w: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Nodes to add where a slope of the curve keeps its sign from one node to the next but may not do so between them.
 
     The curve changes so little over a step that the slope is nearly a parabola there; where an end's tangent leads
     below a tenth of it, the step is looked at in eighths.
     """
-    values = here.turn
     same = (values[:-1] > 0) == (values[1:] > 0)
     step = np.diff(w)
     # Slopes at the nodes by differences of the three around them.

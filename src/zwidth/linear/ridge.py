@@ -17,14 +17,14 @@ import numpy as np
 
 from zwidth.linear.border import Border
 from zwidth.linear.boundary import Boundary
-from zwidth.linear.rows import stable_intervals
+from zwidth.linear.rows import bound_intervals
 from zwidth.linear_loop import LinearLoop, circle
 from zwidth.stability.ridge import RidgeKind
 
 # Newton steps on a corner at most; the residual, as a share of |q|, at which it holds; how far it may move a start.
 _MOST_STEPS, _HOLDS, _NEAR = 12, 1e-11, 1e-5
-# Rows of which none may hold a stiffer wall, and by what share rounding may make one.
-_ROWS, _ABOVE = 65, 1e-7
+# By what share rounding may make a row's wall stiffer.
+_ABOVE = 1e-7
 # Rows next to a top, as shares of the plane, that must reach nearly as high; and how many tops are looked at.
 _BESIDE, _NEARLY = np.array([0.0, 1e-3, -1e-3, 1e-5, -1e-5, 1e-7, -1e-7]), 0.99
 _MOST_TOPS = 32
@@ -72,38 +72,53 @@ def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
     """
     least = -np.inf if negative_damping else 0.0
     tops = _tops(border, least) if border.curved else []
-    for alpha, beta, w, inner in tops[:_MOST_TOPS]:
+    for top in tops[:_MOST_TOPS]:
         # Where the curve runs to infinity rounding may take a part of it for an edge; rows do not see it.
-        if _reach(border, beta, least) < _NEARLY * alpha:
+        if not border.pieces.is_main(border.pieces.piece_at(top.beta, top.place)) or not _is_reached(
+            border, top, least
+        ):
             continue
-        found = _describe(border, alpha, beta, w, inner, negative_damping)
+        found = _describe(border, top, negative_damping)
         _refuse_stiffer(border, found, least)
         return found
-    if tops and len(tops) > _MOST_TOPS:
+    if len(tops) > _MOST_TOPS:
         raise ArithmeticError(f"none of the {_MOST_TOPS} highest of {len(tops)} tops holds")
     return None
 
 
-def _tops(border: Border, least: float) -> list[tuple[float, float, float, bool]]:
-    """Local maxima of the edges with beta of ``least`` or more, highest first; whether each lies inside its edge."""
-    found = []
+class _Top(NamedTuple):
+    """A local maximum of the edges: which column of a row's crossings it is on, and whether it lies inside its edge."""
+
+    alpha: float
+    beta: float
+    w: float
+    place: int
+    inner: bool
+
+
+def _tops(border: Border, least: float) -> list[_Top]:
+    """Local maxima of the edges with beta of ``least`` or more, highest first."""
+    found, b = [], border.boundary
     for edge in border.curved:
         padded = np.concatenate([[-np.inf], np.where(edge.beta >= least, edge.alpha, -np.inf), [-np.inf]])
-        alpha = padded[1:-1]
+        alpha, last = padded[1:-1], edge.w.size - 1
         for k in np.flatnonzero((alpha >= padded[:-2]) & (alpha >= padded[2:]) & (alpha > 0)):
-            inner = 0 < k < edge.w.size - 1
-            found.append((float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), bool(inner)))
+            # An end may be that of an arc as well.
+            place = int(b.arc_at(edge.w[min(max(k, 1), max(last - 1, 0))]))
+            found.append(_Top(float(alpha[k]), float(edge.beta[k]), float(edge.w[k]), place, bool(0 < k < last)))
     # Straight edges end on the curve or on each other.
-    found += [(*meeting, False) for meeting in border.line_meetings() if meeting[0] > 0 and meeting[1] >= least]
-    if np.isfinite(least):
-        found += [(*row, False) for row in _end_of_row(border.boundary, least)]
-    return sorted(found, key=lambda top: -top[0])
+    for alpha, beta, w in border.line_meetings():
+        if alpha > 0 and beta >= least:
+            line = next(k for k, line in enumerate(b.lines) if line.w == w)
+            found.append(_Top(alpha, beta, w, len(b.arcs) + line, False))
+    return sorted(found + (_ends_of_row(b, least) if np.isfinite(least) else []), key=lambda top: -top.alpha)
 
 
-def _describe(border: Border, alpha: float, beta: float, w: float, inner: bool, negative: bool) -> BoundRidge:
+def _describe(border: Border, top: _Top, negative: bool) -> BoundRidge:
+    alpha, beta, w = top[:3]
     if not negative and beta == 0.0:
         return BoundRidge(alpha, beta, w, w, _condition(w), Condition.NO_DAMPING)
-    if inner:
+    if top.inner:
         return BoundRidge(alpha, beta, w, w, Condition.PAIR, Condition.STATIONARY)
     return _corner(border, alpha, beta)
 
@@ -114,15 +129,12 @@ def _condition(w: float) -> Condition:
     return Condition.MINUS_ONE if w == np.pi else Condition.PAIR
 
 
-def _end_of_row(boundary: Boundary, beta: float) -> list[tuple[float, float, float]]:
-    """The top of a row with alpha > 0 as alpha, beta and angle; nothing where none of it is stable."""
-    high = stable_intervals(boundary, np.array([beta])).high
-    high = high[np.isfinite(high) & (high > 0)]
-    if not high.size:
-        return []
-    top = float(high.max())
-    found = boundary.crossings(np.array([beta]))
-    return [(top, beta, float(found.w[0, int(np.nanargmin(np.abs(found.alpha[0] - top)))]))]
+def _ends_of_row(boundary: Boundary, beta: float) -> list[_Top]:
+    """The upper ends with alpha > 0 of a row's stable intervals."""
+    row = np.array([beta])
+    found, w = bound_intervals(boundary, row), boundary.crossings(row).w[0]
+    ends = zip(found.high[0].tolist(), found.above[0].tolist(), strict=True)
+    return [_Top(high, beta, float(w[place]), place, False) for high, place in ends if 0 < high < np.inf]
 
 
 def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
@@ -179,28 +191,17 @@ def _polish(loop: LinearLoop, start: BoundRidge) -> BoundRidge | None:
     return start._replace(alpha=alpha, beta=beta, w1=w1, w2=w2)
 
 
-def _dampings(border: Border, least: float) -> np.ndarray:
-    meetings = [np.array([beta]) for _, beta, _ in border.line_meetings()]
-    return np.maximum(np.concatenate([*(edge.beta for edge in border.curved), *meetings]), least)
-
-
-def _reach(border: Border, beta: float, least: float) -> float:
-    """How stiff the walls of the rows next to a damping become."""
-    size = float(np.ptp(_dampings(border, least))) + abs(beta)
-    return _highest(border, np.maximum(beta + size * _BESIDE, least))
+def _is_reached(border: Border, top: _Top, least: float) -> bool:
+    """Whether rows next to a top are stable nearly up to it."""
+    size = float(np.ptp(border.pieces.corners)) + abs(top.beta)
+    found = bound_intervals(border.boundary, np.maximum(top.beta + size * _BESIDE, least))
+    own = (found.above == top.place) | (found.below == top.place)
+    return bool(np.any(own & (found.high >= _NEARLY * top.alpha)))
 
 
 def _refuse_stiffer(border: Border, found: BoundRidge, least: float) -> None:
-    """Refuse a ridge above which rows anywhere hold a stable wall."""
-    betas = _dampings(border, least)
-    # Between the ends: a row through a corner is no witness.
-    rows = betas.min() + np.ptp(betas) * (np.arange(_ROWS) + 0.5) / _ROWS
-    highest = _highest(border, rows)
+    """Refuse a ridge above which rows of its piece hold a stable wall."""
+    rows, high = border.pieces.main_intervals()
+    highest = float(np.nanmax(high[rows >= least], initial=-np.inf))
     if highest > found.alpha * (1.0 + _ABOVE):
         raise ArithmeticError(f"rows reach {highest!r}, the ridge {found.alpha!r}")
-
-
-def _highest(border: Border, rows: np.ndarray) -> float:
-    """The end of all stable walls of some rows; no row of a held loop is stable to infinity."""
-    high = stable_intervals(border.boundary, rows).high
-    return float(np.max(np.where(np.isfinite(high), high, -np.inf), initial=-np.inf))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,18 +24,37 @@ class Intervals(NamedTuple):
     high: np.ndarray
 
 
+class BoundIntervals(NamedTuple):
+    """The same with the column of the crossings that ends each, -1 where there is none."""
+
+    low: np.ndarray
+    high: np.ndarray
+    below: np.ndarray
+    above: np.ndarray
+
+
 def stable_intervals(boundary: Boundary, beta: np.ndarray) -> Intervals:
     """Where the rows of these dampings, shape (rows,), are stable."""
-    pieces = [_some_intervals(boundary, beta[k : k + _ROWS]) for k in range(0, beta.size, _ROWS)]
-    most = max((piece.low.shape[1] for piece in pieces), default=0)
-    low, high = (np.full((beta.size, most), np.nan) for _ in range(2))
-    for k, piece in enumerate(pieces):
-        rows = slice(k * _ROWS, k * _ROWS + len(piece.low))
-        low[rows, : piece.low.shape[1]], high[rows, : piece.low.shape[1]] = piece
-    return Intervals(low, high)
+    return Intervals(*bound_intervals(boundary, beta)[:2])
 
 
-def _some_intervals(boundary: Boundary, beta: np.ndarray) -> Intervals:
+def bound_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
+    """Where the rows of these dampings, shape (rows,), are stable, and what of the boundary ends each interval."""
+    return join_rows([_some_intervals(boundary, beta[k : k + _ROWS]) for k in range(0, max(beta.size, 1), _ROWS)])
+
+
+def join_rows(parts: Sequence[BoundIntervals], order: np.ndarray | slice = slice(None)) -> BoundIntervals:
+    """The rows of several parts in one, in an order of their own."""
+    most = max(part.low.shape[1] for part in parts)
+
+    def widen(column: np.ndarray, none: float) -> np.ndarray:
+        return np.pad(column, ((0, 0), (0, most - column.shape[1])), constant_values=none)
+
+    columns = zip(zip(*parts, strict=True), (np.nan, np.nan, -1, -1), strict=True)
+    return BoundIntervals(*(np.concatenate([widen(c, none) for c in own])[order] for own, none in columns))
+
+
+def _some_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
     known = np.where(np.isfinite(beta), beta, 0.0)
     found = boundary.crossings(known)
     order = np.argsort(found.alpha, axis=1)
@@ -42,16 +62,19 @@ def _some_intervals(boundary: Boundary, beta: np.ndarray) -> Intervals:
     leaving = np.take_along_axis(found.leaving, order, 1)
     least, most = np.full((beta.size, 1), -np.inf), np.full((beta.size, 1), np.inf)
     ends = np.concatenate([least, np.where(np.isnan(alpha), np.inf, alpha), most], 1)
+    met = np.concatenate([np.full((beta.size, 1), -1), order, np.full((beta.size, 1), -1)], 1)
     outside = boundary.base + np.concatenate([np.zeros((beta.size, 1)), np.cumsum(leaving, 1)], 1)
     # Closer than any alpha in range two crossings are one: the rounding of 0 on an undamped device's own row.
     wide = ends[:, 1:] > ends[:, :-1] + WALL_RANGE[0]
     stable = (np.round(outside) == 0) & wide & (np.isfinite(beta) & found.sound)[:, None]
     # Neighbors that touch, where one pole leaves as another enters, stay apart: their common end is on the boundary.
     place = np.cumsum(stable, 1) - 1
-    low, high = (np.full((beta.size, int(stable.sum(1).max(initial=0))), np.nan) for _ in range(2))
+    shape = beta.size, int(stable.sum(1).max(initial=0))
+    out = BoundIntervals(*(np.full(shape, np.nan) for _ in range(2)), *(np.full(shape, -1) for _ in range(2)))
     row, gap = np.nonzero(stable)
-    low[row, place[row, gap]], high[row, place[row, gap]] = ends[row, gap], ends[row, gap + 1]
-    return Intervals(low, high)
+    for whole, values in zip(out, (ends[:, :-1], ends[:, 1:], met[:, :-1], met[:, 1:]), strict=True):
+        whole[row, place[row, gap]] = values[row, gap]
+    return out
 
 
 def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:

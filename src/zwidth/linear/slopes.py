@@ -11,20 +11,22 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import elementwise
 from zwidth.errors import InputError
+from zwidth.linear.chain import chain_of, flow, rates
 from zwidth.linear.ridge import BoundRidge, Condition
 from zwidth.linear.stiffest import allows_negative, refuse_fractional_power, search
-from zwidth.linear_loop import Jet, circle
+from zwidth.linear_loop import CirclePoints, Jet, circle, lag_jet
 from zwidth.stability.devices import classify_delays
 from zwidth.stability.ridge import slopes_kernel
+from zwidth.status import Status
 from zwidth.xp import is_jax
 
-# The step of a difference, as a share of the parameter; its sixth power is rounding.
-_STEP = 4e-3
+# The step of a difference, as a share of the parameter; its sixth power is rounding. And that of an imaginary step.
+_STEP, _TINY = 1e-3, 1e-30
 # Weights of the differences: around a value, and from it on.
 _CENTRAL = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
 _ONE_SIDED = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
-# Nearer to whole periods than this a delay counts as beside them.
-_SMALL = 1e-3
+# By what share G may differ by its matrices and by its roots.
+_AGREES = 1e-8
 
 
 class SceneSensitivities(NamedTuple):
@@ -38,7 +40,8 @@ class SceneSensitivities(NamedTuple):
 def differentiate(scene: Any, negative_damping: bool | None = None) -> SceneSensitivities:
     """See `zwidth.Scene.sensitivities`."""
     negative = allows_negative(scene, negative_damping)
-    scene = scene.replace(**{path: float(value) for path, value in scene.parameters().items() if is_jax(value)})
+    held = {path: float(value) for path, value in scene.parameters().items() if is_jax(value)}
+    scene = scene.replace(**held) if held else scene
     if scene.is_rigid:
         closed = _by_closed_form(scene, negative)
         if closed is not None:
@@ -49,6 +52,7 @@ def differentiate(scene: Any, negative_damping: bool | None = None) -> SceneSens
     if found is None:
         return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
     per = {path: _slope(scene, found, path) for path in paths}
+    status = Status.NOT_CONVERGED if any(math.isnan(slope) for slope in per.values()) else status
     return SceneSensitivities(np.float64(found.alpha * scene.units.stiffness), per, np.int32(status))
 
 
@@ -93,35 +97,79 @@ def _by_spring(scene: Any, negative: bool) -> float:
 def _slope(scene: Any, found: BoundRidge, path: str) -> float:
     """The derivative of K_max in one parameter: as it moves, the conditions that bind go on to hold.
 
-    How they move at a fixed wall and fixed angles is told by differences of sixth order of smooth closed forms; how the
-    wall follows, by their exact derivatives (docs/theory/scenes.md).
+    The derivatives of the conditions are exact in the wall and its angles. In the parameter they are exact but for the
+    rates of the chain and the velocity estimate, which are smooth over its own size (docs/theory/scenes.md, V21).
     """
     matrix, rows = _conditions(scene, found)
+    at, whole = circle(np.array([found.w1, found.w2])), scene.whole_delay
     for weights in _stencils(scene, path):
         try:
-            states = [weight * _state(scene.replace(**{path: value}), found) for value, weight in weights]
+            states = [
+                [weight * part for part in _inputs(scene.replace(**{path: value}), whole, at)]
+                for value, weight in weights
+            ]
         except InputError:
             # The parameter is at the end of its range: from the other side.
             continue
-        moved = np.sum(states, axis=0)
-        by_alpha = -np.linalg.solve(matrix, moved[1:][rows])[0]
-        unit = scene.units.stiffness
-        return float(unit * by_alpha + found.alpha * moved[0])
+        by_unit, by_delay, by_rate, by_push, by_f, by_f_slope = (
+            np.sum(part, axis=0) for part in zip(*states, strict=True)
+        )
+        q, q_slope = _needed_slopes(scene, at, by_rate, by_push, by_delay)
+        rest, slope = found.beta * by_f - q, found.beta * by_f_slope - q_slope
+        moved = np.array([rest[0].real, rest[0].imag, rest[1].real, rest[1].imag, slope[0].imag])
+        try:
+            by_alpha = -np.linalg.solve(matrix, moved[rows])[0]
+        except np.linalg.LinAlgError:
+            break
+        return float(scene.units.stiffness * by_alpha + found.alpha * by_unit)
     return math.nan
 
 
-def _state(scene: Any, found: BoundRidge) -> np.ndarray:
-    """The stiffness of alpha = 1, and what the conditions say of the wall found before; 0 on its own scene."""
-    rest, slope, _ = _residual(scene, found)
-    return np.array([scene.units.stiffness, rest[0].real, rest[0].imag, rest[1].real, rest[1].imag, slope[0].imag])
+def _inputs(scene: Any, whole: int, at: CirclePoints) -> tuple[Any, ...]:
+    """What K_max depends on a parameter through: the unit of stiffness, the delay, the rates of the chain, F and F'."""
+    delay = scene.timing.delay / scene.timing.period
+    chain = chain_of(scene, (delay, whole))
+    return (scene.units.stiffness, delay, *rates(chain), *chain.estimate.jet(at))
 
 
-def _residual(scene: Any, found: BoundRidge) -> tuple[np.ndarray, np.ndarray, Jet]:
-    """``r = alpha + beta F - q`` at both angles, dr/dw, and F."""
+def _needed_slopes(
+    scene: Any, at: CirclePoints, by_rate: np.ndarray, by_push: np.ndarray, by_delay: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The derivatives of ``q = -1/G`` and of dq/dw in a parameter, by those of the chain's rates and of the delay.
+
+    NaN where G by the matrices of the chain is not G by its roots: then rounding has eaten what they tell.
+    """
+    chain = scene.chain
+    # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
+    rate, push = (value + 1j * _TINY * by for value, by in zip(rates(chain), (by_rate, by_push), strict=True))
+    fraction = chain.d - chain.whole + 1j * _TINY * by_delay
+    steps = (*flow(rate, push, 1.0), flow(rate, push, 1.0 - fraction)[1])
+    (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))
+    turns, slopes = chain.whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
+    exact, lag = scene.loop.needed(at).value, lag_jet(at, turns)
+    for k, (zeta, turn) in enumerate(zip(at.before, 1j * at.z, strict=True)):
+        with np.errstate(all="ignore"):
+            try:
+                back = np.linalg.inv(zeta * np.eye(len(psi)) - psi)
+            except np.linalg.LinAlgError:
+                continue
+            moved = back @ (zeta * late + full)
+            by_w = back @ (turn * late - turn * moved)
+            by_p = back @ (by_psi @ moved + zeta * by_late + by_full)
+            by_both = back @ (by_psi @ by_w + turn * by_late - turn * by_p)
+            value, slope = lag.value[k] / moved[0] ** 2, lag.slope[k] / moved[0] ** 2
+            if abs(lag.value[k] / moved[0] + exact[k]) <= _AGREES * abs(exact[k]):
+                slopes[0, k] = value * by_p[0]
+                slopes[1, k] = slope * by_p[0] + value * (by_both[0] - 2.0 * by_p[0] * by_w[0] / moved[0])
+    return slopes[0], slopes[1]
+
+
+def _residual(scene: Any, found: BoundRidge) -> tuple[np.ndarray, Jet]:
+    """``dr/dw`` of ``r = alpha + beta F - q`` at both angles, and F."""
     at = circle(np.array([found.w1, found.w2]))
     with np.errstate(all="ignore"):
         q, f = scene.loop.needed(at), scene.loop.estimate.jet(at)
-        return found.alpha + found.beta * f.value - q.value, found.beta * f.slope - q.slope, f
+        return found.beta * f.slope - q.slope, f
 
 
 def _conditions(scene: Any, found: BoundRidge) -> tuple[np.ndarray, list[int]]:
@@ -129,7 +177,7 @@ def _conditions(scene: Any, found: BoundRidge) -> tuple[np.ndarray, list[int]]:
 
     At a smooth optimum the angle may stay where it is: to first order it does not matter.
     """
-    _, slope, f = _residual(scene, found)
+    slope, f = _residual(scene, found)
     by_alpha = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
     by_beta = np.array([f.value[0].real, f.value[0].imag, f.value[1].real, f.value[1].imag, f.slope[0].imag])
     columns = [by_alpha]
@@ -150,23 +198,10 @@ def _conditions(scene: Any, found: BoundRidge) -> tuple[np.ndarray, list[int]]:
 
 
 def _stencils(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
-    """Values of a parameter with their weights in its derivative, of sixth order: around it, above it, below it.
-
-    A delay of whole periods is a place where higher derivatives jump, and nobody has less than no damping.
-    """
+    """Values of a parameter with their weights in its derivative, of sixth order: around it, above it, below it."""
     value = float(scene.parameters()[path])
-    period, d = float(scene.timing.period), float(scene.d)
+    period = float(scene.timing.period)
     units = {"mass": scene.mass, "damping": scene.mass / period, "stiffness": scene.mass / period**2, "delay": period}
-    size = abs(value) or float(next(unit for name, unit in units.items() if path.endswith(name)))
-    step = _STEP * size
-    smooth = True
-    if path in ("period", "delay"):
-        # By how many periods the delay moves.
-        far = 3.0 * _STEP * max(d, 1.0) if path == "period" else 3.0 * step / period
-        nearest = abs(d - round(d))
-        smooth = d != round(d) and nearest > _SMALL
-        step *= min(1.0, (0.5 * nearest if smooth else 0.5) / far)
-    around = [(value + k * step, weight / step) for k, weight in _CENTRAL]
-    beside = [[(value + side * k * step, side * w / step) for k, w in enumerate(_ONE_SIDED)] for side in (1, -1)]
-    yield from ([around] if smooth and value > 3.0 * step else [])
-    yield from beside
+    step = _STEP * (abs(value) or float(next(unit for name, unit in units.items() if path.endswith(name))))
+    yield from ([[(value + k * step, weight / step) for k, weight in _CENTRAL]] if value > 3.0 * step else [])
+    yield from ([(value + side * k * step, side * w / step) for k, w in enumerate(_ONE_SIDED)] for side in (1, -1))

@@ -9,12 +9,17 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.errors import InputError, ZwidthError
+from zwidth.linear.columns import stable_dampings
+from zwidth.linear.pieces import Island
 from zwidth.linear.ridge import BoundRidge, find_ridge
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.ridge import RidgeKind, alpha_max
 from zwidth.status import Status
 from zwidth.xp import is_jax, is_traced, namespace
+
+# By what share a row may end below the stiffest wall that is on it.
+_ROUNDED = 1e-6
 
 
 class StiffestWall(NamedTuple):
@@ -43,7 +48,8 @@ def stiffest_wall(scene: Any, negative_damping: bool | None = None) -> StiffestW
         from zwidth.linear.ridge_kkt import traced_wall
 
         return traced_wall(scene, negative)
-    scene = scene.replace(**{path: float(value) for path, value in values.items() if is_jax(value)})
+    held = {path: float(value) for path, value in values.items() if is_jax(value)}
+    scene = scene.replace(**held) if held else scene
     found, status = search(scene, negative)
     if found is None:
         nan = np.float64(math.nan)
@@ -56,6 +62,33 @@ def stiffest_wall(scene: Any, negative_damping: bool | None = None) -> StiffestW
         np.int32(found.kind),
         np.int32(status),
     )
+
+
+def choose_damping(scene: Any, top: StiffestWall, stiffness: float) -> float:
+    """A damping with which a softer wall than the stiffest is stable, where it can be so without leaving its piece.
+
+    That of the stiffest wall, if all walls of that damping between the two are stable; else the middle of the widest
+    interval of dampings.
+    """
+    damping = float(top.virtual_damping)
+    row = scene.stable_stiffness(damping)
+    if scene.is_rigid or np.any((row[:, 0] < stiffness) & (row[:, 1] > (1.0 - _ROUNDED) * top.stiffness)):
+        return damping
+    units, pieces = scene.units, scene.border.pieces
+    alpha, least = stiffness / units.stiffness, -math.inf if allows_negative(scene, None) else 0.0
+    column = np.maximum(stable_dampings(scene.traced_boundary, alpha), least)
+    found = [(high - low, 0.5 * (low + high)) for low, high in column.tolist() if low < high]
+    found = [(width, middle) for width, middle in found if pieces.holds_softly(alpha, middle)]
+    return max(found)[1] * units.virtual_damping if found else damping
+
+
+def list_islands(scene: Any, negative_damping: bool | None = None) -> list[Island]:
+    """See `zwidth.Scene.islands`."""
+    if scene.is_rigid:
+        return []
+    units = np.array([scene.units.stiffness, scene.units.virtual_damping])[:, None]
+    found = scene.border.islands(-math.inf if allows_negative(scene, negative_damping) else 0.0)
+    return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in found]
 
 
 def refuse_fractional_power(scene: Any) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.errors import InputError, describe_choice
+from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.xp import is_jax
 
 _BARE = ("device", "timing", "wall")
@@ -68,6 +69,8 @@ def replace_parameters(scene: Any, changes: dict[str, Any]) -> Any:
     if "rate" in changed.get("timing", {}):
         # Period and rate are one thing; what was given last counts.
         changed["timing"].setdefault("period", None)
+    if "wall" in changed and isinstance(scene.wall, NoWall):
+        scene = replace(scene, wall=VirtualWall(0.0))
     if "coupling" in changed:
         coupling = replace(scene.device.coupling, **changed.pop("coupling"))
         changed.setdefault("device", {})["coupling"] = coupling

@@ -1,11 +1,12 @@
-"""The wall that is rendered."""
+"""The wall that is rendered, and which wall a question means."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
+from zwidth.errors import InputError
 from zwidth.parts.checks import check_number
 
 
@@ -24,3 +25,40 @@ class VirtualWall:
     def __post_init__(self) -> None:
         for name, unit in (("stiffness", "N/m"), ("virtual_damping", "N s/m")):
             object.__setattr__(self, name, check_number(name, getattr(self, name), unit, low=-math.inf))
+
+
+@dataclass(frozen=True)
+class NoWall(VirtualWall):
+    """What a scene has in place of a wall where none was chosen: no force, and no wall that a question could mean."""
+
+    stiffness: Any = field(default=0.0, init=False, repr=False)
+    virtual_damping: Any = field(default=0.0, init=False, repr=False)
+
+
+def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any) -> tuple[Any, Any]:
+    """Which K and B a question means of a scene with this wall, the one rule for all of them.
+
+    Neither given means the scene's own wall. Both given are what they say. K alone is a spring, B = 0, of a scene
+    without a wall; where there is one it could as well mean that wall's B, and is refused.
+    """
+    chosen = not isinstance(wall, NoWall)
+    if stiffness is None and virtual_damping is None:
+        if not chosen:
+            raise InputError(
+                "stiffness: none is given, and the scene has no wall; give stiffness (and virtual_damping), or the "
+                "scene wall=zwidth.VirtualWall(stiffness=...)"
+            )
+        return wall.stiffness, wall.virtual_damping
+    if stiffness is None:
+        raise InputError(
+            "stiffness: none is given beside virtual_damping; give both, or none and the scene the wall that is meant: "
+            "scene.replace(stiffness=..., virtual_damping=...)"
+        )
+    if virtual_damping is None:
+        if chosen:
+            raise InputError(
+                f"virtual_damping: none is given beside stiffness, and the scene's own wall has {wall.virtual_damping} "
+                "N s/m; say which, 0 for a spring alone, or replace the wall: scene.replace(stiffness=...)"
+            )
+        return stiffness, 0.0
+    return stiffness, virtual_damping

@@ -87,6 +87,8 @@ def draw_stores(
     target = beside / FOLDER if out is None else Path(os.fsdecode(out))
     wanted = {name.replace(".", "_"): value for name, value in (at or {}).items()}
     datasets = {store: open_dataset(store).reset_coords(drop=True) for store in stores}
+    for store in (store for store, data in datasets.items() if not data.attrs["complete"]):
+        note(f"{store.name}: chunks are missing and left blank; 'zwidth run CONFIG --resume' computes them")
     known = dict.fromkeys(str(dim) for data in datasets.values() for dim in data.dims)
     unknown = [name for name in wanted if name not in known]
     if unknown:

@@ -12,8 +12,8 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,17 @@ from typing import Any
 from zwidth.errors import StoreError, StoreExistsError
 from zwidth.files.lock import FOLDER as LOCKS
 from zwidth.files.lock import held_briefly
-from zwidth.files.provenance import versions
-from zwidth.files.whole import check_folder, hidden_beside, remove_quietly, write_whole
+from zwidth.files.provenance import digest, versions
+from zwidth.files.whole import check_folder, hidden_beside, is_plain_name, remove_quietly, write_whole
+from zwidth.formatting import describe
 from zwidth.sweep.resume import refuse_changes, refuse_versions
 from zwidth.sweep.store import SUFFIX
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.yaml"
+INPUTS = "inputs"
 RUN_FORMAT = 2
+_SEAL = "record_sha256"
 
 # Beside those that can change a result.
 _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
@@ -43,6 +46,7 @@ class Record:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.content: dict[str, Any] = {}
+        self.damaged = False  # whether the record was not what was written
         self._read()
 
     def _read(self) -> None:
@@ -59,6 +63,15 @@ class Record:
             raise StoreError(
                 f"{self.folder / RUN_FILE}: no record of a run; choose another folder with --out DIR, or remove it"
             )
+        seal = content.pop(_SEAL, None)
+        if seal is not None and digest(content) != seal:
+            self.damaged = True
+            if content.get("format") == RUN_FORMAT:
+                # Which files are the run's can be believed, for they are made anew; what was found cannot.
+                content["studies"] = [{**entry, "state": "open"} for entry in content["studies"] if _names_files(entry)]
+        fault = _find_fault(content)
+        if fault:
+            raise StoreError(f"{self.folder / RUN_FILE}: {fault}; choose another folder with --out DIR, or remove it")
         self.content = content
 
     @property
@@ -70,8 +83,11 @@ class Record:
         """What is recorded of a study."""
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
-    def check_free(self, *, overwrite: bool, going_on: bool) -> None:
-        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with."""
+    def check_free(self, config: str, *, overwrite: bool, going_on: bool) -> None:
+        """Refuse a folder that holds something, unless it is a run that may be replaced or gone on with.
+
+        A run without its record is known by its configuration: the one of the text ``config``.
+        """
         if (self.folder.exists() or self.folder.is_symlink()) and not self.folder.is_dir():
             raise StoreExistsError(f"out: {self.folder} is a file, a folder is needed; choose another with --out DIR")
         check_folder(self.folder)
@@ -86,11 +102,23 @@ class Record:
             return
         # Stores are refused or replaced one by one: they say themselves what they are.
         strange = [path.name for path in self.folder.iterdir() if not _belongs_to_runs(path.name)]
-        if strange:
+        if strange and self._holds_config(config):
+            if not overwrite:
+                raise StoreExistsError(
+                    f"out: {self.folder} holds a run of this configuration without its record {RUN_FILE}; replace its "
+                    "files with --overwrite, keep its sweeps with --resume, or choose another folder with --out DIR"
+                )
+        elif strange:
             raise StoreExistsError(
-                f"out: {self.folder} is not empty and holds no run (no {RUN_FILE}); choose another folder with "
-                "--out DIR"
+                f"out: {self.folder} is not empty and holds no run (no {RUN_FILE}), and no {CONFIG_FILE} of this "
+                "configuration; choose another folder with --out DIR"
             )
+
+    def _holds_config(self, text: str) -> bool:
+        try:
+            return (self.folder / CONFIG_FILE).read_bytes() == text.encode("utf-8")
+        except OSError:
+            return False
 
     def check_same(self, inputs: dict[str, dict[str, Any]]) -> None:
         """Refuse to go on with a run that other releases made, or whose studies, given by name, had other inputs."""
@@ -101,6 +129,9 @@ class Record:
                 f"{self.folder}: an earlier release made this run and kept no checksums to go on from; start again "
                 "with --overwrite, or choose another folder with --out DIR"
             )
+        if self.damaged:
+            # Everything is computed again, and stores know by themselves what they are for.
+            return
         where = self.folder / RUN_FILE
         for name, now in inputs.items():
             entry = self.entry(name)
@@ -114,10 +145,27 @@ class Record:
         about |= {"precision": "float64", "versions": versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
 
-    def keep_config(self, text: str) -> None:
-        """Write the configuration beside its results, unless a file of somebody's own has the name."""
-        path = self.folder / CONFIG_FILE
-        if not path.exists() or CONFIG_FILE in self.files():
+    def keep_config(self, text: str, inputs: Mapping[str, bytes]) -> None:
+        """Write the configuration beside its results, and the files that it reads; what is somebody's own stays.
+
+        Where the folder held this configuration and no record, the record was lost: the run's files are its own.
+        """
+        path, place = self.folder / CONFIG_FILE, self.folder / INPUTS
+        digests = {name: hashlib.sha256(data).hexdigest() for name, data in inputs.items()}
+        wanted = {name: data for name, data in inputs.items() if file_hash(place / name) != digests[name]}
+        known = {} if place.is_symlink() else self.content.get("inputs", {})
+        strange = [name for name in wanted if name not in known and (place.is_symlink() or (place / name).exists())]
+        if strange:
+            raise StoreExistsError(
+                f"out: {place / strange[0]} was not written by this run; move it away, or choose another folder with "
+                "--out DIR"
+            )
+        own = CONFIG_FILE in self.files()
+        lost = not own and self._holds_config(text)
+        self._update(({"inputs": {**known, **digests}} if digests else {}) | ({"lost": True} if lost else {}))
+        for name, data in wanted.items():
+            write_whole(place / name, data)
+        if own or lost or not path.exists():
             self._update({"config_file": CONFIG_FILE})
             write_whole(path, text.encode("utf-8"))
 
@@ -133,7 +181,9 @@ class Record:
             studies = [old for old in content.get("studies", ()) if entry is None or old["name"] != entry["name"]]
             content["studies"] = [*studies, *([] if entry is None else [entry])]
             self.content = content
-            write_whole(self.folder / RUN_FILE, (json.dumps(content, indent=2) + "\n").encode())
+            write_whole(
+                self.folder / RUN_FILE, (json.dumps(content | {_SEAL: digest(content)}, indent=2) + "\n").encode()
+            )
 
     def faults(self, name: str) -> list[str]:
         """The files of a study that are not what was written."""
@@ -160,7 +210,7 @@ class Record:
         before = self.entry(entry["name"]) or {}
         files = {path.name: file_hash(path) for path in sorted(stage.iterdir())}
         for file in files:
-            if (self.folder / file).exists() and file not in self.files():
+            if (self.folder / file).exists() and file not in self.files() and not self.content.get("lost"):
                 raise StoreExistsError(
                     f"out: {self.folder / file} was not written by this run; move it away, or choose another folder "
                     "with --out DIR"
@@ -182,13 +232,18 @@ class Record:
             found.add(CONFIG_FILE)
         for entry in self.content.get("studies", ()):
             found |= {str(file) for file in entry.get("files", ())}
-        # A name that leads out of the folder was not written by a run.
-        return {file for file in found if Path(file).name == file}
+        return found
 
     def clear(self) -> None:
         """Remove what the run has written, the record last; whatever else is in the folder stays."""
         if self.exists:
             self._remove(sorted(self.files() - {RUN_FILE}))
+            place = self.folder / INPUTS
+            if not place.is_symlink():
+                for name in self.content.get("inputs", {}):
+                    (place / name).unlink(missing_ok=True)
+                with suppress(OSError):
+                    place.rmdir()
             self._remove([RUN_FILE])
             self.content = {}
 
@@ -207,14 +262,36 @@ class Record:
                 remove_quietly(left)
 
 
+def _names_files(entry: Any) -> bool:
+    """Whether an entry of a damaged record still tells a study and its files."""
+    return isinstance(entry, dict) and isinstance(entry.get("name"), str) and isinstance(entry.get("files"), dict)
+
+
+def _find_fault(content: Any) -> str:
+    """What keeps a JSON value from being the record of a run."""
+    kinds = {"studies": list, "versions": dict, "inputs": dict}
+    if not all(isinstance(content.get(key, kind()), kind) for key, kind in kinds.items()):
+        return "no record of a run"
+    names = list(content.get("inputs", ()))
+    for entry in content["studies"]:
+        if not isinstance(entry, dict) or not isinstance(entry.get("files", {}), dict | list):
+            return "a damaged record of a run"
+        names += [entry.get("name"), *entry.get("files", ())]
+    # All that a run removes or replaces is named there.
+    outside = [name for name in names if not isinstance(name, str) or not is_plain_name(name)]
+    return f"names {describe(outside[0])}, which is no file of its folder" if outside else ""
+
+
 def _belongs_to_runs(name: str) -> bool:
     """Whether a run without a record, or one that was killed, leaves something of this name."""
     return name.endswith((SUFFIX, ".partial")) or name in (LOCKS, CONFIG_FILE, "figures")
 
 
 def file_hash(path: Path) -> str:
-    """The SHA-256 of a file; empty where there is none."""
+    """The SHA-256 of a file; empty where there is none, or a link to one."""
     try:
+        if path.is_symlink():
+            return ""
         with open(path, "rb") as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError:

@@ -40,6 +40,7 @@ class RunResult:
     repaired: tuple[str, ...] = ()  # files and chunks that were damaged or missing, and that were made again
     hopeless: str = ""  # the error that ended the run early, for nothing else would have escaped it, as a full disk
     interrupted: bool = False  # whether somebody stopped the run, with Ctrl-C; what was done by then is kept
+    lost: str = ""  # why a cluster could not go on, its scheduler having died say; what was done by then is kept
 
     @property
     def failed(self) -> tuple[StudyResult, ...]:
@@ -54,7 +55,7 @@ class RunResult:
     @property
     def ok(self) -> bool:
         """Whether everything that this run was to do is done."""
-        return not self.failed and not self.interrupted and not self.hopeless
+        return not (self.failed or self.interrupted or self.hopeless or self.lost)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,8 @@ from zwidth.config.study import Study
 from zwidth.errors import InputError
 from zwidth.files.lock import holding
 from zwidth.files.whole import hopeless
-from zwidth.runs.record import Record
+from zwidth.runs.inputs import gather_inputs, rename_inputs
+from zwidth.runs.record import RUN_FILE, Record
 from zwidth.runs.result import ProgressCallback, RunResult, StudyEvent, StudyResult
 from zwidth.studies.document import Config, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
@@ -58,14 +59,16 @@ def run(
 
     A sweep is computed chunk by chunk into a store ``<name>.zarr``. Any other study writes a table ``<name>.csv`` (a
     map: ``<name>.npz``) and a figure as PNG and SVG; ``recommend`` adds a recommendation, and a configuration that
-    repeats figures of the paper adds ``published.md`` and ``published.json``. ``run.json`` tells what ran, in which
-    versions, how long it took, what failed, and which files are the run's own.
+    repeats figures of the paper adds ``published.md`` and ``published.json``. Files that the configuration reads are
+    copied to ``inputs``, and ``config.yaml``, the configuration with the names of the copies, computes the same again.
+    ``run.json`` tells what ran, in which versions, how long it took, what failed, and which files are the run's own.
 
     Args:
         config: the path of a configuration; or what its file would hold, as a dict, in which arrays serve as lists and
             files are looked for in the present folder; or a configuration that is read already.
         out: the folder; ``runs/<name of the configuration>`` where left out.
-        overwrite: replace a run that is already there: the files that its record names, and nothing else.
+        overwrite: replace a run that is already there: the files that its record names, and nothing else; where the
+            record is lost and ``config.yaml`` is this configuration's, files of the names that the run writes.
         resume: go on with a run that is there. What is done and undamaged is kept, what failed or is damaged is
             computed again; another configuration, or another release, is refused.
         workers: how many processes compute sweeps on this machine; this process itself where left out. They are
@@ -106,19 +109,20 @@ def run(
     going_on = resume or shard is not None
     _check_options(workers, scheduler, shard, going_on=going_on, overwrite=overwrite)
     config, text = _read_config(config)
+    text, files, names = gather_inputs(text, config.folder)
     shown = Path("runs", config.name) if out is None else Path(os.fsdecode(out))
     folder, clock = Path(os.path.abspath(shown)), time.perf_counter()
-    pieces = _list_computations(config) if shard is None or shard[0] == 1 else []
+    pieces = _list_computations(config, names) if shard is None or shard[0] == 1 else []
     planned = [(study, make_plan(study, memory=memory)) for study in _list_sweeps(config)]
     if planned:
         check_installed()
     # What does not fit, or not belong there, is refused before anything is made.
-    Record(folder).check_free(overwrite=overwrite, going_on=going_on)
+    Record(folder).check_free(text, overwrite=overwrite, going_on=going_on)
     begun = {study.name for study, _ in planned if store_path(folder, study).exists()}
     check_resources([plan for _, plan in planned], folder, workers or 1, begun=set() if overwrite else begun)
     with holding(folder, shard):
         record = Record(folder)
-        record.check_free(overwrite=overwrite, going_on=going_on)
+        record.check_free(text, overwrite=overwrite, going_on=going_on)
         inputs = {piece.name: piece.inputs for piece in pieces} | {one.name: _spell(one) for one, _ in planned}
         if overwrite:
             record.clear()
@@ -131,14 +135,15 @@ def run(
         job = _Run(record, progress or (lambda event: None), len(pieces) + len(planned))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
         record.start(name=config.name, description=config.description, config_sha256=digest)
-        record.keep_config(text)
+        record.keep_config(text, files)
         job.do(pieces)
         about = {"name": config.name, "description": config.description, "config": _spell(config)}
         if planned and not job.over:
             options = {"shard": shard, "workers": workers, "scheduler": scheduler}
             job.sweep(planned, about, perform=perform, **options)
     seconds = time.perf_counter() - clock
-    return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), job.hopeless, job.interrupted)
+    ends = job.hopeless, job.interrupted, job.lost
+    return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), *ends)
 
 
 def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
@@ -159,8 +164,8 @@ class _Run:
         self.tell = tell
         self.total = total
         self.results: list[StudyResult] = []
-        self.repaired: list[str] = []
-        self.hopeless = ""
+        self.repaired = [f"{RUN_FILE} is damaged"] if record.damaged else []
+        self.hopeless = self.lost = ""
         self.interrupted = False
 
     @property
@@ -248,13 +253,13 @@ class _Run:
             # Before the first chunk began.
             self.interrupted = True
             return
-        self.hopeless, self.interrupted = sweeps.hopeless, sweeps.interrupted
+        self.hopeless, self.interrupted, self.lost = sweeps.hopeless, sweeps.interrupted, sweeps.lost
         for study, _ in planned:
             sweep = sweeps.results[study.name]
             self.repaired += sweep.repaired
             # A shard that ends last finds the others' chunks done as well.
             state = "failed" if sweep.failed else "open" if Store(sweep.store).missing() else "done"
-            error = next(iter(sweep.failed.values()), "")
+            error = next(iter(sweep.failed.values()), sweeps.lost)
             seconds = time.perf_counter() - clock
             if not self.hopeless:
                 self.record.note({**_sweep_entry(study, state), "seconds": round(seconds, 3), "error": error})
@@ -270,13 +275,16 @@ def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
     return {"name": study.name, "kind": "sweep", "state": state, "inputs": _spell(study), "files": files}
 
 
-def _list_computations(config: Config) -> list[Computation]:
-    """The studies that are computed as a whole; where figures of the paper are repeated, its numbers as well."""
+def _list_computations(config: Config, names: dict[str, str]) -> list[Computation]:
+    """The studies that are computed as a whole; where figures of the paper are repeated, its numbers as well.
+
+    Their inputs name the copies of files that the run keeps, so that it may go on from its own folder.
+    """
     pieces = []
     for study in config.studies:
         if isinstance(study, ComputedStudy):
             alone = sum(type(other) is type(study) for other in config.studies) == 1
-            inputs = _spell(study)
+            inputs = rename_inputs(_spell(study), names)
             if study.reads_scene and config.scene is not None:
                 inputs["scene"] = _spell(config.scene)
             pieces.append(

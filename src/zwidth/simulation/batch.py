@@ -145,11 +145,18 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, course: Co
         rings = round_up(max(windows) + 1), round_up(int(late.max()) + 3)
         # What JAX is needed for begins here.
         from zwidth.simulation.engine import run_lanes
+        from zwidth.simulation.outlook import foresee
 
         outside = Given(given.start_position, given.start_velocity * period, drawn, history, durations)
         with compute_concretely():
-            found = run_lanes(lanes, options, course, outside, rings)
-        return to_si(found, given, instants, period, mass, names, course.tail)
+            state, readings, reading, frame = run_lanes(lanes, options, course, outside, rings)
+            last, steady = lanes.push + np.zeros(places.size), given.noise == 0
+            if history is not None:
+                # A hand that still moves in the tail moves on.
+                last, steady = last + history[-1], steady & np.all(history[-course.tail :] == history[-1], axis=0)
+            outlook = foresee(lanes, options, state, last, steady, readings, course.periods)
+        found = state, reading, frame
+        return to_si(found, given, outlook, instants, period, mass, names, course)
 
     count = which.size
     size = min(TOGETHER, 1 << (count - 1).bit_length())

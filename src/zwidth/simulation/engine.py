@@ -5,6 +5,7 @@ A block has a fixed number of periods, so that a longer simulation compiles noth
 
 from __future__ import annotations
 
+from collections import deque
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -16,13 +17,16 @@ from zwidth._types import Array
 from zwidth.simulation.batch import Course, Given
 from zwidth.simulation.lanes import Lanes, Options
 from zwidth.simulation.motion import BodyState, dot
-from zwidth.simulation.period import Program, Reading, Work, control, forces_of, move
+from zwidth.simulation.outlook import CYCLE
+from zwidth.simulation.period import Program, Reading, Work, control, forces_of, move, round_to
 
 BLOCK = 128
+# The tail's windows, the same number in each half.
+WINDOWS = 8
 
 
 class Extent(NamedTuple):
-    """How far the first body went within a stretch of time."""
+    """How far every body went before the tail and in each of its windows, (1 + windows, bodies, lanes)."""
 
     low: Array
     high: Array
@@ -32,12 +36,12 @@ class Summary(NamedTuple):
     """What is kept of a motion that is not recorded."""
 
     deepest: Array  # largest position at a sample
-    widest: Array  # largest distance from 0
+    widest: Array  # largest distance of a body from 0
     exits: Array  # times the wall was left
     impact: Array  # velocity at the first sample in contact
     given: Array  # the most energy that the wall has given so far
-    halves: Extent  # of the tail, (2, lanes)
-    turns: Array  # how often the velocity turned positive in each half of it, (2, lanes)
+    extent: Extent
+    turns: Array  # how often the velocity turned positive then, (1 + windows, lanes)
     first_turn: Array
     last_turn: Array
 
@@ -78,11 +82,12 @@ def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) ->
     # All bodies together: nothing is stretched.
     body[0], body[count // 2] = x, v
     back = np.mod(-np.arange(rings[0]), rings[0])
-    positions = x - back[:, None] * v
-    zero, far = np.zeros(x.size), np.full(x.size, np.inf)
-    program = Program(positions, _settle(lanes, x, v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
-    halves = Extent(np.stack([far, far]), np.stack([-far, -far]))
-    summary = Summary(zero, zero, zero, zero + np.nan, zero, halves, np.stack([zero, zero]), zero, zero)
+    # What the program would have read.
+    positions = round_to(lanes.resolution, x - back[:, None] * v)
+    zero, far = np.zeros(x.size), np.full((1 + WINDOWS, count // 2, x.size), np.inf)
+    program = Program(positions, _settle(lanes, positions[0], v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
+    turns = np.zeros((1 + WINDOWS, x.size))
+    summary = Summary(zero, zero, zero, zero + np.nan, zero, Extent(far, -far), turns, zero, zero)
     return State(BodyState(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
 
 
@@ -97,7 +102,7 @@ def _settle(lanes: Lanes, x: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
-    """One period; ``ends`` the periods at which the tail begins, its second half, and the end."""
+    """One period; ``ends`` the periods at which the windows of the tail begin, and the end."""
     sensed = state.body.x[0] + given.noise
     program, reading = control(lanes, options, state.program, given.k, sensed)
     forces = forces_of(lanes, options, program.commands, given.k)
@@ -131,34 +136,35 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     summary = _summarize(lanes, state, reading, body, work, given.k, ends, motion)
     after = State(body, program, work, summary)
     # A block goes on behind the last period.
-    going = given.k < ends[2]
+    going = given.k < ends[-1]
     after = jax.tree.map(partial(jnp.where, going), after, state)
-    return after, (reading, frames) if options.record else None
+    return after, (reading, frames) if options.record else (reading.measured,)
 
 
 def _summarize(
     lanes: Lanes, state: State, reading: Reading, body: BodyState, work: Work, k: Array, ends: Array, motion: Array
 ) -> Summary:
     known = state.summary
-    x, v, next_v = dot(lanes.place[0], state.body.x), dot(motion, state.body.x), dot(motion, body.x)
+    places = jnp.stack([dot(row, state.body.x) for row in lanes.place])
+    v, next_v = dot(motion, state.body.x), dot(motion, body.x)
     first = reading.touching & ~state.program.touching & (k > 0) & jnp.isnan(known.impact)
     turning = (v <= 0) & (next_v > 0)
     moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
-    within = jnp.stack([k >= ends[0], k >= ends[1]]) & jnp.stack([k < ends[1], k < ends[2]])
-    within = within[:, None]
+    window = jnp.sum(k >= ends)
+    low, high = known.extent.low[window], known.extent.high[window]
     return Summary(
-        jnp.fmax(known.deepest, x),
-        jnp.fmax(known.widest, jnp.abs(x)),
+        jnp.fmax(known.deepest, places[0]),
+        jnp.fmax(known.widest, jnp.abs(places).max(0)),
         known.exits + (state.program.touching & ~reading.touching),
         jnp.where(first, v, known.impact),
         jnp.fmax(known.given, work.wall),
         Extent(
-            jnp.where(within, jnp.fmin(known.halves.low, x), known.halves.low),
-            jnp.where(within, jnp.fmax(known.halves.high, x), known.halves.high),
+            known.extent.low.at[window].set(jnp.fmin(low, places)),
+            known.extent.high.at[window].set(jnp.fmax(high, places)),
         ),
-        known.turns + (turning & within),
-        jnp.where(turning & (k >= ends[0]) & (known.turns.sum(0) == 0), moment, known.first_turn),
-        jnp.where(turning & (k >= ends[0]), moment, known.last_turn),
+        known.turns.at[window].add(turning),
+        jnp.where(turning & (window > 0) & (known.turns[1:].sum(0) == 0), moment, known.first_turn),
+        jnp.where(turning & (window > 0), moment, known.last_turn),
     )
 
 
@@ -174,12 +180,12 @@ def compile_block(options: Options) -> Any:
 
 def run_lanes(
     lanes: Lanes, options: Options, course: Course, given: Given, rings: tuple[int, int]
-) -> tuple[State, Reading | None, Frame | None]:
-    """The last state, and what is recorded along a first axis of periods (and a second of substeps)."""
-    halves = course.periods - course.tail, course.periods - course.tail // 2, course.periods
+) -> tuple[State, np.ndarray, Reading | None, Frame | None]:
+    """The last state, the last readings, and what is recorded along a first axis of periods (and of substeps)."""
+    edges = course.periods - course.tail * np.arange(WINDOWS, -1, -1) // WINDOWS
     state: Any = jax.tree.map(jnp.asarray, begin(lanes, given.position, given.velocity, rings))
-    lanes, ends = jax.tree.map(jnp.asarray, lanes), jnp.asarray(halves)
-    recorded = []
+    lanes, ends = jax.tree.map(jnp.asarray, lanes), jnp.asarray(edges)
+    recorded: Any = deque(maxlen=None if options.record else CYCLE // BLOCK + 1)
     for first in range(0, course.periods, BLOCK):
         inputs = Inputs(
             np.arange(first, first + BLOCK),
@@ -192,10 +198,13 @@ def run_lanes(
             state, found = compile_block(options)(lanes, ends, state, inputs)
         recorded.append(jax.tree.map(np.asarray, found))
     state = jax.tree.map(np.asarray, state)
+    behind = -course.periods % BLOCK
+    kept = jax.tree.map(lambda *parts: np.concatenate(parts), *recorded)
+    kept = jax.tree.map(lambda part: part[: len(part) - behind], kept)
     if not options.record:
-        return state, None, None
-    reading, frame = jax.tree.map(lambda *parts: np.concatenate(parts)[: course.periods], *recorded)
-    return state, reading, frame
+        return state, kept[0][-CYCLE:], None, None
+    reading, frame = kept
+    return state, reading.measured[-CYCLE:], reading, frame
 
 
 def _cut(values: np.ndarray | None, first: int, rest: float, shape: tuple[int, ...]) -> np.ndarray:

@@ -6,7 +6,7 @@ Pure functions of JAX arrays whose last axis are the lanes; a state is a tuple o
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -51,15 +51,19 @@ def look_back(ring: Array, k: Array, back: Array) -> Array:
     return jnp.take_along_axis(ring, place[None], 0)[0]
 
 
+def round_to(quantum: Any, position: Any) -> Any:
+    """A position as an encoder of these steps reads it; as it is where they are 0."""
+    xp = np if isinstance(position, np.ndarray) else jnp
+    return xp.where(quantum > 0, quantum * xp.floor(position / xp.where(quantum > 0, quantum, 1.0) + 0.5), position)
+
+
 # Of FOAW's bound.
 _SLACK = 1.0 + 1e-9
 
 
 def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: Array) -> tuple[Program, Reading]:
     """Measure, estimate the velocity and command a force (T2)."""
-    quantum = lanes.resolution
-    steps = jnp.floor(sensed / jnp.where(quantum > 0, quantum, 1.0) + 0.5)
-    measured = jnp.where(quantum > 0, quantum * steps, sensed)
+    measured = round_to(lanes.resolution, sensed)
     positions = program.positions.at[k % program.positions.shape[0]].set(measured)
     estimator = lanes.estimator
     if options.foaw:

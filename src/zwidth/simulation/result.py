@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zwidth.errors import InputError
 from zwidth.status import Status
 
 if TYPE_CHECKING:
@@ -23,10 +24,13 @@ class MotionKind(IntEnum):
     GROWING = 3
     DIVERGED = 4
     UNCLEAR = 5
+    INVALID = 6
 
 
-# A tail this small beside the widest motion is at rest; halves this much alike are steady, and hold so many swings.
-_AT_REST, _STILL, _ALIKE, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 2, 1e100
+# A tail this small beside the widest motion is at rest; windows this much alike are steady, halves hold so many swings.
+_AT_REST, _STILL, _ALIKE, _ABOUT, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 0.05, 2, 1e100
+# Who halves in so many times the periods has changed by 2 % after 20 times as many.
+_FOR_GOOD = 4000.0
 
 OF_MOTION = {
     "position": ("position of the device, into the wall", "m"),
@@ -79,9 +83,11 @@ class Motion:
         bounces: how often the wall was left again.
         impact_velocity: at the first sample at which the wall is entered from outside, in m/s; NaN where it never is.
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
-        outcome: a code of `zwidth.MotionKind`, of the tail alone: REST, its second half is below 1e-9 of the widest
-            motion; STEADY, the widths of its halves differ by at most 2 % and what the encoder's steps and noise can
-            make; DECAYING, GROWING; DIVERGED, beyond 1e100; UNCLEAR, fewer than two swings in a half: simulate longer.
+        outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
+            (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the
+            tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider. STEADY: it goes on,
+            its readings repeat, or it has no place to rest and the tail's halves are alike by 5 % and the encoder's
+            steps. DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed.
     """
@@ -116,12 +122,21 @@ class Motion:
         """The same as an xarray Dataset (extra ``store``), each variable with its long name and unit.
 
         Args:
-            *dims: names of the batch's axes; ``batch_0``, ``batch_1``, ... where left out.
+            *dims: names of the batch's axes, none for a single motion; ``batch_0``, ``batch_1``, ... where left out.
+
+        Raises:
+            InputError: more or fewer names than axes, one twice, or that of a variable.
         """
         import xarray
 
         shape = np.shape(self.amplitude)
         names = dims or tuple(f"batch_{k}" for k in range(len(shape)))
+        taken = {"time", "instant", *OF_MOTION, *OF_WHOLE}
+        if len(names) != len(shape) or len(set(names)) < len(names) or taken & set(names):
+            raise InputError(
+                f"dims: got {', '.join(map(repr, names))} for a batch of shape {shape}; give a name for each axis, all "
+                "different and none of a variable or time"
+            )
         variables: dict[str, Any] = {}
         for name, (long_name, units) in (OF_MOTION | OF_WHOLE).items():
             value = getattr(self, name)
@@ -136,42 +151,62 @@ class Motion:
         return data
 
 
-def classify(known: Any, finite: np.ndarray, blur: np.ndarray, tail: int) -> np.ndarray:
-    """How motions end; ``blur`` is by how much the widths of two halves may differ for no reason of the loop's."""
-    first, second = known.halves.high - known.halves.low
-    changing = np.where(second < first, MotionKind.DECAYING, MotionKind.GROWING)
-    alike = np.abs(first - second) <= _ALIKE * np.maximum(first, second) + blur
-    kind = np.where(alike, MotionKind.STEADY, changing)
-    kind = np.where(known.turns.min(0) < _SWINGS, MotionKind.UNCLEAR, kind)
+def classify(known: Any, outlook: Any, blur: np.ndarray, course: Any) -> np.ndarray:
+    """How motions end; ``blur`` is by how much the widths of windows may differ for no reason of the loop's."""
+    low, high = known.extent.low[1:], known.extent.high[1:]
+    half = len(low) // 2
+    whole = np.stack([high[part].max(0) - low[part].min(0) for part in (slice(half), slice(half, None))])
+    first, second = whole.max(1)
     # A tail of a period or two has not moved for want of time.
-    still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest)
-    kind = np.where(still & (tail >= _STILL), MotionKind.REST, kind)
-    return np.where(finite & (known.widest < _BEYOND), kind, MotionKind.DIVERGED)
+    still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest) & (course.tail >= _STILL)
+    swinging = np.stack([known.turns[1 : half + 1].sum(0), known.turns[half + 1 :].sum(0)]).min(0) >= _SWINGS
+    swinging &= ~still
+
+    def alike(wide: np.ndarray, share: float) -> np.ndarray:
+        return np.ptp(wide, axis=0) <= share * wide.max(0) + blur
+
+    slow, quick = outlook.pace > _FOR_GOOD * course.periods, outlook.pace <= course.periods
+    linear = slow & (outlook.settles | outlook.grows)
+    lasting = swinging & (
+        outlook.repeats | alike(whole[:, 0], _ALIKE) & linear | alike(whole[:, 0], _ABOUT) & outlook.restless & quick
+    )
+    rising = whole[1, 0] >= whole[0, 0]
+    kind = np.full(first.shape, MotionKind.UNCLEAR)
+    growing = outlook.grows & ~still & (rising | (outlook.pace <= 2 * course.periods))
+    kind = np.where(growing, MotionKind.GROWING, kind)
+    kind = np.where(outlook.settles, np.where(still, MotionKind.REST, MotionKind.DECAYING), kind)
+    kind = np.where(lasting, MotionKind.STEADY, kind)
+    # All bodies without any motion of a loop that grows.
+    kind = np.where(outlook.grows & (first == 0) & (second == 0) & still, MotionKind.REST, kind)
+    return np.where(known.widest < _BEYOND, kind, MotionKind.DIVERGED)
 
 
 @np.errstate(all="ignore")
 def to_si(
     found: Any,
     given: Any,
+    outlook: Any,
     instants: np.ndarray | None,
     period: np.ndarray,
     mass: np.ndarray,
     bodies: tuple[str, ...],
-    tail: int,
+    course: Any,
 ) -> dict[str, np.ndarray]:
     """Columns of one row a simulation, by the names of `Motion`; ``bodies`` names the positions of all bodies."""
     state, reading, frame = found
     known, force = state.summary, mass / period**2
-    low, high = known.halves
+    low, high = (part[1:, 0] for part in known.extent)
+    half = len(low) // 2
     finite = np.isfinite(state.body.x).all(0)
-    turns = known.turns.sum(0)
+    turns = known.turns[1:].sum(0)
     frequency = (turns - 1) / ((known.last_turn - known.first_turn) * period)
-    outcome = classify(known, finite, 2.0 * given.resolution + 6.0 * given.noise, tail)
     # A motion that is lost before it is large was not followed.
     lost = ~finite & (known.widest < _BEYOND)
+    outcome = classify(known, outlook, 2.0 * given.resolution + 6.0 * given.noise, course)
+    outcome = np.where(lost, MotionKind.INVALID, outcome)
     columns = {
         "amplitude": np.where(outcome == MotionKind.DIVERGED, np.inf, 0.5 * (high.max(0) - low.min(0))),
-        "trend": (high[1] - low[1]) / (high[0] - low[0]),
+        "trend": np.divide(*(high[part].max(0) - low[part].min(0) for part in (slice(half, None), slice(half)))),
         "frequency": np.where((turns > 1) & (outcome != MotionKind.REST), frequency, np.nan),
         "penetration": known.deepest,
         "bounces": known.exits.astype(int),

@@ -9,18 +9,21 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from zwidth._types import ArrayLike
-from zwidth.batching import as_float64
+from zwidth.batching import as_float64, processors
 from zwidth.errors import InputError, ResourceError, check_choice
 from zwidth.parts.checks import check_whole
-from zwidth.simulation.batch import Course, Numbers, run_batch, structure
-from zwidth.simulation.result import OF_MOTION, Motion
+from zwidth.parts.wall import resolve_wall
+from zwidth.simulation.batch import TOGETHER, Course, Numbers, run_batch, structure
+from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.status import Status
+from zwidth.xp import is_traced
 
 Contact = Literal["bilateral", "unilateral", "push_only"]
 CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")
 
-# Numbers that are kept of every instant, and how much memory they may take.
-_BYTES, _MOST_BYTES = 14 * 8, 4 << 30
+# Bytes for what is kept of an instant while it is turned to SI units, for what jitter, noise and a push take, and the
+# most of all.
+_RECORDED, _JITTERED, _DRAWN, _MOST_BYTES = 2 * 14 * 8, 20 * 8, 4 * 8, 4 << 30
 
 
 class _Argument(NamedTuple):
@@ -78,8 +81,8 @@ def simulate(
     Args:
         scenes: a `zwidth.Scene`, or a list or array of them. Its shape and those of the numbers below broadcast, as the
             shape of the batch.
-        stiffness: K in N/m; the scene's own wall where left out.
-        virtual_damping: B in N s/m, likewise.
+        stiffness: K in N/m.
+        virtual_damping: B in N s/m. Neither means each scene's own wall, as for `zwidth.Scene.is_stable`.
         periods: how many sampling periods, >= 1.
         substeps: instants recorded in each period, >= 1.
         start_position: of all bodies, in m.
@@ -104,7 +107,7 @@ def simulate(
 
     Raises:
         InputError: a number is not usable; friction on a link that rings hundreds of times a period.
-        ResourceError: more is to be recorded than 4 GiB.
+        ResourceError: what is recorded or drawn takes more than 4 GiB.
 
     Numerics:
         Float64. Matrix exponentials over the constant parts of a period; with friction the instants of stopping and
@@ -143,11 +146,7 @@ def simulate(
     course = Course(periods, substeps, tail, contact, record)
     known, which = _list_scenes(scenes)
     numbers, which, good = _read(known, which, given, seed, push_history, periods)
-    if record and numbers.seed.size * periods * substeps * _BYTES > _MOST_BYTES:
-        raise ResourceError(
-            f"{numbers.seed.size} simulations of {periods * substeps} instants take more than "
-            f"{_MOST_BYTES >> 30} GiB to record; use record=False, or fewer of them at a time"
-        )
+    _check_memory(numbers, course)
     shape, which = which.shape, which.ravel()
     found: dict[str, np.ndarray] = {}
     groups: dict[tuple[Any, ...], list[int]] = {}
@@ -165,6 +164,7 @@ def simulate(
         # What was put in place of a bad number is no one's motion.
         column[~good] = _missing(column.dtype)
     found["status"][~good] = Status.INVALID_INPUT
+    found["outcome"][~good] = MotionKind.INVALID
     if record:
         found["time"] = _lay_time(known, which, np.arange(periods * substeps) / substeps, found.get("time"))
     shaped = {
@@ -172,6 +172,21 @@ def simulate(
         for name, column in found.items()
     }
     return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
+
+
+def _check_memory(numbers: Numbers, course: Course) -> None:
+    """Refuse what the memory of a machine may not hold."""
+    count, instants = numbers.seed.size, course.periods * course.substeps
+    together = min(count, TOGETHER * processors())
+    kept = count * instants * _RECORDED if course.record else 0
+    jitter = together * instants * _JITTERED if np.any(numbers.jitter > 0) else 0
+    drawn = together * course.periods * _DRAWN * (bool(np.any(numbers.noise > 0)) + (numbers.history is not None))
+    if kept + jitter + drawn > _MOST_BYTES:
+        remedy = "use record=False, or fewer at a time" if kept else "use fewer periods, or fewer at a time"
+        raise ResourceError(
+            f"{count} simulations of {instants} instants take {(kept + jitter + drawn) / 2**30:.1f} GiB, more than "
+            f"{_MOST_BYTES >> 30} GiB{' to record' if kept else ', for jitter, noise and pushes'}; {remedy}"
+        )
 
 
 def _lay_time(known: list[Any], which: np.ndarray, steps: np.ndarray, drawn: np.ndarray | None) -> np.ndarray:
@@ -203,6 +218,8 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     for place, scene in np.ndenumerate(array):
         if not (hasattr(scene, "device") and hasattr(scene, "timing")):
             raise InputError(f"scenes: got {scene!r}; a zwidth.Scene or a list of them is needed")
+        if is_traced(scene.mass, scene.timing.period):
+            raise InputError("scenes: got one of values that JAX traces; simulate outside of jit, vmap and grad")
         which[place] = known.setdefault(id(scene), len(known))
     return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which
 
@@ -213,9 +230,12 @@ def _read(
     """The numbers of all simulations, the scene of each in the batch's shape, and which have usable numbers."""
     if given["static"] is None:
         given = {**given, "static": given["coulomb"]}
-    for name in ("stiffness", "virtual_damping"):
-        if given[name] is None:
-            given[name] = np.array([float(getattr(scene.wall, name)) for scene in known])[which]
+    walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"]) for scene in known]
+    if given["stiffness"] is None:
+        own = np.array(walls, float).reshape(-1, 2)[which]
+        given = {**given, "stiffness": own[..., 0], "virtual_damping": own[..., 1]}
+    elif given["virtual_damping"] is None:
+        given = {**given, "virtual_damping": 0.0}
     arrays = {name: as_float64(name, value) for name, value in given.items()}
     seeds = _read_seeds(seed)
     outer, pushes = [], None
@@ -273,6 +293,8 @@ def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: 
 
 
 def _read_seeds(seed: Any) -> np.ndarray:
+    if is_traced(seed):
+        raise InputError("seed: got a value that JAX traces; give whole numbers, outside of jit, vmap and grad")
     try:
         seeds = np.asarray(seed)
     except ValueError:

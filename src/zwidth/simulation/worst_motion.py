@@ -17,6 +17,7 @@ from zwidth.linear.passivity import PassivityCondition, needed_damping
 from zwidth.linear_loop import Estimate
 from zwidth.numerics.double_double import two_sum
 from zwidth.parts.checks import check_whole
+from zwidth.parts.wall import resolve_wall
 from zwidth.status import Status
 
 _SHORTEST, _LONGEST = 8, 1 << 22
@@ -24,6 +25,8 @@ _SHORTEST, _LONGEST = 8, 1 << 22
 _PEAK = 1e-3
 # Eight rounding errors of each term; a filter's own are seen where it is given the same motion at another scale.
 _ROUNDING, _SCALE, _SEEN = 2.0**-49, 0.7, 8.0
+# By how much what one motion misses may exceed what the condition asks for: rounding of either.
+_ROUNDED = 1e-9
 # A share of what a filter has been given that no sum shows.
 _FORGOTTEN = 1e-30
 # Nodes of a scan, rounds that narrow its highest one eightfold each, the share of the proved height it must reach, and
@@ -47,7 +50,9 @@ class WorstMotion(NamedTuple):
     status: Status
 
 
-def worst_motion(scene: Any, stiffness: float, virtual_damping: float = 0.0, *, longest: int = 1 << 20) -> WorstMotion:
+def worst_motion(
+    scene: Any, stiffness: float | None = None, virtual_damping: float | None = None, *, longest: int = 1 << 20
+) -> WorstMotion:
     """Return a motion over which device and wall give energy, the proof that the wall is not passive.
 
     ``energy = integral (b v^2 - F_wall v) dt < 0`` from rest at x = 0; afterwards the device is held still.
@@ -55,20 +60,21 @@ def worst_motion(scene: Any, stiffness: float, virtual_damping: float = 0.0, *, 
     Args:
         scene: a `zwidth.Scene`, with the sensor where the wall's force acts. Its hand is left out: the motion is
             prescribed.
-        stiffness: K of the wall in N/m, one number.
+        stiffness: K of the wall in N/m, one number; the scene's own wall where neither is given.
         virtual_damping: B of the wall in N s/m, one number.
         longest: the most periods that are tried, 8 to 4194304.
 
     Returns:
         `WorstMotion`: ``time``, ``position``, ``velocity``, ``force``, ``energy``, arrays of one length. The largest
         sampled position is 1 mm; energy goes by its square. ``missing_damping`` does not depend on that size and is at
-        most ``-scene.passivity_margin``, which longer motions approach. ``frequency`` is where the wall needs the most
-        damping, one of several such; 0 for a push into a wall of negative stiffness. ``status``: OK; UNREACHABLE where
-        no motion gives energy (``passivity_margin`` >= 0); NOT_CONVERGED where none that was tried does so beyond
-        rounding; OUT_OF_RANGE; these with NaN in arrays of length 1.
+        most ``-scene.passivity_margin``, which longer motions approach; no damping makes a wall of negative stiffness
+        passive, and there it is that of the shortest push that gives energy. ``frequency`` is where the wall needs
+        the most damping, one of several such; 0 for a push into a wall of negative stiffness. ``status``: OK;
+        UNREACHABLE where no motion gives energy (``passivity_margin`` >= 0); NOT_CONVERGED where none that was
+        tried does so beyond rounding; OUT_OF_RANGE; these with NaN in arrays of length 1.
 
     Raises:
-        InputError: the sensor is at the tip of a coupling; the wall is not one of finite numbers.
+        InputError: the sensor is at the tip of a coupling; the wall is not one of finite numbers, or not said.
 
     Numerics:
         A sinusoid at that frequency under a window, of 8, 16, ... periods, until it gives energy: some 3 to 9
@@ -87,8 +93,9 @@ def worst_motion(scene: Any, stiffness: float, virtual_damping: float = 0.0, *, 
         0 Hz, -435.13 µJ
     """
     longest = check_whole("longest", longest, _SHORTEST, _LONGEST)
-    alpha, beta = one_wall(*np.broadcast_arrays(*scene.normalize_walls(stiffness, virtual_damping)))
-    wall = np.asarray(stiffness, float).item(), np.asarray(virtual_damping, float).item()
+    given = resolve_wall(scene.wall, stiffness, virtual_damping)
+    alpha, beta = one_wall(*np.broadcast_arrays(*scene.normalize_walls(*given)))
+    wall = np.asarray(given[0], float).item(), np.asarray(given[1], float).item()
     margin = float(scene.passivity_margin(*wall))
     if not margin < 0:
         return _no_motion(Status.UNREACHABLE if margin >= 0 else Status.OUT_OF_RANGE)
@@ -106,10 +113,22 @@ def worst_motion(scene: Any, stiffness: float, virtual_damping: float = 0.0, *, 
     while periods <= longest:
         for w, damping in kinds:
             motion = _move(scene, wall, _sampled_position(w, periods), damping)
-            if motion is not None:
+            if motion is not None and w is None:
+                motion = _shorten_push(scene, wall, periods, motion)
+            if motion is not None and motion.missing_damping <= -margin * (1.0 + _ROUNDED):
                 return motion._replace(frequency=(w or 0.0) / (2.0 * np.pi * scene.timing.period))
         periods *= 2
     return _no_motion(Status.NOT_CONVERGED)
+
+
+def _shorten_push(scene: Any, wall: tuple[float, float], periods: int, motion: WorstMotion) -> WorstMotion:
+    """The shortest push that gives energy: what a push needs has no end, it grows with its length."""
+    low = 0
+    while periods - low > 1:
+        middle = (low + periods) // 2
+        shorter = _move(scene, wall, _sampled_position(None, middle), np.inf)
+        low, periods, motion = (middle, periods, motion) if shorter is None else (low, middle, shorter)
+    return motion
 
 
 def _no_motion(status: Status) -> WorstMotion:

@@ -19,7 +19,7 @@ from zwidth.config.study import DelayModels
 from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.stability.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, add_si_of_scene, stack
+from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device, stack
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
 from zwidth.studies.stable_set import tabulate_walls, trace_outlines
@@ -149,7 +149,8 @@ class BoundaryStudy(CurvesStudy):
             del path["kind"]
             parts.append({"curve": "ridge_path", **path})
             notes += remarks
-        parts += passive_outlines(deltas, delays) if self.passivity else ()
+        share = share_of_device(self.delta, self.d, self.device or scene)
+        parts += passive_outlines(deltas, delays, share) if self.passivity else ()
         table = add_si_of_scene(stack(parts), self.delta, self.d, self.device or scene)
         return Outcome(table=table, figures={"": partial(figures.draw_boundary, table)}, notes=tuple(notes))
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Union
 
 from pydantic import (
@@ -12,6 +14,7 @@ from pydantic import (
     Field,
     GetCoreSchemaHandler,
     GetJsonSchemaHandler,
+    PrivateAttr,
     SerializationInfo,
     TypeAdapter,
     WithJsonSchema,
@@ -19,6 +22,7 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.reader import read_model
@@ -134,6 +138,13 @@ def _check_version(value: Any) -> int:
     raise problem(f"got {describe(value)}", f"this release reads version {FORMAT_VERSION} of the format", remedy)
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a configuration stands, which makes it no other."""
+
+    folder: Path = field(compare=False)
+
+
 class Config(Strict):
     """A configuration file, checked and complete: every study holds the values that it runs with."""
 
@@ -153,6 +164,13 @@ class Config(Strict):
 
     studies: Annotated[tuple[Annotated[Study, _OfAnyKind], ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
+
+    _place: _Place = PrivateAttr(default_factory=lambda: _Place(find_file("").absolute()))
+
+    @property
+    def folder(self) -> Path:
+        """Where the files are that it names."""
+        return self._place.folder
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:

@@ -13,7 +13,7 @@ from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import unit_schema
 from zwidth.config.parameters import CutoffAxis, DampingAxis, WindowAxis
-from zwidth.config.parts import Order
+from zwidth.config.parts import Order, locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.units import quantity
 from zwidth.errors import InputError
@@ -82,7 +82,7 @@ class FiltersStudy(ComputedStudy):
             try:
                 LowPass(cutoff=self.cutoff.largest, order=self.order).estimate(self.device.period)
             except InputError as error:
-                yield ("cutoff",), problem(str(error).removeprefix("velocity.cutoff: "))
+                yield ("cutoff",), locate_refusal(error)[1]
 
     @property
     def dampings(self) -> np.ndarray:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Iterable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
@@ -166,7 +167,7 @@ class FitStudy(ComputedStudy):
     """The longest delay looked for in logs, in s or with a unit; 20 periods where left out."""
 
     resample: bool = False
-    """Whether uneven times of logs are made even by interpolation."""
+    """Whether times off by up to a quarter of a period are taken for those of a clock that wavers, samples as even."""
 
     velocity: VelocityField | None = None
     """How the loop estimates its velocity; the difference of two samples where left out."""
@@ -260,6 +261,7 @@ class FitStudy(ComputedStudy):
             device = ", ".join(f"{label} = {said[label].partition(' (')[0]}" for label in labels)
             answers += [*trouble, f"{device}, fitted to {each.source}", f"K_max = {said['K_max']}"]
             answers += [f"set {said['set']}"] if "set" in said else []
+            answers += [said["no wall"]] if "no wall" in said else []
             notes += [f"{each.source}: {label}: {text}" for label, text in rows if label not in _LABELS]
         answers += [_compare(fits[0].fit, fits[1].fit)] if len(fits) > 1 else []
         step = next((each.fit.resolution for each in fits if each.fit.motions), 0.0)
@@ -282,7 +284,7 @@ class FitStudy(ComputedStudy):
                 given, own = with_unit(period, "s"), with_unit(found.period, "s")
                 raise InputError(f"period: got {given}, and the log's times are {own} apart; remove it, or the times")
             period = found.period
-            fits.append(_Fitted("log", " and ".join(section.csv for section in self.log), found))
+            fits.append(_Fitted("log", " and ".join(Path(section.csv).name for section in self.log), found))
         if self.buzz:
             walls = tuple(BuzzPoint(each.stiffness, each.virtual_damping, each.frequency) for each in self.buzz)
             found = fit_buzz(walls, period=period, velocity=velocity, noise=self.noise)
@@ -292,7 +294,7 @@ class FitStudy(ComputedStudy):
 
 # Labels of what a device is, and of all that is told in answers.
 _DEVICE = ("m", "J", "b", "t_d", "friction")
-_LABELS = ("m", "J", "b", "t_d", "K_max", "set", "fitted to")
+_LABELS = ("m", "J", "b", "t_d", "K_max", "set", "no wall", "fitted to")
 
 
 def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
@@ -307,7 +309,7 @@ def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
     fit = each.fit
     row: dict[str, Any] = {"fitted_to": each.source, "status": Status(fit.status).name}
     of = {"mass": units.mass, "damping": units.damping, "delay": "s", "stiffness_max": units.stiffness}
-    of |= {"friction": units.force} if "friction" in fit.errors else {}
+    of |= {name: units.force for name in ("friction", "offset") if name in fit.errors}
     errors = fit.errors | {"stiffness_max": fit.stiffness_error}
     for name, unit in of.items():
         ends = fit.intervals[name]

@@ -18,7 +18,7 @@ from zwidth.config.study import HeldOnly
 from zwidth.stability.labels import is_stable
 from zwidth.stability.passivity import is_passive
 from zwidth.stability.radii import spectral_radius
-from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene
+from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene, share_of_device
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 
@@ -75,20 +75,22 @@ class MapStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The outputs on the grid, as arrays, and a figure of each."""
         alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
+        share = share_of_device(self.delta, self.d, scene)
         outputs = {name: np.empty(self.shape, dtype=_TYPES[name]) for name in self.outputs}
         # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
         for delta_index, d_index in np.ndindex(delta.size, d.size):
             place = (slice(None), slice(None), delta_index, d_index)
-            wall = (alpha[:, None], beta[None, :], float(delta[delta_index]), float(d[d_index]))
             for name in outputs:
-                outputs[name][place] = np.asarray(_FUNCTIONS[name](*wall))
+                damping = float(delta[delta_index]) * (share if name == "passive" else 1.0)
+                found = _FUNCTIONS[name](alpha[:, None], beta[None, :], damping, float(d[d_index]))
+                outputs[name][place] = np.asarray(found)
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
         arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
-        return Outcome(arrays=arrays, figures={f"_{name}": partial(_draw, arrays, name) for name in names})
+        return Outcome(arrays=arrays, figures={f"_{name}": partial(_draw, arrays, name, share) for name in names})
 
 
-def _draw(arrays: dict[str, Any], name: str) -> Any:
+def _draw(arrays: dict[str, Any], name: str, share: float) -> Any:
     """A figure with the exact edges of the panels that it has."""
     from zwidth.figures.stability_map import PANELS
     from zwidth.figures.style import pick_evenly
@@ -96,7 +98,8 @@ def _draw(arrays: dict[str, Any], name: str) -> Any:
 
     delta, d = arrays["delta"], arrays["d"]
     shown = product(delta[pick_evenly(delta.size, PANELS)], d[pick_evenly(d.size, PANELS)])
-    edges = (
-        {place: find_edges(*map(float, place)).get(name) for place in shown} if name in ("stable", "passive") else {}
-    )
+    edges = {}
+    for delta, d in shown if name in ("stable", "passive") else ():
+        damping = float(delta) * (share if name == "passive" else 1.0)
+        edges[delta, d] = find_edges(damping, float(d)).get(name)
     return figures.draw_map(arrays, name, outlines={place: edge for place, edge in edges.items() if edge})

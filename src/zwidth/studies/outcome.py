@@ -16,6 +16,7 @@ from zwidth.config.axes import Axis
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import Study
 from zwidth.figures.table import SI_COLUMNS
+from zwidth.formatting import to_cell
 
 Table: TypeAlias = dict[str, np.ndarray]
 
@@ -86,10 +87,21 @@ def add_si_columns(table: Table, device: PhysicalDevice | PhysicalScene) -> Tabl
 
 def add_si_of_scene(table: Table, delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Table:
     """A table of walls, in SI units as well where delta and d are those of a rigid scene or device alone."""
+    device = _find_owner(delta, d, owner)
+    return add_si_columns(table, device) if device is not None else table
+
+
+def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:
+    """The part of the damping delta that passivity counts on: without the hand, where they are those of a device."""
+    device = _find_owner(delta, d, owner)
+    return device.own_share if device is not None else 1.0
+
+
+def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> PhysicalScene | PhysicalDevice | None:
+    """The rigid scene or device, where delta and d are those of it alone."""
     if not isinstance(owner, PhysicalScene | PhysicalDevice) or not owner.is_rigid:
-        return table
-    own = _is_single(delta, owner.delta) and _is_single(d, owner.d)
-    return add_si_columns(table, owner) if own else table
+        return None
+    return owner if _is_single(delta, owner.delta) and _is_single(d, owner.d) else None
 
 
 def _is_single(axis: Axis, value: float) -> bool:
@@ -114,9 +126,9 @@ def stack(parts: Iterable[Mapping[str, object]]) -> Table:
 
 
 def csv_text(table: Table) -> str:
-    """A table as CSV; numbers are written with all digits that tell them apart."""
+    """A table as CSV; numbers are written with all digits that tell them apart, texts so that no program runs them."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(table)
-    writer.writerows(zip(*(column.tolist() for column in table.values()), strict=True))
+    writer.writerows(zip(*(map(to_cell, column.tolist()) for column in table.values()), strict=True))
     return buffer.getvalue()

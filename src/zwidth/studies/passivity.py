@@ -59,13 +59,16 @@ def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     return passive_edge(np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS), d)
 
 
-def passive_outlines(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
-    """The edge of the passive set of every device that has damping, as columns; without it nothing is passive."""
+def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:
+    """The edge of the passive set of every device that has damping, as columns; without it nothing is passive.
+
+    ``share`` is the part of the damping that is the device's own: a hand's does not count.
+    """
     for d in delays:
         alpha, beta = unit_outline(float(d))
-        for delta in deltas[deltas > 0]:
+        for delta in deltas[share * deltas > 0]:
             yield {"curve": "passive", "d": d, "delta": delta, "delay_model": "held",
-                   "alpha": delta * alpha, "beta": delta * beta}  # fmt: skip
+                   "alpha": share * delta * alpha, "beta": share * delta * beta}  # fmt: skip
 
 
 def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:

@@ -70,11 +70,14 @@ class RecommendStudy(ResponseStudy):
         wall = VirtualWall(stiffness=alpha * stiffness, virtual_damping=beta * damping)
         verdict = assess(replace(bare, wall=wall))
         assert isinstance(verdict, Assessment), "scenes with parts are recommended for elsewhere"
-        columns, note = self.respond(device, alpha, beta, label=device.label or self.name, physical=True)
+        # The wall as it was judged: from SI units and back, a last digit may be another.
+        columns, note = self.respond(
+            device, verdict.alpha, verdict.beta, label=device.label or self.name, physical=True
+        )
         response = stack([columns])
         found = _summary(device, wall, verdict, self.stiffness_fraction, float(columns["settling_time_s"]))
         edge, verified = outline(device.delta, device.d, "held")
-        passive = passive_outlines(np.array([device.delta]), np.array([device.d]))
+        passive = passive_outlines(np.array([device.delta]), np.array([device.d]), device.own_share)
         region = add_si_columns(stack([edge, *passive]), device)
         notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
         return Outcome(

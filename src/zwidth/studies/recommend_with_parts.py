@@ -7,13 +7,17 @@ import math
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from zwidth import figures
-from zwidth.formatting import plain, with_unit
+from zwidth.design.limits import describe_islands
+from zwidth.formatting import plain, tell_apart, with_unit
 from zwidth.linear.passivity import has_condition
-from zwidth.linear.stiffest import StiffestWall
+from zwidth.linear.stiffest import StiffestWall, choose_damping
 from zwidth.scene import Scene
+from zwidth.status import Status
 from zwidth.studies.outcome import Outcome, stack
-from zwidth.studies.stable_set import bound_damping, name_kind, tabulate_walls, trace_outlines
+from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
 
 _DECAY = math.log(50.0)
 _SIDES = ("lower", "upper")
@@ -23,15 +27,23 @@ _PASSIVE = {True: "yes", False: "no", None: "not known, the sensor is not where 
 def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -> Outcome:
     """The stiffest stable wall and one at a share of its stiffness, with the stable damping around that."""
     top = scene.max_stiffness()
-    wall = top._replace(stiffness=fraction * top.stiffness)
+    softer = fraction * top.stiffness
+    wall = top._replace(stiffness=softer)
+    if top.status == Status.OK:
+        wall = wall._replace(virtual_damping=np.float64(choose_damping(scene, top, float(softer))))
     stable = bool(scene.is_stable(wall.stiffness, wall.virtual_damping))
-    ends = bound_damping(scene, float(wall.stiffness), float(wall.virtual_damping)) if stable else (math.nan, math.nan)
+    columns = scene.stable_damping(wall.stiffness).tolist() if stable else []
+    ends = next(((low, high) for low, high in columns if low < wall.virtual_damping < high), (math.nan, math.nan))
     found = _summarize(scene, top, wall, fraction, stable, ends)
     outlines = stack(trace_outlines(scene, label=label))
     marked = {"stiffest": top, "recommended": wall} if stable else {"stiffest": top}
-    notes = []
+    notes = describe_islands(scene)
     if not stable:
-        notes.append(f"no stable wall at {fraction:g} of the largest stiffness with its damping; choose another share")
+        notes.append(f"no stable wall was found at {fraction:g} of the largest stiffness; choose another share")
+    elif wall.virtual_damping != top.virtual_damping:
+        notes.append(
+            "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
+        )
     return Outcome(
         table=outlines,
         figures={} if not outlines else {"": partial(figures.draw_stable_set, outlines, tabulate_walls(label, marked))},
@@ -53,8 +65,9 @@ def spell_answer(found: dict[str, Any], margins: Any) -> tuple[str, ...]:
     share = f"{100 * best['stiffness_fraction']:g} % of the stiffest stable wall, {largest}"
     wall = f"K = {stiffness}, B = {with_unit(best['virtual_damping'], 'N s/m')}: {share}"
     if not best["stable"]:
-        return wall, "NOT stable; choose a smaller stiffness_fraction"
-    lower, upper = (plain(math.nan if (end := best[f"virtual_damping_{side}"]) is None else end) for side in _SIDES)
+        return wall, "NOT stable; choose another stiffness_fraction"
+    low, high = (math.nan if (end := best[f"virtual_damping_{side}"]) is None else end for side in _SIDES)
+    lower, upper = tell_apart(low, high)
     delay = float(margins.delay_margin)
     apart = (
         f"gain {plain(float(margins.gain_margin))}",
@@ -110,7 +123,11 @@ def _describe(found: dict[str, Any]) -> str:
 
     units = {"stiffness": "N/m", "virtual_damping": "N s/m"}
     top, wall = ([spell(row[name], unit) for name, unit in units.items()] for row in (most, best))
-    lower, upper = (spell(best[f"virtual_damping_{end}"], "N s/m") for end in ("lower", "upper"))
+    low, high = (best[f"virtual_damping_{side}"] for side in _SIDES)
+    if low is None or high is None:
+        lower, upper = spell(low, "N s/m"), spell(high, "N s/m")
+    else:
+        lower, upper = tell_apart(low, high, "N s/m")
     lines = [
         "# Recommended virtual wall",
         "",

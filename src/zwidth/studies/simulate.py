@@ -46,6 +46,7 @@ _WORDS = {
     MotionKind.DECAYING: "decaying",
     MotionKind.GROWING: "growing",
     MotionKind.DIVERGED: "growing without end",
+    MotionKind.INVALID: "not followed to its end",
 }
 
 
@@ -210,10 +211,8 @@ def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarr
 
 def describe_end(motion: Motion, k: int) -> str:
     """How a recorded motion of several ends, in words."""
-    if motion.status[k]:
-        return "not followed to its end"
     end = MotionKind(int(motion.outcome[k]))
-    if end in (MotionKind.REST, MotionKind.DIVERGED):
+    if end in (MotionKind.REST, MotionKind.DIVERGED, MotionKind.INVALID):
         return _WORDS[end]
     velocity, contact = motion.velocity[k], motion.contact[k]
     tail = max(contact.size // 4, 1)

@@ -27,10 +27,12 @@ def perform(path: str, family: str, index: int) -> None:
         from zwidth.sweep.scenes import compute_scenes
 
         block = store.grid.scene_block(plan.place(index))
-        store.write(task, compute_scenes(plan.family, plan.outputs, store.study, block))
-        return
-    # Loads JAX, which a process that only hands out work has no use for.
-    from zwidth.sweep.compute import compute
+        values = compute_scenes(plan.family, plan.outputs, store.study, block)
+    else:
+        # Loads JAX, which a process that only hands out work has no use for.
+        from zwidth.sweep.compute import compute
 
-    block = store.grid.block(plan.place(index))
-    store.write(task, compute(plan.family, plan.outputs, block, store.study.accuracy))
+        values = compute(plan.family, plan.outputs, store.grid.block(plan.place(index)), store.study.accuracy)
+    # A scheduler that restarts, or a run that goes on, may have handed it out twice.
+    if not store.is_done(task):
+        store.write(task, values)

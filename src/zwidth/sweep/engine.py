@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from zwidth.errors import StoreExistsError
-from zwidth.sweep.jobs import Finished, Job, Perform, in_this_process
+from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, Perform, in_this_process
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.resume import check_same, new_store, remove_partials, repair, store_path
 from zwidth.sweep.store import Store
@@ -56,6 +56,7 @@ class Sweeps:
     results: dict[str, SweepResult]  # by the name of the study
     hopeless: str = ""  # the error that ended the run early, for no other chunk would have escaped it, as a full disk
     interrupted: bool = False  # whether somebody stopped the run
+    lost: str = ""  # why the cluster could not go on
 
 
 def compute_sweeps(
@@ -111,7 +112,11 @@ def compute_sweeps(
                 finished = in_workers(list(points), workers, perform)
             else:
                 finished = in_this_process(list(points), perform)
-            _follow(finished, points, sweeps, stores, names, progress)
+            try:
+                _follow(finished, points, sweeps, stores, names, progress)
+            except LostSchedulerError as error:
+                sweeps.lost = f"scheduler: {scheduler} {error}"
+            _count(list(points), sweeps, stores, names)
         return sweeps
 
 
@@ -170,7 +175,6 @@ def _follow(
             if finished.error:
                 sweep.failed[f"{name}/{stores[name].plan.describe(finished.job.task)}"] = finished.error
             else:
-                sweep.computed += 1
                 computed += points[finished.job]
             rate = computed / max(time.perf_counter() - start, 1e-9)
             left = (total - ended) / rate if rate else math.nan
@@ -183,3 +187,18 @@ def _follow(
     finally:
         # Ends the workers.
         results.close()
+
+
+def _count(jobs: list[Job], sweeps: Sweeps, stores: dict[str, Store], names: dict[str, str]) -> None:
+    """Count the chunks that are done: not those that an engine calls so, but those that the stores hold."""
+    over = sweeps.hopeless or sweeps.interrupted or sweeps.lost
+    for job in jobs:
+        name = names[job.path]
+        sweep, store = sweeps.results[name], stores[name]
+        chunk = f"{name}/{store.plan.describe(job.task)}"
+        if store.holds(job.task):
+            sweep.computed += 1
+            # Somebody else has done it in the meantime, a worker that was given up say.
+            sweep.failed.pop(chunk, None)
+        elif not over:
+            sweep.failed.setdefault(chunk, "it was computed, and is not in the store")

@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth.errors import StoreError, StoreExistsError
 from zwidth.files.whole import hidden_beside
-from zwidth.formatting import header
+from zwidth.formatting import header, to_cell
 from zwidth.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 from zwidth.sweep.store import open_dataset
 
@@ -64,6 +64,9 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
             f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; export to netCDF, or select "
             "a part with zwidth.open_dataset"
         )
+    if "device" in dataset.coords:
+        labels = [to_cell(str(label)) for label in np.atleast_1d(dataset["device"].values)]
+        dataset["device"] = (dataset["device"].dims, np.reshape(labels, dataset["device"].shape))
     rows = dataset if dataset.sizes else dataset.expand_dims("point")
     with hidden_beside(target) as partial:
         # What a folder lists first differs from one machine to the next; a table has one order.

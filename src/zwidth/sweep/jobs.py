@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import NamedTuple, TypeAlias
 
+from zwidth.errors import ZwidthError
 from zwidth.files.whole import hopeless
 from zwidth.sweep.plan import Task
 
@@ -13,6 +14,10 @@ Perform: TypeAlias = Callable[[str, str, int], None]
 
 MAX_ATTEMPTS = 3
 """How often a chunk is tried whose worker is killed."""
+
+
+class LostSchedulerError(ZwidthError):
+    """An engine that cannot go on; the message follows on its name."""
 
 
 class Job(NamedTuple):

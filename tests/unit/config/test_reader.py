@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
+from waiting import LONGEST
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
 from zwidth.scene import Scene
@@ -223,5 +224,5 @@ def test_the_schema_describes_every_field():
 
 def test_reading_a_config_needs_no_jax():
     code = "import sys, zwidth.studies.document; print('jax' in sys.modules)"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=LONGEST)
     assert result.stdout.strip() == "False"

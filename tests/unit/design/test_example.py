@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 import zwidth
+from waiting import LONGEST
 from zwidth import max_stiffness
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -15,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[3]
 
 def test_the_example_reaches_the_wanted_stiffness():
     script = ROOT / "scripts" / "example_design.py"
-    result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=300)
+    result = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, timeout=LONGEST)
     assert result.returncode == 0, result.stderr
     rows = re.findall(r"b = ([\d.]+) N s/m, rate = ([\d.]+) Hz: K_max = ([\d.]+) kN/m, price ([\d.]+)", result.stdout)
     damping, rate, stiffness, price = (float(value) for value in rows[0])

@@ -9,6 +9,7 @@ import sys
 import pytest
 from click.testing import CliRunner
 
+from waiting import LONGEST
 from zwidth.cli.commands import cli
 from zwidth.errors import InputError
 
@@ -42,5 +43,5 @@ def test_the_help_loads_no_bokeh():
     code = (
         "import sys; from zwidth.cli.commands import cli; print([n for n in ('bokeh', 'tornado') if n in sys.modules])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=LONGEST)
     assert done.stdout.strip() == "[]"

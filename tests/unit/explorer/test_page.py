@@ -2,54 +2,22 @@
 
 from __future__ import annotations
 
-import json
-from typing import Any
-
 import numpy as np
 import pytest
 
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
 
-from bokeh.document import Document
 from click.testing import CliRunner
 
+from open_pages import open_page, say
 from zwidth.cli.commands import cli
-from zwidth.cli.explore import check_lines, slope_lines
 from zwidth.explorer import details, model
 from zwidth.explorer.controls import Controls
-from zwidth.explorer.details import Words
-from zwidth.explorer.page import Page
-
-
-class Queue:
-    """Takes the place of the worker: what is submitted runs when the test says so."""
-
-    def __init__(self):
-        self.tasks = []
-
-    def submit(self, task, *arguments):
-        self.tasks.append((task, arguments))
-
-    def work(self):
-        tasks, self.tasks = self.tasks, []
-        for task, arguments in tasks:
-            task(*arguments)
 
 
 @pytest.fixture
 def page():
-    queue: Any = Queue()
-    texts: dict[str, Any] = {}
-    opened: Any = Page(Document(), Controls(), Words(check_lines, slope_lines), queue)
-    opened.answer.on_change("data", lambda _, __, data: texts.update(json.loads(data["json"][0])))
-    # There is no loop: what is handed over is taken at once.
-    opened._hand_over = opened._take
-    opened.texts, opened.queue = texts, queue
-    return opened
-
-
-def say(page, **message):
-    page.receive({"json": [json.dumps(message)]})
+    return open_page(Controls())
 
 
 def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):

@@ -264,3 +264,12 @@ def test_the_result_as_plain_numbers():
         fit.stiffness_max + fit.reach * fit.stiffness_error,
     ]
     assert fit.scene.device.mass == fit.mass
+
+
+def test_walls_of_a_weakly_damped_device_are_found():
+    """Undamped, it buzzes at 1.2 Hz: a damping far below those that were looked at."""
+    mass, damping, delay, period = 0.5288937, 0.0202762, 0.1651576e-3, 1e-3
+    points = [(30.48348443813232, 0.0, 1.208272659601074), (133600.01096388383, 109.95602220875084, 87.03698526715972)]
+    fit = zwidth.fit_buzz(points, period=period)
+    assert fit.status == Status.OK
+    np.testing.assert_allclose([fit.mass, fit.damping, fit.delay], [mass, damping, delay], rtol=1e-6)

@@ -9,9 +9,10 @@ from scipy.signal import lfilter, ss2tf
 import tolerances
 import zwidth
 from zwidth.errors import InputError
+from zwidth.fitting.words import choose_wall, describe_fit, write_scene
 from zwidth.status import Status
 
-EXACT, AGAIN = tolerances.FIT_EXACT.float64, tolerances.FIT_AGAIN.float64
+EXACT = tolerances.FIT_EXACT.float64
 PERIOD = 1e-3
 
 
@@ -69,11 +70,12 @@ def test_an_exact_log_gives_the_device_back(mass, damping, delay):
     fit = zwidth.fit_log(PERIOD * np.arange(700), move(mass, damping, delay, force, (0.01, -0.1)), force)
     np.testing.assert_allclose([fit.mass, fit.damping], [mass, damping], rtol=EXACT)
     assert fit.delay == pytest.approx(delay, abs=EXACT * PERIOD)
-    assert (fit.status, fit.offset, fit.doubts) == (Status.OK, 0.0, ())
+    assert fit.offset == pytest.approx(0.0, abs=EXACT)
+    assert (fit.status, fit.doubts) == (Status.OK, ())
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_another_program_finds_the_same(seed):
+def test_another_program_that_knows_of_no_friction_finds_the_same_within_the_errors(seed):
     rng = np.random.default_rng(seed)
     mass, damping, delay = rng.uniform(0.05, 0.5), rng.uniform(1.0, 8.0), rng.uniform(1.1, 4.9) * PERIOD
     force = steps_to_and_fro(rng, 800)
@@ -81,7 +83,9 @@ def test_another_program_finds_the_same(seed):
     fit = zwidth.fit_log(PERIOD, position, force)
     start = [1.01 * mass, 0.99 * damping, delay / PERIOD + 0.02, 0.0, 0.0]
     again = fit_again(force, position, 22, start)
-    np.testing.assert_allclose([fit.mass, fit.damping, fit.delay / PERIOD], again, rtol=AGAIN)
+    # What one number more moves is less than its error: 4 of them for three seeds and numbers.
+    away = (np.array([fit.mass, fit.damping, fit.delay]) - again * [1.0, 1.0, PERIOD]) / list(fit.errors.values())[:3]
+    assert np.abs(away).max() < 4.0
 
 
 def test_a_simulated_motion_gives_its_device_back():
@@ -155,7 +159,6 @@ def test_friction_comes_back_from_a_simulated_motion(delay):
     # A push acts at once: the loop's delay is of the wall's force.
     np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 2.0, 0.3], rtol=EXACT)
     assert fit.delay == pytest.approx(0.0, abs=EXACT)
-    assert fit.tried[0].parts == ("friction",)
     assert (fit.doubts, fit.status) == ((), Status.OK)
 
 
@@ -206,3 +209,59 @@ def test_bad_logs_are_refused_in_one_line(time, position, force, words):
         zwidth.fit_log(time, position, force)
     assert words in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def push_once(coulomb, samples=1500):
+    """One push of 40 ms, after which friction brings the mass to rest."""
+    force = np.zeros(samples)
+    force[50:90] = 1.0
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.5), zwidth.Timing(period=PERIOD))
+    return zwidth.simulate(scene, 0.0, 0.0, push_history=force, coulomb=coulomb, periods=samples).position[
+        :samples
+    ], force
+
+
+@pytest.mark.parametrize("coulomb", [0.002, 0.005, 0.02])
+def test_little_friction_after_a_single_push_is_found_and_how_much_of_it_is_a_constant_force_is_open(coulomb):
+    position, force = push_once(coulomb)
+    fit = zwidth.fit_log(PERIOD, position, force)
+    np.testing.assert_allclose([fit.mass, fit.damping, fit.friction], [0.1, 0.5, coulomb], rtol=1e-8)
+    assert (fit.status, fit.doubts) == (Status.OK, ())
+    # A constant force of -coulomb until it rests moves it alike: no tight interval.
+    assert np.isnan([fit.errors["friction"], *fit.intervals["friction"]]).all()
+    assert fit.safe_wall().stiffness > 0
+
+
+@pytest.mark.parametrize("share", [0.02, 0.05])
+def test_a_clock_that_wavers_changes_nothing_but_the_period(share):
+    rng = np.random.default_rng(14)
+    force = steps_to_and_fro(rng, 600)
+    position = move(0.1, 2.0, 2.3e-3, force) + 1e-6 * rng.standard_normal(600)
+    stamps = PERIOD * (np.arange(600) + share * np.clip(rng.standard_normal(600), -4, 4))
+    fit = zwidth.fit_log(stamps, position, force, resample=True)
+    even = zwidth.fit_log(PERIOD, position, force)
+    assert fit.period == pytest.approx(PERIOD, rel=5e-5)
+    assert fit.delay == pytest.approx(even.delay, abs=3e-4 * PERIOD)
+    assert fit.stiffness_max == pytest.approx(even.stiffness_max, rel=1e-3)
+    assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
+    if share == 0.05:
+        with pytest.raises(InputError, match="ask to resample"):
+            zwidth.fit_log(stamps, position, force)
+    stamps[200:] += 0.6 * PERIOD
+    with pytest.raises(InputError, match="not even"):
+        zwidth.fit_log(stamps, position, force, resample=True)
+
+
+@pytest.mark.parametrize("period, scale, word", [(1.0, 1.0, "sampling period"), (PERIOD, 1e4, "mm")])
+def test_under_a_doubt_there_is_no_wall(period, scale, word):
+    force = steps_to_and_fro(np.random.default_rng(15), 300)
+    fit = zwidth.fit_log(period, scale * move(0.1, 2.0, 1e-3, force), force)
+    assert any(word in doubt for doubt in fit.doubts)
+    assert np.isnan(fit.safe_wall()[:3]).all()
+    assert fit.safe_wall().status == Status.UNDECIDED
+    assert choose_wall(fit) is None
+    said = dict(describe_fit(fit, "a log"))
+    assert "set" not in said
+    assert "safe wall" not in said
+    assert "record again" in said["no wall"]
+    assert not any("recommend" in line for line in write_scene(fit, "a log"))

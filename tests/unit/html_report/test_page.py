@@ -6,6 +6,7 @@ import base64
 import hashlib
 import json
 import re
+import shutil
 
 import numpy as np
 import pytest
@@ -90,3 +91,37 @@ def test_the_command_names_its_file(run, tmp_path):
     result = CliRunner().invoke(cli, ["report", str(run), "--out", str(tmp_path / "it.html"), "--json"])
     assert result.exit_code == 0
     assert json.loads(result.output)["bytes"] == (tmp_path / "it.html").stat().st_size
+
+
+def test_what_is_damaged_or_missing_is_named_and_not_shown(run, tmp_path):
+    damages = {
+        "run.json is damaged": lambda out: edit(out / "run.json", '"seconds": ', '"seconds": 1'),
+        "config.yaml is damaged": lambda out: edit(out / "config.yaml", "num: 30", "num: 31"),
+        "config.yaml is missing": lambda out: (out / "config.yaml").unlink(),
+        "plane.zarr is missing": lambda out: shutil.rmtree(out / "plane.zarr"),
+        "plane.zarr: chunks are missing": lambda out: shutil.rmtree(out / "plane.zarr" / "wall_checksum" / "c"),
+        "top.svg is damaged": lambda out: edit(out / "top.svg", "</svg>", "</svg> "),
+    }
+    for number, (says, damage) in enumerate(damages.items()):
+        out = tmp_path / str(number)
+        shutil.copytree(run, out, ignore=shutil.ignore_patterns("report.html"))
+        damage(out)
+        with pytest.raises(StoreError, match=f"{re.escape(says)}.*'zwidth run CONFIG --resume'"):
+            zwidth.write_report(out)
+        assert not (out / "report.html").exists()
+
+
+def edit(file, old, new):
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def test_labelled_devices_are_sliders_by_name(tmp_path):
+    devices = {"label": ["=one", "two"], "mass": [0.1, 0.2], "damping": [1, 2]}
+    axes = {"devices": devices, "rate": "1 kHz", "delay": "1 periods", "stiffness": [1e3, 2e3, 3e3]}
+    study = {"kind": "sweep", "name": "s", "axes": axes | {"virtual_damping": [0, 1, 2]}, "outputs": ["stable"]}
+    zwidth.run({"version": 1, "name": "n", "studies": [study]}, out=tmp_path / "out")
+    text = zwidth.write_report(tmp_path / "out").read_text(encoding="utf-8")
+    slices = [json.loads(found) for found in re.findall(r'<script type="application/json">(.*?)</script>', text)]
+    assert [other["values"] for other in slices[0]["others"]] == [["=one", "two"]]

@@ -189,3 +189,18 @@ def test_what_a_killed_run_leaves_is_swept_up(finished, both):
     (finished / ".run.json.12345678.partial").write_bytes(b"{")
     assert run(both, out=finished, resume=True).ok
     assert list(finished.glob(".*.partial")) == []
+
+
+def test_what_a_damaged_record_says_is_found_again(finished, both):
+    before = record_of(finished)
+    text = (finished / "run.json").read_text(encoding="utf-8")
+    (finished / "run.json").write_text(text.replace('"kind": "map"', '"kind": "mop"'), encoding="utf-8")
+    result = run(both, out=finished, resume=True)
+    assert result.ok
+    assert result.repaired == ("run.json is damaged",)
+    assert [study.state for study in result.studies] == ["done", "done", "done"]
+    assert result.sweeps["swept"].computed == 0
+    after = record_of(finished)
+    for name in ("kind", "answer", "files", "inputs", "state"):
+        assert [one.get(name) for one in after["studies"]] == [one.get(name) for one in before["studies"]], name
+    assert run(both, out=finished, resume=True).repaired == ()

@@ -145,10 +145,10 @@ def test_data_stay_when_the_drawing_fails(config, tmp_path, monkeypatch):
 def test_repeated_figures_of_the_paper_bring_its_numbers():
     study = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0, "figure": "fig10"}
     config = Config.model_validate({"version": 1, "name": "p", "studies": [study]})
-    assert [piece.name for piece in _list_computations(config)] == ["r", "published"]
+    assert [piece.name for piece in _list_computations(config, {})] == ["r", "published"]
     del study["figure"]
     plain = Config.model_validate({"version": 1, "name": "p", "studies": [study]})
-    assert [piece.name for piece in _list_computations(plain)] == ["r"]
+    assert [piece.name for piece in _list_computations(plain, {})] == ["r"]
 
 
 def test_every_kind_of_study_is_in_the_record_and_the_result(finished):
@@ -231,5 +231,6 @@ def test_a_record_that_names_files_elsewhere_removes_none(finished, both, tmp_pa
     record = record_of(finished)
     record["studies"][0]["files"] |= {"../precious.txt": "", str(precious): ""}
     (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
-    assert run(both, out=finished, overwrite=True).ok
+    with pytest.raises(StoreError, match="no file of its folder"):
+        run(both, out=finished, overwrite=True)
     assert precious.read_text(encoding="utf-8") == "mine"

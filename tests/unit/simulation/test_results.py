@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import zwidth
+from tolerances import SIMULATED_AGAIN
 from zwidth import MotionKind, Status
 from zwidth.errors import InputError
 
@@ -25,16 +26,25 @@ def test_a_linear_motion_ends_as_its_poles_say(share, periods, kind):
 def test_an_undamped_swing_is_steady():
     free = zwidth.Scene(zwidth.Device(mass=0.1, damping=0.5), zwidth.Timing(period=1e-3))
     found = free.simulate(1e3, 0.0, start_position=1e-3, periods=4000)
-    assert MotionKind(found.outcome) is MotionKind.STEADY
+    # It halves in 333,000 periods: that is a decay, and over few periods none.
+    assert MotionKind(found.outcome) is MotionKind.DECAYING
+    assert MotionKind(free.simulate(1e3, 0.0, start_position=1e-3, periods=500, tail=400).outcome) is MotionKind.STEADY
     assert found.trend == pytest.approx(float(free.spectral_radius(1e3, 0.0)) ** 500, rel=1e-3)
     assert found.amplitude == pytest.approx(1e-3, rel=0.02)
     assert found.frequency == pytest.approx(np.sqrt(1e3 / 0.1) / (2 * np.pi), rel=1e-2)
 
 
-@pytest.mark.parametrize("periods", [1, 3, 16, 64])
-def test_too_few_swings_are_not_judged(periods):
-    found = SCENE.simulate(1.2 * TOP.stiffness, TOP.virtual_damping, start_position=1e-3, periods=periods)
+def test_too_few_swings_are_not_judged_where_nothing_is_proved():
+    hit = {"start_position": -1e-4, "start_velocity": 0.1, "push": 1.0, "contact": "unilateral"}
+    found = SCENE.simulate(1.2 * TOP.stiffness, TOP.virtual_damping, periods=30, **hit)
     assert MotionKind(found.outcome) is MotionKind.UNCLEAR
+
+
+def test_a_decay_below_a_step_of_the_encoder_is_not_steady():
+    hand = zwidth.Operator(mass=0.01, damping=0.05, stiffness=100.0)
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.05), TIMING, operator=hand)
+    found = scene.simulate(1e3, 0.0, resolution=1e-4, push=-0.001, periods=2000)
+    assert MotionKind(found.outcome) in (MotionKind.DECAYING, MotionKind.UNCLEAR)
 
 
 def test_the_steps_of_an_encoder_make_no_trend():
@@ -42,7 +52,51 @@ def test_the_steps_of_an_encoder_make_no_trend():
     found = SCENE.simulate(stiffness, 20.0, start_position=1e-4, resolution=2e-5, periods=4000, record=False)
     stable = SCENE.is_stable(stiffness, 20.0)
     assert stable.sum() > 100
-    assert set(found.outcome[stable].tolist()) == {MotionKind.REST, MotionKind.STEADY}
+    assert set(found.outcome[stable].tolist()) <= {MotionKind.REST, MotionKind.STEADY, MotionKind.UNCLEAR}
+    assert np.mean(found.outcome[stable] == MotionKind.UNCLEAR) < 0.5
+
+
+def test_a_wall_that_is_no_number_is_not_quiet():
+    found = SCENE.simulate([1e3, np.nan], 5.0, periods=50)
+    assert found.outcome.tolist() == [MotionKind.REST, MotionKind.INVALID]
+
+
+def test_friction_that_breaks_loose_later_is_no_rest():
+    found = SCENE.simulate(1e3, 5.0, start_position=5e-3, coulomb=2.0, max_rate=1.5, periods=1000)
+    assert found.sticking[-250:].all()
+    assert MotionKind(found.outcome) is MotionKind.UNCLEAR
+
+
+def test_an_encoder_at_rest_does_not_kick():
+    start = np.linspace(-0.49, 0.49, 99) * 1e-4
+    found = SCENE.simulate(0.0, 42.5, resolution=1e-4, start_position=start, coulomb=0.5, periods=100)
+    assert not found.wall_force.any()
+    assert set(found.outcome.tolist()) == {MotionKind.REST}
+
+
+def test_labels_hold_in_longer_runs():
+    rng = np.random.default_rng(3)
+    share, push = rng.uniform(0.1, 1.3, 60), rng.uniform(0, 2, 60)
+    for extra in ({}, {"contact": "unilateral"}, {"resolution": 1e-5}, {"coulomb": 0.2}, {"max_force": 5.0}):
+        given = {"start_position": -1e-4, "push": push, "record": False, **extra}
+        walls = share * TOP.stiffness, TOP.virtual_damping
+        short = SCENE.simulate(*walls, periods=800, **given)
+        late = SCENE.simulate(*walls, periods=8000, tail=200, **given)
+        kind = short.outcome
+        assert np.mean(kind == MotionKind.UNCLEAR) < 0.4
+        assert np.all(late.amplitude[kind == MotionKind.REST] < 1e-9)
+        assert np.all((late.amplitude < short.amplitude)[kind == MotionKind.DECAYING])
+        assert np.all((late.amplitude > short.amplitude)[kind == MotionKind.GROWING])
+
+
+@pytest.mark.parametrize("names", [("a", "b"), (), ("position",)])
+def test_names_of_axes_fit(names):
+    alone, two = SCENE.simulate(1e3, 5.0, periods=5), SCENE.simulate([1e3, 2e3], 5.0, periods=5)
+    if names:
+        with pytest.raises(InputError, match="dims: got"):
+            (alone if len(names) > 1 else two).to_dataset(*names)
+    else:
+        assert alone.to_dataset().amplitude.dims == ()
 
 
 def test_the_amplitude_is_that_of_the_whole_tail():
@@ -110,7 +164,8 @@ def test_a_gap_in_one_history_spoils_no_other():
     found = SCENE.simulate(1e3, 5.0, push_history=pushes, periods=20)
     assert found.status.tolist() == [Status.OK, Status.INVALID_INPUT, Status.OK]
     assert np.isnan(found.position[1]).all()
-    np.testing.assert_array_equal(found.position[0], found.position[2])
+    close = SIMULATED_AGAIN.float64 * np.abs(found.position[0]).max()
+    np.testing.assert_allclose(found.position[0], found.position[2], rtol=0, atol=close)
 
 
 def test_an_adaptive_window_takes_a_line_that_misses_by_just_its_bound():

@@ -5,7 +5,7 @@ import pytest
 
 import zwidth
 from independent_scenes import KINDS, random_scene
-from tolerances import ENERGY_KEPT, FRICTION_TRUTH
+from tolerances import ENERGY_KEPT, FRICTION_TRUTH, SIMULATED_AGAIN
 
 DEVICE = zwidth.Device(mass=0.1, damping=0.5)
 FREE = zwidth.Device(mass=0.1, damping=0.0)
@@ -141,7 +141,8 @@ def test_a_mass_at_rest_stays_until_the_push_exceeds_static_friction():
     assert not np.any(motion.position[:, held])
     gained = (np.cumsum(ramp[first:] - 0.5) * 1e-3 / 0.1)[:-1]
     assert motion.velocity[0, 3 * (first + 1) :: 3] == pytest.approx(gained, rel=1e3 * FRICTION_TRUTH.float64)
-    np.testing.assert_array_equal(motion.position[0], -motion.position[1])
+    close = SIMULATED_AGAIN.float64 * np.abs(motion.position).max()
+    np.testing.assert_allclose(motion.position[0], -motion.position[1], rtol=0, atol=close)
 
 
 def test_a_spring_and_a_block_stick_after_as_many_half_swings_as_friction_allows():

@@ -222,7 +222,7 @@ def test_energy_that_rounding_can_come_to_is_no_proof():
 
 def test_what_is_refused():
     scene = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3))
-    with pytest.raises(InputError, match="one wall of finite numbers"):
+    with pytest.raises(InputError, match="stiffness: got nan; a finite number"):
         zwidth.worst_motion(scene, np.nan)
     with pytest.raises(InputError, match="one wall of finite numbers"):
         zwidth.worst_motion(scene, [1.0, 2.0])  # pyright: ignore[reportArgumentType]
@@ -232,3 +232,13 @@ def test_what_is_refused():
     with pytest.raises(InputError, match="'tip' has no passivity condition"):
         zwidth.worst_motion(zwidth.Scene(zwidth.Device(0.1, 10.0, coupling), zwidth.Timing(1e-3)), 1e3)
     assert zwidth.worst_motion(scene, 1e200).status == Status.OUT_OF_RANGE
+
+
+def test_no_motion_misses_more_than_the_margin_says_negative_stiffness_included():
+    rng = np.random.default_rng(8)
+    for _ in range(60):
+        scene = zwidth.Scene(zwidth.Device(0.1, rng.uniform(0.01, 5)), zwidth.Timing(1e-3, rng.choice([0, 5e-4, 1e-3])))
+        wall = -(10 ** rng.uniform(-0.5, 4)), rng.uniform(-5, 5)
+        found = zwidth.worst_motion(scene, *wall)
+        assert found.status == Status.OK
+        assert found.missing_damping <= -scene.passivity_margin(*wall) * (1 + 1e-6)

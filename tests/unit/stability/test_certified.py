@@ -10,6 +10,7 @@ import pytest
 from mpmath import mpf
 
 import zwidth
+from waiting import LONGEST
 from zwidth.batching import FEW
 from zwidth.domain import wall_status
 from zwidth.errors import InputError
@@ -291,7 +292,7 @@ assert bool(result.stable), result
 assert "flint" not in sys.modules
 assert "jax" not in sys.modules
 """
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=LONGEST)
 
 
 def test_no_setting_is_left_changed():

@@ -13,6 +13,7 @@ import oracles
 import tolerances as tol
 import zwidth
 from compiling import QUICKLY
+from waiting import LONGEST
 from zwidth.errors import InputError
 from zwidth.stability.radii import bound_radius
 from zwidth.status import Method, Status
@@ -176,15 +177,13 @@ def test_at_a_double_pole_there_is_no_derivative(x64):
 
 
 def test_nothing_is_compiled_and_no_delay_takes_long():
+    # Eigenvalues of a matrix of the longest delay would fit neither into the memory nor into an hour.
     code = (
-        "import sys, time, zwidth, numpy\n"
-        "zwidth.spectral_radius(.1, .1, .5, 3)\n"
-        "start = time.perf_counter()\n"
+        "import sys, zwidth\n"
         "for d in (62, 63, 64, 501, 1e4, 1e5, 1.5): zwidth.spectral_radius(.01, .01, .5, d)\n"
-        "assert time.perf_counter() - start < 1, time.perf_counter() - start\n"
         "assert 'jax' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=LONGEST)
 
 
 def test_triple_poles_keep_their_bounds():

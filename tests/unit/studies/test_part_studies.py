@@ -86,12 +86,28 @@ def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
     assert len(outcome.figures[""]()) == 1
 
 
-def test_a_share_of_an_island_that_is_not_stable_is_said_to_be_so():
+def test_a_recommendation_is_of_walls_that_soft_ones_lead_to():
     study = RecommendStudy.model_validate({"kind": "recommend", "name": "r", "device": ISLANDS})
     outcome = study.compute(None, True)
-    assert json.loads(outcome.documents["recommendation.json"])["recommended"]["stable"] is False
-    assert "is NOT stable" in outcome.documents["recommendation.md"]
-    assert any("choose another share" in note for note in outcome.notes)
+    found = json.loads(outcome.documents["recommendation.json"])
+    assert found["recommended"]["stable"] is True
+    assert found["maximum"]["stiffness"] == pytest.approx(6846.364, abs=1e-3)
+    (note,) = outcome.notes
+    assert "island of stable walls, K from 7.537 kN/m to 9.037 kN/m" in note
+
+
+def test_a_share_that_is_not_stable_with_the_damping_of_the_stiffest_wall_has_another():
+    study = RecommendStudy.model_validate(
+        {"kind": "recommend", "name": "r", "device": POLES, "stiffness_fraction": 0.5}
+    )
+    outcome = study.compute(None, True)
+    found, scene = json.loads(outcome.documents["recommendation.json"]), study.device.to_scene()
+    best, most = found["recommended"], found["maximum"]
+    assert best["stiffness"] == 0.5 * most["stiffness"]
+    assert not scene.is_stable(best["stiffness"], most["virtual_damping"])
+    assert np.abs(scene.poles(best["stiffness"], best["virtual_damping"])).max() < 1
+    assert "is stable;" in outcome.documents["recommendation.md"]
+    assert any("B is another one" in note for note in outcome.notes)
 
 
 def test_a_comparison_has_a_row_and_outlines_for_each_device():

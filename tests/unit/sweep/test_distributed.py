@@ -1,6 +1,12 @@
 """Sweeps on a dask.distributed cluster: one on this machine, with workers in processes of their own."""
 
+import os
+import socket
+import subprocess
+import sys
 import warnings
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,10 +17,14 @@ from sweeping import (
     config_of,
     config_of_everything,
     cut,
+    doing_nothing,
+    flags,
     killed_on_2,
     killed_once_on_2,
+    killing_the_scheduler_on_2,
     main_of,
     run_sweeps,
+    stopping_the_scheduler_on_2,
     study,
 )
 from zwidth.errors import InputError
@@ -81,3 +91,66 @@ def test_no_scheduler_at_the_address(tmp_path, monkeypatch):
     monkeypatch.setattr("zwidth.sweep.distributed._CONNECT_SECONDS", 1)
     with pytest.raises(InputError, match=r"scheduler: no answer from 'tcp://127\.0\.0\.1:9'"):
         run_sweeps(config_of(), tmp_path, scheduler="tcp://127.0.0.1:9")
+
+
+@contextmanager
+def own_cluster(folder):
+    """A scheduler with one worker, each a process of its own; yields the address and ends both."""
+    from distributed import Client
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    address, python = f"tcp://127.0.0.1:{port}", [sys.executable, "-m"]
+    paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
+    scheduler = ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"]
+    worker = ["distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
+    with open(folder / "log", "wb") as log:
+        options = {"stdout": log, "stderr": log, "env": environment}
+        started = [
+            subprocess.Popen([*python, *words], **options)
+            for words in (scheduler, [*worker, "--local-directory", folder])
+        ]
+        (folder / "pid").write_text(str(started[0].pid), encoding="utf-8")
+        try:
+            # Both are there: with nobody to talk to, a worker ends by itself.
+            with Client(address, timeout=240) as client:
+                client.wait_for_workers(1, timeout=240)
+            yield address
+        finally:
+            for process in started:
+                process.kill()
+                process.wait()
+
+
+@pytest.mark.parametrize("disturbed", [killing_the_scheduler_on_2, stopping_the_scheduler_on_2])
+def test_a_scheduler_that_dies_or_falls_silent_ends_the_run_in_one_line(
+    finished, tmp_path, monkeypatch, capfd, disturbed
+):
+    monkeypatch.setattr("zwidth.sweep.chunks.perform", disturbed)
+    path, out = tmp_path / "sweep.yaml", tmp_path / "out"
+    path.write_text(yaml.safe_dump({"version": 1, "name": "test", "studies": [study()]}), encoding="utf-8")
+    with own_cluster(tmp_path) as address:
+        assert main_of("run", path, "--out", out, "--scheduler", address) == 1
+    out_text, err = capfd.readouterr()
+    ours = [line for line in err.splitlines() if not line.startswith(("map ", "[1/1] map "))]
+    go_on = f"go on with: zwidth run {path} --out {out} --resume --scheduler {address}"
+    assert ours == [
+        f"zwidth: scheduler: {address} does not answer any more, or has started again; what is done is kept, {go_on}"
+    ]
+    told = int(out_text.split(" of 8 chunks done")[0])
+    # What it was at may have been finished since.
+    assert told <= len(flags(out)) < 8
+    monkeypatch.undo()
+    assert run_sweeps(config_of(), out, resume=True).ok
+    assert_same(finished, out)
+
+
+def test_a_chunk_is_done_when_the_store_says_so(cluster, tmp_path):
+    for engine in ({"scheduler": cluster}, {"workers": 1}, {}):
+        out = tmp_path / "-".join(["out", *engine])
+        result = run_sweeps(config_of(), out, perform=doing_nothing, **engine)
+        assert not result.ok
+        assert (result.computed, result.total) == (0, 8)
+        assert set(result.failed.values()) == {"it was computed, and is not in the store"}

@@ -160,8 +160,9 @@ def test_every_parameter_of_every_part_is_an_axis(path, values, parts, tmp_path)
     for value, stiffness in zip(axis, found.stiffness_max.values, strict=True):
         scene = make_scene(sweep, {"mass": 0.1, "damping": 2.0, "period": 1e-3, path: value})
         assert scene.parameters()[path] == value
-        ends = scene.stable_stiffness(np.linspace(0, 300, 601))
-        assert np.nanmax(ends) <= stiffness * (1 + 1e-9)
+        # Rows that are stable from soft walls on lead to no island.
+        low, high = np.moveaxis(scene.stable_stiffness(np.linspace(0, 300, 601)), -1, 0)
+        assert np.max(high[low <= 0]) <= stiffness * (1 + 1e-9)
 
 
 def test_a_device_that_its_parts_refuse_spoils_no_other(tmp_path):

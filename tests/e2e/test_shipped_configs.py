@@ -1,0 +1,86 @@
+"""Every shipped configuration, with fewer points, through everything that is done with a run."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+import zwidth
+from zwidth.errors import InputError
+from zwidth.runs.draw import Drawing, draw_stores
+from zwidth.sweep.export import to_csv, to_netcdf
+from zwidth.sweep.verify import verify
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+# Runs say when and where they were; the record of a run and the attributes of stores alone hold that.
+TIMED = ("run.json", "zarr.json", "zwidth.json")
+
+
+def shrink(text: str) -> str:
+    """The first study of each kind, with four values an axis and a tenth of the time where motions are long."""
+    text = re.sub(r"num: (\d+)", lambda found: f"num: {min(int(found[1]), 4)}", text)
+    text = re.sub(r"((?:samples|cutoff|damping): \[[^,\]]+, [^,\]]+)[^\]]*\]", r"\1]", text)
+    text = re.sub(r"duration: (\d+)00 periods", r"duration: \g<1>0 periods", text)
+    head, *studies = re.split(r"(?m)^(?=  - kind: )", text)
+    kinds = {study.split()[2]: study for study in reversed(studies)}
+    return head + "".join(study for study in studies if study in kinds.values())
+
+
+def results_of(folder):
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name not in TIMED]
+    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in files if ".locks" not in path.parts}
+
+
+@pytest.fixture(params=sorted(path.stem for path in CONFIGS.glob("*.yaml")))
+def config(request, tmp_path):
+    """A copy that holds all that its configuration reads."""
+    for file in CONFIGS.glob("*.csv"):
+        shutil.copy(file, tmp_path)
+    text = (CONFIGS / f"{request.param}.yaml").read_text(encoding="utf-8")
+    (tmp_path / "own.yaml").write_text(shrink(text), encoding="utf-8")
+    return tmp_path / "own.yaml"
+
+
+def test_a_shipped_configuration_goes_all_the_way(config, tmp_path):
+    first = zwidth.run(config, out=tmp_path / "first")
+    assert [study.error for study in first.failed] == []
+    assert {study.state for study in first.studies} == {"done"}
+    before = results_of(first.folder)
+
+    # From its own folder alone, and elsewhere.
+    config.unlink()
+    for file in tmp_path.glob("*.csv"):
+        file.unlink()
+    moved = first.folder.rename(tmp_path / "moved")
+    second = zwidth.run(moved / "config.yaml", out=tmp_path / "second")
+    assert second.ok
+    assert results_of(second.folder) == before
+    again = zwidth.run(second.folder / "config.yaml", out=moved, resume=True)
+    assert {study.state for study in again.studies} <= {"kept", "done"}
+    assert results_of(moved) == before
+
+    for store in sorted(moved.glob("*.zarr")):
+        to_netcdf(store, tmp_path / f"{store.stem}.nc")
+        to_csv(store, tmp_path / f"{store.stem}.csv")
+    if list(moved.glob("*.zarr")):
+        assert all(found.ok for found in verify(moved))
+        assert draw_stores(moved, drawing=Drawing(formats=("png",)))
+    page = zwidth.write_report(moved).read_text(encoding="utf-8")
+    assert all(f'id="{study.name}"' in page for study in first.studies)
+
+
+def test_a_shipped_configuration_opens_in_the_explorer(config, tmp_path):
+    pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
+    from open_pages import open_page, say
+    from zwidth.explorer.controls import read_controls
+
+    if zwidth.load_config(config).scene is None:
+        with pytest.raises(InputError, match="scene: missing"):
+            read_controls(config)
+        return
+    page = open_page(read_controls(config))
+    say(page, set={}, rest=True)
+    page.queue.work()
+    assert page.texts["error"] == ""
+    assert page.texts["word"] in page.texts["verdict"]

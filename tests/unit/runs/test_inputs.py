@@ -1,0 +1,115 @@
+"""A run holds the files that it reads: it can be repeated from its own folder."""
+
+import hashlib
+import shutil
+from typing import Any
+
+import pytest
+
+import zwidth
+from run_folders import record_of
+from zwidth.errors import StoreExistsError
+from zwidth.runs.inputs import gather_inputs
+from zwidth.sweep.store import open_dataset
+
+TABLE = "label,mass [kg],damping [N s/m]\none,0.1,1\ntwo,0.2,1\n"
+SWEEP = """
+version: 1
+name: table
+studies:
+  - kind: sweep
+    name: swept
+    axes: {devices: {csv: %s}, rate: 1 kHz, delay: 1 periods}  # of the workshop
+    outputs: [stiffness_max]
+"""
+
+
+def write(folder, named, text=TABLE):
+    """A configuration that names a table below its folder."""
+    file = folder / named.strip("'\"")
+    file.parent.mkdir(parents=True, exist_ok=True)
+    file.write_text(text, encoding="utf-8")
+    (folder / "own.yaml").write_text(SWEEP % named, encoding="utf-8")
+    return folder / "own.yaml"
+
+
+@pytest.mark.parametrize("named", ["devices.csv", "of mine/dévices, #1.csv", "'it: is.csv'", '"quoted.csv"'])
+def test_a_run_holds_what_it_reads(tmp_path, named):
+    if not named.startswith(("'", '"')) and "," in named:
+        named = f"'{named}'"
+    config = write(tmp_path / "source", named)
+    out = tmp_path / "out"
+    assert zwidth.run(config, out=out).ok
+    (copy,) = (out / "inputs").iterdir()
+    assert copy.read_text(encoding="utf-8") == TABLE
+    assert record_of(out)["inputs"] == {copy.name: hashlib.sha256(TABLE.encode()).hexdigest()}
+    text = (out / "config.yaml").read_text(encoding="utf-8")
+    assert f"csv: inputs/{copy.name}}}, rate: 1 kHz, delay: 1 periods}}  # of the workshop" in text
+    shutil.rmtree(config.parent)
+    moved = out.rename(tmp_path / "moved")
+    again = zwidth.run(moved / "config.yaml", out=tmp_path / "again")
+    assert again.ok
+    assert (again.folder / "config.yaml").read_text(encoding="utf-8") == text
+    assert open_dataset(again.folder).equals(open_dataset(moved))
+    going: list[dict[str, Any]] = [{"resume": True}, {"overwrite": True}]
+    for options in going:
+        assert zwidth.run(moved / "config.yaml", out=moved, **options).ok
+        assert copy.name in {file.name for file in (moved / "inputs").iterdir()}
+    (moved / "inputs" / copy.name).unlink()
+    (moved / "own.csv").write_text("mine", encoding="utf-8")
+    assert zwidth.run(again.folder / "config.yaml", out=moved, resume=True).ok
+    assert (moved / "inputs" / copy.name).is_file()
+    assert "inputs</code> of the run" in zwidth.write_report(moved).read_text(encoding="utf-8")
+
+
+def test_a_configuration_that_is_read_already_finds_its_files(tmp_path, monkeypatch):
+    config = zwidth.load_config(write(tmp_path / "source", "devices.csv"))
+    monkeypatch.chdir(tmp_path)
+    # What a table holds is written out.
+    assert zwidth.run(config, out="out").ok
+    assert zwidth.run("out/config.yaml", out="again").ok
+
+
+def test_files_of_one_name_anchors_and_quotes(tmp_path):
+    for name in ("a/x.csv", "b/x.csv", "b/X-2.csv", "c.csv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(name, encoding="utf-8")
+    text = (
+        'one: {csv: &first a/x.csv}\ntwo: {csv: "b/x.csv"}  # b\nthree:\n  csv: >-\n    b/X-2.csv\n'
+        "four: {csv: *first}\n"
+        "five: {csv: none.csv, name: c.csv}\nsix: {csv: 'c.csv'}\n"
+    )
+    found, files, names = gather_inputs(text, tmp_path)
+    assert found == (
+        "one: {csv: &first inputs/x.csv}\ntwo: {csv: inputs/x-2.csv}  # b\nthree:\n  csv: inputs/X-2-2.csv\n"
+        "four: {csv: *first}\nfive: {csv: none.csv, name: c.csv}\nsix: {csv: inputs/c.csv}\n"
+    )
+    assert {name: files[copy.removeprefix("inputs/")].decode() for name, copy in names.items()} == {
+        name: name for name in names
+    }
+    # A copy's own name stays.
+    place = tmp_path / "run" / "inputs"
+    place.mkdir(parents=True)
+    for name, data in files.items():
+        (place / name).write_bytes(data)
+    assert gather_inputs(found, place.parent)[:2] == (found, files)
+
+
+def test_what_is_somebodys_own_stays(tmp_path):
+    config = write(tmp_path / "source", "devices.csv")
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    assert zwidth.run(config, out=out).ok
+    shutil.rmtree(out / "inputs")
+    elsewhere.mkdir()
+    (out / "inputs").symlink_to(elsewhere)
+    going: list[dict[str, Any]] = [{"resume": True}, {"overwrite": True}]
+    for options in going:
+        with pytest.raises(StoreExistsError, match="was not written by this run"):
+            zwidth.run(config, out=out, **options)
+    assert list(elsewhere.iterdir()) == []
+    other = tmp_path / "other"
+    (other / "inputs").mkdir(parents=True)
+    (other / "inputs" / "devices.csv").write_text("mine", encoding="utf-8")
+    with pytest.raises(StoreExistsError, match="was not written by this run"):
+        zwidth.run(config, out=other, resume=True)
+    assert (other / "inputs" / "devices.csv").read_text(encoding="utf-8") == "mine"

@@ -1,0 +1,140 @@
+"""The record of a run: it names files of its own folder alone, and may be lost."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from run_folders import record_of, states
+from zwidth.errors import InputError, StoreError, StoreExistsError
+from zwidth.html_report.page import write_report
+from zwidth.runs import run
+
+
+def tree(folder):
+    """All that is in a folder: what each file holds, and where each link leads."""
+    found = {}
+    for path in sorted(folder.rglob("*")):
+        found[path.relative_to(folder).as_posix()] = (
+            f"-> {os.readlink(path)}" if path.is_symlink() else path.read_bytes() if path.is_file() else None
+        )
+    return found
+
+
+OUTSIDE = ["../victim/a.txt", "{victim}/a.txt", "../victim/store.zarr", "..", ".", "", "sub/../../victim/a.txt", "a\0b"]
+
+
+@pytest.mark.parametrize("where", ["files", "name", "inputs"])
+@pytest.mark.parametrize("name", OUTSIDE)
+@pytest.mark.parametrize("options", [{"resume": True}, {"overwrite": True}, {"shard": (1, 2)}], ids=str)
+def test_a_record_that_names_files_elsewhere_is_refused(tmp_path, both, name, where, options):
+    victim = tmp_path / "victim"
+    (victim / "store.zarr").mkdir(parents=True)
+    for file in ("a.txt", "store.zarr/zarr.json", "store.zarr/chunk"):
+        (victim / file).write_text("dear", encoding="utf-8")
+    out = tmp_path / "out"
+    out.mkdir()
+    name, entry = name.format(victim=victim), {"name": "one", "kind": "map", "state": "open", "inputs": {}, "files": {}}
+    record = {"format": 2, "versions": {}, "studies": [entry], "inputs": {}}
+    if where == "name":
+        entry["name"] = name
+    else:
+        (entry if where == "files" else record)[where][name] = "0"
+    (out / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    before = tree(victim), tree(out)
+    with pytest.raises(StoreError, match="which is no file of its folder; choose another folder"):
+        run(both, out=out, **options)
+    with pytest.raises(StoreError, match="no file of its folder"):
+        write_report(out)
+    assert (tree(victim), tree(out)) == before
+
+
+@pytest.mark.parametrize("content", [[], {}, {"studies": 1}, {"studies": [1]}, {"studies": [], "versions": 1},
+                                     {"studies": [{"name": "a", "files": "b"}]}, {"studies": [{}]}])  # fmt: skip
+def test_what_is_no_record_is_told(tmp_path, both, content):
+    (tmp_path / "run.json").write_text(json.dumps(content), encoding="utf-8")
+    with pytest.raises(StoreError, match=r"run.json: .*; choose another folder"):
+        run(both, out=tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("options", [{"resume": True}, {"overwrite": True}], ids=str)
+def test_links_in_a_run_are_replaced_and_what_they_lead_to_stays(finished, both, tmp_path, options):
+    victim = tmp_path / "victim"
+    (victim / "tree").mkdir(parents=True)
+    (victim / "tree" / "zarr.json").write_text("dear", encoding="utf-8")
+    (victim / "two.npz").write_bytes((finished / "two.npz").read_bytes())
+    (victim / "secret.svg").write_text("<svg>dear</svg>", encoding="utf-8")
+    before = tree(victim)
+    for name, target in (("two.npz", "two.npz"), ("one_stable.svg", "secret.svg")):
+        (finished / name).unlink()
+        (finished / name).symlink_to(victim / target)
+    # Another study's leavings, which the record names.
+    (finished / "left.zarr").symlink_to(victim / "tree")
+    record = record_of(finished)
+    record["studies"][0]["files"]["left.zarr"] = None
+    record["studies"][0]["state"] = "open"
+    (finished / "run.json").write_text(json.dumps(record), encoding="utf-8")
+    assert run(both, out=finished, **options).ok
+    assert tree(victim) == before
+    assert not (finished / "two.npz").is_symlink()
+    assert not (finished / "one_stable.svg").is_symlink()
+
+
+def test_a_report_shows_no_link(finished, tmp_path):
+    secret = tmp_path / "secret.svg"
+    secret.write_text("<svg>dear</svg>", encoding="utf-8")
+    (finished / "one_stable.svg").unlink()
+    (finished / "one_stable.svg").symlink_to(secret)
+    with pytest.raises(StoreError, match=r"one_stable\.svg is damaged"):
+        write_report(finished)
+    assert not (finished / "report.html").exists()
+
+
+@pytest.mark.parametrize("options", [{"resume": True}, {"overwrite": True}], ids=str)
+def test_a_lost_record_is_told_and_written_anew(finished, both, options):
+    values = np.load(finished / "two.npz")["stable"]
+    (finished / "run.json").unlink()
+    (finished / "mine.txt").write_text("mine", encoding="utf-8")
+    with pytest.raises(StoreExistsError, match=r"without its record run.json; replace .* --overwrite, .* --resume"):
+        run(both, out=finished)
+    result = run(both, out=finished, **options)
+    assert result.ok
+    assert states(finished) == {"one": "done", "two": "done", "swept": "done"}
+    assert result.sweeps["swept"].computed == (0 if "resume" in options else 1)
+    np.testing.assert_array_equal(np.load(finished / "two.npz")["stable"], values)
+    assert (finished / "mine.txt").read_text(encoding="utf-8") == "mine"
+    assert [study.state for study in run(both, out=finished, resume=True).studies] == ["kept", "kept", "done"]
+
+
+@pytest.mark.parametrize("options", [{}, {"overwrite": True}], ids=str)
+def test_another_configurations_files_are_not_taken_for_a_lost_runs(finished, config, options):
+    (finished / "run.json").unlink()
+    before = tree(finished)
+    with pytest.raises(StoreExistsError, match="holds no run"):
+        run(config, out=finished, **options)
+    assert tree(finished) == before
+
+
+@pytest.mark.parametrize("kind", ["link", "dangling", "hard link", "folder", "fifo", "linked folder"])
+def test_a_lock_writes_into_no_file_elsewhere(config, tmp_path, kind):
+    victim = tmp_path / "victim"
+    victim.mkdir()
+    (victim / "run").write_text("dear", encoding="utf-8")
+    locks = tmp_path / "out" / ".locks"
+    if kind == "linked folder":
+        locks.parent.mkdir()
+        locks.symlink_to(victim)
+    else:
+        locks.mkdir(parents=True)
+        make = {
+            "link": lambda: (locks / "run").symlink_to(victim / "run"),
+            "dangling": lambda: (locks / "run").symlink_to(victim / "none"),
+            "hard link": lambda: (locks / "run").hardlink_to(victim / "run"),
+            "folder": lambda: (locks / "run").mkdir(),
+            "fifo": lambda: os.mkfifo(locks / "run"),
+        }
+        make[kind]()
+    with pytest.raises(InputError, match="link or no file of a run's own; remove it"):
+        run(config, out=tmp_path / "out")
+    assert tree(victim) == {"run": b"dear"}
