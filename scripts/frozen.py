@@ -213,7 +213,8 @@ def keep(target: Path, parts: list[str]) -> None:
     """Ask everything once and write it."""
     answers = {f"{part}/{name}": value for part in parts or PARTS for name, value in PARTS[part]()}
     # A slash would make folders of the archive.
-    np.savez_compressed(target, names=np.array(list(answers)), **{str(k): v for k, v in enumerate(answers.values())})
+    values = {str(k): v for k, v in enumerate(answers.values())}
+    np.savez_compressed(target, allow_pickle=False, names=np.array(list(answers)), **values)
     print(f"{len(answers)} answers in {target}")
 
 

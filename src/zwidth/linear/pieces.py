@@ -77,7 +77,7 @@ class StablePieces:
             joined.append(np.stack([number[row, one], number[row + 1, other]]))
         pairs, count = np.concatenate(joined, 1), int(there.sum())
         # The least number that each is joined to; a graph of SciPy's would take a third of a second to load.
-        piece, before = np.arange(count), None
+        piece, before = np.arange(count), np.full(count, -1)
         while not np.array_equal(piece, before):
             before = piece.copy()
             for one, other in (pairs, pairs[::-1]):
