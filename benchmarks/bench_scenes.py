@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 
 import zwidth
-from zwidth.linear.polynomial import affine_polynomial
-from zwidth.stability.poles import companion
+from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.rigid.poles import companion
 
 MAP, SAMPLE, SCATTERED = 2000, 20_000, 100_000
 # Nearer to the circle than this eigenvalues cannot tell the side.

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure what each trick of `zwidth.xla` gains: the same work with it and without, in turns, in one process.
+"""Measure what each trick of `arrays.xla` gains: the same work with it and without, in turns, in one process.
 
     python benchmarks/bench_xla.py [--points 65536] [--runs 15] [--only TEXT]
 
@@ -19,18 +19,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth import batching, xla
-from zwidth.stability import (
+from zwidth.arrays import batching, xla
+from zwidth.loops.rigid import (
     certified_filter,
     circle,
     crossover,
     pole_step,
-    radius,
     ridge,
     ridge_kkt,
     ridge_newton,
 )
-from zwidth.stability.devices import ANY
+from zwidth.loops.rigid import (
+    pole_search as radius,
+)
+from zwidth.loops.rigid.delay_classes import ANY
 
 Make = Callable[[], Callable[..., Any]]
 

@@ -1,15 +1,15 @@
 """Labels of random walls of every kind of scene beside certified ones: how many differ, and what each costs.
 
-PYTHONPATH=src:tests python benchmarks/certify_scene_labels.py --walls 100000
+PYTHONPATH=src:tests/support:tests/oracles python benchmarks/certify_scene_labels.py --walls 100000
 """
 
 import argparse
 import time
 
 import numpy as np
-
 from independent_scenes import KINDS, random_scene, random_walls
-from zwidth.status import Status
+
+from zwidth.words.status import Status
 
 _WALLS_OF_ONE = 500
 

@@ -25,7 +25,6 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 import jax
 import pytest
 from hypothesis import HealthCheck, settings
-
 from leftovers import what_is_open
 from waiting import wait_for
 
@@ -47,7 +46,7 @@ settings.load_profile("zwidth")
 
 def pytest_configure(config: pytest.Config) -> None:
     """Most tests inside transformations keep JAX's default precision on purpose."""
-    config.addinivalue_line("filterwarnings", "ignore::zwidth.errors.PrecisionWarning")
+    config.addinivalue_line("filterwarnings", "ignore::zwidth.words.errors.PrecisionWarning")
 
 
 @pytest.fixture(scope="module", autouse=True)

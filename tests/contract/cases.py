@@ -74,7 +74,7 @@ SI_DEVICE = {**SI, "damping": [0.0, 10.0, 5.0], "delay": [0.0, 1e-3, 3e-3]}
 BAD_SI = {"mass": -1.0, "period": 0.0, "damping": -1.0, "delay": np.nan}
 BEYOND_SI = {"mass": 1e31, "period": 1e-31, "damping": 1e31, "delay": 1e31}
 WANTED = {"stiffness": [1e4, 5e3, 2e4]}
-REQUIREMENTS = "tests/unit/design/test_requirements.py"
+REQUIREMENTS = "tests/unit/scenes/test_requirements.py"
 WALLS = "alpha, beta 0 or 1e-60 to 1e60 in magnitude; delta 0 to 1e12; d 0 to 1e5"
 DEVICES = "delta 0 to 1e12; d 0 to 1e5"
 QUANTITIES = "SI quantities 0 or 1e-30 to 1e30; mass, period above 0"
@@ -135,7 +135,7 @@ CASES = [
     of_walls(zwidth.decide_stability, derivatives=None, value="False where bad, and why", refuses_tracing=True),
     of_walls(zwidth.is_passive, derivatives=None, value="False where bad"),
     of_walls(zwidth.passivity_margin),
-    of_walls(zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/stability/test_margins.py"),
+    of_walls(zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/loops/rigid/test_margins.py"),
     of_walls(zwidth.modulus_margin, value="NaN where bad or alpha <= 0"),
     of_devices("boundary", zwidth.boundary, {"omega": [0.0, 0.5, 3.0]}),
     of_devices(
@@ -180,26 +180,26 @@ CASES = [
 
 # Public functions that take no arrays point by point, or that compile for long: who holds their contract instead.
 OTHERS = {
-    "assess": "one scene: tests/unit/test_report.py, tests/properties/test_consistency.py",
-    "assess_many": "scenes by name: tests/unit/test_assessment.py",
-    "fastest_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
-    "fastest_wall": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
+    "assess": "one scene: tests/unit/studies/test_paper_values.py, tests/properties/test_consistency.py",
+    "assess_many": "scenes by name: tests/unit/scenes/test_assessment.py",
+    "fastest_damping": "a search, compiled even for one point: tests/unit/scenes/test_traced_choices.py",
+    "fastest_wall": "a search, compiled even for one point: tests/unit/scenes/test_traced_choices.py",
     "fit_buzz": "one device: tests/unit/fitting/test_buzz.py",
     "fit_log": "one device: tests/unit/fitting/test_log.py",
-    "limits_of": "one scene: tests/unit/design/test_limits.py",
+    "limits_of": "one scene: tests/unit/scenes/test_limits.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
-    "most_robust_damping": "a search, compiled even for one point: tests/unit/design/test_traced_choices.py",
+    "most_robust_damping": "a search, compiled even for one point: tests/unit/scenes/test_traced_choices.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
-    "robust_max_stiffness": "boxes of devices: tests/unit/design/test_robust.py",
-    "robust_wall": "boxes of devices: tests/unit/design/test_robust.py",
+    "robust_max_stiffness": "boxes of devices: tests/unit/scenes/test_robust.py",
+    "robust_wall": "boxes of devices: tests/unit/scenes/test_robust.py",
     "run": "a configuration: tests/unit/runs/test_run.py",
     "simulate": "whole motions: tests/unit/simulation/test_against_integrator.py",
-    "simulate_tolerances": "one scene: tests/unit/design/test_tolerances.py",
-    "stable_region": "one device: tests/unit/stability/test_region.py",
+    "simulate_tolerances": "one scene: tests/unit/scenes/test_tolerances.py",
+    "stable_region": "one device: tests/unit/loops/rigid/test_region.py",
     "stability_of": "the former name of `decide_stability`",
-    "step_response": "one wall: tests/unit/test_response.py",
-    "to_control": "one scene: tests/unit/linear/test_answers.py",
-    "use_compilation_cache": "a setting: tests/unit/test_kernel_cache.py",
-    "worst_motion": "one scene and wall: tests/unit/simulation/test_worst_motion.py",
-    "write_report": "a folder: tests/unit/html_report/test_page.py",
+    "step_response": "one wall: tests/unit/loops/rigid/test_response.py",
+    "to_control": "one scene: tests/unit/scenes/test_answers.py",
+    "use_compilation_cache": "a setting: tests/unit/arrays/test_kernel_cache.py",
+    "worst_motion": "one scene and wall: tests/unit/scenes/test_worst_motion.py",
+    "write_report": "a folder: tests/unit/pages/report/test_page.py",
 }

@@ -9,12 +9,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from compiling import QUICKLY
 
 import zwidth
-from compiling import QUICKLY
 from contract.cases import CASES, OTHERS
-from zwidth.errors import InputError, TracedDelayError
-from zwidth.status import Status
+from zwidth.words.errors import InputError, TracedDelayError
+from zwidth.words.status import Status
 
 ALL = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 OPTIONAL = {("boundary_point", "alpha"), ("boundary_point", "beta"), ("required_period", "delay")}

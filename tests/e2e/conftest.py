@@ -1,7 +1,6 @@
 """The browser of a file's tests."""
 
 import pytest
-
 from browser import open_browser
 
 

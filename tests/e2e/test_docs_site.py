@@ -15,7 +15,6 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-
 from browser import open_page
 from waiting import LONGEST
 

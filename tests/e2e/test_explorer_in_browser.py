@@ -16,11 +16,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from browser import open_page
 from click.testing import CliRunner
+from waiting import LONGEST, wait_for
 
 import zwidth
-from browser import open_page
-from waiting import LONGEST, wait_for
 from zwidth.cli.commands import cli
 
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")

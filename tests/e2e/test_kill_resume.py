@@ -9,7 +9,6 @@ import time
 
 import pytest
 import yaml
-
 from sweeping import assert_same, flags, main_of, start, study, zwidth
 from waiting import LONGEST, wait_for
 

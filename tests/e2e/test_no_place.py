@@ -9,7 +9,6 @@ from contextlib import contextmanager
 
 import pytest
 import yaml
-
 from sweeping import AXES, assert_same, chunk_file, command, failing_on_2, flags, flip, main_of, study
 from waiting import LONGEST
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.errors import StoreExistsError
+from zwidth.words.errors import StoreExistsError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

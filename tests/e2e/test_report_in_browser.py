@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
+from browser import open_page
 
 import zwidth
-from browser import open_page
 
 STUDY = {
     "kind": "sweep",

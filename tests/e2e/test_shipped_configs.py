@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 import zwidth
-from zwidth.errors import InputError
 from zwidth.runs.draw import Drawing, draw_stores
 from zwidth.sweep.export import to_csv, to_netcdf
 from zwidth.sweep.verify import verify
+from zwidth.words.errors import InputError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 # Runs say when and where they were; the record of a run and the attributes of stores alone hold that.
@@ -73,7 +73,8 @@ def test_a_shipped_configuration_goes_all_the_way(config, tmp_path):
 def test_a_shipped_configuration_opens_in_the_explorer(config, tmp_path):
     pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
     from open_pages import open_page, say
-    from zwidth.explorer.controls import read_controls
+
+    from zwidth.pages.explorer.controls import read_controls
 
     if zwidth.load_config(config).scene is None:
         with pytest.raises(InputError, match="scene: missing"):

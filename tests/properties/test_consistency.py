@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.domain import wall_status
-from zwidth.settling import settling_time
-from zwidth.stability.radii import bound_radius
-from zwidth.status import Status
+from zwidth.loops.domain import wall_status
+from zwidth.loops.rigid.settling import settling_time
+from zwidth.loops.rigid.spectral_radius import bound_radius
+from zwidth.words.status import Status
 
 # Walls that are judged at one time: few enough for NumPy, so that nothing is compiled.
 BLOCK = 2000

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+import tolerances as tol
 from hypothesis import given
 from hypothesis import strategies as st
 
-import tolerances as tol
 import zwidth
 from properties.strategies import alphas, deltas, magnitudes, shares
 

@@ -18,15 +18,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import any_loop
 import jax
 import numpy as np
 from click.testing import CliRunner
 
-import any_loop
 import zwidth
 from zwidth.cli import cli
-from zwidth.linear.passivity import has_condition
-from zwidth.status import Status
+from zwidth.loops.linear.passivity import has_condition
+from zwidth.words.status import Status
 
 SEED = 20
 # Relative distance from the edge within which two roads may round to different sides.

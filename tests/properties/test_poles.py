@@ -1,10 +1,10 @@
 """What poles and polynomial owe each other, and how they depend on damping and delay."""
 
 import numpy as np
+import tolerances as tol
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-import tolerances as tol
 import zwidth
 from properties.strategies import alphas, magnitudes, shares, walls
 

@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
+import tolerances as tol
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from mpmath import mp
 
 import oracles
-import tolerances as tol
 import zwidth
 from properties.strategies import delays, deltas, magnitudes, whole_delays
 

@@ -235,9 +235,9 @@ def labelled(count: int, seed: int) -> dict[str, np.ndarray]:
 
 def check(points: dict[str, np.ndarray]) -> int:
     """Hold the certified method to the labels; how many it gets wrong or leaves undecided."""
-    from zwidth.domain import wall_status
-    from zwidth.stability.certified import certified_stable
-    from zwidth.status import Status
+    from zwidth.loops.domain import wall_status
+    from zwidth.loops.rigid.certified import certified_stable
+    from zwidth.words.status import Status
 
     start = time.perf_counter()
     walls = [points[name] for name in ("alpha", "beta", "delta", "d")]

@@ -1,6 +1,6 @@
 """Rows of scenes on which several intervals of stiffness are stable, to 20 digits: writes islands.json beside it.
 
-    PYTHONPATH=src:tests python tests/reference/make_islands.py
+    PYTHONPATH=src:tests/support:tests/oracles python tests/reference/make_islands.py
 
 Random scenes are drawn until enough have such a row (the library only points to them). Then nothing of the library is
 used: each end is bisected in balls of 80 digits, by poles of the polynomial in `any_loop.ball_parts` that are proved
@@ -14,10 +14,9 @@ import json
 from pathlib import Path
 from typing import Any
 
+import any_loop
 import flint
 import numpy as np
-
-import any_loop
 
 COUNT, STEPS, DIGITS = 40, 70, 80
 PERIOD, MASS = 1e-3, 0.1

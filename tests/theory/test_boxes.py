@@ -1,11 +1,10 @@
-"""The means of proof themselves: what tests/boxes.py proves, refutes, leaves open and encloses."""
+"""The means of proof themselves: what tests/oracles/boxes.py proves, refutes, leaves open and encloses."""
 
 from __future__ import annotations
 
 import random
 
 import pytest
-
 from boxes import UNIT, Implication, RefutedError, UnprovedError, ball, early_mean, loop, prove
 
 

@@ -1,7 +1,7 @@
 """Poles inside any circle: S19 to S22 of docs/theory/one-crossover.md against roots in 60 digits, on random loops.
 
 The count is written here from the page, factor by factor. The roots are those of the expanded polynomial, from
-tests/oracles.py.
+tests/oracles/oracles.py.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from itertools import pairwise
 
 import mpmath as mp
 import pytest
+from boxes import symbols
 from mpmath import mpc, mpf
 
 import oracles
-from boxes import symbols
 
 
 @pytest.fixture(autouse=True)

@@ -1,8 +1,8 @@
 """Every inequality of S1 to S18 in docs/theory/one-crossover.md, and its theorems against poles.
 
 Inequalities are proved in the balls of python-flint over boxes that cover delta in [0, 1e6] and f in [0, 1] (see
-tests/boxes.py); algebraic identities are checked exactly, in rational polynomials. Theorems are compared with the
-roots of the model's polynomial in 60 digits, from tests/oracles.py, on random loops.
+boxes.py); algebraic identities are checked exactly, in rational polynomials. Theorems are compared with the
+roots of the model's polynomial in 60 digits, from oracles.py, on random loops.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from functools import lru_cache
 
 import mpmath as mp
 import pytest
+from boxes import TAU, UNIT, Implication, RefutedError, ball, early_mean, loop, phi, prove, symbols
 from flint import arb, ctx
 from mpmath import mpf
 
 import oracles
-from boxes import TAU, UNIT, Implication, RefutedError, ball, early_mean, loop, phi, prove, symbols
 
 
 @pytest.fixture(autouse=True)

@@ -1,8 +1,8 @@
 """Every inequality of docs/theory/one-lobe.md, and what it says of rows and columns against poles.
 
 Inequalities are proved in the balls of python-flint over boxes that cover delta in [0, 1e6], f in [0, 1] and the
-stated range of x = cos w (see tests/boxes.py); algebraic identities are checked exactly, in rational polynomials.
-Curve, rows and columns are compared with tests/oracles.py, in 60 digits, at random devices.
+stated range of x = cos w (see boxes.py); algebraic identities are checked exactly, in rational polynomials.
+Curve, rows and columns are compared with oracles.py, in 60 digits, at random devices.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ import random
 
 import mpmath as mp
 import pytest
+from boxes import TAU, UNIT, Implication, RefutedError, UnprovedError, ball, loop, prove, symbols
 from flint import arb, fmpq
 from mpmath import mpf
 
 import oracles
-from boxes import TAU, UNIT, Implication, RefutedError, UnprovedError, ball, loop, prove, symbols
 
 
 @pytest.fixture(autouse=True)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from zwidth.bench.problems import Walls
-from zwidth.loop import char_poly
+from zwidth.loops.rigid.polynomial import char_poly
 
 
 class Baseline(NamedTuple):

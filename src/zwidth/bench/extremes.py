@@ -8,12 +8,12 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.bench.problems import Walls
-from zwidth.stability.boundary import boundary
-from zwidth.stability.certified import certified_stable
-from zwidth.stability.labels import StabilityMethod, is_stable
-from zwidth.stability.region import lobe
-from zwidth.stability.ridge import alpha_max
-from zwidth.status import Status
+from zwidth.loops.rigid.boundary import boundary
+from zwidth.loops.rigid.certified import certified_stable
+from zwidth.loops.rigid.region import lobe
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.verdict import StabilityMethod, is_stable
+from zwidth.words.status import Status
 
 DELTAS = (0.0, 5e-324, 1e-300, 1e-16, 1e-8, 1e-4, 1.0, 50.0, 700.0, 750.0, 1e4, 1e6, 1e12)
 DELAYS = (0.0, 5e-324, 0.5, float(np.nextafter(1.0, 0.0)), 1.0, 8.0, 50.0, 500.0, 1e4, 1e5)

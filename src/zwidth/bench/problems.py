@@ -7,13 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.stability import balls
-from zwidth.stability.boundary import boundary
-from zwidth.stability.certified import certified_stable
-from zwidth.stability.proved import outermost_poles
-from zwidth.stability.region import lobe
-from zwidth.stability.ridge import alpha_max
-from zwidth.status import Status
+from zwidth.loops.rigid import balls
+from zwidth.loops.rigid.boundary import boundary
+from zwidth.loops.rigid.certified import certified_stable
+from zwidth.loops.rigid.outermost_poles import outermost_poles
+from zwidth.loops.rigid.region import lobe
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.words.status import Status
 
 # The device of the speed problems; the cost of no method depends on it.
 MAP_DELTA = 0.5

@@ -13,13 +13,13 @@ import numpy as np
 from zwidth.bench import problems
 from zwidth.bench.baselines import available
 from zwidth.bench.problems import Walls
-from zwidth.stability import balls
-from zwidth.stability.certified import certified_stable
-from zwidth.stability.labels import StabilityMethod, is_stable
-from zwidth.stability.passivity import is_passive, passivity_margin
-from zwidth.stability.poles import poles
-from zwidth.stability.radii import spectral_radius
-from zwidth.stability.ridge import RidgeMethod, alpha_max
+from zwidth.loops.rigid import balls
+from zwidth.loops.rigid.certified import certified_stable
+from zwidth.loops.rigid.passivity import is_passive, passivity_margin
+from zwidth.loops.rigid.poles import poles
+from zwidth.loops.rigid.ridge import RidgeMethod, alpha_max
+from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.verdict import StabilityMethod, is_stable
 
 # A measurement is repeated until it has taken this long, and at least this often.
 _SECONDS = 0.4

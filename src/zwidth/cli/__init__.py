@@ -11,9 +11,9 @@ import sys
 
 import click
 
+from zwidth.arrays.kernel_cache import use_compilation_cache
 from zwidth.cli.commands import cli
-from zwidth.errors import ZwidthError
-from zwidth.kernel_cache import use_compilation_cache
+from zwidth.words.errors import ZwidthError
 
 _EXIT_FAILED, _EXIT_INPUT = 1, 2
 _STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)
@@ -59,7 +59,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _describe_refusal(error: OSError) -> str:
     """What the system refused: the file, why, and what helps."""
-    from zwidth.files.whole import REMEDIES
+    from zwidth.sweep.files.whole import REMEDIES
 
     what = ": ".join(str(part) for part in (error.filename, error.strerror or error) if part)
     remedy = REMEDIES.get(error.errno or 0)

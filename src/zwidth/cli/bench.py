@@ -26,7 +26,7 @@ def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
 
     Errors are measured against ball arithmetic: python-flint must be installed (extra "certified").
     """
-    from zwidth.errors import InputError, ResourceError
+    from zwidth.words.errors import InputError, ResourceError
 
     # A file in the place of the folder would otherwise be found after minutes of work.
     if any(part.is_file() for part in (out, *out.parents)):

@@ -18,7 +18,7 @@ from zwidth.cli.init import init
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.report import report
 from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
-from zwidth.formatting import plain, with_unit
+from zwidth.words.formatting import plain, with_unit
 
 
 @click.group(
@@ -40,10 +40,10 @@ def cli() -> None:
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""
-    from zwidth.assessment import Assessment, assess
     from zwidth.cli import scene_words
-    from zwidth.design.friction import friction_rule
-    from zwidth.design.limits import limits_of
+    from zwidth.scenes.assessment import Assessment, assess
+    from zwidth.scenes.friction import friction_rule
+    from zwidth.scenes.limits import limits_of
 
     verdict, limits, notes = assess(scene), limits_of(scene), scene_words.scene_notes(scene)
     rule = None
@@ -94,8 +94,8 @@ def ridge(
     """
     import numpy as np
 
-    from zwidth.stability.ridge import RidgeKind, alpha_max
-    from zwidth.status import Status
+    from zwidth.loops.rigid.ridge import RidgeKind, alpha_max
+    from zwidth.words.status import Status
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
@@ -138,8 +138,8 @@ def ridge(
 def _print_part_ridge(scene: Any, as_json: bool) -> None:
     """The stiffest wall of a scene with parts."""
     from zwidth.cli import scene_words
-    from zwidth.stability.ridge import RidgeKind
-    from zwidth.status import Status
+    from zwidth.loops.rigid.ridge import RidgeKind
+    from zwidth.words.status import Status
 
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:

@@ -10,7 +10,7 @@ import click
 
 from zwidth.cli.options import flag_of, json_option, scene_options
 from zwidth.cli.words import row
-from zwidth.formatting import plain, with_unit
+from zwidth.words.formatting import plain, with_unit
 
 _FINDS = {
     "damping": ("damping", "N s/m"),
@@ -127,7 +127,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
 def _tolerate(
     scene: Any, shares: dict[str, float], distribution: Any, samples: int | None, seed: int
 ) -> tuple[dict[str, Any], list[str]]:
-    from zwidth.design.tolerances import Tolerance, simulate_tolerances
+    from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
     count = samples if samples is not None else 10_000 if scene.is_rigid else 200
     named = {name: Tolerance(share, distribution) for name, share in shares.items()}
@@ -150,7 +150,7 @@ def _tolerate(
 
 def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[str]]:
     """What every device of the box bears."""
-    from zwidth.design.robust import Interval, robust_max_stiffness, robust_wall
+    from zwidth.scenes.robust import Interval, robust_max_stiffness, robust_wall
 
     nominal = (scene.mass, scene.damping, scene.timing.period, scene.timing.delay)
     box: dict[str, Any] = dict(zip(_BOX, nominal, strict=True))

@@ -8,7 +8,7 @@ import click
 
 from zwidth.cli.options import json_option
 from zwidth.cli.words import row
-from zwidth.formatting import with_unit
+from zwidth.words.formatting import with_unit
 
 _COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
 
@@ -21,7 +21,7 @@ def devices(name: str | None, as_json: bool) -> None:
 
     A dash stands where nothing is published. Rotary devices have an inertia in kg m^2 and a damping in N m s/rad.
     """
-    from zwidth.devices import DEVICES, Published, find_device
+    from zwidth.parts.devices import DEVICES, Published, find_device
 
     chosen = DEVICES if name is None else (find_device(name),)
     if as_json:

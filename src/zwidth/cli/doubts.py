@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from zwidth.formatting import short
-from zwidth.units import Span
+from zwidth.parts.span import Span
+from zwidth.words.formatting import short
 
 # What devices have, by what kind of quantity it is: the SI unit, from and up to. An inertia of a rotary device, in
 # kg m^2, is far below any mass.

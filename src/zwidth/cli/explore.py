@@ -21,16 +21,16 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
     import threading
     import webbrowser
 
-    from zwidth.errors import InputError
+    from zwidth.words.errors import InputError
 
     try:
-        from zwidth.explorer.server import Explorer
+        from zwidth.pages.explorer.server import Explorer
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
             raise
         raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
-    from zwidth.explorer.controls import read_controls
-    from zwidth.explorer.details import Words
+    from zwidth.pages.explorer.controls import read_controls
+    from zwidth.pages.explorer.details import Words
 
     explorer = Explorer(read_controls(path), Words(check_lines, slope_lines), port)
     click.echo(f"{explorer.address}  (Ctrl-C ends it)")
@@ -43,9 +43,9 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 
 def check_lines(scene: Any, verdict: Any, limits: list[Any]) -> list[str]:
     """What `zwidth check` says of a scene's wall, without color."""
-    from zwidth.assessment import Assessment
     from zwidth.cli import scene_words
     from zwidth.cli.words import row, verdict_lines
+    from zwidth.scenes.assessment import Assessment
 
     rigid = isinstance(verdict, Assessment)
     lines = verdict_lines(scene, verdict) if rigid else scene_words.scene_verdict_lines(scene, verdict)

@@ -11,8 +11,8 @@ import click
 
 from zwidth.cli.options import QuantityType, json_option, velocity_options
 from zwidth.cli.words import row
-from zwidth.errors import InputError, UnusableValueError
-from zwidth.quantities import POSITIVE
+from zwidth.words.errors import InputError, UnusableValueError
+from zwidth.words.quantities import POSITIVE
 
 if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
@@ -56,7 +56,7 @@ class WallType(click.ParamType):
 
 def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
     """A number in its SI unit, and whether the unit is of a rotary axis."""
-    from zwidth.units import ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPING, RATE, STIFFNESS, read_quantity
+    from zwidth.words.units import ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPING, RATE, STIFFNESS, read_quantity
 
     angular = {"K": ANGULAR_STIFFNESS, "B": ANGULAR_DAMPING}.get(letter)
     linear = {"K": STIFFNESS, "B": DAMPING, "f": RATE}[letter]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from zwidth.errors import InputError, ZwidthError, check_choice
+from zwidth.words.errors import InputError, ZwidthError, check_choice
 
 _PACKAGE = Path(__file__).resolve().parents[1]
 # A table that a configuration reads from its own folder.

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
-from zwidth.quantities import ANY, NOT_NEGATIVE, PARAMETERS, Range
+from zwidth.words.quantities import ANY, NOT_NEGATIVE, PARAMETERS, Range
 
 if TYPE_CHECKING:
-    from zwidth.scene import Scene
+    from zwidth.scenes.scene import Scene
 
 Command: TypeAlias = Callable[..., Any]
 
@@ -28,8 +28,9 @@ class QuantityType(click.ParamType):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Parse one option; a length of time that may be in periods becomes a `Span`."""
-        from zwidth.errors import UnusableValueError
-        from zwidth.units import find_dimension, read_quantity, read_span
+        from zwidth.parts.span import read_span
+        from zwidth.words.errors import UnusableValueError
+        from zwidth.words.units import find_dimension, read_quantity
 
         try:
             number: Any = float(value)
@@ -127,13 +128,13 @@ def velocity_options(function: Command) -> Command:
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
     from zwidth.cli.doubts import doubts_of
-    from zwidth.errors import InputError
     from zwidth.parts.coupling import Coupling
     from zwidth.parts.device import Device
     from zwidth.parts.operator import Operator
     from zwidth.parts.timing import Timing
     from zwidth.parts.wall import VirtualWall
-    from zwidth.scene import Scene
+    from zwidth.scenes.scene import Scene
+    from zwidth.words.errors import InputError
 
     if not given and not required:
         return None

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from zwidth.formatting import plain
+from zwidth.words.formatting import plain
 
 if TYPE_CHECKING:
     from zwidth.runs.result import StudyEvent

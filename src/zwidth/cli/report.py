@@ -19,7 +19,7 @@ def report(folder: Path, out: Path | None, as_json: bool) -> None:
 
     The file needs no server and no network.
     """
-    from zwidth.html_report.page import write_report
+    from zwidth.pages.report.page import write_report
 
     file = write_report(folder, out)
     click.echo(json.dumps({"file": str(file), "bytes": file.stat().st_size}) if as_json else f"wrote {file}")

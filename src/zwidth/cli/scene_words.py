@@ -6,13 +6,13 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from zwidth.cli.words import Slope, margin_lines, passivity_words, pole_words, row, stability_word
-from zwidth.formatting import plain, short, tell_apart, with_unit
+from zwidth.words.formatting import plain, short, tell_apart, with_unit
 
 if TYPE_CHECKING:
-    from zwidth.assessment import SceneAssessment
-    from zwidth.design.friction import FrictionRule
-    from zwidth.design.limits import Limit
-    from zwidth.scene import Scene
+    from zwidth.scenes.assessment import SceneAssessment
+    from zwidth.scenes.friction import FrictionRule
+    from zwidth.scenes.limits import Limit
+    from zwidth.scenes.scene import Scene
 
 _UNITS = {"mass": "kg", "damping": "N s/m", "stiffness": "N/m", "cutoff": "Hz", "time_constant": "s"}
 
@@ -138,14 +138,14 @@ def coded_period_notes(scene: Scene) -> list[str]:
 
 def scene_notes(scene: Scene) -> list[str]:
     """What is remarkable of a scene beside its verdict."""
-    from zwidth.design.limits import describe_islands
+    from zwidth.scenes.limits import describe_islands
 
     return [*coded_period_notes(scene), *describe_islands(scene)]
 
 
 def part_slopes(scene: Scene) -> list[Slope]:
     """What a little more of every parameter of a scene with parts changes of its stiffest wall."""
-    from zwidth.design.stiffness import describe_effect, one_percent
+    from zwidth.scenes.stiffness import describe_effect, one_percent
 
     per, values = scene.sensitivities().per, scene.parameters()
     found = []

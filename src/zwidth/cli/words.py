@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from zwidth.formatting import plain, with_unit
+from zwidth.words.formatting import plain, with_unit
 
 if TYPE_CHECKING:
-    from zwidth.assessment import Assessment, SceneAssessment
-    from zwidth.scene import Scene
+    from zwidth.scenes.assessment import Assessment, SceneAssessment
+    from zwidth.scenes.scene import Scene
 
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.
@@ -42,7 +42,7 @@ class Slope(NamedTuple):
 
 def find_slopes(scene: Scene, delay_model: Any) -> list[Slope]:
     """What damping, mass, period and delay change of the stiffest wall of a device."""
-    from zwidth.design.stiffness import sensitivities, sensitivity_lines
+    from zwidth.scenes.stiffness import sensitivities, sensitivity_lines
 
     numbers = (scene.device.damping, scene.device.mass, scene.timing.period, scene.timing.delay)
     device: dict[str, Any] = dict(zip(("damping", "mass", "period", "delay"), numbers, strict=True))

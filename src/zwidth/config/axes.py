@@ -26,8 +26,8 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
 from zwidth.config.fields import Strict, repeated
 from zwidth.config.numbers import number, whole_number
-from zwidth.formatting import describe, short, suggestion
-from zwidth.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
+from zwidth.words.formatting import describe, short, suggestion
+from zwidth.words.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
 
 LONGEST_AXIS = 10_000_000
 """More values than any result could use, few enough to be laid out in memory."""

@@ -12,10 +12,11 @@ from zwidth.config.fields import Delay, Duration, Strict, unit_schema
 from zwidth.config.numbers import whole_number
 from zwidth.config.parts import SimulatedVelocityField
 from zwidth.config.units import quantity
-from zwidth.quantities import NOT_NEGATIVE, POSITIVE
-from zwidth.scene import Scene
+from zwidth.parts.span import Span
+from zwidth.scenes.scene import Scene
 from zwidth.simulation.simulate import Contact
-from zwidth.units import FORCE, FORCE_RATE, LENGTH, SPEED, Span
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
+from zwidth.words.units import FORCE, FORCE_RATE, LENGTH, SPEED
 
 Position = Annotated[float, BeforeValidator(quantity(LENGTH)), unit_schema(LENGTH)]
 Velocity = Annotated[float, BeforeValidator(quantity(SPEED)), unit_schema(SPEED)]

@@ -19,9 +19,9 @@ from zwidth.config.axes import SPELLED, Entry, read_entries
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.parameters import make_delay_readers
 from zwidth.config.units import make_entry_reader
-from zwidth.formatting import describe, from_cell, resembling, suggestion
-from zwidth.quantities import PARAMETERS
-from zwidth.units import looks_like_number
+from zwidth.words.formatting import describe, from_cell, resembling, suggestion
+from zwidth.words.quantities import PARAMETERS
+from zwidth.words.units import looks_like_number
 
 LABEL = "label"
 MAX_ROWS = 100_000

@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from zwidth.errors import ConfigError, UnusableValueError
-from zwidth.formatting import LONGEST_VALUE, describe, suggestion
+from zwidth.words.errors import ConfigError, UnusableValueError
+from zwidth.words.formatting import LONGEST_VALUE, describe, suggestion
 
 if TYPE_CHECKING:
     from pydantic_core import PydanticCustomError, ValidationError

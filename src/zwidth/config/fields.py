@@ -21,9 +21,10 @@ from pydantic import ModelWrapValidatorHandler as Handler
 from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, validation_error
 from zwidth.config.numbers import number
 from zwidth.config.units import quantity, span
-from zwidth.formatting import describe, resembling, suggestion
-from zwidth.quantities import FRACTION, NOT_NEGATIVE, POSITIVE
-from zwidth.units import DAMPING, MASS, PERIOD_WORDS, STIFFNESS, TIME, Dimension, Span
+from zwidth.parts.span import Span
+from zwidth.words.formatting import describe, resembling, suggestion
+from zwidth.words.quantities import FRACTION, NOT_NEGATIVE, POSITIVE
+from zwidth.words.units import DAMPING, MASS, PERIOD_WORDS, STIFFNESS, TIME, Dimension
 
 
 class Strict(BaseModel):

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 from zwidth.config.faults import problem, raise_problems
-from zwidth.formatting import describe
-from zwidth.quantities import ANY, Range
-from zwidth.units import check_range, looks_like_number, to_float
+from zwidth.words.formatting import describe
+from zwidth.words.quantities import ANY, Range
+from zwidth.words.units import check_range, looks_like_number, to_float
 
 _NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
 

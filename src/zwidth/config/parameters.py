@@ -1,4 +1,4 @@
-"""The parameters of `zwidth.quantities` as values and axes of a configuration."""
+"""The parameters of `words.quantities` as values and axes of a configuration."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from zwidth.config.axes import SPELLED, Axis, Entry, axis_schema, make_axis_read
 from zwidth.config.faults import problem
 from zwidth.config.fields import unit_schema
 from zwidth.config.units import make_entry_reader, quantity, span
-from zwidth.formatting import describe, short
-from zwidth.quantities import NOT_NEGATIVE, OF_PARTS, PARAMETERS, POSITIVE, Range
-from zwidth.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, find_dimension
+from zwidth.words.formatting import describe, short
+from zwidth.words.quantities import NOT_NEGATIVE, OF_PARTS, PARAMETERS, POSITIVE, Range
+from zwidth.words.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, find_dimension
 
 
 def make_delay_readers() -> tuple[Entry, Entry, Callable[[], bool]]:

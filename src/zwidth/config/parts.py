@@ -15,8 +15,6 @@ from zwidth.config.faults import LocatedProblem, listing, problem, validation_er
 from zwidth.config.fields import Damping, Mass, Strict, unit_schema
 from zwidth.config.numbers import number, whole_number
 from zwidth.config.units import quantity
-from zwidth.errors import InputError
-from zwidth.formatting import describe, suggestion
 from zwidth.parts.coupling import Coupling
 from zwidth.parts.operator import Operator
 from zwidth.parts.velocity import (
@@ -28,8 +26,10 @@ from zwidth.parts.velocity import (
     VelocityFilter,
     WindowedDifference,
 )
-from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
-from zwidth.units import LENGTH, MASS, RATE, STIFFNESS, TIME
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import describe, suggestion
+from zwidth.words.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.words.units import LENGTH, MASS, RATE, STIFFNESS, TIME
 
 PARTS = ("velocity", "operator", "coupling")
 

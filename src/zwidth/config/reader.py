@@ -36,7 +36,7 @@ from zwidth.config.faults import (
     problem,
     problems_of,
 )
-from zwidth.formatting import describe
+from zwidth.words.formatting import describe
 
 _Model = TypeVar("_Model", bound=BaseModel)
 

@@ -9,7 +9,6 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WrapValidator
 
-from zwidth._types import DelayModel
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import (
     Damping,
@@ -35,16 +34,18 @@ from zwidth.config.parts import (
     locate_refusal,
 )
 from zwidth.config.units import quantity
-from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
-from zwidth.errors import InputError
-from zwidth.formatting import describe, short
-from zwidth.normalization import normalize
+from zwidth.loops.domain import LARGEST_DAMPING, WALL_RANGE, within
+from zwidth.loops.normalization import normalize
 from zwidth.parts.device import Device
+from zwidth.parts.span import Span
 from zwidth.parts.timing import Timing
 from zwidth.parts.wall import VirtualWall
-from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
-from zwidth.scene import Scene
-from zwidth.units import RATE, TIME, Span
+from zwidth.scenes.scene import Scene
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import describe, short
+from zwidth.words.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
+from zwidth.words.types import DelayModel
+from zwidth.words.units import RATE, TIME
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PARTS})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})

@@ -8,12 +8,12 @@ from typing import Annotated, Any, ClassVar, Literal, get_args
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from zwidth._types import DELAY_MODELS, DelayModel
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
 from zwidth.config.scenes import AnyScene, is_adaptive, is_with_parts
-from zwidth.formatting import describe
+from zwidth.words.formatting import describe
+from zwidth.words.types import DELAY_MODELS, DelayModel
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30

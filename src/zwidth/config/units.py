@@ -1,4 +1,4 @@
-"""Validators for quantities, which `zwidth.units` reads."""
+"""Validators for quantities, which `words.units` reads."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Any
 
 from zwidth.config.faults import raise_problems
 from zwidth.config.numbers import number, whole_number
-from zwidth.quantities import ANY, PARAMETERS, Range
-from zwidth.units import Dimension, Span, find_dimension, read_quantity, read_span
+from zwidth.parts.span import Span, read_span
+from zwidth.words.quantities import ANY, PARAMETERS, Range
+from zwidth.words.units import Dimension, find_dimension, read_quantity
 
 
 def quantity(dimension: Dimension, allowed: Range = ANY) -> Callable[[Any], float]:

@@ -1,5 +1,6 @@
 """Every name of `zwidth.figures`, once."""
 
+from . import plot as plot
 from .boundary import draw_boundary as draw_boundary
 from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines

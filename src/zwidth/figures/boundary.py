@@ -10,9 +10,9 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
 
-from zwidth.errors import InputError
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves, select, si_scale
+from zwidth.words.errors import InputError
 
 # A legend of more entries than this is harder to read than a color bar.
 _LEGEND_ENTRIES = 8

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.errors import InputError
 from zwidth.figures import grid, style
 from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
 from zwidth.figures.region import agrees, fit_axes
-from zwidth.quantities import OUTPUTS, WALL
+from zwidth.words.errors import InputError
+from zwidth.words.quantities import OUTPUTS, WALL
 
 if TYPE_CHECKING:
     import xarray

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves, select
-from zwidth.formatting import header
+from zwidth.words.formatting import header
 
 # Samples that one panel shows; of longer logs every n-th.
 _MOST = 4000

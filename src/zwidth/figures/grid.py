@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import style
-from zwidth.quantities import NOT_COMPUTED, OF_PARTS, OUTPUTS, STATUS_OF, VARIABLES, WALL
+from zwidth.words.quantities import NOT_COMPUTED, OF_PARTS, OUTPUTS, STATUS_OF, VARIABLES, WALL
 
 if TYPE_CHECKING:
     import xarray

@@ -15,7 +15,7 @@ from matplotlib.ticker import FuncFormatter
 from zwidth.figures import style
 from zwidth.figures.grid import logarithmic
 from zwidth.figures.table import SI_COLUMNS, Table, curves
-from zwidth.formatting import with_unit
+from zwidth.words.formatting import with_unit
 
 _AXES = {
     SI_COLUMNS[0]: ("stiffness", "K", "N/m"),

@@ -13,11 +13,11 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from zwidth.errors import InputError
 from zwidth.figures import grid, region, style
 from zwidth.figures.contours import label_contours
 from zwidth.figures.stability_map import SHADES
-from zwidth.quantities import OUTPUTS, Output
+from zwidth.words.errors import InputError
+from zwidth.words.quantities import OUTPUTS, Output
 
 if TYPE_CHECKING:
     import xarray

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import style
 from zwidth.figures.table import SI_COLUMNS, Table
-from zwidth.formatting import header
-from zwidth.quantities import PARAMETERS
+from zwidth.words.formatting import header
+from zwidth.words.quantities import PARAMETERS
 
 _WORDS = {"above": "or more", "below": "or less"}
 # From so many times its least value on, an axis has powers of ten only.

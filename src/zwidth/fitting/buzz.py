@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.errors import InputError
+from zwidth.arrays.circle import circle
 from zwidth.fitting.buzz_devices import Candidate, find_candidates, weigh
 from zwidth.fitting.buzz_points import BuzzPoint as BuzzPoint
 from zwidth.fitting.buzz_points import read_noise, read_points
@@ -22,14 +22,14 @@ from zwidth.fitting.device_fit import (
     RivalDevice,
     StiffnessEstimate,
     in_si,
-    scene_of,
 )
-from zwidth.formatting import plain, with_unit
-from zwidth.linear_loop import circle
+from zwidth.fitting.scenes import scene_of
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity
-from zwidth.scene import Scene
-from zwidth.status import Status
+from zwidth.scenes.scene import Scene
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import plain, with_unit
+from zwidth.words.status import Status
 
 # Beyond this condition number some direction is not seen at all.
 _BLIND = 1e6

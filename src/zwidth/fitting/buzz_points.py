@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.errors import InputError
-from zwidth.formatting import plain, with_unit
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import plain, with_unit
 
 # Dampings closer than this are one experiment.
 _SAME = 1e-6

@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.fitting.device_fit import with_cutoff
-from zwidth.linear_loop import CirclePoints, Estimate, Jet, circle, lag_jet
+from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
+from zwidth.fitting.scenes import with_cutoff
+from zwidth.loops.rigid.plant import held_plant, split_delay
+from zwidth.loops.rigid.ridge_slopes import plant_slopes
+from zwidth.parts.estimate import Estimate
 from zwidth.parts.velocity import Velocity
-from zwidth.plant import held_plant, split_delay
-from zwidth.stability.ridge_slopes import plant_slopes
 
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share
 # beyond which w was not found.

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.errors import InputError, UnusableValueError
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.log import fit_log
-from zwidth.formatting import describe, suggestion, with_unit
-from zwidth.quantities import POSITIVE
-from zwidth.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
+from zwidth.words.errors import InputError, UnusableValueError
+from zwidth.words.formatting import describe, suggestion, with_unit
+from zwidth.words.quantities import POSITIVE
+from zwidth.words.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
 
 QUANTITIES = ("time", "position", "force")
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.formatting import with_unit
-from zwidth.parts.device import Device
-from zwidth.parts.timing import Timing
+from zwidth.fitting.scenes import scene_of
 from zwidth.parts.velocity import Velocity
-from zwidth.scene import Scene
-from zwidth.status import Status
+from zwidth.scenes.scene import Scene
+from zwidth.words.formatting import with_unit
+from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     from zwidth.fitting.safe_wall import SafeWall
@@ -265,19 +264,6 @@ def _without_nan(value: Any) -> Any:
     if isinstance(value, list):
         return [_without_nan(part) for part in value]
     return None if value != value else value
-
-
-def scene_of(values: Iterable[float], period: float, velocity: Velocity) -> Scene:
-    """A device of this mass, damping and delay with its timing; a fourth value is the velocity's cut-off."""
-    mass, damping, delay, *cutoff = map(float, values)
-    if cutoff:
-        velocity = with_cutoff(velocity, cutoff[0])
-    return Scene(Device(mass, damping), Timing(period=period, delay=delay), velocity=velocity)
-
-
-def with_cutoff(velocity: Any, cutoff: float) -> Any:
-    """A low-pass with another cut-off in Hz."""
-    return replace(velocity, cutoff=cutoff, **({"time_constant": None} if hasattr(velocity, "time_constant") else {}))
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.batching import FEW
-from zwidth.errors import InputError
+from zwidth.arrays.batching import FEW
 from zwidth.fitting.buzz import BuzzPoint
-from zwidth.fitting.device_fit import DeviceFit, scene_of
+from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.safe_wall import draw_devices
+from zwidth.fitting.scenes import scene_of
 from zwidth.fitting.words import LINEAR, AxisUnits, choose_wall
-from zwidth.formatting import header
-from zwidth.stability.boundary import boundary_point
-from zwidth.status import Status
+from zwidth.loops.rigid.boundary import boundary_point
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import header
+from zwidth.words.status import Status
 
 # Devices drawn around the estimate, dampings of the boundary, and how far beyond its end.
 _DRAWS, _DRAWS_WITH_PARTS, _ROWS, _BEYOND = 1000, 200, 121, 1.1

@@ -6,8 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from zwidth._types import ArrayLike
-from zwidth.errors import InputError
 from zwidth.fitting.device_fit import (
     BEYOND,
     MASS_OPEN,
@@ -16,16 +14,18 @@ from zwidth.fitting.device_fit import (
     FittedMotion,
     StiffnessEstimate,
     in_si,
-    scene_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.moving import PARTS, Recordings
 from zwidth.fitting.output_error import LEAST, FittedModel, find_largest, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
-from zwidth.formatting import plain, with_unit
+from zwidth.fitting.scenes import scene_of
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
-from zwidth.status import Status
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import plain, with_unit
+from zwidth.words.status import Status
+from zwidth.words.types import ArrayLike
 
 # By default the longest delay, in periods.
 _LONGEST = 20

@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.numerics.phi import PhiFunctions, phi_functions
-from zwidth.plant import split_delay
+from zwidth.arrays.phi import PhiFunctions, phi_functions
+from zwidth.loops.rigid.plant import split_delay
 
 
 class Pieces(NamedTuple):

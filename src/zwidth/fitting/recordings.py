@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.batching import as_float64
-from zwidth.errors import InputError
+from zwidth.arrays.batching import as_float64
 from zwidth.fitting.moving import Recording
-from zwidth.formatting import plain, with_unit
 from zwidth.parts.checks import check_number
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import plain, with_unit
 
 # How far a sample's time may lie from an even one, as a share of the period, unasked and where a wavering clock is
 # asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.

@@ -15,22 +15,23 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth._types import Array
-from zwidth.batching import FEW
-from zwidth.design.tolerances import borne_by
-from zwidth.domain import SI_RANGE, device_status
-from zwidth.errors import InputError
+from zwidth.arrays.batching import FEW
+from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
-from zwidth.fitting.device_fit import scene_of
-from zwidth.linear.polynomial import affine_polynomial
-from zwidth.linear_loop import circle
+from zwidth.fitting.scenes import scene_of
+from zwidth.loops.domain import device_status
+from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.rigid.boundary import boundary_point
+from zwidth.loops.rigid.poles import companion
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.verdict import is_stable
 from zwidth.parts.checks import check_whole
-from zwidth.scene import Scene
-from zwidth.stability.boundary import boundary_point
-from zwidth.stability.labels import is_stable
-from zwidth.stability.poles import companion
-from zwidth.stability.ridge import alpha_max
-from zwidth.status import Status
+from zwidth.scenes.scene import Scene
+from zwidth.scenes.tolerances import borne_by
+from zwidth.words.errors import InputError
+from zwidth.words.quantities import SI_RANGE
+from zwidth.words.status import Status
+from zwidth.words.types import Array
 
 if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit

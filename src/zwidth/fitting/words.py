@@ -8,10 +8,10 @@ from dataclasses import fields
 from typing import NamedTuple
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
-from zwidth.formatting import plain, with_unit
 from zwidth.parts.velocity import VELOCITY_KINDS
-from zwidth.quantities import RECOMMENDED_SHARE
-from zwidth.status import Status
+from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import RECOMMENDED_SHARE
+from zwidth.words.status import Status
 
 SYMBOLS = {
     "mass": "m",

@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.errors import InputError, UnusableValueError
-from zwidth.formatting import describe
-from zwidth.quantities import NOT_NEGATIVE, Range
-from zwidth.units import Span, find_dimension, read_quantity, read_span, to_float
-from zwidth.xp import is_jax
+from zwidth.arrays.xp import is_jax
+from zwidth.parts.span import Span, read_span
+from zwidth.words.errors import InputError, UnusableValueError
+from zwidth.words.formatting import describe
+from zwidth.words.quantities import NOT_NEGATIVE, Range
+from zwidth.words.units import find_dimension, read_quantity, to_float
 
 
 def check_number(field: str, value: Any, unit: str, *, low: float = 0.0, low_open: bool = False) -> Any:

@@ -10,8 +10,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from zwidth.errors import check_choice
 from zwidth.parts.checks import check_number
+from zwidth.words.errors import check_choice
 
 
 @dataclass(frozen=True)

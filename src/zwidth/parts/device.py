@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from zwidth.errors import InputError
 from zwidth.parts.checks import check_number
 from zwidth.parts.coupling import Coupling
+from zwidth.words.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from zwidth.errors import InputError
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
+from zwidth.words.errors import InputError
 
 
 def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:

@@ -9,8 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from zwidth.errors import InputError
 from zwidth.parts.checks import check_number
+from zwidth.words.errors import InputError
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.errors import InputError, describe_choice
+from zwidth.arrays.xp import is_jax
 from zwidth.parts.wall import NoWall, VirtualWall
-from zwidth.xp import is_jax
+from zwidth.words.errors import InputError, describe_choice
 
 _BARE = ("device", "timing", "wall")
 _NAMED = ("velocity", "operator")

@@ -7,11 +7,11 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from zwidth._types import DELAY_MODELS, DelayModel
-from zwidth.errors import InputError, check_choice
+from zwidth.arrays.xp import is_jax
 from zwidth.parts.checks import check_number, check_span
-from zwidth.units import Span, in_periods
-from zwidth.xp import is_jax
+from zwidth.parts.span import Span, in_periods
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.types import DELAY_MODELS, DelayModel
 
 
 @dataclass(frozen=True)

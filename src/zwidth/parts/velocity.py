@@ -13,10 +13,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from zwidth.errors import InputError
-from zwidth.linear_loop import Estimate
+from zwidth.arrays.xp import is_jax, namespace
 from zwidth.parts.checks import check_number, check_whole
-from zwidth.xp import is_jax, namespace
+from zwidth.parts.estimate import Estimate
+from zwidth.words.errors import InputError
 
 _LONGEST_WINDOW, _HIGHEST_ORDER, _LONGEST_ADAPTIVE = 1000, 8, 64
 

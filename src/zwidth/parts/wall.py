@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from zwidth.errors import InputError
 from zwidth.parts.checks import check_number
+from zwidth.words.errors import InputError
 
 
 @dataclass(frozen=True)

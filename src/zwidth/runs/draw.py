@@ -11,15 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.errors import InputError, StoreError
 from zwidth.figures.curves import draw_curves, draw_outlines, find_family
 from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.style import save, style_sheet
-from zwidth.formatting import short
-from zwidth.quantities import OUTPUTS, VARIABLES
 from zwidth.runs.edges import Edges, make_edges
 from zwidth.sweep.store import SUFFIX, Store, find_stores, open_dataset
+from zwidth.words.errors import InputError, StoreError
+from zwidth.words.formatting import short
+from zwidth.words.quantities import OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray

@@ -18,14 +18,14 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from zwidth.errors import StoreError, StoreExistsError
-from zwidth.files.lock import FOLDER as LOCKS
-from zwidth.files.lock import held_briefly
-from zwidth.files.provenance import digest, versions
-from zwidth.files.whole import check_folder, hidden_beside, is_plain_name, remove_quietly, write_whole
-from zwidth.formatting import describe
+from zwidth.sweep.files.lock import FOLDER as LOCKS
+from zwidth.sweep.files.lock import held_briefly
+from zwidth.sweep.files.provenance import digest, versions
+from zwidth.sweep.files.whole import check_folder, hidden_beside, is_plain_name, remove_quietly, write_whole
 from zwidth.sweep.resume import refuse_changes, refuse_versions
 from zwidth.sweep.store import SUFFIX
+from zwidth.words.errors import StoreError, StoreExistsError
+from zwidth.words.formatting import describe
 
 RUN_FILE = "run.json"
 CONFIG_FILE = "config.yaml"

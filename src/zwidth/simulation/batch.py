@@ -4,40 +4,30 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from zwidth.batching import compute_concretely, processors
-from zwidth.linear.chain import Chain, chain_of
-from zwidth.linear_loop import Estimate
+from zwidth.arrays.batching import compute_concretely, processors
+from zwidth.loops.linear.chain import Chain, chain_of
+from zwidth.parts.estimate import Estimate
 from zwidth.parts.velocity import FOAW, BackwardDifference
 from zwidth.simulation.flow import Mechanics, mechanics
-from zwidth.simulation.lanes import Lanes, Motor, Options, cut_period, lay_estimators, lay_machines, round_up
+from zwidth.simulation.lanes import (
+    Course,
+    Given,
+    Lanes,
+    Motor,
+    Options,
+    cut_period,
+    lay_estimators,
+    lay_machines,
+    round_up,
+)
 from zwidth.simulation.result import to_si
 
 # Lanes that run together: enough for the vector units, few enough that a state stays next to the processor.
 TOGETHER = 1 << 10
-
-
-class Course(NamedTuple):
-    """What the simulations of a batch share."""
-
-    periods: int
-    substeps: int
-    tail: int
-    contact: str
-    record: bool
-
-
-class Given(NamedTuple):
-    """What comes from outside, normalized."""
-
-    position: np.ndarray
-    velocity: np.ndarray
-    noise: np.ndarray | None  # (periods, lanes), in m
-    history: np.ndarray | None  # (periods, lanes)
-    durations: np.ndarray | None  # (periods, substeps, pieces, lanes)
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth._types import Array
-from zwidth.simulation.batch import Course, Given
-from zwidth.simulation.lanes import Lanes, Options
+from zwidth.simulation.lanes import Course, Given, Lanes, Options
 from zwidth.simulation.motion import BodyState, dot
 from zwidth.simulation.outlook import CYCLE
 from zwidth.simulation.period import Program, Reading, Work, control, forces_of, move, round_to
+from zwidth.words.types import Array
 
 BLOCK = 128
 # The tail's windows, the same number in each half.

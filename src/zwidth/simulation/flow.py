@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.linear.chain import Chain, rates
+from zwidth.loops.linear.chain import Chain, rates
 
 # Of series in a matrix of norm up to 1/2: the first term left out is below 1e-19 of the whole.
 _TERMS = 15

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth._types import Array
-from zwidth.errors import InputError
-from zwidth.linear.state_space import estimate_matrices
-from zwidth.linear_loop import Estimate
+from zwidth.loops.linear.state_space import estimate_matrices
+from zwidth.parts.estimate import Estimate
 from zwidth.parts.velocity import FOAW
 from zwidth.simulation.flow import Flow, Mechanics, digit_flow, flow
+from zwidth.words.errors import InputError
+from zwidth.words.types import Array
 
 # With friction, steps are so short a part of the fastest motion that two events within one are seen (T5), and never so
 # many that a period would take forever.
@@ -32,6 +32,26 @@ class Options(NamedTuple):
     jitter: bool
     foaw: int  # longest window, 0 where the estimate is linear
     record: bool
+
+
+class Course(NamedTuple):
+    """What the simulations of a batch share."""
+
+    periods: int
+    substeps: int
+    tail: int
+    contact: str
+    record: bool
+
+
+class Given(NamedTuple):
+    """What comes from outside, normalized."""
+
+    position: np.ndarray
+    velocity: np.ndarray
+    noise: np.ndarray | None  # (periods, lanes), in m
+    history: np.ndarray | None  # (periods, lanes)
+    durations: np.ndarray | None  # (periods, substeps, pieces, lanes)
 
 
 class Motor(NamedTuple):

@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from zwidth._types import Array
 from zwidth.simulation.flow import DIGITS, Flow
 from zwidth.simulation.lanes import Lanes
+from zwidth.words.types import Array
 
 # More events within a period than a motion has: what is left then is unknown, NaN.
 _MOST_EVENTS = 512

@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth._types import Array
 from zwidth.simulation.lanes import Lanes, Options
 from zwidth.simulation.motion import BodyState, advance, dot, slide, times
+from zwidth.words.types import Array
 
 
 class Program(NamedTuple):

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.errors import InputError
-from zwidth.status import Status
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     import xarray

@@ -8,15 +8,16 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from zwidth._types import ArrayLike
-from zwidth.batching import as_float64, processors
-from zwidth.errors import InputError, ResourceError, check_choice
+from zwidth.arrays.batching import as_float64, processors
+from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole
 from zwidth.parts.wall import resolve_wall
-from zwidth.simulation.batch import TOGETHER, Course, Numbers, run_batch, structure
+from zwidth.simulation.batch import TOGETHER, Numbers, run_batch, structure
+from zwidth.simulation.lanes import Course
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
-from zwidth.status import Status
-from zwidth.xp import is_traced
+from zwidth.words.errors import InputError, ResourceError, check_choice
+from zwidth.words.status import Status
+from zwidth.words.types import ArrayLike
 
 Contact = Literal["bilateral", "unilateral", "push_only"]
 CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")

@@ -10,19 +10,19 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 
 from zwidth import figures
-from zwidth._types import DelayModel
-from zwidth.batching import map_flat
+from zwidth.arrays.batching import map_flat
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels
-from zwidth.loop import frequency_boundary, frequency_loop, line_at_minus_one
-from zwidth.stability.region import Piece, stable_region
+from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop, line_at_minus_one
+from zwidth.loops.rigid.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device, stack
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
 from zwidth.studies.stable_set import tabulate_walls, trace_outlines
+from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 
@@ -187,7 +187,7 @@ def _upper_kernel(delta, d, delay: str):
     """The largest stable beta as alpha -> 0: the lobe's end, or the line P(-1) = 0 where it comes first."""
     import jax.numpy as jnp
 
-    from zwidth.stability.bracketing import lobe_end
+    from zwidth.loops.rigid.bracketing import lobe_end
 
     loop = frequency_loop(delta, d, delay)
     omega = lobe_end(loop, d, delay)

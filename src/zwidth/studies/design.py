@@ -18,16 +18,16 @@ from zwidth.config.numbers import number, whole_number
 from zwidth.config.parameters import StiffnessAxis
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.units import make_entry_reader
-from zwidth.design.tolerances import Tolerance, simulate_tolerances
-from zwidth.errors import InputError
 from zwidth.figures.table import SI_COLUMNS
-from zwidth.formatting import describe, header, short, suggestion
-from zwidth.linear.required import RequiredValue
 from zwidth.parts.wall import VirtualWall
-from zwidth.quantities import PARAMETERS, PHYSICAL, Range
-from zwidth.scene import Scene
-from zwidth.status import Status
+from zwidth.scenes.required import RequiredValue
+from zwidth.scenes.scene import Scene
+from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import describe, header, short, suggestion
+from zwidth.words.quantities import PARAMETERS, PHYSICAL, Range
+from zwidth.words.status import Status
 
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
 # Scenes that the search for one value asks about.

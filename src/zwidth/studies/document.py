@@ -28,7 +28,6 @@ from zwidth.config.fields import Name, Strict, members
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import Study
-from zwidth.formatting import describe, suggestion
 from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.compare import CompareStudy
 from zwidth.studies.design import DesignStudy
@@ -42,7 +41,8 @@ from zwidth.studies.ridge import RidgeStudy
 from zwidth.studies.simulate import SimulateStudy
 from zwidth.studies.step import StepStudy
 from zwidth.sweep.study import SweepStudy
-from zwidth.units import looks_like_number
+from zwidth.words.formatting import describe, suggestion
+from zwidth.words.units import looks_like_number
 
 FORMAT_VERSION = 1
 

@@ -16,14 +16,14 @@ from zwidth.config.parameters import CutoffAxis, DampingAxis, WindowAxis
 from zwidth.config.parts import Order, locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.units import quantity
-from zwidth.errors import InputError
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
-from zwidth.quantities import POSITIVE
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, stack
 from zwidth.studies.stable_set import name_kind
-from zwidth.units import LENGTH, SPEED
+from zwidth.words.errors import InputError
+from zwidth.words.quantities import POSITIVE
+from zwidth.words.units import LENGTH, SPEED
 
 Length = Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)]
 Speed = Annotated[float, BeforeValidator(quantity(SPEED, POSITIVE)), unit_schema(SPEED)]

@@ -18,16 +18,16 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Fraction, Strict, VirtualDamping, members, unit_schema
 from zwidth.config.parts import Frequency, Spring, Time, VelocityField, build_velocity, locate_refusal
 from zwidth.config.scenes import AnyScene
-from zwidth.errors import InputError
 from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
-from zwidth.formatting import describe, header, plain, with_unit
-from zwidth.status import Status
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
-from zwidth.units import LENGTH
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import describe, header, plain, with_unit
+from zwidth.words.status import Status
+from zwidth.words.units import LENGTH
 
 # Times of a log and the period may differ so much, as a share.
 _SAME_PERIOD = 1e-3

@@ -19,15 +19,15 @@ from zwidth.config.parameters import StiffnessAxis, VirtualDampingAxis
 from zwidth.config.scenes import AnyScene
 from zwidth.config.units import quantity
 from zwidth.figures.table import SI_COLUMNS
-from zwidth.formatting import with_unit
 from zwidth.parts.velocity import FOAW
-from zwidth.quantities import NOT_NEGATIVE, POSITIVE
-from zwidth.scene import Scene
+from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
-from zwidth.status import Status
 from zwidth.studies.outcome import Outcome, csv_text, stack
 from zwidth.studies.simulate import SimulatedStudy, check_circumstances, name_column
-from zwidth.units import FORCE, LENGTH, Dimension
+from zwidth.words.formatting import with_unit
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
+from zwidth.words.status import Status
+from zwidth.words.units import FORCE, LENGTH, Dimension
 
 # The axes that there may be, with their columns.
 _COLUMNS = {

@@ -15,9 +15,9 @@ from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.config.fields import members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly
-from zwidth.stability.labels import is_stable
-from zwidth.stability.passivity import is_passive
-from zwidth.stability.radii import spectral_radius
+from zwidth.loops.rigid.passivity import is_passive
+from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.verdict import is_stable
 from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene, share_of_device
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]

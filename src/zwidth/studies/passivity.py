@@ -15,7 +15,7 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly
-from zwidth.stability.passivity import passive_stiffness_slope, passivity_margin
+from zwidth.loops.rigid.passivity import passive_stiffness_slope, passivity_margin
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome
 from zwidth.studies.ridge import ridge_table

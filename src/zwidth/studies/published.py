@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from zwidth import report
+from zwidth.studies import paper_values as report
 from zwidth.studies.outcome import Outcome
 
 

@@ -11,18 +11,18 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.assessment import Assessment, assess
 from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
-from zwidth.formatting import plain, with_unit
+from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.wall import VirtualWall
-from zwidth.quantities import RECOMMENDED_SHARE
-from zwidth.stability.ridge import alpha_max
+from zwidth.scenes.assessment import Assessment, assess
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, add_si_columns, si_scales, stack
 from zwidth.studies.passivity import passive_outlines
 from zwidth.studies.recommend_with_parts import recommend_with_parts, spell_answer
 from zwidth.studies.step import ResponseStudy
+from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import RECOMMENDED_SHARE
 
 
 class RecommendStudy(ResponseStudy):

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 
 from zwidth import figures
-from zwidth.design.limits import describe_islands
-from zwidth.formatting import plain, tell_apart, with_unit
-from zwidth.linear.passivity import has_condition
-from zwidth.linear.stiffest import StiffestWall, choose_damping
-from zwidth.scene import Scene
-from zwidth.status import Status
+from zwidth.loops.linear.passivity import has_condition
+from zwidth.scenes.limits import describe_islands
+from zwidth.scenes.scene import Scene
+from zwidth.scenes.stiffest import StiffestWall, choose_damping
 from zwidth.studies.outcome import Outcome, stack
 from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
+from zwidth.words.formatting import plain, tell_apart, with_unit
+from zwidth.words.status import Status
 
 _DECAY = math.log(50.0)
 _SIDES = ("lower", "upper")

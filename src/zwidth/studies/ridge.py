@@ -9,14 +9,14 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth._types import DelayModel
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels
-from zwidth.stability.ridge import RidgeKind, RidgePoint, alpha_max
-from zwidth.stability.slope import stiffness_slope
-from zwidth.status import Status
+from zwidth.loops.rigid.ridge import RidgeKind, RidgePoint, alpha_max
+from zwidth.loops.rigid.slope import stiffness_slope
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, Table, stack
+from zwidth.words.status import Status
+from zwidth.words.types import DelayModel
 
 # Every batch has this size, so that a run with many of them compiles the ridge once for each delay model.
 _BATCH = 4096

@@ -26,15 +26,15 @@ from zwidth.config.scenes import (
     WallField,
 )
 from zwidth.config.study import HeldOnly
-from zwidth.errors import InputError
 from zwidth.figures.table import SI_COLUMNS
-from zwidth.formatting import with_unit
 from zwidth.parts.velocity import FOAW
-from zwidth.quantities import POSITIVE, Range
-from zwidth.scene import Scene
+from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, si_scales, stack
 from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import with_unit
+from zwidth.words.quantities import POSITIVE, Range
 
 _POSITIVE = {"type": "number", "exclusiveMinimum": 0}
 Fractions = Annotated[Axis, PlainValidator(axis(POSITIVE)), SPELLED, axis_schema(_POSITIVE, _POSITIVE)]

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.figures.table import SI_COLUMNS
-from zwidth.linear.stiffest import StiffestWall
-from zwidth.scene import Scene
-from zwidth.stability.passivity import passivity_margin
-from zwidth.stability.region import stable_region
-from zwidth.stability.ridge import RidgeKind
-from zwidth.status import Status
+from zwidth.loops.rigid.passivity import passivity_margin
+from zwidth.loops.rigid.region import stable_region
+from zwidth.loops.rigid.ridge import RidgeKind
+from zwidth.scenes.scene import Scene
+from zwidth.scenes.stiffest import StiffestWall
 from zwidth.studies.outcome import Table
+from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     from zwidth.figures.region import Outlines

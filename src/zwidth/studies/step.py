@@ -29,13 +29,13 @@ from zwidth.config.scenes import (
     normalized_wall,
 )
 from zwidth.config.study import HeldOnly, refuse_parts
-from zwidth.formatting import plain, with_unit
-from zwidth.quantities import Range
-from zwidth.response import step_response
-from zwidth.stability.ridge import alpha_max
+from zwidth.loops.rigid.response import step_response
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.parts.span import Span
 from zwidth.studies.outcome import ComputedStudy, Outcome, stack
 from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
-from zwidth.units import Span
+from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import Range
 
 
 class ResponseStudy(ComputedStudy):

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.formatting import with_unit
+from zwidth.words.formatting import with_unit
 
 _KEYS = ("stiffness_fraction", "walls")
 

@@ -11,9 +11,9 @@ import numpy as np
 from zarr.core.buffer.core import default_buffer_prototype
 from zarr.storage import LocalStore
 
-from zwidth.errors import StoreError
-from zwidth.files.whole import content
+from zwidth.sweep.files.whole import content
 from zwidth.sweep.plan import Task
+from zwidth.words.errors import StoreError
 
 if TYPE_CHECKING:
     from zarr.abc.store import ByteRequest

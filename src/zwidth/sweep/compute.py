@@ -15,15 +15,15 @@ from typing import TypeAlias
 
 import numpy as np
 
-from zwidth.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
-from zwidth.stability.boundary_map import row_limits
-from zwidth.stability.decay import rates
-from zwidth.stability.margins import margins_kernel
-from zwidth.stability.passivity import margin_at_one_delay
-from zwidth.stability.proved import outermost_poles, radius_at, usable
-from zwidth.stability.ridge import alpha_max
-from zwidth.status import Status
+from zwidth.loops.rigid.boundary_map import row_limits
+from zwidth.loops.rigid.decay import rates
+from zwidth.loops.rigid.margins import margins_kernel
+from zwidth.loops.rigid.outermost_poles import outermost_poles, radius_at, usable
+from zwidth.loops.rigid.passivity import margin_at_one_delay
+from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.sweep.grid import Block
+from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.words.status import Status
 
 Columns: TypeAlias = tuple[np.ndarray, ...]
 

@@ -11,8 +11,8 @@ from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any
 
-from zwidth.errors import InputError
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, Perform, describe_failure
+from zwidth.words.errors import InputError
 
 if TYPE_CHECKING:
     from distributed import Client

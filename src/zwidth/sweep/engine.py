@@ -10,12 +10,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from zwidth.errors import StoreExistsError
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, Perform, in_this_process
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.resume import check_same, new_store, remove_partials, repair, store_path
 from zwidth.sweep.store import Store
 from zwidth.sweep.study import SweepStudy
+from zwidth.words.errors import StoreExistsError
 
 
 @dataclass(frozen=True)

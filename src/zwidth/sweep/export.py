@@ -9,11 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.errors import StoreError, StoreExistsError
-from zwidth.files.whole import hidden_beside
-from zwidth.formatting import header, to_cell
-from zwidth.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
+from zwidth.sweep.files.whole import hidden_beside
 from zwidth.sweep.store import open_dataset
+from zwidth.words.errors import StoreError, StoreExistsError
+from zwidth.words.formatting import header, to_cell
+from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 
 MAX_CSV_POINTS = 1_000_000
 

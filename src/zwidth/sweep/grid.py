@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.config.device_table import LABEL
-from zwidth.normalization import normalize
-from zwidth.quantities import PARAMETERS, WALL, Family
+from zwidth.loops.normalization import normalize
 from zwidth.sweep.study import SweepStudy
+from zwidth.words.quantities import PARAMETERS, WALL, Family
 
 
 class Block(NamedTuple):

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Generator, Iterable
 from typing import NamedTuple, TypeAlias
 
-from zwidth.errors import ZwidthError
-from zwidth.files.whole import hopeless
+from zwidth.sweep.files.whole import hopeless
 from zwidth.sweep.plan import Task
+from zwidth.words.errors import ZwidthError
 
 Perform: TypeAlias = Callable[[str, str, int], None]
 """What computes one chunk: `zwidth.sweep.chunks.perform`, or in a test something that fails."""

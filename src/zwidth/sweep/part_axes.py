@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import build_velocity, locate_refusal
-from zwidth.errors import InputError
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
 from zwidth.parts.timing import Timing
-from zwidth.quantities import WALL
-from zwidth.scene import Scene
+from zwidth.scenes.scene import Scene
+from zwidth.words.errors import InputError
+from zwidth.words.quantities import WALL
 
 if TYPE_CHECKING:
     from zwidth.sweep.study import Axes, SweepStudy

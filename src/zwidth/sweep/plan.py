@@ -12,11 +12,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from zwidth.errors import ResourceError
-from zwidth.files.whole import check_folder, existing
-from zwidth.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.sweep.files.whole import check_folder, existing
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.study import SweepStudy
+from zwidth.words.errors import ResourceError
+from zwidth.words.quantities import MARGIN_OUTPUTS, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 
 MEMORY = 2**28
 """Bytes that one chunk may take while it is computed, beside what an idle worker takes."""

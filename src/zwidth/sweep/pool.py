@@ -13,7 +13,7 @@ from contextlib import suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from zwidth.kernel_cache import mend_compilation_cache
+from zwidth.arrays.kernel_cache import mend_compilation_cache
 from zwidth.sweep.jobs import MAX_ATTEMPTS, Finished, Job, Perform, attempt
 
 # Never fork a process in which JAX may have started: its threads do not survive, its locks do.

@@ -9,12 +9,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from zwidth.errors import StoreError
-from zwidth.files.provenance import differences, digest, versions
-from zwidth.formatting import describe
+from zwidth.sweep.files.provenance import differences, digest, versions
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
 from zwidth.sweep.study import SweepStudy
+from zwidth.words.errors import StoreError
+from zwidth.words.formatting import describe
 
 _SHOWN_DIFFERENCES = 10
 

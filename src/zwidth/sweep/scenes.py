@@ -6,13 +6,13 @@ from functools import lru_cache
 
 import numpy as np
 
-from zwidth.errors import InputError, ZwidthError
-from zwidth.quantities import OUTPUTS, STATUS_OF, Family
-from zwidth.scene import Scene
-from zwidth.status import Status
+from zwidth.scenes.scene import Scene
 from zwidth.sweep.grid import SceneBlock
 from zwidth.sweep.part_axes import make_scene
 from zwidth.sweep.study import SweepStudy
+from zwidth.words.errors import InputError, ZwidthError
+from zwidth.words.quantities import OUTPUTS, STATUS_OF, Family
+from zwidth.words.status import Status
 
 
 @lru_cache(maxsize=64)

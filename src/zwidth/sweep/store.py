@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.errors import InputError, StoreError, StoreExistsError
-from zwidth.files.provenance import digest
-from zwidth.files.whole import checksum, content, hidden_beside, remove_quietly, write_whole
-from zwidth.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
+from zwidth.sweep.files.provenance import digest
+from zwidth.sweep.files.whole import checksum, content, hidden_beside, remove_quietly, write_whole
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.study import SweepStudy
+from zwidth.words.errors import InputError, StoreError, StoreExistsError
+from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 
 if TYPE_CHECKING:
     import xarray

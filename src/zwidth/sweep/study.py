@@ -24,15 +24,11 @@ from zwidth.config.parameters import (
     TimeAxis,
     VirtualDampingAxis,
 )
-from zwidth.config.parts import (
-    CouplingSection,
-    OperatorSection,
-    VelocityField,
-    list_parts,
-)
+from zwidth.config.parts import CouplingSection, OperatorSection, VelocityField, list_parts
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study
-from zwidth.quantities import (
+from zwidth.sweep.part_axes import find_faults
+from zwidth.words.quantities import (
     MAX_DELAY_PERIODS,
     NORMALIZED,
     OF_PARTS,
@@ -45,7 +41,6 @@ from zwidth.quantities import (
     Family,
     Range,
 )
-from zwidth.sweep.part_axes import find_faults
 
 MAX_SWEEP_POINTS = 10**12
 

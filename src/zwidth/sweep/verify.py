@@ -7,8 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from zwidth.errors import StoreError
 from zwidth.sweep.store import Store, find_stores
+from zwidth.words.errors import StoreError
 
 
 @dataclass(frozen=True)

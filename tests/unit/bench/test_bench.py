@@ -12,8 +12,8 @@ from matplotlib.text import Text
 from zwidth.bench import problems, report, suite
 from zwidth.bench.baselines import available
 from zwidth.cli.commands import cli
-from zwidth.errors import InputError
 from zwidth.figures.pareto import Mark, draw_pareto
+from zwidth.words.errors import InputError
 
 
 def test_labels_near_the_boundary_are_those_of_their_side():

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-
 from waiting import LONGEST
 
 PAGE = Path(__file__).resolve().parents[3] / "docs" / "shell-completion.md"

@@ -7,8 +7,8 @@ from click.testing import CliRunner
 
 from zwidth.cli.commands import cli
 from zwidth.cli.init import find_examples
-from zwidth.errors import InputError
 from zwidth.studies.document import load_config
+from zwidth.words.errors import InputError
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 EXAMPLES = sorted(file.stem for file in CONFIGS.glob("*.yaml"))

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-
 from sweeping import main_of
+
 from zwidth.config.faults import ConfigFileError, dotted
 from zwidth.config.reader import MAX_DEPTH, MAX_NODES
 from zwidth.studies.document import Config, load_config

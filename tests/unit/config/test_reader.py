@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-
 from waiting import LONGEST
+
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
-from zwidth.scene import Scene
+from zwidth.parts.span import Span
+from zwidth.scenes.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
 from zwidth.studies.passivity import PassivityStudy
 from zwidth.studies.ridge import RidgeStudy
-from zwidth.units import Span
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))

@@ -6,18 +6,8 @@ import pytest
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.units import quantity
-from zwidth.units import (
-    ANGLE,
-    ANGULAR_DAMPING,
-    ANGULAR_STIFFNESS,
-    DAMPING,
-    MASS,
-    RATE,
-    STIFFNESS,
-    TIME,
-    TORQUE,
-    Span,
-)
+from zwidth.parts.span import Span
+from zwidth.words.units import ANGLE, ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPING, MASS, RATE, STIFFNESS, TIME, TORQUE
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,6 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
-from matplotlib.axis import Tick
-from matplotlib.colors import to_rgb
-from matplotlib.contour import ContourSet
-from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
-from matplotlib.text import Annotation, Text
-
 from figure_tables import (
     BOUNDARY,
     EVERY_FIGURE,
@@ -32,10 +24,18 @@ from figure_tables import (
     response,
     ridge,
 )
+from matplotlib.axes import Axes
+from matplotlib.axis import Tick
+from matplotlib.colors import to_rgb
+from matplotlib.contour import ContourSet
+from matplotlib.figure import Figure
+from matplotlib.patches import Polygon
+from matplotlib.text import Annotation, Text
+
 from zwidth import figures
-from zwidth.errors import InputError
 from zwidth.figures import style, table
 from zwidth.studies.outcome import csv_text, stack
+from zwidth.words.errors import InputError
 
 
 def draw(name, axes=None, **keywords):

@@ -1,8 +1,8 @@
 """Maps end at the exact edge where one is known."""
 
 import numpy as np
-
 from figure_tables import grid_map
+
 from zwidth import figures
 
 TURN = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 100)

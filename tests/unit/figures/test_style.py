@@ -4,9 +4,9 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+from figure_tables import EVERY_FIGURE, RIDGE
 from matplotlib.text import Annotation, Text
 
-from figure_tables import EVERY_FIGURE, RIDGE
 from zwidth import figures
 from zwidth.figures import grid, style
 

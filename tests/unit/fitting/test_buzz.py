@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+import tolerances
 from scipy.linalg import expm
 
-import tolerances
 import zwidth
-from zwidth.errors import InputError
-from zwidth.status import Status
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
 
 EXACT = tolerances.FIT_EXACT.float64
 HEARD = [(6846.364, 0.0, 40.0945620), (15860.788, 18.7195, 68.6254)]

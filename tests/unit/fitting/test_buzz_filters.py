@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-
 import tolerances
+
 import zwidth
-from zwidth.errors import InputError
-from zwidth.status import Status
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
 
 EXACT = tolerances.FIT_EXACT.float64
 PERIOD = 1e-3

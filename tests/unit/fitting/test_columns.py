@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from zwidth.errors import InputError
 from zwidth.fitting.columns import fit_motions, read_log
+from zwidth.words.errors import InputError
 
 # (time in s, position in m or rad, force in N or N m) of every file below that is read.
 TIME, PLACE, FORCE = [0.0, 0.001], [0.0015, -0.002], [0.5, -1.25]

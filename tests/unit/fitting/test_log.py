@@ -2,15 +2,15 @@
 
 import numpy as np
 import pytest
+import tolerances
 from scipy.linalg import expm
 from scipy.optimize import least_squares
 from scipy.signal import lfilter, ss2tf
 
-import tolerances
 import zwidth
-from zwidth.errors import InputError
 from zwidth.fitting.words import choose_wall, describe_fit, write_scene
-from zwidth.status import Status
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
 
 EXACT = tolerances.FIT_EXACT.float64
 PERIOD = 1e-3

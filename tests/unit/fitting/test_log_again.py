@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 import pytest
+import tolerances
 from scipy.optimize import least_squares
 
-import tolerances
 import zwidth
-from zwidth.errors import InputError
 from zwidth.fitting.moving import Recording, Recordings
 from zwidth.fitting.output_error import FittedModel
-from zwidth.status import Status
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
 
 PERIOD, SKIP, STEP = 1e-3, 22, 3e-5
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 import tolerances
+
 import zwidth
 from zwidth.fitting.moving import PARTS, Recording, Recordings
 

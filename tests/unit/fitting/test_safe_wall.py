@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.errors import InputError
-from zwidth.status import Status
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
 
 PERIOD = 1e-3
 HEARD = [(6.85e3, 0, 40.1), (15.9e3, 18.7, 68.6), (19.7e3, 37.4, 89.1)]

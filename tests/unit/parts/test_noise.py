@@ -5,8 +5,8 @@ import pytest
 from scipy import signal
 
 import zwidth
-from zwidth.errors import InputError
 from zwidth.parts.noise import find_velocity_noise
+from zwidth.words.errors import InputError
 
 PERIOD, COUNT = 1e-3, 20e-6
 

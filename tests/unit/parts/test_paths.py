@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 import zwidth
-from zwidth.errors import InputError
+from zwidth.words.errors import InputError
 
 SCENE = zwidth.Scene(
     zwidth.Device(0.1, 10, zwidth.Coupling(0.05, 20e3, 1.0, "tip")),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.errors import InputError
+from zwidth.words.errors import InputError
 
 DEVICE, TIMING = zwidth.Device(mass=0.1), zwidth.Timing(period=1e-3)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.errors import InputError
+from zwidth.words.errors import InputError
 
 DEVICE, TIMING, WALL = zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(10e3, 40)
 SCENES = {

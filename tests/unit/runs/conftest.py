@@ -1,8 +1,8 @@
 """Configurations of runs, runs of them, and what their folders hold."""
 
 import pytest
-
 from run_folders import BOTH, SMALL
+
 from zwidth.runs import run
 from zwidth.studies.map import MapStudy
 

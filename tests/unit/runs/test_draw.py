@@ -5,13 +5,13 @@ import json
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
-
 from sweeping import config_of, failing_on_2, main_of, run_sweeps, study
-from zwidth.errors import InputError, StoreError
+
 from zwidth.figures import draw_curves, draw_outlines, draw_plane
 from zwidth.runs import draw
 from zwidth.runs.draw import draw_stores
 from zwidth.sweep.store import open_dataset
+from zwidth.words.errors import InputError, StoreError
 
 PLANE = {
     "alpha": {"linear": {"start": 0.01, "stop": 1.0, "num": 15}},

@@ -6,14 +6,14 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib.image import imread
-
 from sweeping import config_of, main_of, run_sweeps, study
-from zwidth.errors import InputError
+
 from zwidth.figures import draw_curves, draw_plane
 from zwidth.figures.style import figure_of
 from zwidth.runs import draw
 from zwidth.runs.draw import Drawing, draw_stores
 from zwidth.sweep.store import open_dataset
+from zwidth.words.errors import InputError
 
 AXES = {
     "mass": [0.1, 0.2, 0.5],

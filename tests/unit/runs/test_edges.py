@@ -2,8 +2,8 @@
 
 import numpy as np
 import pytest
-
 from sweeping import config_of, run_sweeps, study
+
 from zwidth import Device, LowPass, Scene, Timing, is_passive, is_stable
 from zwidth.figures import draw_outlines, draw_plane
 from zwidth.figures.grid import prepare

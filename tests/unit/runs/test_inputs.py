@@ -5,12 +5,12 @@ import shutil
 from typing import Any
 
 import pytest
+from run_folders import record_of
 
 import zwidth
-from run_folders import record_of
-from zwidth.errors import StoreExistsError
 from zwidth.runs.inputs import gather_inputs
 from zwidth.sweep.store import open_dataset
+from zwidth.words.errors import StoreExistsError
 
 TABLE = "label,mass [kg],damping [N s/m]\none,0.1,1\ntwo,0.2,1\n"
 SWEEP = """

@@ -5,11 +5,11 @@ import os
 
 import numpy as np
 import pytest
-
 from run_folders import record_of, states
-from zwidth.errors import InputError, StoreError, StoreExistsError
-from zwidth.html_report.page import write_report
+
+from zwidth.pages.report.page import write_report
 from zwidth.runs import run
+from zwidth.words.errors import InputError, StoreError, StoreExistsError
 
 
 def tree(folder):

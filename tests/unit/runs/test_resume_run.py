@@ -8,11 +8,11 @@ import threading
 
 import numpy as np
 import pytest
-
 from run_folders import BOTH, contents, record_of, states
 from sweeping import chunk_file, flip
-from zwidth.errors import StoreError
+
 from zwidth.runs import run
+from zwidth.words.errors import StoreError
 
 
 def test_a_finished_run_is_resumed_without_any_work(finished, both):
@@ -108,7 +108,7 @@ def test_a_study_that_is_added_is_computed_and_one_that_is_removed_stays(finishe
 
 
 def test_another_release_is_refused(finished, both, monkeypatch):
-    monkeypatch.setattr("zwidth.files.provenance.__version__", "99.0")
+    monkeypatch.setattr("zwidth.sweep.files.provenance.__version__", "99.0")
     with pytest.raises(
         StoreError, match=r"run\.json: made with zwidth .*, now there is 99\.0; install the same release"
     ):

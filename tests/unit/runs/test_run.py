@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from run_folders import BOTH, SMALL, contents, record_of, states
 
 import zwidth
-from run_folders import BOTH, SMALL, contents, record_of, states
-from zwidth.errors import ConfigError, InputError, StoreError, StoreExistsError
 from zwidth.runs import run
 from zwidth.runs.run import _list_computations
 from zwidth.studies import Config, Outcome, load_config
 from zwidth.studies.map import MapStudy
 from zwidth.sweep.verify import verify
+from zwidth.words.errors import ConfigError, InputError, StoreError, StoreExistsError
 
 
 def test_a_run_writes_what_its_record_lists(config, tmp_path):

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-
 import tolerances
 from independent_scenes import KINDS
 from random_motions import PERIODS, RandomMotion, condition, judge, nearest_decision, random_motion
+
 from zwidth import Motion
 
 # Decided by rounding, or so unstable that the integrator's own error shows (random_motions).

@@ -2,17 +2,17 @@
 
 from typing import Any
 
+import any_loop
 import numpy as np
 import pytest
 import scipy.signal
-from scipy.integrate import solve_ivp
-
-import any_loop
 import tolerances as tol
-import zwidth
 from independent_scenes import KINDS, random_scene, random_walls
 from integrator import integrate, velocity_program
 from random_motions import condition, judge, largest_difference, nearest_decision, random_motion
+from scipy.integrate import solve_ivp
+
+import zwidth
 
 
 def worst(got, expected):

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-
-import zwidth
 from any_loop import closed_loop_matrix
 from independent_scenes import KINDS, random_scene
 from tolerances import GROWTH_SIMULATED, SIMULATED_LINEAR
+
+import zwidth
 
 MOST = 4000
 

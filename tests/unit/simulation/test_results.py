@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tolerances import SIMULATED_AGAIN
 
 import zwidth
-from tolerances import SIMULATED_AGAIN
 from zwidth import MotionKind, Status
-from zwidth.errors import InputError
+from zwidth.words.errors import InputError
 
 TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
 SCENE = zwidth.Scene(zwidth.Device(mass=0.1, damping=2.0), TIMING)

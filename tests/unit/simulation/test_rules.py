@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-
-import zwidth
 from independent_scenes import KINDS, random_scene
 from tolerances import ENERGY_KEPT, FRICTION_TRUTH, SIMULATED_AGAIN
+
+import zwidth
 
 DEVICE = zwidth.Device(mass=0.1, damping=0.5)
 FREE = zwidth.Device(mass=0.1, damping=0.0)

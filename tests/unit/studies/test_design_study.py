@@ -5,10 +5,10 @@ import pytest
 
 import zwidth
 from zwidth import figures
-from zwidth.errors import ConfigError
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.studies.design import DesignStudy
 from zwidth.studies.document import load_config
+from zwidth.words.errors import ConfigError
 
 DEVICE = {"mass": 0.1, "damping": 10.0, "rate": 1000, "delay": 1e-3}
 FILTERED = {**DEVICE, "velocity": {"kind": "low_pass", "cutoff": 100}}

@@ -11,8 +11,8 @@ import pytest
 
 import zwidth
 from zwidth.config.reader import read_mapping
-from zwidth.errors import StoreError
 from zwidth.studies.document import Config, load_config
+from zwidth.words.errors import StoreError
 
 ROOT = Path(__file__).resolve().parents[3]
 WALLS = [

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from zwidth.formatting import header
 from zwidth.studies import Config, load_config
+from zwidth.words.formatting import header
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 WORDS = {"fitted_to", "label", "curve", "kind", "delay_model", "estimate", "parameter", "enough", "status", "piece"}

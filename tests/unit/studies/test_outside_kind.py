@@ -6,12 +6,12 @@ from typing import ClassVar, Literal
 
 import numpy as np
 import pytest
+from sweeping import main_of
 
 import zwidth
-from sweeping import main_of
 from zwidth.config.axes import DeltaAxis
-from zwidth.errors import ConfigError, StoreError
 from zwidth.studies import ComputedStudy, Outcome, document, register
+from zwidth.words.errors import ConfigError, StoreError
 
 
 class RatioStudy(ComputedStudy):

@@ -7,8 +7,8 @@ import pytest
 
 import zwidth
 from zwidth.config.scenes import PhysicalScene
-from zwidth.stability.passivity import passive_stiffness_slope
-from zwidth.stability.poles import unstable_poles
+from zwidth.loops.rigid.passivity import passive_stiffness_slope
+from zwidth.loops.rigid.poles import unstable_poles
 from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
 from zwidth.studies.map import MapStudy
 from zwidth.studies.outcome import csv_text, stack

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
+from sweeping import study, sweep_of
 
 import zwidth
-from sweeping import study, sweep_of
 from zwidth.bench.problems import exact_radius
-from zwidth.status import Status
 from zwidth.sweep.compute import compute
 from zwidth.sweep.grid import Grid
+from zwidth.words.status import Status
 
 OUTPUTS = ("spectral_radius", "margin")
 

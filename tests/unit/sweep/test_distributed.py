@@ -11,7 +11,6 @@ from typing import Any
 
 import pytest
 import yaml
-
 from sweeping import (
     assert_same,
     config_of,
@@ -27,7 +26,8 @@ from sweeping import (
     stopping_the_scheduler_on_2,
     study,
 )
-from zwidth.errors import InputError
+
+from zwidth.words.errors import InputError
 
 # Closing a cluster leaves sockets to the garbage collector, which pytest then reports in whatever test runs next.
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning", "ignore::pytest.PytestUnraisableExceptionWarning")

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from sweeping import config_of, study, sweep_of
-from zwidth.errors import ResourceError
+
 from zwidth.runs import plan_run
 from zwidth.sweep.plan import MEMORY, FamilyPlan, Plan, check_resources, chunk_shape, kept_plan, make_plan
+from zwidth.words.errors import ResourceError
 
 HUGE = {
     "alpha": {"linear": {"start": 0, "stop": 1, "num": 100_000}},

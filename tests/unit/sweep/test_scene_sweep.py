@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-
-import zwidth
 from independent_scenes import closed_loop_matrix
 from sweeping import config_of, study
+
+import zwidth
 from zwidth.config.faults import ConfigFileError
 from zwidth.runs.draw import draw_stores
-from zwidth.status import Status
 from zwidth.studies.document import Config
 from zwidth.sweep.chunks import perform
 from zwidth.sweep.export import to_csv, to_netcdf
@@ -16,6 +15,7 @@ from zwidth.sweep.part_axes import make_scene
 from zwidth.sweep.store import open_dataset
 from zwidth.sweep.study import SweepStudy
 from zwidth.sweep.verify import verify
+from zwidth.words.status import Status
 
 CUTOFFS, DAMPINGS = [10.0, 30.0, 100.0], [0.0, 10.0]
 STIFFNESS, VIRTUAL = np.linspace(100, 15_000, 23), np.linspace(-5, 60, 14)

@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-
-import zwidth
 from sweeping import (
     AXES,
     DEVICES,
@@ -25,11 +23,13 @@ from sweeping import (
     study,
     values_of,
 )
-from zwidth.errors import InputError, StoreError, StoreExistsError
-from zwidth.status import Status
+
+import zwidth
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store, open_dataset
 from zwidth.sweep.verify import verify
+from zwidth.words.errors import InputError, StoreError, StoreExistsError
+from zwidth.words.status import Status
 
 
 @pytest.fixture(scope="module")
@@ -251,7 +251,7 @@ def test_another_configuration_is_refused(finished, change, key, words):
 
 def test_another_release_is_refused(finished, monkeypatch):
     config, folder = finished
-    monkeypatch.setattr("zwidth.files.provenance.__version__", "99.0")
+    monkeypatch.setattr("zwidth.sweep.files.provenance.__version__", "99.0")
     with pytest.raises(StoreError, match=r"made with zwidth .*, now there is 99\.0; install the same release"):
         run_sweeps(config, folder, resume=True)
 

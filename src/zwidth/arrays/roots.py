@@ -1,0 +1,164 @@
+"""Zeros of functions of one unknown, elementwise, one text for NumPy and JAX.
+
+The number of steps is fixed, so that no point of a batch waits for another, and none depends on those beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.xp import along, epsilon, frozen, namespace, repeat
+from zwidth.words.types import Array
+
+Function = Callable[[Array], Array]
+Sloped = Callable[[Array], tuple[Array, Array]]
+
+# Halvings to the last place of float64, with room; also of a logarithm that spans 32 decades.
+_HALVINGS = 60
+# After a step of such a share of x nothing but rounding is left, near a double zero too.
+_SMALL = 1e-11
+# Cells of a first look at a function of several zeros, and what counts as zero, in rounding units of 1.
+_CELLS, _ZERO = 160, 45.0
+# A phase in radians, which false position is for, is not known better.
+_ROUNDING = 1e-15
+
+
+def bisect(holds: Function, low: Array, high: Array, *, geometric: bool = False) -> Array:
+    """Where a condition that holds at ``low`` ceases to; ``geometric``: by halving the ratio of two positive places."""
+    xp = namespace(low, high)
+
+    def middle(low: Array, high: Array) -> Array:
+        return xp.sqrt(low) * xp.sqrt(high) if geometric else 0.5 * (low + high)
+
+    def halve(ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        at = middle(*ends)
+        held = holds(at)
+        return xp.where(held, at, ends[0]), xp.where(held, ends[1], at)
+
+    return middle(*repeat(_HALVINGS, halve, (low, high), xp))
+
+
+def newton(function: Sloped, low: Array, high: Array, start: Array, steps: int) -> tuple[Array, Array]:
+    """Newton's method in a bracket below which a function is negative; the zero, and the size of the last step.
+
+    The bracket shrinks with every value, and a step that leaves it becomes a bisection. A point whose step was
+    ``_SMALL`` is done: of its error nothing but rounding is left.
+    """
+    xp = namespace(low, start)
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        x, low, high, last = state
+        value, slope = function(x)
+        low, high = xp.where(value < 0, x, low), xp.where(value < 0, high, x)
+        new = x - value / slope
+        new = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+        done = last <= _SMALL * xp.abs(x)
+        return xp.where(done, x, new), low, high, xp.where(done, last, xp.abs(new - x))
+
+    state = (start, low, high, xp.full_like(start, xp.inf)[()])
+    if xp is not np:
+        state = repeat(steps, step, state, xp)
+    for _ in range(steps if xp is np else 0):
+        state = step(state)
+        if np.all(state[3] <= _SMALL * np.abs(state[0])):
+            break
+    return state[0], state[3]
+
+
+def last_cell(function: Function, inner: Array, outer: Array, offset: Array) -> tuple[Array, Array, Array]:
+    """A narrow bracket of the last zero between ``inner`` and ``outer`` of a function that is positive at ``outer``.
+
+    ``function`` takes points along a new last axis. They have equal ratios with ``offset`` added. A peak above zero
+    narrower than a cell is not seen; a dip below it is bracketed where the lowest of the samples stands beside it. The
+    third result tells whether a sample was not positive.
+    """
+    xp = namespace(inner, outer)
+    first, width = inner[..., None], (outer - inner)[..., None]
+    part = along(np.arange(_CELLS + 1) / _CELLS, inner)
+    spread = xp.expm1(part * xp.log((outer + offset) / (inner + offset))[..., None]) * (inner + offset)[..., None]
+    points = first + xp.where(part < 1.0, spread, width)
+    values = function(points)
+    last = xp.max(xp.where(values <= _ZERO * epsilon(values), xp.arange(_CELLS + 1), -1), axis=-1)
+    lowest = xp.argmin(xp.where(xp.isnan(values), xp.inf, values), axis=-1)
+    crossed = last >= 0
+    ends = xp.where(crossed, last, xp.maximum(lowest - 1, 0)), xp.minimum(xp.where(crossed, last, lowest) + 1, _CELLS)
+    low, high = (xp.take_along_axis(points, end[..., None], axis=-1)[..., 0][()] for end in ends)
+    return low, high, crossed
+
+
+class _Bracket(NamedTuple):
+    low: Any
+    high: Any
+    at_low: Any  # weights: the values, halved where an end stays twice
+    at_high: Any
+    side: Any  # which end moved last, 1 the low one
+    best: Any
+    value: Any
+
+
+def false_position(
+    function: Function, low: Array, high: Array, at_low: Array, at_high: Array, steps: int, width: Array | float
+) -> Array:
+    """Where a function that is positive at ``low`` and not at ``high`` changes sign.
+
+    False position with halved weights, every sixth step a bisection. NumPy stops when every point is done: its value
+    no more than rounding, or the bracket no wider than ``width``.
+    """
+    xp = namespace(low, at_low)
+
+    def done(at: _Bracket) -> Array:
+        return (xp.abs(at.value) <= _ROUNDING) | (at.high - at.low <= width)
+
+    def step(k: Any, at: _Bracket) -> _Bracket:
+        gap = at.at_low - at.at_high
+        trial = at.low + (at.high - at.low) * (at.at_low / xp.where(gap > 0, gap, 1.0))
+        inside = (trial > at.low) & (trial < at.high) & (k % 6 != 5)
+        # A scalar of NumPy is five times faster than an array of no dimension.
+        trial = xp.where(inside, trial, 0.5 * (at.low + at.high))[()]
+        value = function(trial)
+        # A point that is done keeps its value: it must not depend on the points beside it.
+        above, better = value > 0, (xp.abs(value) < xp.abs(at.value)) & ~done(at)
+        return _Bracket(
+            xp.where(above, trial, at.low),
+            xp.where(above, at.high, trial),
+            xp.where(above, value, xp.where(at.side < 0, 0.5 * at.at_low, at.at_low)),
+            xp.where(above, xp.where(at.side > 0, 0.5 * at.at_high, at.at_high), value),
+            xp.where(above, 1.0, -1.0) + 0.0 * value,
+            xp.where(better, trial, at.best),
+            xp.where(better, value, at.value),
+        )
+
+    lower = at_low < -at_high
+    none = 0.0 * at_low
+    at = _Bracket(low, high, at_low, at_high, none, xp.where(lower, low, high), xp.where(lower, at_low, at_high))
+    if xp is np:
+        for k in range(steps):
+            at = step(k, at)
+            if np.all(done(at)):
+                break
+        return at.best
+    from jax.lax import fori_loop
+
+    return fori_loop(0, steps, step, at).best
+
+
+def follow_root(function: Function, root: Array, usable: Callable[[Array, Array], Array]) -> Array:
+    """A zero, in JAX with its derivatives in whatever the function depends on, to the second order.
+
+    Each of two Newton steps makes one order exact; one is taken where ``usable(slope, step)``.
+    """
+    xp = namespace(root)
+    if xp is np:
+        return root
+    import jax
+
+    root = frozen(root, xp)
+    for _ in range(2):
+        value, slope = jax.jvp(function, (root,), (xp.ones_like(root),))
+        step = value / xp.where(slope == 0, 1.0, slope)
+        taken = usable(*frozen((slope, step), xp))
+        root = root - xp.where(taken, value / xp.where(taken, slope, 1.0), 0.0)
+    return root

@@ -1,0 +1,99 @@
+"""Where the model is computed: one range for every function, checked here.
+
+No device lies outside; inside, no square or product of the formulas overflows or loses its digits. A value that is NaN,
+infinite or negative where it must not be is INVALID_INPUT, one beyond the ranges OUT_OF_RANGE, in that order.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from zwidth.arrays.xp import namespace
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
+from zwidth.words.types import Array
+
+# alpha and beta are 0 or of a magnitude in this range.
+WALL_RANGE = (1e-60, 1e60)
+# The largest physical damping (delta) and the longest delay (d).
+LARGEST_DAMPING = 1e12
+LONGEST_DELAY = 1e5
+
+
+def within(value: Array, limits: tuple[float, float]) -> Array:
+    """Whether a value is 0 or of a magnitude within ``limits``."""
+    xp = namespace(value)
+    size = xp.abs(value)
+    # In single precision the limits lie outside of what there is.
+    return (size == 0) | ((size >= limits[0]) & (size <= min(limits[1], float(np.finfo(size.dtype).max))))
+
+
+def device_status(delta: Array, d: Array) -> Array:
+    """The `Status` of a device and its delay."""
+    xp = namespace(delta, d)
+    valid = xp.isfinite(delta) & xp.isfinite(d) & (delta >= 0) & (d >= 0)
+    inside = (delta <= LARGEST_DAMPING) & (d <= LONGEST_DELAY)
+    return _status(valid, inside, xp)
+
+
+def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """The `Status` of a wall on a device."""
+    xp = namespace(alpha, beta, delta, d)
+    valid = xp.isfinite(alpha) & xp.isfinite(beta) & xp.isfinite(delta) & xp.isfinite(d) & (delta >= 0) & (d >= 0)
+    inside = (delta <= LARGEST_DAMPING) & (d <= LONGEST_DELAY) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+    return _status(valid, inside, xp)
+
+
+def _status(valid: Array, inside: Array, xp: Any) -> Array:
+    status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
+    return status.astype(np.int32)
+
+
+def valid_device(delta: Array, d: Array) -> Array:
+    """Whether a device and its delay lie where the model is computed."""
+    return device_status(delta, d) == Status.OK
+
+
+def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """Whether a wall on a device lies where the model is computed."""
+    return wall_status(alpha, beta, delta, d) == Status.OK
+
+
+# A bad point is NaN, and so are its derivatives: `where(ok, value, nan)` alone would give it the derivative 0, a finite
+# number that means nothing. What may compute with NaN is voided before; what may not (a solver, a search, an
+# exponent) gets harmless numbers, and its results are poisoned behind.
+
+
+def void(ok: Array, *values: Array) -> tuple[Array, ...]:
+    """The values where ``ok``, else NaN: so is what is computed with them, derivatives included."""
+    xp = namespace(ok, *values)
+    factor = xp.where(ok, 1.0, np.nan)
+    return tuple(value * factor for value in values)
+
+
+def poison(ok: Array, *inputs: Array) -> Array:
+    """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
+    xp = namespace(ok, *inputs)
+    # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
+    total = sum(xp.where(ok, 0.0, value) for value in inputs)
+    return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
+
+
+# Every other name is one of a wall's numbers.
+_LARGEST = {"delta": LARGEST_DAMPING, "d": LONGEST_DELAY}
+
+
+def check_scalars(**values: Any) -> None:
+    """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
+    for name, value in values.items():
+        if not isinstance(value, int | float | np.floating | np.integer) or not np.isfinite(value):
+            continue
+        if name in _LARGEST:
+            inside, allowed = value <= _LARGEST[name], f"0 to {_LARGEST[name]:g}"
+        else:
+            inside = bool(within(np.float64(value), WALL_RANGE))
+            allowed = f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude"
+        if not inside:
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}")

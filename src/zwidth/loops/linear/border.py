@@ -1,0 +1,293 @@
+"""The edge of the stable set of any linear loop: which parts of the boundary it is, and its corners."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.circle import circle
+from zwidth.arrays.roots import false_position
+from zwidth.loops.linear.boundary import Boundary
+from zwidth.loops.linear.crossing_lines import CrossingLine
+from zwidth.loops.linear.curve import curve_at, zeros_of
+from zwidth.loops.linear.pieces import Island, StablePieces
+
+# The place where an edge ends is told to the last digit by so many rounds over so many places.
+_ROUNDS = 11
+# The ends of straight edges are drawn only.
+_LINE_ROUNDS = 6
+# Steps towards a corner, and how far beside it, as a share of w, the edge must be seen to end.
+_STEPS, _BESIDE = 60, 1e-11
+_SHARES = np.arange(1, 32) / 32.0
+# Points of a straight edge, and how far beyond the corners one is looked for.
+_LINE_POINTS, _BEYOND = 257, 0.05
+# Lines whose slopes differ by less, as a share, do not meet.
+_PARALLEL = 1e-12
+# Dampings of corners that differ by less, as a share, are one.
+_SAME = 1e-12
+
+
+class Edge(NamedTuple):
+    """One part of the edge of the stable set, end to end."""
+
+    w: np.ndarray
+    alpha: np.ndarray
+    beta: np.ndarray
+    line: int  # which of the boundary's lines, or -1 for the curve
+
+
+@dataclass(frozen=True)
+class Border:
+    """The edge of the stable set of one loop."""
+
+    boundary: Boundary
+
+    @cached_property
+    def curved(self) -> list[Edge]:
+        """The edges on the curve of complex pairs."""
+        b = self.boundary
+        here = curve_at(b.loop, b.w)
+        tops = zeros_of(b.loop, b.w, here.alpha_slope, "alpha_slope")
+        tops = tops[np.isfinite(curve_at(b.loop, tops).alpha)] if tops.size else tops
+        w = np.unique(np.concatenate([b.w, tops]))
+        piece = np.searchsorted(b.infinite, w)
+        held = b.borders(w)
+        edges = []
+        for start, stop in _runs(held, piece):
+            first, last = self._end(w, piece, start, -1), self._end(w, piece, stop, 1)
+            at = np.unique(np.concatenate([[first], w[start : stop + 1], [last]]))
+            curve = curve_at(b.loop, np.clip(at, 1e-300, np.pi))
+            alpha, beta = curve.alpha.copy(), curve.beta.copy()
+            for k, end in ((0, 0.0), (-1, np.pi)):
+                if at[k] == end:
+                    alpha[k], beta[k] = self.at_end(end)
+            edges.append(Edge(at, alpha, beta, -1))
+        return edges
+
+    def at_end(self, w: float) -> tuple[float, float]:
+        """The curve's limit at z = 1 or z = -1."""
+        at = circle(np.array([w]))
+        with np.errstate(all="ignore"):
+            q, f = self.boundary.loop.needed(at), self.boundary.loop.estimate.jet(at)
+            beta = q.slope[0].imag / f.slope[0].imag
+            return float(q.value[0].real - beta * f.value[0].real), float(beta)
+
+    def _end(self, w: np.ndarray, piece: np.ndarray, k: int, side: int) -> float:
+        """Where a run of nodes on the edge ends beyond its last node ``k``."""
+        after = k + side
+        if not 0 <= after < w.size:
+            end = 0.0 if side < 0 else np.pi
+            return end if np.all(np.isfinite(self.at_end(end))) else float(w[k])
+        if piece[after] != piece[k]:
+            # Towards an angle at which the curve runs to infinity; it may leave the stable set before.
+            limit = self.boundary.infinite[piece[k] if side > 0 else piece[k] - 1]
+            return self._corner(float(w[k]), float(limit))
+        return self._corner(float(w[k]), float(w[after]))
+
+    def _corner(self, inside: float, outside: float) -> float:
+        """Where the curve stops to be an edge between two angles: another crossing of its row meets it there."""
+        b = self.boundary
+        inside, outside = _narrow(b.borders, inside, outside, 1)
+        own = int(b.arc_at(np.array(inside)))
+
+        def gaps(w: np.ndarray) -> np.ndarray:
+            here = curve_at(b.loop, w)
+            return b.crossings(here.beta).alpha - here.alpha[:, None]
+
+        ends = gaps(np.array([inside, outside]))
+        ends[:, own] = np.nan
+        meets = np.flatnonzero(np.sign(ends[0]) * np.sign(ends[1]) == -1)
+        if meets.size == 1:
+            (column,), sign = meets, np.sign(ends[0, meets[0]])
+            first, last = (np.abs(ends[k, column]) for k in (0, 1))
+            low, high, at_low, at_high = np.array([[inside], [outside], [first], [-last]])
+            found = false_position(
+                lambda w: sign * gaps(w)[:, column] / (first + last),
+                low,
+                high,
+                at_low / (first + last),
+                at_high / (first + last),
+                _STEPS,
+                2e-16 * outside,
+            )
+            w = float(found[0])
+            if list(b.borders(np.array([w - _BESIDE * w, w + _BESIDE * w]))) in ([True, False], [False, True]):
+                return w
+        return _narrow(b.borders, inside, outside, _ROUNDS)[0]
+
+    @cached_property
+    def pieces(self) -> StablePieces:
+        """The pieces that these edges enclose; what counts as soft is decided where edges pass alpha = 0."""
+        b = self.boundary
+        turns = np.array([(arc.first, arc.beta[np.argmin(arc.w)]) for arc in b.arcs]).reshape(-1, 2)
+        found = [np.array([beta for _, beta, _ in self.line_meetings()])]
+        for edge in self.curved:
+            found.append(edge.beta[[0, -1]])
+            found.append(turns[(turns[:, 0] > edge.w[0]) & (turns[:, 0] < edge.w[-1]), 1])
+            k = np.flatnonzero((edge.alpha[1:] > 0) != (edge.alpha[:-1] > 0))
+            found.append(edge.beta[k])
+        corners = np.unique(np.concatenate(found))
+        zeros = np.array([line.q / line.f for line in b.lines if line.f != 0.0])
+        within = zeros[(zeros > corners.min(initial=np.inf)) & (zeros < corners.max(initial=-np.inf))]
+        corners = np.union1d(corners[np.isfinite(corners)], within)
+        apart = np.diff(corners, prepend=-np.inf) > _SAME * np.abs(corners)
+        return StablePieces(b, corners[apart])
+
+    def piece_of(self, edge: Edge) -> int:
+        """The piece that an edge borders, -1 where rows do not see it."""
+        b, k = self.boundary, edge.w.size // 2
+        if edge.line >= 0:
+            return self.pieces.piece_at(float(edge.beta.mean()), len(b.arcs) + edge.line)
+        return self.pieces.piece_at(float(edge.beta[k]), int(b.arc_at(edge.w[k])))
+
+    def islands(self, least: float) -> list[Island]:
+        """The pieces without soft walls, with walls of alpha > 0 and beta > ``least``, the stiffest first."""
+        extents = self.pieces.extents()
+        for edge in (*self.curved, *self.straight) if extents else ():
+            piece = self.piece_of(edge)
+            if piece in extents:
+                walls = np.stack([edge.alpha, edge.beta])
+                low, high = extents[piece]
+                extents[piece] = np.minimum(low, walls.min(1)), np.maximum(high, walls.max(1))
+        ends = [np.stack(extent, 1) for extent in extents.values()]
+        found = [Island(*(tuple(pair.tolist()) for pair in both)) for both in ends]
+        found = [one for one in found if one.stiffness[1] > 0 and one.virtual_damping[1] > least]
+        return sorted(found, key=lambda one: -one.stiffness[1])
+
+    @cached_property
+    def straight(self) -> list[Edge]:
+        """The edges on which a real pole, or a pair at one frequency, is on the circle."""
+        betas = np.concatenate([*(edge.beta for edge in self.curved), self._line_corners()])
+        betas = betas if betas.size else np.zeros(1)
+        size = np.ptp(betas) + 1e-300
+        edges = []
+        for place, line in enumerate(self.boundary.lines):
+            ends = betas.min() - _BEYOND * size, betas.max() + _BEYOND * size
+            corners = np.concatenate([*(edge.beta[[0, -1]] for edge in self.curved), self._line_corners()])
+            beta = np.linspace(*ends, _LINE_POINTS)
+            corners = corners[(corners > ends[0]) & (corners < ends[1])]
+            near = np.concatenate([corners - 1e-6 * size, corners + 1e-6 * size])
+            beta = np.unique(np.concatenate([beta, near]))
+            held = self.boundary.line_borders(place, beta)
+            for start, stop in _runs(held, 0 * held):
+                low = self._line_end(place, beta, start, -1)
+                high = self._line_end(place, beta, stop, 1)
+                both = np.array([low, high])
+                edges.append(Edge(np.full(2, line.w), line.q - both * line.f, both, place))
+        return edges
+
+    def _line_corners(self) -> np.ndarray:
+        """The dampings at which two of the lines meet."""
+        lines = self.boundary.lines
+        return np.array([beta for k, line in enumerate(lines) for beta in _meetings(lines[:k], line)])
+
+    def _line_end(self, place: int, beta: np.ndarray, k: int, side: int) -> float:
+        after = k + side
+        if not 0 <= after < beta.size:
+            return float(beta[k])
+        ends = float(beta[k]), float(beta[after])
+        return _narrow(lambda at: self.boundary.line_borders(place, at), *ends, _LINE_ROUNDS)[0]
+
+    def line_meetings(self) -> list[tuple[float, float, float]]:
+        """Corners of two lines: all other highest points are on the curve."""
+        b = self.boundary
+        found = []
+        for place, line in enumerate(b.lines):
+            for beta in _meetings(b.lines[:place], line):
+                near = beta + 1e-9 * (1.0 + abs(beta)) * np.array([-1.0, 1.0])
+                if b.line_borders(place, near).any():
+                    found.append((float(line.q - beta * line.f), float(beta), line.w))
+        return found
+
+
+def _meetings(others: Sequence[CrossingLine], line: CrossingLine) -> list[float]:
+    """The dampings at which a line meets others that are not parallel to it."""
+    return [
+        (line.q - other.q) / (line.f - other.f)
+        for other in others
+        if abs(other.f - line.f) > _PARALLEL * (abs(other.f) + abs(line.f))
+    ]
+
+
+def _narrow(
+    holds: Callable[[np.ndarray], np.ndarray], inside: float, outside: float, rounds: int
+) -> tuple[float, float]:
+    """Narrow the place towards ``outside`` at which a condition ceases to hold; many places are asked at one time."""
+    for _ in range(rounds):
+        places = inside + (outside - inside) * _SHARES
+        held = holds(places)
+        first = int(np.argmin(held)) if not held.all() else held.size
+        inside = float(places[first - 1]) if first else inside
+        outside = float(places[first]) if first < held.size else outside
+    return inside, outside
+
+
+def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:
+    """First and last index of every run of true values within one piece."""
+    runs = []
+    start = None
+    for k in range(held.size):
+        if held[k] and start is None:
+            start = k
+        if start is not None and (k + 1 == held.size or not held[k + 1] or piece[k + 1] != piece[k]):
+            runs.append((start, k))
+            start = None
+    return runs
+
+
+class Outline(NamedTuple):
+    """One closed outline of the stable set; a hole where unstable walls lie inside, an island where no soft ones do."""
+
+    stiffness: np.ndarray
+    virtual_damping: np.ndarray
+    hole: bool
+    island: bool  # of a piece without soft walls
+
+    @property
+    def area(self) -> float:
+        """Inside, of the polygon."""
+        x, y = self.stiffness, self.virtual_damping
+        return 0.5 * abs(float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y)))
+
+
+def outlines(border: Border) -> list[Outline]:
+    """Join the edges to closed outlines, the largest first."""
+    edges = [*border.curved, *border.straight]
+    if not edges:
+        return []
+    scale = np.array([max(np.ptp(np.concatenate([e[k] for e in edges])), 1e-300) for k in (1, 2)])
+    paths = [np.stack([e.alpha, e.beta], -1) for e in edges]
+    main = [border.pieces.is_main(border.piece_of(edge)) for edge in edges]
+    loops = []
+    while paths:
+        path, soft = paths.pop(), main.pop()
+        while True:
+            gaps = [
+                (float(np.abs((path[-1] - other[end]) / scale).max()), k, end)
+                for k, other in enumerate(paths)
+                for end in (0, -1)
+            ]
+            closing = float(np.abs((path[-1] - path[0]) / scale).max())
+            if not gaps or (path.shape[0] > 2 and closing <= min(min(gaps)[0], 1e-3)):
+                break
+            gap, k, end = min(gaps)
+            if gap > 1e-3:
+                break
+            other, soft = paths.pop(k), soft | main.pop(k)
+            path = np.concatenate([path, (other if end == 0 else other[::-1])[1:]])
+        loops.append((path, soft))
+    found = [Outline(path[:, 0], path[:, 1], False, not soft) for path, soft in loops]
+    found.sort(key=lambda outline: -outline.area)
+    return [o._replace(hole=_inside(found, k) % 2 == 1) for k, o in enumerate(found)]
+
+
+def _inside(found: list[Outline], k: int) -> int:
+    """How many of the larger outlines an outline lies in."""
+    from matplotlib.path import Path
+
+    point = found[k].stiffness[0], found[k].virtual_damping[0]
+    return sum(bool(Path(np.stack([o.stiffness, o.virtual_damping], -1)).contains_point(point)) for o in found[:k])

@@ -1,0 +1,184 @@
+"""All poles of a linear loop with walls: companion eigenvalues, then Aberth's steps on the factored polynomial.
+
+With zeta = z - 1 and every root t of the loop by its offset 1 - t,
+
+    P = z^lag prod(zeta + t) Q + g prod(zeta + b) (alpha Q + beta R),     F = R/Q
+
+keeps the digits of poles next to z = 1, which the coefficients lose; a pole is kept as its zeta as well.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.rigid.poles import MOST_POLES, companion
+from zwidth.parts.estimate import Estimate
+from zwidth.words.errors import InputError
+from zwidth.words.types import Array
+
+# Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
+_STEPS, _ARRIVED = 60, 4e-16
+# Numbers that a block of walls holds: eigenvalues and the distances between poles take order^2 each.
+_NUMBERS = 1 << 20
+
+
+class PolynomialValue(NamedTuple):
+    """P, its derivative, and the size of what it is the sum of."""
+
+    value: Array
+    slope: Array
+    size: Array
+
+
+def _times(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
+    return one[0] * other[0], one[1] * other[0] + one[0] * other[1]
+
+
+def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> tuple[Array, Array]:
+    value, slope = np.full_like(zeta, factor), np.zeros_like(zeta)
+    for offset in offsets:
+        one = zeta + offset
+        value, slope = value * one, slope * one + value
+    return value, slope
+
+
+def _power(zeta: Array, turns: int) -> tuple[Array, Array]:
+    """``z^turns``."""
+    if turns == 0:
+        return np.ones_like(zeta), np.zeros_like(zeta)
+    below = (1.0 + zeta) ** (turns - 1)
+    return below * (1.0 + zeta), turns * below
+
+
+def _difference(zeta: Array, window: int) -> tuple[Array, Array]:
+    """``(z^window - 1)/window``: next to z = 1 by the binomial's product, where the subtraction has no digit left."""
+    power, slope = _power(zeta, window)
+    log = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -0.999)) + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real)
+    turned = window * log
+    near = np.abs(turned) < 1.0
+    small = np.where(near, turned, 0.0)
+    return np.where(near, np.expm1(small), power - 1.0) / window, slope / window
+
+
+def degree_of(loop: LinearLoop) -> int:
+    """How many poles a wall with damping has."""
+    f = loop.estimate
+    return loop.poles.size + loop.lag + f.poles.size + max(f.window + f.lag, 0)
+
+
+def abs2(z: Array) -> Array:
+    """``|z|^2``."""
+    return z.real * z.real + z.imag * z.imag
+
+
+def log_size(zeta: Array) -> Array:
+    """``log|z|``, with the digits of a slow pole."""
+    with np.errstate(divide="ignore"):
+        return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -1.0))
+
+
+def evaluate(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
+    """The factored polynomial; arrays that broadcast with zeta."""
+    f = loop.estimate
+    turns = f.window + f.lag
+    device = _times(_product(zeta, loop.poles), _power(zeta, loop.lag))
+    answer = _product(zeta, loop.zeros, loop.gain)
+    bottom = _times(_product(zeta, f.poles), _power(zeta, max(turns, 0)))
+    top = _product(zeta, f.zeros, float(f.gain))
+    if f.window:
+        top = _times(top, _difference(zeta, f.window))
+    top = _times(top, _power(zeta, max(-turns, 0)))
+    wall = alpha * bottom[0] + beta * top[0], alpha * bottom[1] + beta * top[1]
+    own, pushed = _times(device, bottom), _times(answer, wall)
+    largest = np.abs(own[0]) + np.abs(answer[0]) * (np.abs(alpha * bottom[0]) + np.abs(beta * top[0]))
+    return PolynomialValue(own[0] + pushed[0], own[1] + pushed[1], largest)
+
+
+def _start(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
+    """Eigenvalues of the companion matrices, less 1."""
+    D, N1, N2 = affine_polynomial(loop)
+    monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
+    return np.linalg.eigvals(companion(monic)) - 1.0 + 0j
+
+
+def _polish(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> Array:
+    """Aberth's steps: Newton's, from which each pole keeps off the others."""
+    here = np.arange(len(zeta))
+    same = np.eye(zeta.shape[1], dtype=bool)
+    for _ in range(_STEPS):
+        now = zeta[here]
+        at = evaluate(loop, alpha[here, None], beta[here, None], now)
+        with np.errstate(all="ignore"):
+            newton = at.value / at.slope
+            apart = np.where(same, np.inf, now[:, :, None] - now[:, None, :])
+            step = newton / (1.0 - newton * (1.0 / apart).sum(-1))
+        # Below the rounding of P a step moves nothing but noise.
+        good = np.isfinite(step) & (np.abs(at.value) > 1e-16 * at.size) & (np.abs(step) < 0.5)
+        step = np.where(good, step, 0.0)
+        zeta[here] = now - step
+        moving = (np.abs(step) > _ARRIVED * np.abs(now)).any(1)
+        if not moving.any():
+            break
+        here = here[moving]
+    return zeta
+
+
+def poles_less_one(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
+    """``z - 1`` for all poles of walls of shape (walls,): shape (walls, order); NaN where a wall is not finite."""
+    order = degree_of(loop)
+    if order > MOST_POLES:
+        raise InputError(
+            f"scene: its {order} poles would take minutes a wall, and at most {MOST_POLES} are computed; "
+            "spectral_radius and is_stable answer for every delay at once"
+        )
+    out = np.full((alpha.size, order), complex(np.nan, np.nan))
+    known = np.flatnonzero(np.isfinite(alpha) & np.isfinite(beta))
+    block = max(1, _NUMBERS // order**2)
+    for damped in (True, False):
+        walls = known[(beta[known] != 0) == damped]
+        for k in range(0, walls.size, block):
+            some = walls[k : k + block]
+            a, b = alpha[some], beta[some]
+            if damped:
+                out[some] = _polish(loop, a, b, _start(loop, a, b))
+            else:
+                out[some] = _springs(loop, a)
+    return out
+
+
+def _springs(loop: LinearLoop, alpha: Array) -> Array:
+    """Walls without damping: the poles of the estimate are in nobody's loop, and known."""
+    f = loop.estimate
+    alone = LinearLoop(loop.gain, loop.lag, loop.zeros, loop.poles, Estimate(0))
+    none = np.zeros_like(alpha)
+    idle = np.concatenate([-f.poles, -np.ones(max(f.window + f.lag, 0))])
+    return np.concatenate(
+        [_polish(alone, alpha, none, _start(alone, alpha, none)), np.broadcast_to(idle, (alpha.size, idle.size))], 1
+    )
+
+
+def all_poles(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
+    """`poles_less_one` of arrays of one shape, along a new last axis."""
+    found = poles_less_one(loop, alpha.reshape(-1), beta.reshape(-1))
+    return found.reshape(*alpha.shape, found.shape[-1])
+
+
+# In a difference of two numbers: what the rounding of either may leave of it.
+_CANCELLED = 1e-14
+
+
+def is_marginal(loop: LinearLoop, alpha: float, beta: float) -> bool:
+    """Whether a wall has one pole exactly at z = 1 and all others strictly inside: it neither pulls back nor grows."""
+    wall = np.array([alpha]), np.array([beta])
+    at = evaluate(loop, *wall, np.zeros(1, complex))
+    undamped = evaluate(loop, wall[0], 0.0 * wall[1], np.zeros(1, complex))
+    # Where the wall's damping takes away all that the device has, the difference is rounding: two poles at z = 1.
+    parts = np.abs(undamped.slope[0]) + np.abs(at.slope[0] - undamped.slope[0])
+    if at.value[0] != 0 or np.abs(at.slope[0]) <= _CANCELLED * parts:
+        return False
+    found = all_poles(loop, *wall)[0]
+    return bool(np.all(log_size(np.delete(found, np.argmin(np.abs(found)))) < 0))

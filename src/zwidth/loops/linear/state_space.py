@@ -1,0 +1,116 @@
+"""A scene as state-space matrices: the chain's exact discretization, the velocity estimate and the forces on their way.
+
+Normalized to T = 1 and the mass that the wall's force acts on. One period of the loop, u the wall's force and w one
+held from outside on the same body,
+
+    x+ = e^A x + Gamma(1 - f) u_(k-n) + (Gamma(1) - Gamma(1 - f)) u_(k-n-1) + Gamma(1) w,    u = -(alpha + beta F) y
+
+The estimate is the difference over its window, a shift register, and a filter in the coefficients of zeta = z - 1:
+filters that are slow beside the period keep their digits there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.loops.linear.chain import Chain, sampled
+from zwidth.parts.estimate import Estimate
+
+
+class Matrices(NamedTuple):
+    """``x+ = A x + B u``, ``y = C x + D u``."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+
+
+def _filter(estimate: Estimate) -> Matrices:
+    """What follows the window's difference, in controllable form around z = 1; it has no more zeros than poles."""
+    zeros = np.concatenate([estimate.zeros, np.ones(max(-estimate.lag, 0))])
+    poles = np.concatenate([estimate.poles, np.ones(max(estimate.lag, 0))])
+    size = poles.size
+    bottom = np.atleast_1d(np.poly(-poles)).real
+    top = float(estimate.gain) * np.atleast_1d(np.poly(-zeros)).real
+    top = np.concatenate([np.zeros(bottom.size - top.size), top])
+    A = np.eye(size, k=-1) + np.eye(size)
+    B = np.zeros((size, 1))
+    if size:
+        A[0] -= bottom[1:]
+        B[0] = 1.0
+    return Matrices(A, B, (top[1:] - top[0] * bottom[1:])[None, :], top[:1, None])
+
+
+def in_series(first: Matrices, second: Matrices) -> Matrices:
+    """The second behind the first."""
+    n, m = first.A.shape[0], second.A.shape[0]
+    A = np.block([[first.A, np.zeros((n, m))], [second.B @ first.C, second.A]])
+    B = np.concatenate([first.B, second.B @ first.D])
+    return Matrices(A, B, np.concatenate([second.D @ first.C, second.C], 1), second.D @ first.D)
+
+
+def _shift(count: int) -> Matrices:
+    """A register of the last inputs; the outputs are these, the newest first."""
+    A = np.eye(count, k=-1)
+    B = np.zeros((count, 1))
+    B[:1] = 1.0
+    return Matrices(A, B, np.eye(count), np.zeros((count, 1)))
+
+
+def estimate_matrices(estimate: Estimate) -> Matrices:
+    """The velocity estimate, from sampled position."""
+    behind = _filter(estimate)
+    if not estimate.window:
+        return behind
+    past = _shift(estimate.window)
+    weights = np.zeros((1, estimate.window + 1))
+    weights[0, [0, -1]] = 1.0 / estimate.window, -1.0 / estimate.window
+    difference = Matrices(past.A, past.B, weights[:, 1:], weights[:, :1])
+    return in_series(difference, behind)
+
+
+def wall_matrices(estimate: Estimate, alpha: float, beta: float) -> Matrices:
+    """``alpha + beta F``."""
+    f = estimate_matrices(estimate)
+    return Matrices(f.A, f.B, beta * f.C, alpha + beta * f.D)
+
+
+def delayed_device(chain: Chain) -> Matrices:
+    """G: from the wall's force to the sampled position, with the forces that are on their way."""
+    parts = sampled(chain)
+    size = parts.psi.shape[0]
+    held = parts.late is not None
+    now = parts.late if held else parts.full
+    count = chain.whole + (1 if held else 0)
+    A = np.zeros((size + count, size + count))
+    B = np.zeros((size + count, 1))
+    A[:size, :size] = np.eye(size) + parts.psi
+    A[size:, size:] = np.eye(count, k=-1)
+    B[size : size + 1] = 1.0
+    if chain.whole:
+        A[:size, size + chain.whole - 1] = now
+    else:
+        B[:size, 0] = now
+    if held:
+        A[:size, size + chain.whole] += parts.full - now
+    C = np.eye(1, size + count)
+    return Matrices(A, B, C, np.zeros((1, 1)))
+
+
+def open_loop(chain: Chain, alpha: float, beta: float) -> Matrices:
+    """``L = (alpha + beta F) G``, from the position that the wall is given to the one that its force answers."""
+    return in_series(wall_matrices(chain.estimate, alpha, beta), delayed_device(chain))
+
+
+def closed_loop(chain: Chain, alpha: float, beta: float) -> Matrices:
+    """From a force held on the device to the sampled position, in contact with the wall."""
+    loop = open_loop(chain, alpha, beta)
+    size = loop.A.shape[0]
+    bodies = 2 * len(chain.bodies)
+    filtered = size - delayed_device(chain).A.shape[0]
+    push = np.zeros((size, 1))
+    push[filtered : filtered + bodies, 0] = sampled(chain).full
+    return Matrices(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))

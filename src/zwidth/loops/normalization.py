@@ -1,0 +1,228 @@
+"""From SI quantities to the numbers that the stability of a rigid loop depends on, and back.
+
+The normalization is the paper's eqs. (14) and (16): ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``,
+``d = t_d/T``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.batching import refuse_masked
+from zwidth.arrays.xp import is_jax, is_traced, namespace
+from zwidth.loops.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE, void, within
+from zwidth.parts.span import accept_units, in_periods
+from zwidth.words.errors import InputError
+from zwidth.words.quantities import SI_RANGE
+from zwidth.words.status import Status
+from zwidth.words.types import Array, ArrayLike
+
+
+class Normalized(NamedTuple):
+    """The four dimensionless numbers that the stability of the wall depends on."""
+
+    alpha: Array
+    beta: Array
+    delta: Array
+    d: Array
+
+
+class Physical(NamedTuple):
+    """The same wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
+
+    mass: Array
+    damping: Array
+    period: Array
+    delay: Array
+    stiffness: Array
+    virtual_damping: Array
+
+
+# field -> (unit, lowest value, whether the lowest value itself is excluded, magnitudes allowed beside 0)
+_RANGES: dict[str, tuple[str, float, bool, tuple[float, float]]] = {
+    "mass": ("kg", 0.0, True, SI_RANGE),
+    "damping": ("N s/m", 0.0, False, SI_RANGE),
+    "period": ("s", 0.0, True, SI_RANGE),
+    "delay": ("s", 0.0, False, SI_RANGE),
+    "stiffness": ("N/m", -math.inf, False, SI_RANGE),
+    "virtual_damping": ("N s/m", -math.inf, False, SI_RANGE),
+    "wanted_stiffness": ("N/m", 0.0, True, SI_RANGE),
+    "delta": ("", 0.0, False, (0.0, LARGEST_DAMPING)),
+    "d": ("", 0.0, False, (0.0, LONGEST_DELAY)),
+    "alpha": ("", -math.inf, False, WALL_RANGE),
+    "beta": ("", -math.inf, False, WALL_RANGE),
+}
+
+
+def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
+    """Return ``value`` as float64; a scalar out of range raises. A traced value is left to JAX."""
+    if is_traced(value):
+        return value
+    refuse_masked(name, value)
+    try:
+        number = np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{name}: got {value!r}, a rectangular array of real numbers is needed") from error
+    if number.dtype.kind not in "biuf":
+        raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed")
+    number = number.astype(np.float64, copy=False)
+    if number.ndim == 0:
+        unit, lowest, excluded, (least, most) = _RANGES[name]
+        if not _valid(name, number):
+            bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
+            raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
+        if not within(number, (least, most)):
+            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"at most {most:g}"
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}{f' (in {unit})' if unit else ''}")
+    return number
+
+
+def _valid(name: str, value: Array) -> Array:
+    _, lowest, excluded, _ = _RANGES[name]
+    return namespace(value).isfinite(value) & ((value > lowest) if excluded else (value >= lowest))
+
+
+def _in_range(name: str, value: Array) -> Array:
+    return _valid(name, value) & within(value, _RANGES[name][3])
+
+
+def quantity_status(**values: Array) -> Array:
+    """The `Status` of quantities named as in `normalize`: INVALID_INPUT before OUT_OF_RANGE, elementwise."""
+    xp = namespace(*values.values())
+    valid = inside = True
+    for name, value in values.items():
+        valid, inside = valid & _valid(name, value), inside & within(value, _RANGES[name][3])
+    return xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
+
+
+def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
+    """Check the arguments, put NaN where an array's entry is out of range, and apply ``formula``."""
+    checked = {name: _check_quantity(name, value) for name, value in values.items()}
+    try:
+        np.broadcast_shapes(*(np.shape(value) for value in checked.values()))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in checked.items())
+        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+    if any(map(is_jax, values.values())):
+        from zwidth.arrays.batching import elementwise
+
+        return elementwise(_formula_at, tuple(values), tuple(values.values()), (formula, tuple(values)))
+    with np.errstate(all="ignore"):
+        result = _formula_at(*checked.values(), formula, tuple(values))
+    return tuple(part[()] for part in result)
+
+
+def _formula_at(*arguments: Any) -> tuple[Array, ...]:
+    """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
+    *values, formula, names = arguments
+    return formula(*(void(_in_range(name, value), value)[0] for name, value in zip(names, values, strict=True)))
+
+
+def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:
+    """Eqs. (14), (16)."""
+    return (
+        stiffness * period * period / mass,
+        virtual_damping * period / mass,
+        damping * period / mass,
+        in_periods(delay, period),
+    )
+
+
+def _denormalize(mass, period, alpha, beta, delta, d) -> tuple[Array, ...]:
+    """Eqs. (14), (16) solved for the SI quantities, in the order of `Physical`."""
+    rate = mass / period
+    return mass, delta * rate, period, d * period, alpha * rate / period, beta * rate
+
+
+@accept_units
+def normalize(
+    *,
+    mass: ArrayLike,
+    damping: ArrayLike = 0.0,
+    period: ArrayLike,
+    delay: ArrayLike = 0.0,
+    stiffness: ArrayLike = 0.0,
+    virtual_damping: ArrayLike = 0.0,
+) -> Normalized:
+    """Turn SI quantities into the normalized ones.
+
+    ``alpha = K T^2/m``, ``beta = B T/m``, ``delta = b T/m``, ``d = t_d/T``.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b, the physical damping of the device, in N s/m, >= 0.
+        period: T, the sampling period, in s, > 0.
+        delay: t_d, from the sample to the moment its force acts, in s, >= 0.
+        stiffness: K of the virtual wall in N/m.
+        virtual_damping: B of the virtual wall in N s/m.
+            All broadcast against each other; each is 0 or 1e-30 to 1e30 in magnitude.
+
+    Returns:
+        ``alpha``, ``beta``, ``delta``, ``d``. ``d`` is taken as whole where the quotient is whole but for rounding.
+        An entry of an array that is out of range gives NaN.
+
+    Raises:
+        InputError: a scalar is out of range, or an argument is no number.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
+
+    Example:
+        >>> import zwidth
+        >>> wall = zwidth.normalize(mass=0.1, damping=10, period=1e-3, delay=1e-3, stiffness=14.9e3)
+        >>> print(f"{wall.alpha:.3f} {wall.delta:.1f} {wall.d:.0f}")
+        0.149 0.1 1
+    """
+    numbers = _convert_quantities(
+        _normalize,
+        mass=mass,
+        damping=damping,
+        period=period,
+        delay=delay,
+        stiffness=stiffness,
+        virtual_damping=virtual_damping,
+    )
+    return Normalized(*numbers)
+
+
+def denormalize(
+    *,
+    mass: ArrayLike,
+    period: ArrayLike,
+    alpha: ArrayLike = 0.0,
+    beta: ArrayLike = 0.0,
+    delta: ArrayLike = 0.0,
+    d: ArrayLike = 0.0,
+) -> Physical:
+    """Turn normalized quantities back into SI ones, for a device of this mass and sampling period.
+
+    ``K = alpha m/T^2``, ``B = beta m/T``, ``b = delta m/T``, ``t_d = d T``.
+
+    Args:
+        mass: m in kg, > 0.
+        period: T in s, > 0.
+        alpha: normalized stiffness, 0 or 1e-60 to 1e60 in magnitude.
+        beta: normalized virtual damping, 0 or 1e-60 to 1e60 in magnitude.
+        delta: normalized physical damping, 0 to 1e12.
+        d: delay in periods, 0 to 1e5.
+
+    Returns:
+        ``mass``, ``damping``, ``period``, ``delay``, ``stiffness``, ``virtual_damping`` in SI units.
+
+    Raises:
+        InputError: a scalar is out of range, or an argument is no number.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eqs. (14), (16).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.denormalize(mass=0.1, period=1e-3, alpha=0.149).stiffness:.0f} N/m")
+        14900 N/m
+    """
+    numbers = _convert_quantities(_denormalize, mass=mass, period=period, alpha=alpha, beta=beta, delta=delta, d=d)
+    return Physical(*numbers)

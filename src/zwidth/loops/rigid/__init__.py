@@ -1,0 +1,1 @@
+"""The rigid loop by its closed forms: one question a file."""

@@ -1,0 +1,223 @@
+"""All poles of many walls at one time: Aberth's and Ehrlich's simultaneous iteration, with Smith's discs as its proof.
+
+With q_i the product of z_i - z_j over all j but i and q_i' its derivative by z_i, a step is P q/(P' q - P q'): products
+alone and one quotient a pole, which compilers make into one loop over the walls. The same q ends it. Every zero of a
+monic polynomial of degree N lies in one of the discs |z - z_i| <= N |P(z_i)/q_i| (Smith 1970), and where these are
+disjoint each holds exactly one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.xp import epsilon, namespace, repeat
+from zwidth.loops.domain import poison, valid_wall
+from zwidth.loops.rigid.degrees import Degree
+from zwidth.loops.rigid.polynomial import choose_plant
+from zwidth.words.types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirst
+
+# With half as many more as there are poles, all but some 2 walls in 1,000 are settled.
+_FIRST_STEPS = 9
+# Of the coefficients of N(z), which come from series, of their sum and of the products behind it, in rounding units.
+_ROUNDING = 32.0
+
+
+class Cartesian(NamedTuple):
+    """A complex number by its parts: real arithmetic is faster."""
+
+    re: Array
+    im: Array
+
+    def times(self, other: Cartesian) -> Cartesian:
+        """The product."""
+        return Cartesian(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
+
+    def over(self, other: Cartesian) -> Cartesian:
+        """The quotient."""
+        size = other.re * other.re + other.im * other.im
+        return Cartesian(
+            (self.re * other.re + self.im * other.im) / size, (self.im * other.re - self.re * other.im) / size
+        )
+
+
+class ProductForm(NamedTuple):
+    """``P(z) = z^power (z - 1)(z - c) + N(z) (alpha z + beta (z - 1))``, N by its coefficients, highest power first.
+
+    Rounding errors stay small where the coefficients of P cancel. Without virtual damping a factor z is left out.
+    """
+
+    power: int
+    c: Array
+    n: tuple[Array, ...]
+    alpha: Array
+    beta: Array | None
+
+    @property
+    def poles(self) -> int:
+        """The degree of P."""
+        return self.power + 2
+
+
+def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> ProductForm:
+    """The polynomial of every wall, with a new first axis for its poles; of walls with ``spring`` beta is 0."""
+    xp = namespace(alpha, beta, delta, d)
+    plant = choose_plant(delta, d, degree)
+    n = (plant.a2, plant.a1, plant.a0)[: 3 if degree.fractional else 2]
+    c, alpha, beta, *n = (xp.asarray(part)[None] for part in (plant.c, alpha, beta, *n))
+    return ProductForm(degree.poles - 2 - spring, c, tuple(n), alpha, None if spring else beta)
+
+
+def _plus(x: Cartesian, y: Cartesian) -> Cartesian:
+    return Cartesian(x.re + y.re, x.im + y.im)
+
+
+def _power(z: Cartesian, power: int) -> Cartesian:
+    """z^power by repeated squaring."""
+    if power == 0:
+        return Cartesian(0.0 * z.re + 1.0, 0.0 * z.im)
+    root = _power(z, power // 2)
+    square = root.times(root)
+    return square.times(z) if power % 2 else square
+
+
+def evaluate(z: Cartesian, form: ProductForm) -> tuple[Cartesian, Cartesian]:
+    """P(z) and P'(z)."""
+    one, pole = Cartesian(z.re - 1.0, z.im), Cartesian(z.re - form.c, z.im)
+    quadratic = one.times(pole)
+    lag = _power(z, max(form.power - 1, 0))
+    body = z.times(_plus(one, pole))
+    if form.power:
+        slope = lag.times(Cartesian(form.power * quadratic.re + body.re, form.power * quadratic.im + body.im))
+        value = lag.times(z).times(quadratic)
+    else:
+        slope, value = _plus(one, pole), quadratic
+    n = Cartesian(form.n[0] + 0.0 * z.re, 0.0 * z.im)
+    n_slope = Cartesian(0.0 * z.re, 0.0 * z.im)
+    for coefficient in form.n[1:]:
+        n_slope = _plus(n_slope.times(z), n)
+        n = n.times(z)
+        n = Cartesian(n.re + coefficient, n.im)
+    if form.beta is None:
+        wall, stiffness = Cartesian(form.alpha, 0.0), 0.0
+    else:
+        stiffness = form.alpha + form.beta
+        wall = Cartesian(form.alpha * z.re + form.beta * one.re, stiffness * z.im)
+    push = n_slope.times(wall)
+    slope = Cartesian(slope.re + push.re + stiffness * n.re, slope.im + push.im + stiffness * n.im)
+    return _plus(value, n.times(wall)), slope
+
+
+def rounding(z: Cartesian, form: ProductForm, unit: float) -> Array:
+    """What rounding errors may add up to in P(z)."""
+    xp = namespace(z.re)
+    # Sums of the parts' sizes are upper bounds of moduli that neither overflow nor underflow.
+    r, one, pole = (xp.abs(z.re - zero) + xp.abs(z.im) for zero in (0.0, 1.0, form.c))
+    lagged = r**form.power * one * ((3.0 * form.power + 8.0) * pole + 2.0 * form.c)
+    n = form.n[0]
+    for coefficient in form.n[1:]:
+        n = n * r + coefficient
+    wall = xp.abs(form.alpha) if form.beta is None else xp.abs(form.alpha) * r + xp.abs(form.beta) * one
+    return unit * (lagged + _ROUNDING * n * wall)
+
+
+def join(re: Array, im: Array) -> Array:
+    """A complex array. As one array it is computed by one loop, as two by two loops that repeat what they share."""
+    if namespace(re) is np:
+        return re + 1j * im
+    from jax.lax import complex as join
+
+    return join(re, im)
+
+
+def split(z: Array) -> Cartesian:
+    """Real and imaginary parts."""
+    return Cartesian(z.real, z.imag)
+
+
+def _differences(z: RootsFirst) -> list[Cartesian]:
+    """From each pole the ones that follow it, nearest in number first."""
+    twice, count = namespace(z).concatenate([z, z]), z.shape[0]
+    return [split(z - twice[k : k + count]) for k in range(1, count)]
+
+
+def _step(z: RootsFirst, form: ProductForm) -> RootsFirst:
+    q, *others = _differences(z)
+    at = split(z)
+    q_slope = Cartesian(0.0 * at.re + 1.0, 0.0 * at.im)
+    for difference in others:
+        q_slope = _plus(q_slope.times(difference), q)
+        q = q.times(difference)
+    value, slope = evaluate(at, form)
+    ours, theirs = slope.times(q), value.times(q_slope)
+    step = value.times(q).over(Cartesian(ours.re - theirs.re, ours.im - theirs.im))
+    return join(at.re - step.re, at.im - step.im)
+
+
+def _start(form: ProductForm) -> RootsFirst:
+    """Two poles near those of the device, the others around 0, where the two parts of P are about equally large."""
+    xp = namespace(form.c)
+    around = form.power
+    last = form.alpha if form.beta is None else form.beta
+    r = xp.clip(xp.abs(form.n[-1] * last) ** (1.0 / max(around, 1)), 0.02, 3.0)
+    # No two are each other's conjugates: a symmetric set stays so, and could not change how many of it are real.
+    circle = np.exp(1j * (2.0 * np.pi * np.arange(around) / max(around, 1) + 0.4)).reshape(-1, *[1] * (r.ndim - 1))
+    return xp.concatenate([r * circle, 0.0 * r + (0.9 + 0.45j), 0.0 * r + (0.75 - 0.4j)])
+
+
+def discs(z: RootsFirst, form: ProductForm) -> tuple[RadiiFirst, Array, Array]:
+    """Radii of discs round ``z``, the poles along the first axis: in each lies one pole if the second result says so.
+
+    The third says whether P is as small at each of them as rounding lets it be seen.
+    """
+    xp = namespace(z)
+    at, unit = split(z), epsilon(z.real)
+    apart = [xp.sqrt(part.re * part.re + part.im * part.im) for part in _differences(z)]
+    q = 0.0 * at.re + 1.0
+    for distance in apart:
+        q = q * distance
+    value, bound = evaluate(at, form)[0], rounding(at, form, unit)
+    size = xp.abs(value.re) + xp.abs(value.im)
+    # A thousandth more than N, for the rounding of q.
+    within = 1.001 * form.poles * (size + bound) / q
+    twice = xp.concatenate([within, within])
+    disjoint = xp.isfinite(within)
+    for k, distance in enumerate(apart[: form.poles // 2], start=1):
+        disjoint = disjoint & (distance > within + twice[k : k + form.poles])
+    settled = size <= bound + unit * (xp.abs(at.re) + xp.abs(at.im)) * q
+    return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
+
+
+def replace_invalid(
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree
+) -> tuple[tuple[Reals, Reals, Reals, Reals], Reals]:
+    """Walls that can be computed, and what to add to the results of those that could not."""
+    xp = namespace(alpha, beta, delta, d)
+    ok = valid_wall(alpha, beta, delta, d)
+    alpha_in, beta_in, delta_in = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
+    inside = (alpha_in, beta_in, delta_in, xp.where(ok, d, float(degree.whole)))
+    return inside, poison(ok, alpha, beta, delta, d)
+
+
+def with_zero(poles: Array, spring: bool) -> Array:
+    """The pole 0 of walls without virtual damping, which is not computed."""
+    xp = namespace(poles)
+    return xp.concatenate([poles, xp.zeros_like(poles[..., :1])], axis=-1) if spring else poles
+
+
+def aberth_kernel(
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool
+) -> tuple[Roots, Radii, Array]:
+    """All poles, how far each is off at most, and whether that is proved and no digit is missing."""
+    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
+    form = product_form(*walls, degree, spring)
+    xp = namespace(form.c)
+    z = repeat(_FIRST_STEPS + form.poles // 2, lambda z: _step(z, form), _start(form), xp)
+    within, proved, settled = discs(z, form)
+    # A disc on the real axis that holds one pole holds a real one, unless the pole's conjugate is in a disc close by.
+    real = xp.abs(z.imag) <= within
+    within = within + xp.where(real, xp.abs(z.imag), 0.0)
+    z = join(z.real, xp.where(real, 0.0, z.imag))
+    z, within = (with_zero(xp.moveaxis(part, 0, -1), spring) + spoiled[..., None] for part in (z, within))
+    return z, within, proved & settled

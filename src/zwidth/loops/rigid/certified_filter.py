@@ -1,0 +1,213 @@
+"""The verdict in float64 balls over arrays of walls: the certified method's first step, which settles nearly all.
+
+The text is that of `loops.rigid.crossover`. Here are the numbers that go into it: device, crossover and lag, with
+proved errors. ``u = 2^-53``. No library's exp is trusted.
+
+- ``exp``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 14 terms below 3u: together
+  below 8u. Below x = -700 it is off by 1e-304 at most.
+- `numerics.phi.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have
+  positive terms only, 4u: phi1 and gap are within 14u, phi2 15u, and psi, in which phi1 and gap share the error of the
+  exponential, 8u + 12u. Above, where c < 0.083, phi1 is within 5u, phi2 7u, psi 14u, gap 20u. All are within 30u.
+- Held fraction: t = 1 - f is off by u, and x = delta t by 2u. phi1 and phi2 amplify that at most once and psi twice,
+  e^-x x times; as ``x e^-x <= phi1(x)`` and ``<= 1/2``, that error is below 2u of another term of a1, and of a0 below u
+  of a1. Term by term, sums included, a2 is within 40u, a1 within 75u, a0 within 60u (and u of a1).
+"""
+
+from __future__ import annotations
+
+from math import factorial
+from typing import Any
+
+import numpy as np
+
+from zwidth.arrays.batching import BLOCK, FEW, compile_strips, map_blocks
+from zwidth.arrays.phi import phi_functions
+from zwidth.arrays.xla import COSINE, SINE, fit_arcsine, store_once
+from zwidth.arrays.xp import horner, namespace
+from zwidth.loops.domain import WALL_RANGE, wall_status
+from zwidth.loops.rigid.boundary_map import row_limits
+from zwidth.loops.rigid.crossover import Lag, first_zero, long_verdict, short_verdict
+from zwidth.loops.rigid.delay_classes import DeviceTerms, Kind, classify_delays, device
+from zwidth.loops.rigid.enclosure import TINY, UNIT, Ball
+from zwidth.loops.rigid.folding import Points, pick_points
+from zwidth.words.status import Status
+from zwidth.words.types import Array
+
+UNSTABLE, STABLE, OPEN = 0, 1, 2
+# Added to the code where alpha or beta is 0 or a value is out of range: XLA takes numbers below 2^-1022 for zero, and
+# at alpha = 0 the verdict is not on the pole at z = 1.
+SPECIAL = 4
+
+_LOG2_E = 1.4426950408889634
+# The first part has 32 significant bits: its products with whole numbers below 2^21 are exact.
+_LN2_HIGH, _LN2_LOW = 6.93147180369123816490e-01, 1.90821492927058770002e-10
+_EXP_TERMS = [1.0 / factorial(k) for k in range(14)]
+_EXP_LIMIT = -700.0
+
+# asin(sqrt y)/sqrt y by powers of 4 y - 1, within 2^-46 of itself for 0 <= y <= 0.5002, rounding included.
+ARCSINE = fit_arcsine(16)
+_LARGEST_U = 1.0002
+# Of both series, on [0, 1.6], the first term left out and the rounding are below 2^-43 (of the angle for the sine).
+_LARGEST_ANGLE = 1.6
+_HALF_PI_BELOW, _HALF_PI_ABOVE = 1.570796326794896, 1.570796326794897
+
+
+def exp(x: Array) -> Array:
+    """``e^x``, x <= 0, within 8u, and 1e-304 below -700."""
+    xp = namespace(x)
+    x = xp.maximum(x, _EXP_LIMIT)
+    k = xp.round(x * _LOG2_E)
+    return horner((x - k * _LN2_HIGH) - k * _LN2_LOW, _EXP_TERMS) * _power_of_two(k, xp)
+
+
+def _power_of_two(k: Array, xp: Any) -> Array:
+    if xp is np:
+        return np.ldexp(1.0, np.nan_to_num(k).astype(np.int64))
+    from jax.lax import bitcast_convert_type
+
+    return bitcast_convert_type((1023 + k.astype(xp.int64)) << 52, xp.float64)
+
+
+def functions(x: Array) -> Any:
+    """The phi-functions, each within 30u."""
+    return phi_functions(x, exp)
+
+
+def enclosed_device(delta: Array, d: Array, kind: Kind) -> DeviceTerms:
+    """The device of exact delta and d in balls, NaN where they are out of range."""
+    here = device(delta, d, kind, functions)
+    if kind.fractional and kind.long:
+        # Several loops of the compiler use it.
+        here = store_once(here, delta)
+
+    def within(mid: Array, units: float) -> Ball:
+        return Ball(mid, (units * UNIT) * abs(mid) + TINY)
+
+    exact = {"delta": Ball(here.delta), "f": Ball(here.f), "em": within(here.em, 32.0), "p1": within(here.p1, 31.0)}
+    if not kind.fractional:
+        a2, a1, gap = within(here.a2, 31.0), within(here.a1, 31.0), within(here.gap, 31.0)
+        return here._replace(**exact, c=within(here.c, 18.0), a2=a2, a1=a1, a0=None, gap=gap)
+    a2, a1 = within(here.a2, 42.0), within(here.a1, 78.0)
+    a0 = Ball(here.a0, UNIT * (62.0 * here.a0 + 2.0 * here.a1) + TINY)
+    late = {"p1_t": within(here.p1_t, 35.0), "psi_t": within(here.psi_t, 36.0)} if kind.short else {}
+    return here._replace(**exact, **late, c=within(here.c, 18.0), a2=a2, a1=a1, a0=a0, gap=a2 - a1 + a0)
+
+
+def enclose_zero(cubic: tuple[Ball, ...]) -> tuple[Ball, Array]:
+    """Around the zero of the midpoints, as wide as the radii make it; the signs of H at both ends are the proof."""
+    mids, radii = zip(*((h.mid, h.radius) for h in cubic), strict=True)
+    u = first_zero(mids)
+    value, slope = horner(u, mids), horner(u, [k * h for k, h in enumerate(mids)][1:])
+    error = _horner_error(u, mids, radii)
+    reach = 1.5 * (2.0 * error + abs(value)) / abs(slope) + (8.0 * UNIT) * u
+    low, high = u - reach, u + reach
+    bound = _horner_error(high, mids, radii)
+    found = (low > 0) & (high < _LARGEST_U) & (horner(low, mids) > bound) & (horner(high, mids) < -bound)
+    return Ball(u, reach + (4.0 * UNIT) * u), found
+
+
+def _horner_error(u: Array, mids: tuple[Array, ...], radii: tuple[Array, ...]) -> Array:
+    """Of H at up to u >= 0: the radii of its coefficients, and 7u of the absolute terms for Horner's rule."""
+    return horner(u, [radius + (8.0 * UNIT) * abs(mid) for mid, radius in zip(mids, radii, strict=True)]) + TINY
+
+
+def take_lag(u: Ball, whole: Array) -> Lag:
+    """The lag by series of half its angle, ``(n + 1/2) w/2``."""
+    xp = namespace(u.mid)
+    safe = xp.where((u.mid > 0) & (u.mid < _LARGEST_U), u.mid, 0.5)
+    half = (whole + 0.5) * (xp.sqrt(0.5 * safe) * horner(2.0 * safe - 1.0, ARCSINE))
+    # dw/du = 1/sqrt(u (2 - u))
+    error = 0.5 * (whole + 0.5) * u.radius / xp.sqrt(xp.maximum((u * (2 - u)).lower(), 0.0)) + 2.0**-45 * half
+    within = half + error < _HALF_PI_BELOW
+    beyond = (half - error) * (whole + 1.0) > (_HALF_PI_ABOVE * (whole + 0.5)) * (1.0 + 4.0 * UNIT)
+    angle = xp.minimum(half, _LARGEST_ANGLE)
+    square = angle * angle
+    sine, cosine = angle * horner(square, SINE), horner(square, COSINE)
+    # The derivative of both by half of the angle is at most 2, that of the square of its sine at most twice the angle.
+    return Lag(
+        Ball((cosine - sine) * (cosine + sine), 2.0 * error + 2.0**-40),
+        Ball(2.0 * sine * cosine, 2.0 * error + 2.0**-40 * angle),
+        Ball(sine * sine, 2.0 * error * (angle + error) + 2.0**-40 * square),
+        within,
+        beyond,
+    )
+
+
+def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) -> Array:
+    """The codes of walls, elementwise."""
+    xp = namespace(alpha, beta, delta)
+    here = enclosed_device(delta, d, kind)
+    wall = Ball(alpha), Ball(beta)
+    found = []
+    if kind.short:
+        found.append(short_verdict(*wall, here))
+    if kind.long:
+        found.append(long_verdict(*wall, here.whole, here, enclose_zero, take_lag))
+    stable, unstable = (xp.where(here.whole < 1, *pair) for pair in zip(found[0], found[-1], strict=True))
+    code = xp.where((stable | unstable) & (beta + delta > 0), stable.astype(xp.uint8), xp.uint8(OPEN))
+    # P(1) = phi1 alpha < 0: a real pole beyond 1. The lobe lies above beta = -delta.
+    code = xp.where((alpha < 0) | ((alpha > 0) & (beta <= -delta)), xp.uint8(UNSTABLE), code)
+    least, most = WALL_RANGE
+    stiffness, damping = abs(alpha), abs(beta)
+    plain = (stiffness >= least) & (stiffness <= most) & (damping >= least) & (damping <= most)
+    return code + xp.where(plain & (here.delta.mid == delta), xp.uint8(0), xp.uint8(SPECIAL))
+
+
+def each_code(points: Points) -> np.ndarray:
+    """The code of every point, point by point."""
+    shape, kind = points.shape, classify_delays(points.d)
+    if points.size <= FEW:
+        # NumPy is several times faster with scalars than with arrays without axes.
+        with np.errstate(all="ignore"):
+            alpha, beta, delta, d = (array[()] for array in points)
+            return np.broadcast_to(wall_codes(alpha, beta, delta, d, kind), shape).copy()
+    code = map_blocks(compile_strips(wall_codes, (kind,)), points.columns(), BLOCK).reshape(shape)
+    if np.signbit(points.delta).any() or np.signbit(points.d).any():
+        code |= np.where((points.delta < 0) | (points.d < 0), SPECIAL, 0).astype(np.uint8)
+    return code
+
+
+# Of each row a wall so far below its end is tried, and one as far above.
+_ASIDE = 1e-9
+
+
+def filter_walls(points: Points) -> np.ndarray:
+    """The code of every point, of the broadcast shape.
+
+    On every row (beta, delta, d) the stable walls are one interval, 0 < alpha < limit (docs/theory/one-lobe.md): what
+    lies below a wall proved stable is stable, what lies above one proved unstable is not. Which two walls does not
+    matter for the proof, so those next to the limit as computed are taken. What they leave is asked point by point.
+    """
+    if not has_rows(points):
+        return each_code(points)
+    # A wall of moderate stiffness stands for the row: what is special about it is special about all.
+    usual = (wall_status(np.ones(()), *points[1:]) == Status.OK) & (points.beta != 0)
+    least, most = WALL_RANGE
+    size = np.abs(points.alpha)
+    known = (size >= least) & (size <= most)
+    stiffness = np.unique(points.alpha[known & (points.alpha > 0)])
+    limit = row_limits(*points[1:])
+    ends = np.concatenate([[0.0], stiffness, [np.inf]])
+    below = ends[np.searchsorted(stiffness, limit * (1.0 - _ASIDE))]
+    above = ends[np.searchsorted(stiffness, limit * (1.0 + _ASIDE)) + 1]
+    tried = [each_code(Points(np.clip(alpha, least, most), *points[1:])) for alpha in (below, above)]
+    stable, unstable = np.where(tried[0] == STABLE, below, 0.0), np.where(tried[1] == UNSTABLE, above, np.inf)
+    # Walls without or with negative stiffness: P(1) < 0 is a real pole beyond 1.
+    alpha = np.where(points.alpha < 0, np.inf, points.alpha)
+    over = alpha > stable
+    between = over & (alpha < unstable)
+    code = 1 - over.view(np.uint8)
+    code += OPEN * between.view(np.uint8)
+    if not (known.all() and usual.all()):
+        code[~np.broadcast_to(known & usual, points.shape)] = OPEN
+    rest = code == OPEN
+    if rest.any():
+        code[rest] = each_code(pick_points(points, rest))
+    return code
+
+
+def has_rows(points: Points) -> bool:
+    """Whether alpha varies along axes of its own, and along enough values for two trials a row to pay."""
+    rows = np.broadcast_shapes(*(array.shape for array in points[1:]))
+    apart = all(along == 1 or across == 1 for along, across in zip(points.alpha.shape, rows, strict=True))
+    return points.is_dense and apart and points.alpha.size >= 64

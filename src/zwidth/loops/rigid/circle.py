@@ -1,0 +1,268 @@
+"""How many poles lie inside the circle |z| = r, in closed form: where the two parts of the loop are equally large.
+
+P = T + B as in `loops.rigid.crossover`, ``T = z^(1+n) (z - 1)(z - c)`` and ``B = M(z) (s z - beta)`` with
+s = alpha + beta and ``M = (a2 z + h)(1 + q/z)``, whose zeros are real and not positive. On ``z = r e^(j w)``,
+0 < w < pi, with x = sin^2(w/2) every factor has ``|z - a|^2 = (r - a)^2 + 4 r a x`` and an imaginary part of one sign.
+Hence
+
+- |T|^2 - |B|^2 is a quadratic in x (whole delays) or a cubic; its zeros in (0, 1) are the crossovers;
+- every argument is continuous where it is principal, and between crossovers that of P stays within a quarter turn of
+  that of the larger part. At a crossover the two differ by ``theta = arg T - arg B``; P continues with the other part
+  plus or minus 2 pi m, m the whole number nearest to theta/(2 pi).
+
+The number of zeros inside is the turn of P over pi; nothing in it grows with n. The logarithm of r is what is given, so
+that circles a hair beside the unit circle are told apart from it.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.xla import angle, find_turn
+from zwidth.arrays.xp import epsilon, namespace
+from zwidth.loops.domain import valid_wall, void
+from zwidth.loops.rigid.plant import held_plant, split_delay, undelayed_plant
+from zwidth.words.types import Array
+
+# Steps of the bracketed Newton iteration for the zeros of the cubic.
+_CUBIC_STEPS = 6
+
+
+class Loop(NamedTuple):
+    """One loop by its factors; NaN throughout where an input is out of range."""
+
+    alpha: Array
+    beta: Array
+    s: Array  # alpha + beta
+    turns: Array  # 1 + n, the powers of z in T
+    lag: Array  # 1 + d
+    c: Array
+    em: Array  # 1 - c
+    a2: Array
+    h: Array
+    q: Array  # 0 for whole delays
+
+
+def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Loop:
+    """The factors of P; ``fractional`` says whether any delay has a fraction."""
+    xp = namespace(alpha, beta, delta, d)
+    ok = valid_wall(alpha, beta, delta, d)
+    delta, d = xp.where(ok, delta, 1.0), xp.where(ok, d, 0.0)
+    whole, f = split_delay(d)
+    if fractional:
+        plant = held_plant(delta, f)
+        h = 0.5 * (plant.a1 + xp.sqrt(xp.maximum(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0)))
+        q = plant.a0 / h
+    else:
+        plant = undelayed_plant(delta)
+        h, q = plant.a1, 0.0 * plant.a1
+    alpha, beta, s = void(ok, alpha, beta, alpha + beta)
+    return Loop(alpha, beta, s, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
+
+
+class _Circle(NamedTuple):
+    """One circle: the factors at z = r, what T and B are multiplied by, and |T|^2 - |B|^2 by powers of x."""
+
+    r: Array
+    near: Array  # r - 1
+    off: Array  # r - c
+    front: Array  # s r - beta
+    body: Array  # a2 r + h
+    h: tuple[Array, Array, Array, Array]
+    first: tuple[Array, Array]  # |T| and |B| at x = 0
+    last: tuple[Array, Array]  # and at x = 1
+    sizes: tuple[Array, ...]  # the parts of |T|^2 and of a bound of |B|^2, by powers of x
+
+    def parts(self, x: Array) -> Array:
+        """What the difference is a difference of, at x."""
+        t0, t1, c0, c1, m0, w0, w1 = self.sizes
+        return (t0 + t1 * x) * (c0 + c1 * x) + m0 * (w0 + w1 * x)
+
+    def slope(self, x: Array) -> Array:
+        """The derivative of the difference."""
+        return self.h[1] + x * (2.0 * self.h[2] + 3.0 * x * self.h[3])
+
+    def value(self, x: Array) -> Array:
+        """The difference."""
+        return self.h[0] + x * (self.h[1] + x * (self.h[2] + x * self.h[3]))
+
+
+def _circle(log_r: Array, loop: Loop, fractional: bool, xp: Any) -> _Circle:
+    r, near = xp.exp(log_r), xp.expm1(log_r)
+    off, front, body = near + loop.em, loop.alpha * r + loop.beta * near, loop.a2 * r + loop.h
+    power = loop.turns * log_r
+    less = xp.exp(-xp.abs(power))
+    # The larger of r^(1+n) and 1 is divided out.
+    up, down = xp.where(power < 0, less, 1.0), xp.where(power < 0, 1.0, less)
+    t0, t1 = up * near * (up * near), 4.0 * r * up * up
+    c0, c1 = off * off, 4.0 * r * loop.c
+    w0, w1 = front * front, 4.0 * r * loop.s * loop.beta
+    m0, m1 = down * body * (down * body), -4.0 * r * loop.a2 * loop.h * down * down
+    b0, b1, b2, b3 = m0 * w0, m0 * w1 + m1 * w0, m1 * w1, 0.0 * m0
+    held, late = 1.0, 1.0
+    if fractional:
+        ratio = loop.q / r
+        held, late = 1.0 + ratio, 1.0 - ratio
+        g0, g1 = held * held, -4.0 * ratio
+        b0, b1, b2, b3 = b0 * g0, b1 * g0 + b0 * g1, b2 * g0 + b1 * g1, b2 * g1
+        m0 = m0 * g0
+    first = up * xp.abs(near * off), down * xp.abs(body * held * front)
+    turned = (loop.h - loop.a2 * r) * late * (front + 2.0 * loop.beta)
+    last = up * (1.0 + r) * (loop.c + r), down * xp.abs(turned)
+    h = (t0 * c0 - b0, t0 * c1 + t1 * c0 - b1, t1 * c1 - b2, -b3)
+    return _Circle(r, near, off, front, body, h, first, last, (t0, t1, c0, c1, m0, w0, xp.abs(w1)))
+
+
+def _quadratic_zeros(h0: Array, h1: Array, h2: Array, xp: Any) -> list[Array]:
+    """Both zeros in order, NaN where they are complex."""
+    root = xp.sqrt(h1 * h1 - 4.0 * h0 * h2)
+    half = -0.5 * (h1 + xp.where(h1 < 0, -root, root))
+    one, other = half / h2, h0 / half
+    # Without a leading coefficient one zero is at infinity, or both.
+    one = xp.where(h2 == 0, np.inf, one)
+    other = xp.where(half == 0, one, other)
+    return [xp.minimum(one, other), xp.maximum(one, other)]
+
+
+def _cubic_zeros(at: _Circle, xp: Any) -> list[Array]:
+    """The zeros in (0, 1) in order, at most one between two extremes; NaN where there is none."""
+    h0, h1, h2, h3 = at.h
+    low, high = _quadratic_zeros(h1, 2.0 * h2, 3.0 * h3, xp)
+    low, high = (xp.where(xp.isfinite(x), xp.clip(x, 0.0, 1.0), 0.0) for x in (low, high))
+    ends = [0.0 * h0, xp.minimum(low, high), xp.maximum(low, high), 0.0 * h0 + 1.0]
+    values = [at.value(x) for x in ends]
+    return [_find_zero_between(ends[k], ends[k + 1], values[k], values[k + 1], at, xp) for k in range(3)]
+
+
+def _find_zero_between(low: Array, high: Array, first: Array, last: Array, at: _Circle, xp: Any) -> Array:
+    """The zero of a monotone piece of a cubic: each step solves for the parabola that touches it twice."""
+    exists = (first < 0) != (last < 0)
+    if xp is np and not np.any(exists):
+        return low + np.nan
+    falls = first > 0
+    sign = xp.where(falls, -2.0, 2.0)
+    x = xp.where(xp.abs(first) < xp.abs(last), low, high)
+    for _ in range(_CUBIC_STEPS):
+        value, slope, bend = at.value(x), at.slope(x), 2.0 * at.h[2] + 6.0 * x * at.h[3]
+        before = (value > 0) == falls
+        low, high = xp.where(before, x, low), xp.where(before, high, x)
+        new = x - sign * value / (xp.abs(slope) + xp.sqrt(xp.maximum(slope * slope - 2.0 * value * bend, 0.0)))
+        old, x = x, xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+        if xp is np and np.all((old == x) | ~exists):
+            break
+    return xp.where(exists, x, np.nan)
+
+
+def _only_zero(at: _Circle, fractional: bool, xp: Any) -> tuple[Array, Array]:
+    """The one zero in (0, 1) of a difference whose signs at the ends differ, and whether it is known to be the one."""
+    h0, h1, h2, h3 = at.h
+    sign = xp.where(h0 > 0, 1.0, -1.0)
+    bend = h2 + h3 if fractional else h2
+    root = xp.sqrt(xp.maximum(h1 * h1 - 4.0 * h0 * bend, 0.0))
+    ahead = sign * h1 < 0
+    x = xp.where(ahead, 2.0 * h0, -h1 - sign * root) / xp.where(ahead, sign * root - h1, 2.0 * bend)
+    if not fractional:
+        return x, root > 0
+    low, high = 0.0 * x, 1.0 + 0.0 * x
+    x = xp.where((x > 0) & (x < 1.0), x, 0.5)
+    for _ in range(_CUBIC_STEPS):
+        value = at.value(x)
+        before = sign * value > 0
+        low, high = xp.where(before, x, low), xp.where(before, high, x)
+        new = x - value / at.slope(x)
+        x = xp.where((new >= low) & (new <= high), new, 0.5 * (low + high))
+    # Monotone, or with one extreme, or none inside; and the steps have arrived.
+    alone = (h2 * h2 < 3.0 * h1 * h3) | (h1 * at.slope(1.0) < 0) | (xp.abs(h2) > 3.0 * xp.abs(h3)) | (h2 * h3 > 0)
+    return x, alone & (xp.abs(at.value(x)) <= 8.0 * epsilon(x) * at.parts(x))
+
+
+def _phase(x: Array, at: _Circle, loop: Loop, fractional: bool, xp: Any) -> tuple[Array, Array, Array]:
+    """``arg T - arg B`` at a crossover, continuous from w = 0, w, and a bound of what moves the one with the other."""
+    y = 1.0 - x
+    im, twice = 2.0 * at.r * xp.sqrt(x * y), 2.0 * at.r * x
+    one, pole = at.near - twice, at.off - twice
+    sign = xp.where(loop.s < 0, -1.0, 1.0)
+    wall, wall_im = sign * (at.front - loop.s * twice), sign * loop.s * im
+    body, body_im = at.body - loop.a2 * twice, loop.a2 * im
+    # (z - 1)/(a2 z + h), its argument in (0, pi), and (z - c)/W in (-pi, pi).
+    p_re, p_im = one * body + im * body_im, im * body - one * body_im
+    q_re, q_im = pole * wall + im * wall_im, im * wall - pole * wall_im
+    v_re, v_im = p_re * q_re - p_im * q_im, p_re * q_im + p_im * q_re
+    phase = angle(v_re, v_im)
+    phase = xp.where((v_im < 0) & (q_im >= 0), phase + 2.0 * np.pi, phase)
+    w = find_turn(x, y, xp)
+    theta = loop.turns * w + phase + xp.where(loop.s < 0, np.pi, 0.0)
+    if fractional:
+        # arg(1 + q/z) = arg(z + q) - w, in [-pi, 0]
+        ratio = loop.q / at.r
+        theta = theta - angle(1.0 + ratio - 2.0 * ratio * x, -ratio * im / at.r)
+    # z/(z - a) = 1 + a/(z - a) of every factor
+    rate = loop.turns + 0.0 * x
+    parts = [(1.0, one, im), (loop.c, pole, im), (loop.h, body, body_im), (xp.abs(loop.beta), wall, wall_im)]
+    for zero, part, part_im in [*parts, (loop.q, at.r - twice + loop.q, im)] if fractional else parts:
+        rate = rate + zero / xp.maximum(xp.abs(part), part_im)
+    return theta, w, rate
+
+
+class Count(NamedTuple):
+    """What the count on one circle has seen."""
+
+    missing: Array  # poles that are not inside
+    sure: Array  # rounding errors cannot have decided that
+    crossings: list[Array]  # the arguments w of the crossovers, and where there is none of any point
+
+    @property
+    def full(self) -> Array:
+        """Every pole is inside."""
+        return self.missing == 0
+
+
+def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> Count:
+    """How many poles are not inside ``|z| = e^log_r``.
+
+    With ``single`` nothing is sure where there is more than one crossover; that takes half of the time.
+    """
+    xp = namespace(log_r, loop.alpha)
+    at = _circle(log_r, loop, fractional, xp)
+    outer, ends_outer = at.first[0] > at.first[1], at.last[0] > at.last[1]
+    eps = epsilon(log_r)
+    blur = 4.0 * eps * (loop.turns + 8.0)
+    sure = ~(_may_cancel(at.first, blur) | _may_cancel(at.last, blur))
+    if single:
+        x, alone = _only_zero(at, fractional, xp)
+        zeros = [xp.where(outer != ends_outer, x, -1.0)]
+        monotone = False if fractional else (at.h[1] * at.slope(1.0) > 0)
+        sure = sure & xp.where(outer != ends_outer, alone, monotone)
+    else:
+        zeros = _cubic_zeros(at, xp) if fractional else _quadratic_zeros(*at.h[:3], xp)
+    half = xp.where(loop.s < 0, -1.0, 1.0)
+    # The argument of P over pi at both ends, that of its larger part.
+    start = xp.where(
+        outer, xp.where(at.near < 0, 1.0, 0.0) + xp.where(at.off < 0, 1.0, 0.0), xp.where(at.front < 0, half, 0.0)
+    )
+    body, wall = loop.h - loop.a2 * at.r, -(at.front + 2.0 * loop.beta)
+    stop = xp.where(body < 0, 1.0, 0.0) - xp.where(loop.q > at.r, 1.0, 0.0) + xp.where(wall < 0, half, 0.0)
+    stop = xp.where(ends_outer, loop.turns + 2.0, stop)
+    turn, crossings = 0.0 * start, []
+    for x in zeros:
+        valid = (x >= 0) & (x < 1.0)
+        x = xp.where(valid, x, 0.5)
+        theta, w, rate = _phase(x, at, loop, fractional, xp)
+        part = theta / (2.0 * np.pi)
+        whole = xp.round(part)
+        turn = turn + xp.where(valid, xp.where(outer, whole, -whole), 0.0)
+        outer = outer != valid
+        # The rounding of theta, and that of x where the two sizes cross at a small angle.
+        shift = rate * at.parts(x) / (xp.abs(at.slope(x)) * xp.sqrt(x * (1.0 - x)))
+        sure = sure & (~valid | (0.5 - xp.abs(part - whole) > blur + 4.0 * eps * shift))
+        crossings.append(w)
+    # Rounding must not have changed the number of crossovers.
+    sure = sure & (outer == ends_outer)
+    return Count(loop.turns + 2.0 - (stop - start + 2.0 * turn), sure, crossings)
+
+
+def _may_cancel(sizes: tuple[Array, Array], blur: Array) -> Array:
+    """Whether T and B may cancel but for rounding errors where the circle meets the real axis."""
+    return namespace(blur).abs(sizes[0] - sizes[1]) <= blur * sizes[1]

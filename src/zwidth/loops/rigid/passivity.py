@@ -1,0 +1,248 @@
+"""Passivity of the sampled wall of the rigid loop (Colgate's condition), for any delay.
+
+Per frequency the condition is a lower bound on the physical damping. For whole d, with D = sin((d + 1/2) w)/sin(w/2),
+
+    delta > alpha D/2 - beta cos((d + 1) w)            for every w in (0, pi]
+
+which at d = 0 is eq. (21), ``delta > alpha/2 + |beta|``. For a held delay d = n + f the worst motion also bends when
+the force arrives; with s = sin(w/2) and G = j e^(jw(n + 1/2)) (alpha - 2j beta s e^(jw/2)) the bound becomes
+
+    delta > (-h + sqrt(h^2 + 4 f (1 - f) s^2 |G|^2)) / (4 s),   h = Re{((1 - f) + f e^(jw)) G}
+
+Both are convex and homogeneous in (alpha, beta): one convex set for each delay, whatever the device. Where the bound is
+highest: `loops.rigid.needed_damping`. On a map of one delay it is a polynomial of one variable, the direction.
+"""
+
+from __future__ import annotations
+
+from functools import cache, lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.batching import FEW, as_float64, elementwise, map_blocks, to_caller
+from zwidth.arrays.xp import horner, is_traced, namespace
+from zwidth.loops.domain import LONGEST_DELAY, check_scalars, poison, valid_wall
+from zwidth.loops.rigid.degrees import NAMES
+from zwidth.loops.rigid.delay_classes import ANY, Kind, classify_delays
+from zwidth.loops.rigid.folding import lay_out, split
+from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
+from zwidth.words.errors import InputError
+from zwidth.words.types import Array, ArrayLike
+
+# Chebyshev terms: the last one is below 1e-16 for every delay.
+_TERMS = 30
+_MAP_BLOCK = 1 << 15
+# Each narrows the bracket of a direction eightfold.
+_ROUNDS = 17
+_NO_DELAY = Kind(True, False, False)
+
+
+def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) -> Array:
+    xp = namespace(alpha, beta, delta, d)
+    ok = valid_wall(alpha, beta, delta, d)
+    stiff, damper, delay = xp.where(ok, xp.maximum(alpha, 0.0), 0.0), xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
+    margin = delta - needed_damping(stiff, damper, delay, kind)
+    return _limit_margin(margin, alpha) + poison(ok, alpha, beta, delta, d)
+
+
+def _limit_margin(margin: Array, alpha: Array) -> Array:
+    """A spring of negative stiffness gives unbounded energy, which the frequency condition does not see."""
+    xp = namespace(margin, alpha)
+    return xp.where(alpha < 0, xp.minimum(margin, alpha), margin)
+
+
+class PassiveTable(NamedTuple):
+    """What all walls of one delay need, as one polynomial of the direction."""
+
+    f: float
+    at_zero: float  # the slope in alpha of what is needed at w = 0, for whole d
+    first: float  # `Directions`
+    width: float
+    last: float  # in the variable of the polynomial
+    limit: float  # the same, infinite where there is none
+    powers: list[float]
+
+
+@lru_cache(maxsize=256)
+def table(d: float) -> PassiveTable:
+    """The `PassiveTable` of one delay.
+
+    Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x = beta
+    - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
+    """
+    turn = directions(np.float64(d))
+    width = 0.5 * (d + 0.5)
+    span = turn.last - turn.first
+    last = span / (span + width) if np.isfinite(span) else 1.0
+    # Whole turns taken off in whole numbers: an angle of 30 pi would leave half of them without their last digits.
+    turns = np.outer(np.arange(_TERMS), 2 * np.arange(_TERMS) + 1) % (4 * _TERMS)
+    cosines = np.cos(np.pi * turns / (2 * _TERMS))
+    node = cosines[1]
+    place = 0.5 * last * (node + 1.0)
+    alpha = 1.0 - place
+    beta = turn.first * alpha + place * width
+    with np.errstate(all="ignore"):
+        needed = needed_damping(alpha, beta, np.full(_TERMS, d), classify_delays(d))
+    # place width + alpha width is the width.
+    terms = cosines @ needed * (2.0 / (_TERMS * width))
+    terms[0] *= 0.5
+    # By powers, whose coefficients fall as well: Clenshaw's sum loses two digits towards the ends.
+    powers = np.polynomial.chebyshev.cheb2poly(terms)
+    limit = float(last) if np.isfinite(span) else np.inf
+    return PassiveTable(d - np.floor(d), d + 0.5, float(turn.first), width, float(last), limit, powers.tolist())
+
+
+def _map_kernel(alpha: Array, beta: Array, delta: Array, known: PassiveTable) -> Array:
+    """`passivity_margin` at one delay."""
+    xp = namespace(alpha)
+    f, at_zero, first, width, last, limit, powers = known
+    ok = valid_wall(alpha, beta, delta, 0.0 * delta)
+    stiff = xp.maximum(alpha, 0.0)
+    beyond = beta - first * stiff
+    size = beyond + width * stiff
+    place = beyond / xp.where(beyond > 0, size, 1.0)
+    y = 2.0 * place / last - 1.0
+    inside = size * horner(y, powers)
+    zero, _ = larger_root(at_zero * stiff - beta, f * (1.0 - f) * stiff * stiff, xp)
+    pi = (1.0 - f) * (beta + 0.5 * stiff)
+    needed = xp.where(beyond > 0, xp.where(place < limit, inside, pi), zero)
+    return xp.where(ok, _limit_margin(delta - needed, alpha), xp.nan)
+
+
+@cache
+def _compiled_map() -> Any:
+    import jax
+
+    return jax.jit(_map_kernel)
+
+
+def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: float) -> np.ndarray:
+    """`passivity_margin` of arrays of one shape by NumPy; a point's value does not depend on the others."""
+    if not 0 <= d <= LONGEST_DELAY:
+        return np.full(alpha.shape, np.nan)
+    with np.errstate(all="ignore"):
+        return _map_kernel(alpha, beta, delta, table(d))
+
+
+def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
+    """`passivity_margin` of many walls that share few delays; None where they do not."""
+    laid = lay_out(values)
+    alpha, beta, delta, d = laid.points
+    if laid.points.size <= FEW or np.unique(d).size * FEW > laid.points.size:
+        return None
+    out = np.full(laid.points.shape, np.nan)
+    for delay, arrays, place in split((alpha, beta, delta), d):
+        if not 0 <= delay <= LONGEST_DELAY:
+            continue
+        columns = np.broadcast_arrays(*arrays)
+        known = table(float(delay))
+        flat = map_blocks(
+            lambda *part, known=known: _compiled_map()(*part, known), [c.reshape(-1) for c in columns], _MAP_BLOCK
+        )
+        out[place] = flat.reshape(columns[0].shape)
+    return to_caller(laid.spread(out), values)
+
+
+def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+    """Return by how much the physical damping exceeds what a passive wall needs.
+
+    ``margin = delta - sup_w needed(w)``, in units of delta = b T/m; the wall is passive where it is positive. At
+    d = 0 it is ``delta - alpha/2 - |beta|``, eq. (21).
+
+    Args:
+        alpha: normalized stiffness; no damping makes a wall of negative stiffness passive, and its margin is at most
+            alpha itself.
+        beta: normalized virtual damping.
+        delta: normalized physical damping, >= 0.
+        d: delay in periods, >= 0, whole or not (held). All four broadcast.
+
+    Returns:
+        Array of the broadcast shape; NaN where the input is out of range (see `loops.domain`).
+
+    Numerics:
+        About 1e-15 of what is needed, at a cost that does not grow with d. Where the condition peaks is proved for
+        whole d, and seen for held delays (`loops.rigid.needed_damping`). Many walls that share a delay go by a
+        polynomial of their direction. Traceable, also twice; at whole d derivatives in d are those from the right.
+
+    References:
+        Colgate, Schenkel 1994; Hulin, Preusche, Hirzinger 2006, eqs. (20), (21), here extended to any delay.
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.passivity_margin(0.2, 0.3, 1.0, 0):.2f}")
+        0.60
+    """
+    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
+    values = (alpha, beta, delta, d)
+    if is_traced(*values):
+        return elementwise(_margin_kernel, NAMES, values, (ANY,))
+    if not all(isinstance(value, int | float | np.number) for value in values):
+        found = _on_maps(values)
+        if found is not None:
+            return found
+    delay = as_float64("d", d)
+    kind = classify_delays(delay)
+    # Compiled, one text serves every delay.
+    return elementwise(_margin_kernel, NAMES, values, (kind if kind == _NO_DELAY or delay.size <= FEW else ANY,))
+
+
+def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
+    """Whether the wall is passive, for any delay: `passivity_margin` > 0.
+
+    Passive implies stable for alpha > 0; stable does not imply passive.
+
+    Args:
+        alpha, beta, delta, d: as for `passivity_margin`.
+
+    Returns:
+        Boolean array of the broadcast shape; False where the input is out of range. Right beyond about 1e-15 of the
+        boundary.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (21), here extended to any delay.
+
+    Example:
+        >>> import zwidth
+        >>> bool(zwidth.is_passive(0.2, 0.3, 1.0, 0)), bool(zwidth.is_passive(0.2, 0.9, 1.0, 0))
+        (True, False)
+    """
+    values = (alpha, beta, delta, d)
+    margin = passivity_margin(*values)
+    if is_traced(*values):
+        return margin > 0
+    # Compared by NumPy: outside float64 mode JAX would warn of the type it keeps.
+    return to_caller(np.asarray(margin) > 0, values)
+
+
+def passive_stiffness_slope(d: float) -> tuple[float, float]:
+    """The stiffest passive wall and its damping, both over delta, for one delay.
+
+    The condition is homogeneous in (alpha, beta, delta), so ``alpha_passive = slope * delta`` for every delta. For
+    whole d the damping has no effect on the peak where cos((d + 1) w) = 0: ``slope = 2 tan(pi/(4 (d + 1)))``. For a
+    held delay the direction is searched: the passive set is convex, so that it has one tip.
+    """
+    check_scalars(d=d)
+    delay = as_float64("d", d)
+    if delay.ndim or not (np.isfinite(delay) and delay >= 0):
+        raise InputError(f"d: got {d!r}; a single finite number of at least 0 is needed")
+    period = float(delay) + 1.0
+    if period == np.floor(period):
+        half = np.pi / (4.0 * period)
+        slope = 2.0 * np.tan(half)
+        return float(slope), float(slope * (0.25 / (period * np.sin(half) ** 2) - 0.5))
+    unit = 1.0 / (period - 0.5)
+
+    def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        alpha, beta = unit * np.cos(angles), np.sin(angles)
+        needed = needed_damping(alpha, beta, np.full(angles.shape, float(delay)), classify_delays(delay))
+        return alpha / needed, beta / needed
+
+    lower, upper = -0.49 * np.pi, 0.49 * np.pi
+    with np.errstate(all="ignore"):
+        for _ in range(_ROUNDS):
+            angles = np.linspace(lower, upper, 17)
+            best = int(np.argmax(stiffness(angles)[0]))
+            lower, upper = angles[max(best - 1, 0)], angles[min(best + 1, 16)]
+        alpha, beta = stiffness(np.array([0.5 * (lower + upper)]))
+    return float(alpha[0]), float(beta[0])

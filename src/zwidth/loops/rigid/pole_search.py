@@ -1,0 +1,179 @@
+"""The outermost pole of one loop: two starts, a fixed number of steps, one proof; a search for what that leaves.
+
+Either the slow pole next to 1 is the outermost, or the first pair of the ring that a delay makes. Halley's method
+follows both, and the larger one to its end. The proof: all poles are inside ``|z| = r (1 + tol)``, counted, and a pole
+is within tol of where the method ended. Where that fails the radius is searched for by halving an interval of counts.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.xla import angle
+from zwidth.arrays.xp import epsilon, frozen, namespace, repeat
+from zwidth.loops.domain import poison, valid_wall, void
+from zwidth.loops.rigid.circle import Loop, count, factor_loop
+from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
+from zwidth.words.types import Array
+
+# Steps on both starts, then on the larger of the two.
+_BOTH, _LARGER = 2, 3
+# A step after which a pole is within so much of where it began may be taken without looking again: N |P/P'| bounds
+# the distance before the step, N >= 3, and the step is an N-th of it.
+_AFTER = 1.4
+# Of counts next to a pole: what their rounding allows, and what rates of decay promise.
+_COUNTED, _RELATIVE = 4096.0, 2e-11
+# From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
+# crossovers depend on it.
+_SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
+
+
+class Found(NamedTuple):
+    """The outermost pole ``e^(re + j im)``, 0 <= im <= pi, and whether it is proved to be that."""
+
+    re: Array
+    im: Array
+    proved: Array
+    doubt: Array  # of rounding errors in re
+
+
+def _largest(loop: Loop) -> Array:
+    """The logarithm of a radius that no pole exceeds: beyond it T is the larger part."""
+    xp = namespace(loop.alpha)
+    size = (loop.a2 + loop.h) * (1.0 + loop.q) * (xp.abs(loop.alpha) + 2.0 * xp.abs(loop.beta))
+    root = xp.sqrt(size)
+    # |T| >= r^(1+n) (r - 1)^2, |B| <= size r^2
+    short = xp.log1p(xp.where(loop.turns > 1, root, root + size))
+    steep = xp.maximum(np.log(2.0), xp.log(4.0 * size) / loop.turns)
+    return 1e-9 + xp.where(loop.turns > 1, xp.minimum(short, steep), short)
+
+
+def _slow_pole(loop: Loop) -> tuple[Array, Array]:
+    """The larger pole near 1, of P to second order in z - 1."""
+    xp = namespace(loop.alpha)
+    alpha, s, turns = loop.alpha, loop.s, loop.turns
+    m0, m1 = (loop.a2 + loop.h) * (1.0 + loop.q), loop.a2 - loop.h * loop.q
+    constant = m0 * alpha
+    linear = loop.em + m0 * s + (m1 - turns * m0) * alpha
+    lead = 1.0 + (m1 - turns * m0) * s + (0.5 * turns * (turns + 1.0) * m0 - turns * m1) * alpha
+    lead = xp.where(lead > 0.1, lead, 1.0)
+    inside = linear * linear - 4.0 * lead * constant
+    root = xp.sqrt(xp.abs(inside))
+    sum_ = linear + xp.where(linear < 0, -root, root)
+    real = xp.where(linear < 0, -0.5 * sum_ / lead, -2.0 * constant / sum_)
+    pair = inside < 0
+    re, im = xp.where(pair, -0.5 * linear / lead, real), xp.where(pair, 0.5 * root / lead, 0.0)
+    re = xp.maximum(re, -0.5)
+    return 0.5 * xp.log1p(re * (2.0 + re) + im * im), angle(1.0 + re, im)
+
+
+def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The first pair of the ring, where T and B have one size as they change with |z| from the unit circle on."""
+    xp = namespace(loop.alpha)
+    im = np.pi / (loop.lag + 1.0)
+    x = xp.sin(0.5 * im) ** 2
+    sizes = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
+    body = (loop.a2 + loop.h) ** 2 - 4.0 * loop.a2 * loop.h * x
+    wall = loop.alpha * loop.alpha + 4.0 * loop.s * loop.beta * x
+    turns = loop.turns
+    if fractional:
+        body, turns = body * ((1.0 + loop.q) ** 2 - 4.0 * loop.q * x), turns + 1.0
+    return xp.maximum(0.5 * xp.log(body * wall / (sizes[0] * sizes[1])) / turns, -1.0), im
+
+
+def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
+    """The slow pole and the pair, after so many steps from their starts."""
+
+    def step(state: Any) -> Any:
+        slow_re, slow_im, re, im = state
+        return (*halley_step(slow_re, slow_im, loop, fractional), *halley_step(re, im, loop, fractional))
+
+    return repeat(steps, step, (*_slow_pole(loop), *_pair(loop, fractional)), namespace(loop.alpha))
+
+
+def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
+    """The larger of the two, nearly."""
+    xp = namespace(loop.alpha)
+    slow_re, slow_im, re, im = both_poles(_BOTH, loop, fractional)
+    first = (slow_re >= re) | xp.isnan(re)
+    state = xp.where(first, slow_re, re), xp.where(first, slow_im, im)
+    return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), state, xp)
+
+
+def window(re: Array, tolerance: Any) -> Array:
+    """How far outside of a pole the count finds no other: as near as its rounding allows, for rates of decay."""
+    xp = namespace(re)
+    return xp.minimum(tolerance, xp.maximum(_COUNTED * epsilon(re), _RELATIVE * xp.abs(re)))
+
+
+def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool, single: bool) -> Found:
+    """The pole after one more step, and whether its modulus is proved to be the radius within the tolerance."""
+    xp = namespace(re, loop.alpha)
+    # A wall without stiffness has a pole at 1.
+    at_one = (loop.alpha == 0) & ~(re > tolerance)
+    step = newton_step(re, im, loop, fractional)
+    re, im = (xp.where(at_one, 0.0, part) for part in move_pole(re, im, step.re, step.im))
+    seen = count(re + window(re, tolerance), loop, fractional, single)
+    proved = (at_one | (_AFTER * step.within <= tolerance)) & seen.full & seen.sure
+    return Found(re, im, proved, xp.where(at_one, 0.0, step.doubt))
+
+
+def quick_kernel(alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool) -> Found:
+    """The outermost pole of most points."""
+    loop = factor_loop(alpha, beta, delta, d, fractional)
+    return certify_pole(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
+
+
+def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:
+    """Whether two counts prove that the radius is ``e^log_r`` within a relative tolerance."""
+    above, below = (count(log_r + by, loop, fractional) for by in (tolerance, -tolerance))
+    return above.full & above.sure & ~below.full & below.sure
+
+
+def search(tolerance: Array, loop: Loop, fractional: bool) -> Found:
+    """The outermost pole by halvings of the interval that counts leave, then a few steps."""
+    xp = namespace(loop.alpha)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        middle = 0.5 * (state[0] + state[1])
+        full = count(middle, loop, fractional).full
+        return xp.where(full, state[0], middle), xp.where(full, middle, state[1])
+
+    high = _largest(loop)
+    _, radius = repeat(_HALVINGS, step, (0.0 * high + _SMALLEST, high), xp)
+    best, im = np.inf, 0.0 * radius
+    # On that circle the pole is at a crossover or at one of the ends.
+    for place in (0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings):
+        within = newton_step(radius, place, loop, fractional).within
+        im, best = xp.where(within < best, place, im), xp.minimum(within, best)
+    at = repeat(_POLISHING, lambda at: halley_step(*at, loop, fractional), (radius, im), xp)
+    found = certify_pole(*at, tolerance, loop, fractional, False)
+    # Next to multiple poles the steps end anywhere; the counts still know the radius.
+    return found._replace(re=xp.where(found.proved, found.re, radius))
+
+
+def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional: bool) -> Array:
+    """The logarithm of the radius with its derivatives, inside somebody's transformation.
+
+    NaN where it was not found; derivatives are those of the outermost pole, NaN where that is a multiple one.
+    """
+    from jax.lax import cond
+
+    xp = namespace(alpha, beta, delta, d)
+    still = factor_loop(*frozen((alpha, beta, delta, d), xp), fractional)
+    eps = epsilon(still.c)
+    found = certify_pole(*candidate(still, fractional), eps**0.58, still, fractional, False)
+    late = cond(found.proved.all(), lambda: found, lambda: search(eps**0.58, still, fractional))
+    start, im, simple, _ = frozen(Found(*(xp.where(found.proved, *pair) for pair in zip(found, late, strict=True))), xp)
+    loop, re = factor_loop(alpha, beta, delta, d, fractional), start
+    # Each step doubles the order to which the derivatives are right: two make first and second ones exact.
+    for _ in range(2):
+        step = newton_step(re, im, loop, fractional)
+        re, im = re + step.re, im + step.im
+    known = simple | has_bound(start, eps**0.25, still, fractional)
+    (change,) = void(simple, re - start)
+    value = frozen(xp.where(simple, re, start), xp)
+    value = xp.where(simple, value + (change - frozen(change, xp)), value + 0.0 * change)
+    return xp.where(known, value, np.nan) + poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)

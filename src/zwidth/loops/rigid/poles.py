@@ -1,0 +1,389 @@
+"""All poles: eigenvalues of the companion matrix, polished, or of many walls at one time by Aberth's iteration."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.arrays.batching import as_float64, map_blocks
+from zwidth.arrays.xp import is_traced, namespace, repeat
+from zwidth.loops.domain import LONGEST_DELAY, check_scalars, wall_status
+from zwidth.loops.rigid.aberth import (
+    aberth_kernel,
+    discs,
+    evaluate,
+    join,
+    product_form,
+    replace_invalid,
+    rounding,
+    split,
+    with_zero,
+)
+from zwidth.loops.rigid.degrees import NAMES, Degree, few_poles, find_degree, map_by_degree
+from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.status import Method, Status
+from zwidth.words.types import Array, ArrayLike, Coefficients, Counts, Matrices, Radii, Reals, Roots, RootsFirst
+
+PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
+
+# The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
+_POLISHING_STEPS = 3
+
+# All poles take degree^3 operations and degree^2 numbers: 4,000 take minutes and 0.3 GB.
+MOST_POLES = 4000
+
+# Beyond, steps and the time to compile them grow, and the product of all distances between poles loses its digits.
+_MOST_AT_ONE_TIME = 24
+# Numbers of one kind that a block of walls holds, which then stay in the cache, and those of a block of matrices.
+_NUMBERS, _MATRICES = 1 << 15, 1 << 15
+
+
+class Poles(NamedTuple):
+    """Poles, how far each is off at most, both with a last axis for the poles; and a status and `Method` a wall."""
+
+    z: Roots
+    within: Radii
+    status: Array
+    method: Array
+
+
+def companion(monic: Coefficients) -> Matrices:
+    """The companion matrices whose eigenvalues are the zeros of monic polynomials, highest power first."""
+    xp = namespace(monic)
+    size = monic.shape[-1] - 1
+    below = xp.broadcast_to(xp.eye(size - 1, size, dtype=monic.dtype), (*monic.shape[:-1], size - 1, size))
+    return xp.concatenate([-monic[..., None, 1:], below], axis=-2)
+
+
+def pole_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool = False) -> Roots:
+    """All poles along a new last axis of degree.poles; NaN where the input is out of range.
+
+    With ``spring``, for walls without virtual damping, one pole is 0 and the matrix a row smaller.
+    """
+    matrices = _matrices(alpha, beta, delta, d, degree, spring)
+    xp = namespace(matrices)
+    z = _eigenvalues(matrices) if xp is np else xp.linalg.eigvals(matrices)
+    return _polish_poles(z, alpha, beta, delta, d, degree, spring)
+
+
+def _matrices(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Matrices:
+    monic = coefficients(*replace_invalid(alpha, beta, delta, d, degree)[0], degree)
+    return companion(monic[..., :-1] if spring else monic)
+
+
+def _eigenvalues(matrices: np.ndarray) -> np.ndarray:
+    """Eigenvalues by LAPACK; NaN for a matrix on which it gives up, which must not spoil the others."""
+    try:
+        return np.linalg.eigvals(matrices) + 0j
+    except np.linalg.LinAlgError:
+        if len(matrices) == 1:
+            return np.full(matrices.shape[:-1], complex(np.nan, np.nan))
+        return np.concatenate([_eigenvalues(half) for half in np.array_split(matrices, 2)])
+
+
+def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool) -> Roots:
+    """Short Newton steps on the factored polynomial, where |P| is lower at their end: a multiple pole stays put."""
+    xp = namespace(z, alpha)
+    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
+    form = product_form(*walls, degree, spring)
+
+    def step(z: RootsFirst) -> RootsFirst:
+        here = split(z)
+        value, slope = evaluate(here, form)
+        still = (slope.re == 0) & (slope.im == 0)
+        by = value.over(slope._replace(re=xp.where(still, 1.0, slope.re)))
+        taken = ~still & (_square(by) < 1e-6 * xp.maximum(_square(here), 1e-6))
+        return join(here.re - xp.where(taken, by.re, 0.0), here.im - xp.where(taken, by.im, 0.0))
+
+    first = xp.moveaxis(z, -1, 0)
+    last = repeat(_POLISHING_STEPS, step, first, xp)
+    better = _square(evaluate(split(last), form)[0]) < _square(evaluate(split(first), form)[0])
+    return with_zero(xp.moveaxis(xp.where(better, last, first), 0, -1), spring) + spoiled[..., None]
+
+
+def _square(z: Any) -> Array:
+    return z.re * z.re + z.im * z.im
+
+
+def radius_kernel(
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool = False, find: Any = pole_kernel
+) -> Reals:
+    """The spectral radius from the companion matrix; at least 1 without stiffness, for a pole is there."""
+    xp = namespace(alpha, beta, delta, d)
+    radius = xp.max(xp.abs(find(alpha, beta, delta, d, degree, spring)), axis=-1)
+    return xp.where(alpha == 0, xp.maximum(radius, 1.0), radius)
+
+
+def is_spring(beta: ArrayLike) -> bool:
+    """Whether all walls are known to be without virtual damping: one pole less to compute."""
+    return not is_traced(beta) and np.size(values := as_float64("beta", beta)) > 0 and not np.any(values)
+
+
+def check_degree(d: ArrayLike) -> None:
+    """Refuse to begin what would take minutes a point and gigabytes."""
+    if is_traced(d):
+        return
+    delays = as_float64("d", d)
+    longest = float(np.max(delays, where=delays <= LONGEST_DELAY, initial=0.0))
+    poles = find_degree(longest).poles
+    if poles > MOST_POLES:
+        raise InputError(
+            f"d: got {longest:g}; its {poles} poles would take about {8e-6 * poles**2:.0f} MB and "
+            f"{2e-9 * poles**3:.0f} s a point, and at most {MOST_POLES} are computed; zwidth.spectral_radius, "
+            "decay_rate and is_stable answer for every delay at once"
+        )
+
+
+def _check(values: tuple[ArrayLike, ...], delay_model: str = "held", method: str = "companion") -> None:
+    check_has_poles(delay_model)
+    check_choice("method", method, get_args(PoleMethod))
+    check_scalars(**dict(zip(NAMES, values, strict=True)))
+    check_degree(values[3])
+
+
+def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ...]) -> Any:
+    """What a kernel makes of the poles that its last argument finds."""
+    _check(values)
+    static = (is_spring(values[1]),)
+    if is_traced(*values):
+        return map_by_degree(_inside_jax(kernel), values, static=(*static, pole_kernel))
+    return map_by_degree(_by_companion, values, static=(*static, kernel), few=lambda degree: sys.maxsize)
+
+
+@cache
+def _inside_jax(kernel: Callable[..., Any]) -> Any:
+    """The kernel as one program: differentiated outside `jit`, every operation would be compiled alone."""
+    import jax
+
+    return jax.jit(kernel, static_argnums=(4, 5, 6))
+
+
+def _found_poles(*arguments: Any) -> Roots:
+    *wall, find = arguments
+    return find(*wall)
+
+
+def _by_companion(*arguments: Any) -> Any:
+    """A kernel for NumPy columns of one degree, with the eigenvalues from LAPACK on every processor."""
+    *columns, degree, spring, kernel = arguments
+    # Of large matrices the eigenvalues take so long that nothing else is worth a compilation.
+    few = columns[0].size <= few_poles(degree)
+    find = pole_kernel if few or degree.poles > _MOST_AT_ONE_TIME else _compiled_around_lapack
+
+    def block(*walls: np.ndarray) -> Any:
+        with np.errstate(all="ignore"):
+            return kernel(*walls, degree, spring, find)
+
+    return block(*columns) if few else map_blocks(block, columns, _block(_MATRICES // degree.poles**2))
+
+
+def _compiled_around_lapack(*arguments: Any) -> np.ndarray:
+    *walls, degree, spring = arguments
+    before, after = _compile_by_degree(_matrices, degree, spring), _compile_by_degree(_polish_poles, degree, spring)
+    return np.asarray(after(_eigenvalues(np.asarray(before(*walls))), *walls))
+
+
+@cache
+def _compile_by_degree(kernel: Callable[..., Any], degree: Degree, spring: bool) -> Any:
+    import jax
+
+    return jax.jit(lambda *arrays: kernel(*arrays, degree, spring))
+
+
+def _block(most: int) -> int:
+    """The largest power of two that is not above."""
+    return 1 << max(1, most).bit_length() - 1
+
+
+def companion_chunk(degree: Degree) -> int:
+    """How many companion matrices fit into about 32 MiB."""
+    return _block((1 << 22) // degree.poles**2)
+
+
+def poles(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: PoleMethod = "auto",
+    delay: str = "held",
+) -> Roots:
+    """Return the poles of the closed loop.
+
+    ``P(z) = 0``, see `zwidth.char_poly`; the loop is stable when every ``|z| < 1``. In no particular order.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not; concrete also inside `jit`. All four broadcast.
+        method: "companion" computes eigenvalues; "aberth" all poles at one time by the iteration of Aberth and Ehrlich,
+            and eigenvalues where it has no proof that each pole was found; "auto" takes that for many walls with up to
+            24 poles, and eigenvalues otherwise and inside `jit`.
+        delay: only "held" has poles.
+
+    Returns:
+        Complex array of the broadcast shape with one more axis at the end: 3 + d poles for whole d, 4 + n for
+        d = n + f. Where degrees are mixed, the missing poles are NaN, at the end. A point out of range is NaN.
+
+    Raises:
+        InputError: an argument is no real number or a scalar out of range, shapes do not broadcast, a name is unknown,
+            ``delay="fractional_power"``, there are more than 4,000 poles: what their memory and time would be; or
+            "aberth" is asked for inside a JAX transformation.
+        TracedDelayError: d is traced.
+
+    Numerics:
+        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k);
+        `enclose_poles` has bounds. Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is
+        0; then Newton steps on the factored polynomial. Aberth's iteration works on that polynomial too, O(degree^2) a
+        step. Few points need no JAX; many are compiled once for every degree.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17); Aberth 1973; Smith 1970.
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> np.abs(zwidth.poles(0.5, 0.5, 0.1, 1)).max() > 1
+        np.True_
+    """
+    values = (alpha, beta, delta, d)
+    _check(values, delay, method)
+    if is_traced(*values) and method == "aberth":
+        raise InputError(
+            "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"
+        )
+    if method == "companion" or is_traced(*values):
+        return _of_all_poles(_found_poles, values)
+    return _found(values, method).z
+
+
+def enclose_poles(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: PoleMethod = "auto",
+    delay: str = "held",
+) -> Poles:
+    """Return the poles of the closed loop with discs in which they lie.
+
+    Args:
+        alpha, beta, delta, d, method, delay: as for `zwidth.poles`.
+
+    Returns:
+        Poles: ``z`` as `zwidth.poles` has it; ``within``, of the same shape: where the status is OK, exactly one pole
+        of the loop lies in the disc of this radius round each, rounding errors included. ``status``: INVALID_INPUT
+        or OUT_OF_RANGE with NaN; NOT_CONVERGED where the discs are not disjoint (next to multiple poles): all poles
+        lie in their union, and ``within`` says no more. ``method``: the `Method` of each wall.
+
+    Raises:
+        InputError: as for `zwidth.poles`, and for traced values.
+
+    References:
+        Smith 1970, on discs that contain the zeros of a polynomial.
+
+    Example:
+        >>> from zwidth.loops.rigid.poles import enclose_poles
+        >>> bool(enclose_poles(0.5, 0.5, 0.1, 1).within.max() < 1e-12)
+        True
+    """
+    values = (alpha, beta, delta, d)
+    if is_traced(*values):
+        raise InputError("enclose_poles: got traced values; inside a JAX transformation use `zwidth.poles`")
+    _check(values, delay, method)
+    return _found(values, method)
+
+
+def _found(values: tuple[ArrayLike, ...], method: str) -> Poles:
+    static = (is_spring(values[1]), method)
+    return map_by_degree(_found_on_host, values, static=static, few=lambda degree: sys.maxsize)
+
+
+def _found_on_host(*arguments: Any) -> Poles:
+    """Poles of NumPy columns of one degree, by Aberth's iteration where it pays and by eigenvalues where it must."""
+    alpha, beta, delta, d, degree, spring, method = arguments
+    columns = [alpha, beta, delta, d]
+    of_input = wall_status(alpha, beta, delta, d)
+    few = of_input.size <= few_poles(degree)
+    if method == "companion" or (method == "auto" and (few or degree.poles > _MOST_AT_ONE_TIME)):
+        z, within, proved = _by_companion(*columns, degree, spring, _disc_kernel)
+        used = np.full_like(of_input, Method.COMPANION)
+    else:
+        if few:
+            z, within, proved = aberth_kernel(alpha, beta, delta, d, degree, spring)
+        else:
+            block = _block(_NUMBERS // degree.poles)
+            z, within, proved = map_blocks(_compile_by_degree(aberth_kernel, degree, spring), columns, block)
+        used = np.full_like(of_input, Method.ABERTH)
+        left = np.flatnonzero(~proved & (of_input == Status.OK))
+        if left.size:
+            remaining = [column[left] for column in columns]
+            z[left], within[left], proved[left] = _by_companion(*remaining, degree, spring, _disc_kernel)
+            used[left] = Method.COMPANION
+    status = np.where((of_input == Status.OK) & ~proved, np.int32(Status.NOT_CONVERGED), of_input)
+    return Poles(z, within, status, used)
+
+
+def _disc_kernel(
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any
+) -> tuple[Roots, Radii, Array]:
+    """Poles, their discs, and whether these are disjoint."""
+    z = find(alpha, beta, delta, d, degree, spring)
+    xp = namespace(z)
+    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
+    first = xp.moveaxis(z[..., :-1] if spring else z, -1, 0)
+    within, proved, _ = discs(first, product_form(*walls, degree, spring))
+    return z, with_zero(xp.moveaxis(within, 0, -1), spring) + spoiled[..., None], proved
+
+
+def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Reals:
+    """The spectral radius at every point, from the poles."""
+    return _of_all_poles(radius_kernel, (alpha, beta, delta, d))
+
+
+def unstable_poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Counts:
+    """How many poles lie on or outside the unit circle; -1 where the input is out of range."""
+    return _of_all_poles(_count_kernel, (alpha, beta, delta, d))
+
+
+def _count_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any) -> Counts:
+    xp = namespace(alpha, beta, delta, d)
+    z = find(alpha, beta, delta, d, degree, spring)
+    count = xp.sum(xp.abs(z) >= 1.0, axis=-1)
+    # Without stiffness a pole is at 1, whatever rounding makes of it.
+    count = xp.where(alpha == 0, xp.maximum(count, 1), count)
+    return xp.where(xp.isnan(z[..., 0].real), -1, count)
+
+
+def radius_and_bound(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> tuple[Array, ...]:
+    """The spectral radius from the poles, a bound of its error, no certificates, a status and the method."""
+    values = (alpha, beta, delta, d)
+    radius, error, status = _of_all_poles(_bound_kernel, values)
+    return radius, error, 0 * status > 0, status, 0 * status + np.int32(Method.COMPANION)
+
+
+def _bound_kernel(
+    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any
+) -> tuple[Reals, Reals, Array]:
+    """A pole lies within degree |P/P'| of any z. What rounding may do to P itself comes on top."""
+    xp = namespace(alpha, beta, delta, d)
+    poles = find(alpha, beta, delta, d, degree, spring)
+    size = xp.abs(poles)
+    largest = xp.argmax(xp.where(xp.isnan(size), 0.0, size), axis=-1)[..., None]
+    z = split(xp.take_along_axis(poles, largest, axis=-1)[..., 0][None])
+    radius = xp.where(alpha == 0, xp.maximum(xp.max(size, axis=-1), 1.0), xp.max(size, axis=-1))
+    form = product_form(alpha, beta, delta, d, degree, spring)
+    value, slope = evaluate(z, form)
+    off = xp.sqrt(_square(value)) + rounding(z, form, 2.2e-16)
+    error = (degree.poles * off / xp.sqrt(_square(slope)))[0] + 4e-16 * radius
+    status = wall_status(alpha, beta, delta, d)
+    bounded = xp.isfinite(error)
+    status = xp.where((status == Status.OK) & ~bounded, np.int32(Status.NOT_CONVERGED), status)
+    return radius, xp.where(xp.isnan(radius), np.nan, xp.where(bounded, error, np.inf)), status

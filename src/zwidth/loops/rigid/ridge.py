@@ -1,0 +1,154 @@
+"""The stiffest stable wall of the rigid loop, alpha_max(delta, d)."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from zwidth.arrays.batching import elementwise, pointwise
+from zwidth.arrays.xp import epsilon, namespace
+from zwidth.loops.domain import check_scalars, device_status, void
+from zwidth.loops.rigid.delay_classes import ANY, Kind, classify_delays
+from zwidth.loops.rigid.plant import Plant, split_delay, undelayed_plant
+from zwidth.loops.rigid.polynomial import check_delay_model
+from zwidth.loops.rigid.ridge_newton import Ridge, guess_start, is_undelayed
+from zwidth.loops.rigid.ridge_slopes import (
+    alpha_by_lag,
+    alpha_change,
+    differentiable_plant,
+    differentiable_ridge,
+    plant_slopes,
+)
+from zwidth.words.errors import check_choice
+from zwidth.words.status import Status
+from zwidth.words.types import Array, ArrayLike, DelayModel
+
+RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
+_METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
+# What fits the second-level cache, for the general route and for this one.
+_CHUNK, _BLOCK = 1 << 13, 1 << 15
+
+
+class RidgeKind(IntEnum):
+    """Which kind of optimum the ridge is."""
+
+    SMOOTH = 0
+    CORNER = 1
+    NO_DAMPING = 2  # of a scene where only B >= 0 counts: the end of the row B = 0
+
+
+class RidgePoint(NamedTuple):
+    """The stiffest stable wall of a device, or an array of them."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    kind: Array
+    status: Array
+
+
+def alpha_max(
+    delta: ArrayLike, d: ArrayLike, *, delay: DelayModel = "held", method: RidgeMethod = "auto"
+) -> RidgePoint:
+    """Find the stiffest stable virtual wall.
+
+    ``alpha_max(delta, d) = sup {alpha : some beta is stable}``; in SI units ``K_max = alpha_max m/T^2``.
+
+    Args:
+        delta: normalized physical damping b T/m, 0 to 1e12.
+        d: delay in periods, 0 to 1e5, whole or not. Both broadcast.
+        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
+        method: "newton" solves the stationarity of the paper's loop in closed form, "kkt" the general conditions with
+            optimistix; "auto" is "newton".
+
+    Returns:
+        RidgePoint with arrays of the broadcast shape: ``alpha``; ``beta``, the damping that goes with it; ``omega``,
+        the frequency in radians a period at which the loop then oscillates; ``kind``, 0 smooth or 1 corner (a double
+        pole at z = -1); ``status``, see `zwidth.Status`. NaN where the status is not 0.
+
+    Numerics:
+        alpha to about 1e-15 relative: at a maximum an error of omega enters squared. Traceable in delta and d, also
+        twice. alpha's first derivatives are continuous, also where the corner takes over (d = 0:
+        delta = 3.65936162742...) and at whole d > 0; its second ones and the first ones of beta and omega jump there,
+        and at a whole d are those from the right. A fractional power has a corner at d = 0 only, with -inf in d.
+
+        Float64 when called directly. Inside a transformation, `jax.grad` included, JAX's own precision holds: float32
+        unless ``jax.config.update("jax_enable_x64", True)`` was called, which a `zwidth.PrecisionWarning` says once.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII, eqs. (24), (25).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.alpha_max(0.0, 1).alpha:.4f}")
+        0.1445
+    """
+    check_delay_model(delay)
+    check_choice("method", method, _METHODS)
+    check_scalars(delta=delta, d=d)
+    if method == "kkt":
+        # The general route iterates over long formulas; its solvers take a second to import.
+        from zwidth.loops.rigid.ridge_kkt import kkt_kernel
+
+        return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
+    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)
+
+
+def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgePoint:
+    """`alpha_max`, elementwise."""
+    return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
+
+
+class RidgeSlopes(NamedTuple):
+    """The stiffest wall with its derivatives."""
+
+    point: RidgePoint
+    by_delta: Array
+    by_d: Array
+
+
+def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgeSlopes:
+    """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
+    by_delta, by_f = plant_slopes(delta, f)
+    undelayed = is_undelayed(delay_model, kind)
+    fractional = delay_model == "fractional_power"
+    by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
+    by_delta = alpha_change(ridge.s, plant, lag, by_delta, undelayed)
+    by_delta, by_d = void(converged(ridge), by_delta, by_d)
+    return RidgeSlopes(_point(ridge, status), by_delta, by_d)
+
+
+def _solve_ridge(
+    delta: Array, d: Array, delay_model: str, kind: Kind
+) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
+    """The ridge, its status, the plant behind a lag, and the plant's damping and fraction."""
+    status = device_status(delta, d)
+    delta, d = void(status == Status.OK, delta, d)
+    whole, f = split_delay(d)
+    if not kind.fractional:
+        # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
+        delay_model = "held"
+    if delay_model == "fractional_power":
+        whole, f = d, 0.0 * d
+    start = guess_start(delta, d, f, kind)
+    plant = differentiable_plant(delta, f) if kind.fractional and delay_model == "held" else undelayed_plant(delta)
+    ridge = differentiable_ridge(plant, whole, start, delay_model, kind)
+    return ridge, status, plant, whole, (delta, f)
+
+
+def converged(ridge: Ridge) -> Array:
+    """Whether the solver has arrived."""
+    # Quadratic convergence: after a step of sqrt(eps) nothing but rounding is left.
+    return namespace(ridge.s).abs(ridge.last) <= 2.0 * epsilon(ridge.s) ** 0.5 * ridge.s
+
+
+def _point(ridge: Ridge, status: Array) -> RidgePoint:
+    xp = namespace(ridge.alpha)
+    arrived = converged(ridge)
+    status = xp.where((status == Status.OK) & ~arrived, int(Status.NOT_CONVERGED), status)
+    kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
+    alpha, beta, omega = void(arrived, ridge.alpha, ridge.beta, ridge.omega)
+    return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))

@@ -1,0 +1,303 @@
+"""The ridge of the rigid loop by Newton's method on its closed-form optimality condition.
+
+The curve z = e^(j omega) and its slope are written in ``y = s^2``, ``s = sin(omega/2)``. There the maximum stays a
+regular one at omega = pi, where every derivative in omega vanishes by symmetry, and the corner is the end point s = 1.
+With D = lag + 1, lag = n (held) or d (fractional power), q = 1 - y, M = N(z)/z and a prime for d/dy:
+
+    (z - c) conj M = g1 + j g2 sin omega     quadratic and linear in y
+    |M|^2 = rho = m^2 + k^2 4 y q            m = Re M = N(1) - 2 b y, b = a2 + a0, k = a2 - a0
+    tau = sin(D omega)/sin omega             kappa = cos(D omega)
+    Q = tau g1 + kappa g2                    B = kappa g1 - 4 y q tau g2
+    alpha = 4 y Q/rho                        beta = -B/rho - alpha/2
+    T = rho (Q + y Q') - y Q rho' = 0        T = rho^2 alpha'/4,  T' = rho (2 Q' + y Q'') - y Q rho''
+
+tau is the Chebyshev polynomial U_(D-1) of cos omega for whole D, kappa is T_D, hence
+
+    kappa' = -2 D tau     tau' = (D kappa - tau cos omega)/(2 y q)
+    tau'' = -((3/2) cos omega tau' + (D^2 - 1) tau)/(y q)          and for D = 1: tau = 1, kappa = 1 - 2 y
+
+The lobe has one maximum (docs/theory/one-lobe.md, Theorem 3b), so nothing is searched. The number of steps is fixed:
+no point waits for another.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.xla import ARCSINE, COSINE, SINE, store_once
+from zwidth.arrays.xp import epsilon, frozen, horner, namespace, repeat
+from zwidth.loops.rigid.delay_classes import ANY, Kind
+from zwidth.loops.rigid.plant import Plant
+from zwidth.words.types import Array
+
+
+class Curve(NamedTuple):
+    """Coefficients in y of the curve of one device: all that the solver needs beside the exponent D."""
+
+    g1: tuple[Array, Array, Array]
+    g2: tuple[Array, Array]
+    at_one: Array  # N(1)
+    b: Array
+    k: Array
+    gap: Array  # N(-1)
+
+
+def expand_curve(plant: Plant) -> Curve:
+    """The curve of one plant; every coefficient is free of cancellation where the ridge can be."""
+    c, em, a2, a1, a0, gap = plant
+    b = a2 + a0
+    at_one = b + a1
+    g1 = (em * at_one, -2.0 * (4.0 * a0 - gap + em * b), 8.0 * a0)
+    g2 = (a1 + a2 * c + a0 * (1.0 + em), -4.0 * a0)
+    return Curve(g1, g2, at_one, b, a2 - a0, gap)
+
+
+class Wave(NamedTuple):
+    """What depends on the frequency and the exponent alone."""
+
+    y: Array
+    q: Array
+    half: Array  # omega/2, of no meaning at the corner
+    per_sin: Array  # 1/sin omega, of no meaning at the corner
+    tau: Array
+    kappa: Array
+    tau1: Array  # d tau/dy
+    tau2: Array
+
+
+def wave(s: Array, lag: Array, undelayed: bool) -> Wave:
+    """The oscillating factors at one s, finite with their derivatives up to the corner. ``undelayed``: all D are 1."""
+    xp = namespace(s, lag)
+    y, q = s * s, (1.0 - s) * (1.0 + s)
+    cos_w = q - y
+    # At the corner D = 1, and what the root enters is 0.
+    root = xp.sqrt(xp.where(s < 1.0, q, 1.0))
+    low = y < 0.5
+    small = xp.where(low, s, root)
+    half = small * horner(4.0 * small * small - 1.0, ARCSINE)
+    half = xp.where(low, half, 0.5 * np.pi - half)
+    per_sin = 0.5 / (s * root)
+    if undelayed:
+        return Wave(y, q, half, per_sin, 1.0, cos_w, 0.0, 0.0)
+    # D omega as omega + lag omega: nothing cancels near pi, and D = 1 keeps its derivatives in D.
+    D, x = lag + 1.0, lag * half
+    square = x * x
+    sine, cosine = x * horner(square, SINE), horner(square, COSINE)
+    ratio, cosine = 2.0 * sine * cosine * per_sin, 1.0 - 2.0 * sine * sine
+    sin2 = 4.0 * y * q
+    tau, kappa = cosine + cos_w * ratio, cos_w * cosine - sin2 * ratio
+    # For D = 1 kappa is cos omega and the next two are exactly 0.
+    square = 4.0 * per_sin * per_sin
+    # D kappa - tau cos omega
+    tau1 = 0.5 * (lag * cos_w * cosine - ratio * (D * sin2 + cos_w * cos_w)) * square
+    return Wave(y, q, half, per_sin, tau, kappa, tau1, -(1.5 * cos_w * tau1 + lag * (D + 1.0) * tau) * square)
+
+
+class Sides(NamedTuple):
+    """What wall and stationarity share."""
+
+    g1: Array
+    g2: Array
+    m: Array
+    rho: Array
+
+
+def sides(at: Wave, curve: Curve) -> Sides:
+    """(z - c) conj M and M at one s."""
+    xp = namespace(at.y, curve.b)
+    g1 = curve.g1[0] + at.y * (curve.g1[1] + at.y * curve.g1[2])
+    g2 = curve.g2[0] + at.y * curve.g2[1]
+    # Free of cancellation at both ends.
+    m = xp.where(at.y < 0.5, curve.at_one - 2.0 * curve.b * at.y, 2.0 * curve.b * at.q - curve.gap)
+    return Sides(g1, g2, m, m * m + curve.k * curve.k * (4.0 * at.y * at.q))
+
+
+def wall(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
+    """(alpha, beta) of the curve at one s."""
+    at = wave(s, lag, undelayed)
+    g1, g2, _, rho = sides(at, curve)
+    per_rho = 1.0 / rho
+    alpha = 4.0 * at.y * (at.tau * g1 + at.kappa * g2) * per_rho
+    return alpha, -(at.kappa * g1 - 4.0 * at.y * at.q * at.tau * g2) * per_rho - 0.5 * alpha
+
+
+def stationarity(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
+    """T and dT/ds, see the head of this file."""
+    at = wave(s, lag, undelayed)
+    y, q, tau, kappa, tau1, tau2 = at.y, at.q, at.tau, at.kappa, at.tau1, at.tau2
+    g1, g2, m, rho = sides(at, curve)
+    cos_w, k2, twice = q - y, curve.k * curve.k, 2.0 * (lag + 1.0)
+    dg1, dg2 = curve.g1[1] + 2.0 * y * curve.g1[2], curve.g2[1]
+    drho, ddrho = 4.0 * (k2 * cos_w - curve.b * m), 8.0 * (curve.b * curve.b - k2)
+    value = tau * g1 + kappa * g2
+    slope = tau1 * g1 + tau * (dg1 - twice * g2) + kappa * dg2
+    bend = tau2 * g1 + tau1 * (2.0 * dg1 - twice * g2) + 2.0 * tau * (curve.g1[2] - twice * dg2)
+    weighted = y * value
+    first = rho * (value + y * slope) - weighted * drho
+    return first, 2.0 * s * (rho * (2.0 * slope + y * bend) - weighted * ddrho)
+
+
+class Corner(NamedTuple):
+    """The wall with a double pole at z = -1, P(-1) = P'(-1) = 0."""
+
+    alpha: Array
+    beta: Array
+    reached: Array  # whether the lobe ends there
+    is_ridge: Array  # and whether it is the stiffest stable wall
+
+
+def corner(curve: Curve, lag: Array) -> Corner:
+    """The corner: where the lobe reaches y = 1 with alpha > 0, the ridge if it is still rising there.
+
+    The curve gets there on the first lobe only if D = 1 and if arg M grows up to pi: N(-1) > 0, k > 0.
+    """
+    xp = namespace(curve.b, lag)
+    g1 = sum(curve.g1[1:], curve.g1[0])
+    g2 = curve.g2[0] + curve.g2[1]
+    value, slope = g1 - g2, curve.g1[1] + 2.0 * curve.g1[2] - 2.0 * g2 - curve.g2[1]
+    rho, drho = curve.gap**2, 4.0 * (curve.b * curve.gap - curve.k**2)
+    reached = (lag <= 0.0) & (curve.gap > 0.0) & (curve.k > 0.0) & (value > 0.0)
+    is_ridge = reached & (rho * (value + slope) - value * drho >= 0.0)
+    # Elsewhere nothing may overflow: its derivative would be NaN and spoil what is chosen instead.
+    rho = xp.where(reached, rho, 1.0)
+    alpha = 4.0 * value / rho
+    return Corner(alpha, g1 / rho - 0.5 * alpha, reached, is_ridge)
+
+
+class Start(NamedTuple):
+    """Where the solver begins."""
+
+    scale: Array  # u = 1/(d + 1): s lies between 0.5 u and 1.3 u
+    s: Array
+    power: Array  # Newton's method is applied to T s^power
+    corner: Array  # whether the ridge is a corner, where (delta, d) alone says so: 1 yes, -1 no, 0 unknown
+
+
+# The last smooth delta at d = 0: the corner takes over at 3.6593616274217835070, 4e-18 above this float64. Judged by
+# rounded coefficients of the curve, its next neighbors would fall on either side.
+_TAKE_OVER = 3.6593616274217835
+
+# s/u as a polynomial in t = r/(r + 3), r = delta (d + 1), and u, fitted over all devices: within 0.8 % below one
+# period, 1.1 % beyond. Two steps then leave 5e-9, the third nothing but rounding.
+_SHORT = (
+    (0.3748, 0.6572, -0.7317, -0.01088, 0.2558),
+    (-0.1878, 3.83, -4.872, 1.835),
+    (1.511, -6.996, 5.233),
+    (0.2643, 1.186),
+    (-0.4501,),
+)
+_LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
+# Below one period T bends more; so much that the power matters.
+_POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
+_HELD_STEPS = 3
+_FRACTIONAL_STEPS = 12
+
+
+def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
+    return horner(t, [horner(u, list(row)) for row in rows])
+
+
+def guess_start(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
+    """Where to begin for one (delta, d); ``strength`` 1 stands for delta -> infinity."""
+    xp = namespace(delta, d)
+    delta, d, f = frozen((delta, d, fraction), xp)
+    r = delta * (d + 1.0)
+    u, t = 1.0 / (d + 1.0), r / (r + 3.0) if strength is None else strength
+    s = power = corner = zero = 0.0 * u
+    if kind.long:
+        s = _polynomial(t, u, _LONG) + 0.4702 * f * (1.0 - f) * u * u * t
+    if kind.short:
+        short, low, bent = d < 1.0, _polynomial(t, u, _SHORT), _polynomial(t, u, _POWER)
+        s, power = (xp.where(short, low, s), xp.where(short, bent, zero)) if kind.long else (low, bent)
+        corner = xp.where(d == 0.0, xp.where(delta > _TAKE_OVER, 1.0, -1.0), zero)
+    return Start(u, s * u, power, corner)
+
+
+class Ridge(NamedTuple):
+    """The ridge of one plant: s is exactly 1 at a corner, ``last`` the last step taken in s."""
+
+    alpha: Array
+    beta: Array
+    omega: Array
+    s: Array
+    last: Array
+
+
+def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tuple[Array, Array]:
+    """Newton's method clipped to a bracket that holds every ridge; the last step comes back too."""
+    xp = namespace(curve.b, lag)
+    lower, upper = 0.5 * start.scale, xp.minimum(1.3 * start.scale, 1.0)
+    s = xp.minimum(xp.maximum(start.s, lower), upper)
+
+    def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
+        s, _ = state
+        first, second = stationarity(s, curve, lag, undelayed)
+        new = s - first * s / (second * s + start.power * first)
+        return xp.minimum(xp.maximum(new, lower), upper), s
+
+    s, before = repeat(_HELD_STEPS, step, (s, s), xp)
+    return s, s - before
+
+
+def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Array]:
+    """The same with a shrinking bracket.
+
+    For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2): there the step is
+    Newton's for ``T q^(3/2)`` as a function of ``q^(5/2)``.
+    """
+    xp = namespace(curve.b, lag)
+    d = lag
+    # d = 0 may end at pi itself, where 1/sin omega is infinite.
+    rest = xp.maximum(0.3 * xp.minimum(d, 0.05) ** (2.0 / 3.0), epsilon(d))
+    lower, upper = 0.5 * start.scale, xp.minimum(xp.sqrt(1.0 - rest), 1.05 * start.scale)
+
+    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        s, lower, upper = state
+        value, slope = stationarity(s, curve, lag)
+        rising = value > 0.0
+        lower, upper = xp.where(rising, s, lower), xp.where(rising, upper, s)
+        q = (1.0 - s) * (1.0 + s)
+        near = (q < 0.5) & (d > 0.0)
+        # dq = -2 s ds
+        scaled = 3.0 * s * value - q * slope
+        ratio = 1.0 - 5.0 * s * value / scaled
+        usable = xp.where(near, (scaled > 0.0) & (ratio > 0.0), slope < 0.0)
+        power = xp.where(near & usable, ratio, 1.0) ** 0.4
+        candidate = xp.where(near, xp.sqrt(1.0 - q * power), s - value / slope)
+        candidate = xp.minimum(xp.maximum(candidate, lower), upper)
+        # Off the bracket, towards pi, q is bisected geometrically: it may be small.
+        inner = xp.sqrt(1.0 - xp.sqrt((1.0 - lower * lower) * (1.0 - upper * upper)))
+        return xp.where(usable, candidate, xp.where(rising, inner, 0.5 * (lower + upper))), lower, upper
+
+    first = xp.minimum(xp.maximum(start.s, lower), upper)
+    state = repeat(_FRACTIONAL_STEPS - 1, step, (first, lower, upper), xp)
+    s = step(state)[0]
+    return s, s - state[0]
+
+
+def is_undelayed(delay_model: str, kind: Kind) -> bool:
+    """Whether every D is 1."""
+    return delay_model == "held" and not kind.long
+
+
+def solve(plant: Plant, lag: Array, start: Start, delay_model: str, kind: Kind) -> Ridge:
+    """The ridge of one plant behind ``lag`` periods (whole in the held model)."""
+    xp = namespace(plant.a2, lag)
+    undelayed = is_undelayed(delay_model, kind)
+    curve = expand_curve(store_once(plant, start.scale))
+    if delay_model == "fractional_power":
+        s, last = _solve_fractional(curve, lag, start)
+    else:
+        s, last = _solve_held(curve, lag, start, undelayed)
+    # Just before the take-over a smooth optimum may round to the corner's place.
+    s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))
+    alpha, beta = wall(s, curve, lag, undelayed)
+    ridge = Ridge(alpha, beta, 2.0 * wave(s, lag, True).half, s, last)
+    if not kind.short:
+        return ridge
+    at_end = corner(curve, lag)
+    taken = xp.where(start.corner == 0.0, at_end.is_ridge, start.corner > 0.0)
+    there = Ridge(at_end.alpha, at_end.beta, np.pi, 1.0, 0.0)
+    return Ridge(*(xp.where(taken, end, value) for end, value in zip(there, ridge, strict=True)))

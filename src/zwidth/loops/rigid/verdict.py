@@ -1,0 +1,174 @@
+"""Stable or not, for whole arrays of walls."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+
+from zwidth.arrays.batching import BLOCK, FEW, compile_strips, elementwise, is_number, map_blocks, to_caller
+from zwidth.arrays.xp import is_traced
+from zwidth.loops.domain import check_scalars, wall_status
+from zwidth.loops.rigid.boundary_map import boundary_map
+from zwidth.loops.rigid.crossover import stable_kernel
+from zwidth.loops.rigid.degrees import NAMES
+from zwidth.loops.rigid.delay_classes import classify_delays
+from zwidth.loops.rigid.folding import Points, lay_out
+from zwidth.loops.rigid.poles import unstable_poles
+from zwidth.loops.rigid.polynomial import check_has_poles
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.status import Method, Status
+from zwidth.words.types import Array, ArrayLike, DelayModel
+
+StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
+STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
+
+
+class Stability(NamedTuple):
+    """Labels with their status and the `Method` that decided each point, all of the broadcast shape."""
+
+    stable: Array
+    status: Array
+    method: Array
+
+
+def is_stable(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: StabilityMethod = "auto",
+    delay: DelayModel = "held",
+) -> Array:
+    """Tell which walls are stable: every pole strictly inside the unit circle.
+
+    ``P(z) = 0`` only for ``|z| < 1``, see `zwidth.char_poly`.
+
+    Args:
+        alpha: normalized stiffness K T^2/m.
+        beta: normalized virtual damping B T/m.
+        delta: normalized physical damping b T/m, >= 0.
+        d: delay in periods, >= 0, whole or not, mixed in one array. All four broadcast; axes along which an argument
+            does not vary cost nothing: for a map pass alpha of shape (1, N) and beta of shape (M, 1).
+        method: "crossover" asks for the phase where the loop gain is one, in closed form; "companion" computes all
+            poles; "certified" never guesses (`zwidth.decide_stability` names the points it leaves open). "auto" is
+            "crossover", which on a map of one device compares alpha with the end of its row, the same closed form.
+        delay: only "held" has poles.
+
+    Returns:
+        Boolean array of the broadcast shape, maybe read-only. False for a point out of range.
+
+    Raises:
+        InputError: an argument is no real number, a scalar is out of range, shapes do not broadcast, or a name is
+            unknown.
+        TracedDelayError: d is traced with method "companion".
+
+    Numerics:
+        At a cost that does not depend on d. Float64 when called directly, the ambient precision inside `jit`. The label
+        of the closed form is right where alpha is more than some rounding errors away from the boundary; there is no
+        faster, rougher method. What a point costs: benchmarks/results/bench.md.
+
+    References:
+        docs/theory/one-crossover.md; Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import numpy as np, zwidth
+        >>> zwidth.is_stable(np.array([0.1, 0.6, 0.8]), 0.4, 0.1, 0)
+        array([ True,  True, False])
+    """
+    values = (alpha, beta, delta, d)
+    _check(method, delay, values)
+    if is_traced(*values):
+        return _traced(values, method)
+    if method in ("auto", "crossover") and all(map(is_number, values)):
+        return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
+    laid = lay_out(values)
+    return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
+
+
+def decide_stability(
+    alpha: ArrayLike,
+    beta: ArrayLike,
+    delta: ArrayLike,
+    d: ArrayLike,
+    *,
+    method: StabilityMethod = "auto",
+    delay: DelayModel = "held",
+) -> Stability:
+    """Tell which walls are stable, and for each point how that was decided.
+
+    Args:
+        alpha, beta, delta, d, method, delay: as for `zwidth.is_stable`.
+
+    Returns:
+        Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
+        is not computed, and with method "certified" UNDECIDED or ON_BOUNDARY where no label is given (``stable`` is
+        False there); ``method``, the `Method` that decided. Arrays may be read-only.
+
+    Raises:
+        InputError: as for `zwidth.is_stable`, and for traced values.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (17), section V.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.decide_stability([0.1, float("nan")], 0.4, 0.1, 1).status
+        array([0, 1], dtype=int32)
+    """
+    values = (alpha, beta, delta, d)
+    _check(method, delay, values)
+    if is_traced(*values):
+        raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
+    laid = lay_out(values)
+    stable, used, status = _decide(laid.points, method)
+    ranged = wall_status(*laid.points)
+    status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
+    codes = (np.broadcast_to(status, laid.points.shape).astype(np.int32), np.asarray(used, np.int32))
+    return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
+
+
+# Deprecated: the name goes with version 0.2.
+stability_of = decide_stability
+
+
+def _check(method: str, delay_model: str, values: tuple[ArrayLike, ...]) -> None:
+    check_has_poles(delay_model)
+    check_choice("method", method, STABILITY_METHODS)
+    check_scalars(**dict(zip(NAMES, values, strict=True)))
+
+
+def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
+    if method == "certified":
+        raise InputError(
+            "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
+            "'auto', 'crossover' or 'companion'"
+        )
+    if method == "companion":
+        return unstable_poles(*values) == 0
+    d = values[3]
+    return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
+
+
+def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
+    """Labels, what decided them, and statuses where they are not all OK."""
+    if method == "companion":
+        return np.asarray(unstable_poles(*points)) == 0, Method.COMPANION, None
+    if method == "certified":
+        # Loaded here: it needs an extra for its last resort.
+        from zwidth.loops.rigid.certified import certified_stable
+
+        proved = certified_stable(*points)
+        return proved.stable, Method.CERTIFIED, proved.status
+    return _by_crossover(points), Method.CROSSOVER, None
+
+
+def _by_crossover(points: Points) -> np.ndarray:
+    if points.is_dense:
+        return boundary_map(points)
+    shape, kind = points.shape, classify_delays(points.d)
+    if points.size <= FEW:
+        with np.errstate(all="ignore"):
+            return np.broadcast_to(stable_kernel(*points, kind), shape)
+    return map_blocks(compile_strips(stable_kernel, (kind,)), points.columns(), BLOCK).reshape(shape)

@@ -1,1 +1,0 @@
-"""Numerics that know nothing of walls: special functions, sums of floats, roots and minima."""

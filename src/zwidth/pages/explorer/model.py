@@ -1,0 +1,235 @@
+"""What the page shows of a scene, as plain arrays; nothing here knows of a browser.
+
+K and B stand for alpha and beta where the scene is normalized (m = 1, T = 1).
+"""
+
+from __future__ import annotations
+
+from math import ceil, floor, isfinite, log10
+from typing import Any
+
+import numpy as np
+
+from zwidth.loops.linear.crossing_lines import end_lines
+from zwidth.loops.linear.passivity import has_condition
+from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.rigid.poles import companion
+from zwidth.loops.rigid.region import stable_region
+from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.scenes.assessment import Assessment, SceneAssessment
+from zwidth.scenes.scene import Scene
+from zwidth.simulation.result import MotionKind
+from zwidth.words.formatting import plain
+
+Curve = tuple[np.ndarray, np.ndarray]
+Range = tuple[float, float]
+
+# Points of the curve and of a line while a slider moves.
+_QUICK_CURVE, _QUICK_LINE = 513, 129
+# How many coefficients of the poles leave time to ask every so many place at first.
+_STRIDES = ((9, 1), (15, 2), (26, 4), (42, 8))
+# Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
+_ON_EDGE = 1e-5
+LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
+# So few that no compiler is asked for (`arrays.batching.FEW`).
+_FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (72, 56), (48, 40), 12, (36, 30)
+_DIRECTIONS, _FEW_DIRECTIONS = 181, 41
+_RIDGE_POINTS, _FEW_RIDGE_POINTS, _MOST_DAMPING = 61, 9, 4.0
+_SHORTEST, _LONGEST = 30, 3000
+_IMPACT, _APPROACH = 0.1, 5.0
+
+
+def outlines(scene: Scene) -> list[Curve]:
+    """The closed outlines of the stable set, holes and islands among them, as `zwidth` finds them."""
+    if scene.is_rigid:
+        region, units = stable_region(float(scene.delta), float(scene.d)), scene.units
+        return [(region.alpha * units.stiffness, region.beta * units.virtual_damping)]
+    return [(piece.stiffness, piece.virtual_damping) for piece in scene.stable_region()]
+
+
+def quick_edge(scene: Scene) -> Curve:
+    """Points of the stable set's edge, NaN between its parts, at a cost that follows a drag.
+
+    On the boundary curve and on the lines of real poles, those at which no pole lies outside of the unit circle. A
+    part through which the curve runs in a few of its places, as behind a long window, comes with the `outlines` only.
+    """
+    if scene.is_rigid:
+        return outlines(scene)[0]
+    # Closer together at low frequencies, where loops with a hand have their resonance.
+    w = np.pi * ((np.arange(_QUICK_CURVE) + 0.5) / _QUICK_CURVE) ** 2
+    parts = [_on_edge(scene, *scene.boundary(w / scene.timing.period))]
+    known = parts[0][1][np.isfinite(parts[0][1])]
+    low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
+    damping = np.linspace(low - 0.5 * (high - low), high + 0.5 * (high - low), _QUICK_LINE)
+    units = scene.units
+    for line in end_lines(scene.loop):
+        stiffness = (line.q - damping / units.virtual_damping * line.f) * units.stiffness
+        parts.append(_on_edge(scene, stiffness, damping))
+    x, y = (np.concatenate([np.append(part[k], np.nan) for part in parts]) for k in (0, 1))
+    return x, y
+
+
+def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
+    """Points of a curve that border the stable set, the others NaN: some are asked, then those between two answers."""
+    D, N1, N2 = affine_polynomial(scene.loop)
+    alpha, beta = scene.normalize_walls(stiffness, damping)
+    finite = np.isfinite(alpha) & np.isfinite(beta)
+    edge = np.zeros(alpha.size, bool)
+
+    def ask(places: np.ndarray) -> None:
+        places = places[finite[places]]
+        polynomials = D + alpha[places, None] * N1 + beta[places, None] * N2
+        poles = np.linalg.eigvals(companion(polynomials / D[0]))
+        edge[places] = np.abs(poles).max(-1) <= 1.0 + _ON_EDGE
+
+    stride = next((stride for most, stride in _STRIDES if D.size <= most), 16)
+    places = np.arange(0, alpha.size, stride)
+    ask(places)
+    ask(np.arange(places[-1] + 1, alpha.size))
+    while stride > 1:
+        between = places[:-1] + stride // 2
+        same = edge[places[:-1]] == edge[places[1:]]
+        edge[between[same]] = edge[places[:-1]][same]
+        ask(between[~same])
+        stride //= 2
+        places = np.arange(0, alpha.size, stride)
+    edge &= finite
+    return np.where(edge, stiffness, np.nan), np.where(edge, damping, np.nan)
+
+
+def judge_quickly(scene: Scene) -> tuple[bool, np.ndarray]:
+    """Whether the scene's wall is stable, and its poles."""
+    wall = scene.wall.stiffness, scene.wall.virtual_damping
+    return bool(scene.decide_stability(*wall, method="companion").stable), scene.poles(*wall)
+
+
+def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
+    """Round axis ranges that hold a curve, and the wall where it is not far beyond it."""
+    ranges = []
+    for axis in (0, 1):
+        values = np.append(curve[axis][np.isfinite(curve[axis])], 0.0)
+        low, high, place = float(values.min()), float(values.max()), wall[axis]
+        size = (high - low) or abs(place) or 1.0
+        step = 10.0 ** floor(log10(size)) / 4.0
+        low, high = step * floor(low / step - 0.2), step * ceil(high / step + 0.2)
+        if low - 2.0 * size <= place <= high + 2.0 * size:
+            low, high = min(low, step * floor(place / step)), max(high, step * ceil(place / step))
+        ranges.append((low, high))
+    return ranges[0], ranges[1]
+
+
+def nyquist_curve(scene: Scene) -> np.ndarray:
+    """The open loop L up to half the sampling rate, complex."""
+    top = 0.5 / scene.timing.period
+    return scene.frequency_response(
+        scene.wall.stiffness, scene.wall.virtual_damping, np.geomspace(1e-4, 1.0, 600) * top
+    )
+
+
+def crossover(scene: Scene, verdict: Assessment | SceneAssessment) -> complex:
+    """The open loop where its magnitude is 1, the frequency of which the verdict has; NaN without one."""
+    hertz = verdict.gain_crossover
+    wall = scene.wall.stiffness, scene.wall.virtual_damping
+    return complex(scene.frequency_response(*wall, hertz)) if isfinite(hertz) else complex("nan+nanj")
+
+
+def length_of(scene: Scene, verdict: Assessment | SceneAssessment) -> int:
+    """How many periods show the wall's slowest motion: six of its time constants, if that is neither few nor many."""
+    periods = 6.0 * abs(verdict.time_constant) / scene.timing.period
+    return int(min(max(periods, _SHORTEST), _LONGEST)) if isfinite(periods) else 10 * _SHORTEST
+
+
+def step_motion(scene: Scene, periods: int) -> Curve:
+    """Time and position at the samples under a force of 1 that sets in at 0, with the wall on both sides."""
+    loop = scene.state_space(scene.wall.stiffness, scene.wall.virtual_damping)
+    state, position = np.zeros(loop.A.shape[0]), np.empty(periods + 1)
+    with np.errstate(all="ignore"):
+        for k in range(periods + 1):
+            position[k] = (loop.C @ state)[0] + loop.D[0, 0]
+            state = loop.A @ state + loop.B[:, 0]
+    return np.arange(periods + 1) * scene.timing.period, position
+
+
+def passive_set(scene: Scene) -> Curve | None:
+    """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
+    if not has_condition(scene.device):
+        return None
+    damping, units = float(scene.device.damping), scene.units
+    if damping == 0:
+        return np.empty(0), np.empty(0)
+    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS if scene.is_rigid else _FEW_DIRECTIONS)
+    # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
+    along = np.maximum(np.cos(turn), 0.0) * units.stiffness, np.sin(turn) * units.virtual_damping
+    share = damping / (damping - np.asarray(scene.passivity_margin(*along)))
+    return along[0] * share, along[1] * share
+
+
+def radius_map(scene: Scene, across: Range, up: Range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Stiffness and damping over a frame, and the spectral radius of the walls there."""
+    small = scene.poles(1.0, 1.0).size <= _LARGE_LOOP
+    grid = _FINE_GRID if scene.is_rigid else _GRID if small else _COARSE_GRID
+    stiffness, damping = np.linspace(*across, grid[0]), np.linspace(*up, grid[1])
+    return stiffness, damping, np.asarray(scene.spectral_radius(stiffness, damping[:, None]))
+
+
+def ridge_path(scene: Scene) -> Curve:
+    """The stiffest stable wall as the device's damping grows from none to four times what it is."""
+    units = scene.units
+    own = float(scene.damping) if scene.is_rigid else float(scene.device.damping)
+    most = _MOST_DAMPING * (own or 0.25 * units.virtual_damping)
+    if scene.is_rigid:
+        path = alpha_max(np.linspace(0.0, most, _RIDGE_POINTS) / units.virtual_damping, float(scene.d))
+        return np.asarray(path.alpha) * units.stiffness, np.asarray(path.beta) * units.virtual_damping
+    dampings = np.linspace(0.0, most, _FEW_RIDGE_POINTS)
+    walls = [scene.replace(damping=float(damping)).max_stiffness() for damping in dampings]
+    return np.array([float(w.stiffness) for w in walls]), np.array([float(w.virtual_damping) for w in walls])
+
+
+def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:
+    """Time, position and wall force of the device that hits the wall, and what comes of it in words."""
+    # From five periods before the wall at a tenth of a meter a second; the normalized device at as many units.
+    start = -_APPROACH * _IMPACT * scene.timing.period
+    hit = scene.simulate(start_position=start, start_velocity=_IMPACT, contact="unilateral", periods=periods)
+    kind = MotionKind(int(hit.outcome))
+    end = "" if kind in (MotionKind.UNCLEAR, MotionKind.INVALID) else f", {kind.name.lower()} at the end"
+    words = f"(leaves it {int(hit.bounces)} times{end})"
+    return hit.time, hit.position, hit.wall_force, words
+
+
+def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
+    """The lines on which the spectral radius is one of the `LEVELS`, and where to write which."""
+    from contourpy import contour_generator
+
+    x, y, values = radius_map(scene, across, up)
+    generator = contour_generator(x, y, np.ma.masked_invalid(values))
+    found: dict[str, list[Any]] = {"xs": [], "ys": [], "x": [], "y": [], "text": []}
+    for level in LEVELS:
+        lines: Any = generator.lines(level)
+        for line in sorted(lines, key=len, reverse=True):
+            # Below the ridge, where no other line runs; of several pieces the longest one has the name.
+            named = line[np.argmax(line[:, 0] / np.ptp(across) - 0.7 * line[:, 1] / np.ptp(up))]
+            text = f"{level:g}" if line is max(lines, key=len) else ""
+            for name, value in zip(found, (line[:, 0], line[:, 1], *named, text), strict=True):
+                found[name].append(value)
+    return found
+
+
+def normalized_lines(verdict: Assessment) -> list[str]:
+    """The verdict on a normalized wall, whose units are the period and the mass."""
+    span = f"{plain(verdict.virtual_damping_lower)} to {plain(verdict.virtual_damping_upper)}"
+    rows = {
+        "verdict": f"{word_of(verdict)}, spectral radius {verdict.spectral_radius:.6f}",
+        "stable alpha": f"up to {plain(verdict.stiffness_limit)} at this beta",
+        "stable beta": f"{span} at this alpha",
+        "passive": f"{'yes' if verdict.passive else 'no'}, margin {plain(verdict.passivity_margin)} of delta",
+        "stiffest stable wall": f"alpha_max = {plain(verdict.alpha_max)} at beta = {plain(verdict.beta_at_max)}",
+        "slowest pole": f"time constant {plain(verdict.time_constant)} periods",
+        "margins": f"gain {plain(verdict.gain_margin)}, phase {plain(verdict.phase_margin)} degrees, "
+        f"delay {plain(verdict.delay_margin)} periods, modulus {plain(verdict.modulus_margin)}",
+    }
+    return [f"{label:<20}  {text}" for label, text in rows.items()]
+
+
+def word_of(verdict: Assessment | SceneAssessment) -> str:
+    """The verdict in a word."""
+    return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"

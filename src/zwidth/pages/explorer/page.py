@@ -1,0 +1,284 @@
+"""The figures of the page and what drives them: controls come in as one message, numbers and texts go out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from concurrent.futures import Executor
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from bokeh.document import Document
+from bokeh.events import Tap
+from bokeh.models import ColumnDataSource, DataRange1d
+from bokeh.plotting import figure
+
+from zwidth.figures import style
+from zwidth.pages.explorer import model
+from zwidth.pages.explorer.controls import Controls
+from zwidth.pages.explorer.details import IMPORTING, Update, Wish, Words, compute_details, show_outlines
+from zwidth.pages.explorer.recipes import to_python, to_yaml
+from zwidth.parts.wall import VirtualWall
+from zwidth.words.errors import ZwidthError
+
+# A message holds some dozen numbers.
+_LONGEST_MESSAGE = 4000
+_COLUMNS = {
+    "area": ("xs", "ys"),
+    "edge": ("x", "y"),
+    "contours": ("xs", "ys", "x", "y", "text"),
+    "passive": ("x", "y"),
+    "ridge": ("x", "y"),
+    "best": ("x", "y"),
+    "wall": ("x", "y"),
+    "poles": ("x", "y"),
+    "nyquist": ("x", "y"),
+    "crossover": ("x", "y"),
+    "step": ("x", "y"),
+    "contact": ("x", "position", "force"),
+}
+# What hangs on the device and takes its time: another device's is taken away at once.
+_OF_DEVICE = ("contours", "passive", "ridge", "best")
+# Ink, edge, passive, ridge and the rest on a light page and on a dark one.
+_LIGHT = {"ink": style.BLACK, "faint": "#565656", "edge": style.BLUE, "passive": "#00735A", "ridge": style.VERMILION}
+_DARK = {"ink": "#F2F2F2", "faint": "#A6A6A6", "edge": style.SKY, "passive": "#2FC79C", "ridge": style.ORANGE}
+_TURN = np.linspace(0.0, 2.0 * np.pi, 361)
+
+
+class Page:
+    """One open page."""
+
+    def __init__(self, document: Document, controls: Controls, words: Words, executor: Executor) -> None:
+        self.document, self.controls, self.words, self.executor = document, controls, words, executor
+        self.generation, self.serial, self.dark = 0, 0, False
+        self.device: tuple[Any, ...] = ()
+        self.drawn = False
+        self.options = {"contact": False, "costly": False}
+        self.sources = {
+            name: ColumnDataSource({column: [] for column in columns}, name=f"{name} data")
+            for name, columns in _COLUMNS.items()
+        }
+        self.inputs = ColumnDataSource({"json": []}, name="inputs")
+        self.answer = ColumnDataSource({"json": []}, name="answer")
+        self.inputs.on_change("data", lambda _, __, data: self.receive(data))
+        self.inks: list[tuple[Any, str, str]] = []
+        self.frame: tuple[model.Range, model.Range] | None = None
+        self.plots = {name: draw() for name, draw in self._drawings().items()}
+        self.plots["plane"].tags = [self.inputs, self.answer]
+        self.plots["plane"].on_event(Tap, self._tap)
+        for name, plot in self.plots.items():
+            plot.name = name
+            document.add_root(plot)
+        self._paint()
+
+    def _drawings(self) -> dict[str, Callable[[], figure]]:
+        return {
+            "plane": self._draw_plane,
+            "poles": self._draw_poles,
+            "nyquist": self._draw_nyquist,
+            "step": lambda: self._draw_motion("step", "y", "position over force"),
+            "contact": lambda: self._draw_motion("contact", "position", "position"),
+            "force": lambda: self._draw_motion("contact", "force", "wall force"),
+        }
+
+    def _new(self, height: int, **keywords: Any) -> figure:
+        tools = "pan,wheel_zoom,box_zoom,reset"
+        plot = figure(height=height, sizing_mode="stretch_width", tools=tools, output_backend="canvas", **keywords)
+        plot.toolbar.logo, plot.toolbar.autohide, plot.toolbar.active_drag = None, True, None  # pyright: ignore
+        plot.background_fill_color = plot.border_fill_color = None  # pyright: ignore
+        plot.outline_line_color = None  # pyright: ignore
+        return plot
+
+    def _add(self, plot: figure, glyph: str, source: str, color: str, *, parts: str = "line", **keywords: Any) -> Any:
+        """A glyph whose colors follow the light."""
+        drawn = getattr(plot, glyph)(source=self.sources.get(source) or ColumnDataSource(), **keywords)
+        self.inks += [(drawn.glyph, f"{part}_color", color) for part in parts.split()]
+        return drawn
+
+    def _draw_plane(self) -> figure:
+        plot = self._new(460, x_range=(0, 1), y_range=(0, 1))
+        # Lines alone carry the meaning; what is filled is pale.
+        area = {"line_color": None, "fill_alpha": 0.13}
+        self._add(plot, "multi_polygons", "area", "edge", parts="fill", xs="xs", ys="ys", legend_label="stable", **area)
+        self._add(plot, "multi_line", "contours", "faint", xs="xs", ys="ys", legend_label="spectral radius")
+        small = {"text_font_size": "10px", "x_offset": 2, "text_baseline": "bottom"}
+        self._add(plot, "text", "contours", "faint", parts="text", x="x", y="y", text="text", **small)
+        self._add(plot, "line", "edge", "edge", x="x", y="y", line_width=2.5, legend_label="stable")
+        dashed = {"line_width": 2, "line_dash": [8, 3, 2, 3], "legend_label": "passive"}
+        self._add(plot, "line", "passive", "passive", x="x", y="y", **dashed)
+        dotted = {"line_width": 2, "line_dash": [4, 4], "legend_label": "stiffest as b grows"}
+        self._add(plot, "line", "ridge", "ridge", x="x", y="y", **dotted)
+        mark = {"x": "x", "y": "y", "fill_color": None, "line_width": 2}
+        self._add(plot, "scatter", "best", "ridge", marker="diamond", size=13, legend_label="stiffest", **mark)
+        self._add(plot, "scatter", "wall", "ink", marker="circle_cross", size=17, legend_label="your wall", **mark)
+        legend = plot.legend[0]
+        legend.update(ncols=2, label_text_font_size="11px", background_fill_alpha=0.0, border_line_color=None)
+        legend.update(padding=2, spacing=2, margin=0, glyph_height=16)
+        plot.add_layout(legend, "above")
+        return plot
+
+    def _draw_circle(self, seen: list[str]) -> figure:
+        """A plane of complex numbers with the unit circle; the ranges hold what is named."""
+        plot = self._new(280, match_aspect=True)
+        circle = plot.line(np.cos(_TURN), np.sin(_TURN), line_width=1.5)
+        self.inks.append((circle.glyph, "line_color", "faint"))
+        plot.x_range, plot.y_range = (DataRange1d(renderers=[circle]) for _ in "xy")
+        plot.tags = seen
+        return plot
+
+    def _draw_poles(self) -> figure:
+        plot = self._draw_circle(["poles"])
+        poles = self._add(plot, "scatter", "poles", "edge", x="x", y="y", marker="x", size=11, line_width=2.5)
+        for axis in (plot.x_range, plot.y_range):
+            axis.renderers = [*axis.renderers, poles]  # pyright: ignore[reportAttributeAccessIssue]
+        plot.xaxis.axis_label, plot.yaxis.axis_label = "Re z", "Im z"
+        return plot
+
+    def _draw_nyquist(self) -> figure:
+        plot = self._draw_circle(["crossover"])
+        self._add(plot, "line", "nyquist", "edge", x="x", y="y", line_width=2)
+        critical = plot.scatter([-1.0], [0.0], marker="cross", size=13, line_width=2.5)
+        self.inks.append((critical.glyph, "line_color", "ridge"))
+        mark = {"marker": "circle", "size": 11, "fill_color": None, "line_width": 2}
+        self._add(plot, "scatter", "crossover", "ink", x="x", y="y", **mark)
+        plot.xaxis.axis_label, plot.yaxis.axis_label = "Re L", "Im L"
+        return plot
+
+    def _draw_motion(self, source: str, column: str, label: str) -> figure:
+        plot = self._new(220)
+        self._add(plot, "line", source, "edge", x="x", y=column, line_width=2)
+        plot.xaxis.axis_label, plot.yaxis.axis_label = "time", label
+        return plot
+
+    def _paint(self) -> None:
+        """Colors for a light page or a dark one."""
+        inks = _DARK if self.dark else _LIGHT
+        for glyph, name, ink in self.inks:
+            setattr(glyph, name, inks[ink])
+        for plot in self.plots.values():
+            for axis in plot.axis:
+                axis.axis_label_text_color = axis.major_label_text_color = inks["ink"]
+                axis.axis_line_color = axis.major_tick_line_color = axis.minor_tick_line_color = inks["faint"]
+                axis.axis_label_text_font_style = "normal"
+            plot.grid.grid_line_color, plot.grid.grid_line_alpha = inks["faint"], 0.25
+        self.plots["plane"].legend.label_text_color = inks["ink"]
+
+    def _name_axes(self) -> None:
+        normalized = self.controls.normalized
+        names = {
+            "plane": ("alpha", "beta") if normalized else ("stiffness K in N/m", "damping B in N s/m"),
+            "step": ("time in periods", "position") if normalized else ("time in s", "position in mm/N"),
+            "contact": ("time in periods", "position") if normalized else ("time in s", "position in mm"),
+            "force": ("time in periods", "wall force") if normalized else ("time in s", "wall force in N"),
+        }
+        for name, (x, y) in names.items():
+            self.plots[name].xaxis.axis_label, self.plots[name].yaxis.axis_label = x, y
+
+    def receive(self, data: Any) -> None:
+        """Take what the page sends: changed values, whether the slider rests, what else is wanted."""
+        try:
+            (text,) = data["json"]
+            message = json.loads(text) if isinstance(text, str) and len(text) <= _LONGEST_MESSAGE else None
+            if not isinstance(message, dict) or not isinstance(message.get("set", {}), dict):
+                raise ValueError(text)
+        except (ValueError, TypeError, KeyError, RecursionError):
+            self.tell({"error": "the page sent something that is no message; reload it"})
+            return
+        self.serial = message.get("serial", 0)
+        if message.get("dark") in (True, False) and message["dark"] != self.dark:
+            self.dark = message["dark"]
+            self._paint()
+        for name in self.options:
+            self.options[name] = bool(message.get(name, self.options[name]))
+        self.update(message.get("set", {}), rest=bool(message.get("rest")))
+
+    def _tap(self, event: Any) -> None:
+        names = ("alpha", "beta") if self.controls.normalized else ("stiffness", "virtual_damping")
+        place = [float(f"{value:.4g}") if isinstance(value, int | float) else value for value in (event.x, event.y)]
+        self.update(dict(zip(names, place, strict=True)), rest=True)
+
+    def update(self, changes: dict[str, Any], *, rest: bool) -> None:
+        """Show what follows a drag at once, and have the rest computed where the slider rests."""
+        self.generation += 1
+        try:
+            with IMPORTING:
+                controls = self.controls.change(changes)
+                self._show_at_once(controls, rest)
+        except Exception as error:
+            self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
+            return
+        if rest:
+            assert self.frame is not None, "it has just been shown"
+            wish = Wish(controls.scene, controls.normalized, *self.frame, outline=not self.drawn, **self.options)
+            self.executor.submit(self._compute, self.generation, wish)
+
+    def _show_at_once(self, controls: Controls, rest: bool) -> None:
+        scene = controls.scene
+        edge = model.quick_edge(scene)
+        stable, poles = model.judge_quickly(scene)
+        device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
+        if device != self.device:
+            self.device, self.drawn = device, False
+            # Of a scene with parts, what is quick has no inside; its outlines come when the slider rests.
+            moving = {"area": {"xs": [], "ys": []}, "edge": {"x": edge[0], "y": edge[1]}}
+            self._fill(show_outlines([edge]) if scene.is_rigid else moving)
+            self._fill({name: {column: [] for column in _COLUMNS[name]} for name in _OF_DEVICE})
+            self.tell({"slopes": ""})
+        self.controls = controls
+        self._name_axes()
+        wall = {"x": [controls.wall[0]], "y": [controls.wall[1]]}
+        self._fill({"wall": wall, "poles": {"x": np.real(poles), "y": np.imag(poles)}})
+        frame = model.frame(edge, controls.wall)
+        if frame != self.frame:
+            self.frame = frame
+            for axis, (low, high) in zip(
+                (self.plots["plane"].x_range, self.plots["plane"].y_range), frame, strict=True
+            ):
+                axis.update(start=low, end=high)
+        word = "stable" if stable else "UNSTABLE"
+        radius = f"spectral radius {np.abs(poles).max():.6f}"
+        recipes = {"yaml": to_yaml(controls), "python": to_python(controls)} if rest else {}
+        said = {"error": "", "word": word, "radius": radius, "busy": True, **recipes}
+        self.tell({**said, "state": controls.shown(), "frame": frame})
+
+    def _fill(self, update: Update) -> None:
+        for name, columns in update.items():
+            self.sources[name].data = columns
+
+    def tell(self, texts: dict[str, Any]) -> None:
+        """Send texts and numbers that the page writes by itself."""
+        self.answer.data = {"json": [json.dumps({"serial": self.serial, **texts})]}
+
+    def _compute(self, generation: int, wish: Wish) -> None:
+        """In the worker's thread: compute part by part, unless something newer is wanted."""
+        try:
+            for update in compute_details(wish, self.words):
+                if generation != self.generation:
+                    return
+                self._hand_over(generation, update)
+            self._hand_over(generation, {"busy": False})
+        except Exception as error:
+            self._hand_over(generation, {"error": _explain(error), "busy": False})
+
+    def close(self) -> None:
+        """Want nothing more."""
+        self.generation += 1
+
+    def _hand_over(self, generation: int, update: Update) -> None:
+        self.document.add_next_tick_callback(lambda: self._take(generation, update))
+
+    def _take(self, generation: int, update: Update) -> None:
+        if generation != self.generation:
+            return
+        self._fill({name: columns for name, columns in update.items() if name in self.sources})
+        texts = {name: text for name, text in update.items() if name not in self.sources}
+        if "contours" in update:
+            self.drawn = True
+        if texts:
+            self.tell(texts)
+
+
+def _explain(error: Exception) -> str:
+    """What the page says of an error; whatever it is, the page stays."""
+    return str(error) if isinstance(error, ZwidthError) else f"{type(error).__name__}: {error}"

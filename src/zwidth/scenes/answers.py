@@ -1,0 +1,375 @@
+"""What a scene answers of its walls, in SI units: labels, poles, margins, passivity, state space, responses."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.batching import as_float64
+from zwidth.arrays.circle import circle
+from zwidth.loops.linear import state_space
+from zwidth.loops.linear.chain import Chain
+from zwidth.loops.linear.columns import stable_dampings
+from zwidth.loops.linear.delay_margin import linear_margins
+from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.margins import answer
+from zwidth.loops.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
+from zwidth.loops.linear.pieces import Island
+from zwidth.loops.linear.poles import all_poles, log_size
+from zwidth.loops.linear.radius import spectral_radius as linear_radius
+from zwidth.loops.linear.rows import label_walls, stable_intervals
+from zwidth.loops.rigid.margins import Margins, margins
+from zwidth.loops.rigid.passivity import passivity_margin
+from zwidth.loops.rigid.poles import poles
+from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod, decide_stability, is_stable
+from zwidth.parts.wall import resolve_wall
+from zwidth.scenes.stiffest import list_islands
+from zwidth.words.errors import InputError, check_choice
+from zwidth.words.status import Method, Status
+from zwidth.words.types import Array, ArrayLike
+
+if TYPE_CHECKING:
+    import control
+
+
+class StateSpace(NamedTuple):
+    """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, a step every ``dt`` seconds."""
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    D: np.ndarray
+    dt: float
+
+
+class PoleTable(NamedTuple):
+    """Poles, the slowest first, and the motions they stand for; arrays with a last axis of poles."""
+
+    z: np.ndarray
+    frequency: np.ndarray  # at which it oscillates, in Hz; half the sampling rate for a negative real pole
+    damping_ratio: np.ndarray  # -Re s/|s| with s = log(z)/T; negative for a growing motion
+    time_constant: np.ndarray  # -1/Re s in s; negative for a growing one, infinite on the unit circle
+
+
+def tabulate_poles(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, period: float) -> PoleTable:
+    """The poles of walls of one shape."""
+    zeta: Array = all_poles(loop, alpha, beta)
+    size = log_size(zeta)
+    order = np.argsort(-size, axis=-1, kind="stable")
+    zeta, size = (np.take_along_axis(values, order, -1) for values in (zeta, size))
+    turn = np.abs(np.arctan2(zeta.imag, 1.0 + zeta.real))
+    with np.errstate(all="ignore"):
+        # A pole at z = 0 is gone after one period.
+        ratio = np.where(np.isinf(size), 1.0, -size / np.hypot(size, turn))
+        ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
+        return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
+
+
+def respond(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: ArrayLike, period: float) -> Array:
+    """``L = (alpha + beta F) G`` at frequencies in Hz up to half the sampling rate; NaN for others."""
+    try:
+        hertz, a, b = np.broadcast_arrays(as_float64("frequency", frequency), alpha, beta)
+    except ValueError as error:
+        raise InputError(
+            f"shapes do not broadcast: frequency {np.shape(frequency)}, walls {alpha.shape}; make each axis equal or 1"
+        ) from error
+    w = 2.0 * np.pi * hertz * period
+    # Half the sampling rate is half a turn, whatever the rounding of the quotient.
+    w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
+    inside = (w > 0) & (w <= np.pi)
+    value = answer(loop, a, b, circle(np.where(inside, w, 1.0))).value
+    return np.where(inside, value, complex(np.nan, np.nan))[()]
+
+
+def closed_loop_si(chain: Chain, alpha: float, beta: float, mass: float, period: float) -> StateSpace:
+    """From a force in N held on the device to the sensed position in m."""
+    return _in_si(chain, state_space.closed_loop(chain, alpha, beta), period, mass, period * period / mass)
+
+
+def open_loop_si(chain: Chain, alpha: float, beta: float, mass: float, period: float) -> StateSpace:
+    """From the position that the wall is given to the one that its force answers, both in m."""
+    return _in_si(chain, state_space.open_loop(chain, alpha, beta), period, mass, 1.0)
+
+
+def _in_si(chain: Chain, loop: state_space.Matrices, period: float, mass: float, unit: float) -> StateSpace:
+    """States in m, m/s and N in place of units of the period and the mass."""
+    count = len(chain.bodies)
+    waiting = state_space.delayed_device(chain).A.shape[0] - 2 * count
+    filtered = loop.A.shape[0] - 2 * count - waiting
+    scale = np.concatenate(
+        [np.ones(filtered + count), np.full(count, 1.0 / period), np.full(waiting, mass / period**2)]
+    )
+    return StateSpace(
+        loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit, loop.C / scale, loop.D * unit, period
+    )
+
+
+class SceneAnswers:
+    """The questions of `zwidth.Scene` about walls; of the scene they need its parts, loop and boundary.
+
+    Without a stiffness and a damping each means the scene's own wall (`zwidth.parts.wall.resolve_wall`).
+    """
+
+    def poles(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> np.ndarray:
+        """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.
+
+        Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
+        is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return poles(alpha, beta, self.delta, self.d)
+        return 1.0 + all_poles(self.loop, alpha, beta)
+
+    def pole_table(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> PoleTable:
+        """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return tabulate_poles(self.loop, alpha, beta, self.timing.period)
+
+    def spectral_radius(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> Array:
+        """The largest pole magnitude of walls, below 1 exactly where `is_stable` is true; NaN where not known.
+
+        From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return spectral_radius(alpha, beta, self.delta, self.d)
+        stable = label_walls(self.traced_boundary, alpha, beta).reshape(-1)
+        found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
+        return found.reshape(alpha.shape)[()]
+
+    def islands(self: Any, *, negative_damping: bool | None = None) -> list[Island]:
+        """The islands: pieces of the stable set that no path of stable walls leads to from soft ones.
+
+        A wall on an island is stable, but as its stiffness falls it becomes unstable before it is soft, whatever B does
+        meanwhile. It does not count for `max_stiffness`.
+
+        Args:
+            negative_damping: as for `max_stiffness`; False leaves out islands that lie in B <= 0.
+
+        Returns:
+            A list, the stiffest first; ``stiffness`` in N/m and ``virtual_damping`` in N s/m are pairs, the least and
+            the largest of the island. Empty for a rigid scene, whose stable walls are one piece.
+
+        Example:
+            >>> import zwidth
+            >>> timing, window = zwidth.Timing(period=1e-3, delay=1e-3), zwidth.WindowedDifference(samples=24)
+            >>> (island,) = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=window).islands()
+            >>> print("{:.0f} to {:.0f} N/m".format(*island.stiffness))
+            7537 to 9037 N/m
+        """
+        return list_islands(self, negative_damping)
+
+    def state_space(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
+        """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
+
+        Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
+        """
+        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def open_loop(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
+        """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
+        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
+        return open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+
+    def frequency_response(
+        self: Any,
+        stiffness: ArrayLike | None = None,
+        virtual_damping: ArrayLike | None = None,
+        frequency: ArrayLike | None = None,
+    ) -> Array:
+        """The open loop ``L = (K + B F) G``, complex, at frequencies in Hz up to half the sampling rate.
+
+        All three broadcast; the wall is stable or not by how L winds around -1. NaN for other frequencies.
+        """
+        if frequency is None:
+            raise InputError("frequency: none is given; give frequencies in Hz, up to half the sampling rate")
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        return respond(self.loop, alpha, beta, frequency, self.timing.period)
+
+    def is_stable(
+        self: Any,
+        stiffness: ArrayLike | None = None,
+        virtual_damping: ArrayLike | None = None,
+        *,
+        method: StabilityMethod = "auto",
+    ) -> Array:
+        """Whether walls are stable: every pole strictly inside the unit circle.
+
+        Args:
+            stiffness: K in N/m.
+            virtual_damping: B in N s/m. Both broadcast; neither means the scene's own wall.
+            method: as for `decide_stability`, which has the statuses as well.
+
+        Returns:
+            Boolean array of the broadcast shape, False for what is NaN.
+
+        Raises:
+            InputError: it is not said which wall is meant. K alone, with B = 0, is meant where the scene has no wall.
+
+        Numerics:
+            Closed form for a rigid device with the backward difference. Otherwise by the signed crossings of each
+            row (`loops.linear.boundary`): the first call lays out the boundary (some 20 to 100 ms), then each damping
+            costs some microseconds and a stiffness next to nothing.
+        """
+        if method != "auto":
+            return self.decide_stability(stiffness, virtual_damping, method=method).stable
+        alpha, beta = self.normalize_walls(stiffness, virtual_damping)
+        if self.is_rigid:
+            return is_stable(alpha, beta, self.delta, self.d)
+        return label_walls(self.traced_boundary, alpha, beta)[()]
+
+    def stable_stiffness(self: Any, virtual_damping: ArrayLike | None = None) -> np.ndarray:
+        """The stable intervals of the stiffness at a damping, several where there are several.
+
+        Args:
+            virtual_damping: B in N s/m, a number or an array; that of the scene's own wall where left out, 0 without.
+
+        Returns:
+            Array (n, 2) in N/m, or with the shape of the damping in front and NaN where a row has fewer intervals. The
+            ends are not stable themselves.
+        """
+        damping = self.wall.virtual_damping if virtual_damping is None else virtual_damping
+        beta = as_float64("virtual_damping", damping) / self.units.virtual_damping
+        found = stable_intervals(self.traced_boundary, beta.reshape(-1))
+        both = np.stack(found, -1) * self.units.stiffness
+        return both.reshape(*beta.shape, *both.shape[1:])
+
+    def stable_damping(self: Any, stiffness: float | None = None) -> np.ndarray:
+        """The stable intervals of the virtual damping at one stiffness, several where there are several.
+
+        Args:
+            stiffness: K in N/m; that of the scene's own wall where left out.
+
+        Returns:
+            Array (n, 2) in N s/m. The ends are not stable themselves.
+        """
+        stiffness = resolve_wall(self.wall, None, None)[0] if stiffness is None else stiffness
+        alpha, _ = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, 0.0)))
+        return stable_dampings(self.traced_boundary, alpha) * self.units.virtual_damping
+
+    def decide_stability(
+        self: Any,
+        stiffness: ArrayLike | None = None,
+        virtual_damping: ArrayLike | None = None,
+        *,
+        method: StabilityMethod = "auto",
+    ) -> Stability:
+        """Labels of walls with a status and what decided each, as `zwidth.decide_stability` has them.
+
+        "auto" and "crossover" count by the signed crossings of each row, "companion" computes all poles, "certified"
+        decides in balls of python-flint, exactly for the numbers given, or says UNDECIDED or ON_BOUNDARY.
+        """
+        check_choice("method", method, STABILITY_METHODS)
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return decide_stability(alpha, beta, self.delta, self.d, method=method)
+        known = np.isfinite(alpha) & np.isfinite(beta)
+        status = np.where(known, np.int32(Status.OK), np.int32(Status.INVALID_INPUT))
+        if method == "certified":
+            from zwidth.scenes.certified import decide_walls
+
+            walls = [np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping)]
+            stable, status = decide_walls(self, *np.broadcast_arrays(*walls))
+            used = Method.CERTIFIED
+        elif method == "companion":
+            with np.errstate(invalid="ignore"):
+                stable, used = log_size(all_poles(self.loop, alpha, beta)).max(-1) < 0, Method.COMPANION
+        else:
+            stable, used = label_walls(self.traced_boundary, alpha, beta), Method.CROSSOVER
+        return Stability(stable[()], status[()], np.full(alpha.shape, used, np.int32)[()])
+
+    def passivity_margin(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> Array:
+        """The device's own damping in excess of what a passive wall needs, in N s/m; NaN where a wall is not finite.
+
+        Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
+        (`loops.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
+        motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip there is
+        no such condition, and InputError says so. A wall that pushes has at most its K T.
+        """
+        check_has_condition(self.device)
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        if self.is_rigid:
+            return passivity_margin(alpha, beta, self.own_delta, self.d) * self.units.virtual_damping
+        condition = PassivityCondition.derive(self.chain.estimate, self.d)
+        return (passivity_margins(condition, alpha, beta, self.own_delta) * self.units.virtual_damping)[()]
+
+    def is_passive(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> Array:
+        """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
+        return np.asarray(self.passivity_margin(stiffness, virtual_damping)) > 0
+
+    def margins(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> Margins:
+        """Gain, phase, delay and modulus margin of walls, with the frequencies where they are taken, in Hz.
+
+        Of several crossovers the nearest counts, as in python-control: ``gain_margin`` is the factor nearest to 1 on K
+        and B together, and ``phase_margin`` the least turn in degrees, that bring a pole to the unit circle; the turn
+        is negative for an unstable wall. ``delay_margin`` in s is the least extra delay that does, held as the hardware
+        does it, fraction by fraction with the exact loop (0 for an unstable wall, NaN where poles counted before and
+        beyond do not confirm it); ``modulus_margin`` is the least distance of L from -1. Where no factor, turn or delay
+        brings a pole there, the first three are infinite for a stable wall, and 0, NaN and 0 for an unstable one.
+        Walls out of range are NaN. A rigid scene answers by `zwidth.margins`. A wall takes some milliseconds, its
+        delay margin some 0.2 s.
+        """
+        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
+        hertz = 1.0 / (2.0 * np.pi * self.timing.period)
+        if self.is_rigid:
+            found = margins(alpha, beta, self.delta, self.d)
+        else:
+            found = linear_margins(self.chain, self.traced_boundary, alpha, beta)
+        return found._replace(
+            delay_margin=found.delay_margin * self.timing.period,
+            phase_crossover=found.phase_crossover * hertz,
+            gain_crossover=found.gain_crossover * hertz,
+            modulus_frequency=found.modulus_frequency * hertz,
+        )
+
+
+def to_control(scene: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> control.StateSpace:
+    """Return the closed loop of a scene and a wall as a model of python-control.
+
+    From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.
+
+    Args:
+        scene: a `zwidth.Scene`.
+        stiffness: K of the wall in N/m, one number; the scene's own wall where neither is given.
+        virtual_damping: B of the wall in N s/m, one number.
+
+    Returns:
+        control.StateSpace with ``dt`` the sampling period; states in m, m/s and N.
+
+    Raises:
+        InputError: python-control is not installed; it is not said which wall is meant.
+
+    References:
+        Fuller, Greiner, Moore, Murray, van Paassen, Yorke 2021 (python-control).
+
+    Example:
+        >>> import zwidth
+        >>> scene = zwidth.Scene(zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3))
+        >>> zwidth.to_control(scene, 10e3, 5).dt
+        0.001
+    """
+    try:
+        import control
+    except ImportError as error:
+        raise InputError("to_control: python-control is not installed; pip install control") from error
+    return control.StateSpace(*scene.state_space(stiffness, virtual_damping))
+
+
+def one_wall(alpha: np.ndarray, beta: np.ndarray) -> tuple[float, float]:
+    """The numbers of a single wall."""
+    if alpha.size != 1:
+        raise InputError(f"stiffness, virtual_damping: got shape {alpha.shape}; one wall of finite numbers is needed")
+    for name, value in (("stiffness", alpha), ("virtual_damping", beta)):
+        if not np.isfinite(value).all():
+            raise InputError(f"{name}: got {value.item():g}; a finite number is needed")
+    return float(alpha.reshape(())), float(beta.reshape(()))

@@ -1,0 +1,209 @@
+"""Stability of any scene that is never guessed: its characteristic polynomial in balls, decided by Schur and Cohn.
+
+Every number of the scene and of the wall is taken as exact; only the delay in periods is the float64 quotient that the
+scene uses. The chain's matrix exponential, its characteristic polynomial and the velocity estimate are balls of
+python-flint. With P of degree n and ``P*(z) = z^n P(1/z)``, all zeros of P lie inside the unit circle exactly if
+``|P(0)| < |lead|`` and those of ``(lead P - P(0) P*)/z`` do. Where a comparison is not certain, the precision doubles.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from zwidth.loops.linear.chain import Chain, chain_of, rates
+from zwidth.loops.rigid import balls
+from zwidth.parts.velocity import Butterworth, LowPass, VelocityFilter, WindowedDifference
+from zwidth.words.errors import InputError
+from zwidth.words.status import Status
+
+if TYPE_CHECKING:
+    import flint
+
+_FIRST_BITS, _MOST_BITS = 128, 8192
+
+
+class BallPolynomials(NamedTuple):
+    """``P = D + K N1 + B N2`` at one precision, K in N/m and B in N s/m."""
+
+    D: flint.arb_poly
+    N1: flint.arb_poly
+    N2: flint.arb_poly
+    rest: bool  # whether F answers a position at rest with exactly 0, so that K = 0 leaves a pole at z = 1 exactly
+
+
+def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Labels and statuses of walls of one shape, in SI units."""
+    if not balls.available():
+        raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
+    known: dict[int, BallPolynomials] = {}
+    stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)
+    for place in np.ndindex(stiffness.shape):
+        stable[place], status[place] = _decide(scene, float(stiffness[place]), float(damping[place]), known)
+    return stable, status
+
+
+def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, BallPolynomials]) -> tuple[bool, Status]:
+    import flint
+
+    if not (np.isfinite(stiffness) and np.isfinite(damping)):
+        return False, Status.INVALID_INPUT
+    bits = _FIRST_BITS
+    while bits <= _MOST_BITS:
+        with flint.ctx.workprec(bits):
+            if bits not in known:
+                known[bits] = _polynomials(scene)
+            D, N1, N2, rest = known[bits]
+            p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
+            at_one = stiffness == 0 and rest and _is_free(scene)
+            if at_one:
+                # z = 1 is a pole; the others decide whether it is the only one not inside.
+                p = _without_one(p)
+            verdict = all_inside(p)
+        if verdict is not None:
+            return (False, Status.ON_BOUNDARY if verdict else Status.OK) if at_one else (verdict, Status.OK)
+        bits *= 2
+    return False, Status.UNDECIDED
+
+
+def _is_free(scene: Any) -> bool:
+    """Whether no spring ties the device to the ground."""
+    return scene.operator is None or scene.operator.stiffness == 0
+
+
+def all_inside(p: flint.arb_poly) -> bool | None:
+    """Whether all zeros lie inside the unit circle; None where the balls are too wide to tell."""
+    import flint
+
+    while p.degree() > 0:
+        first, last = p[0], p[p.degree()]
+        if first == 0:
+            p = flint.arb_poly(p.coeffs()[1:])
+            continue
+        gap = abs(last) - abs(first)
+        if not gap > 0:
+            return False if gap < 0 else None
+        coefficients = p.coeffs()
+        mirrored = flint.arb_poly(coefficients[::-1])
+        reduced = (p * (1 / last) - mirrored * (first / last / last)).coeffs()
+        p = flint.arb_poly(reduced[1 : len(coefficients)])
+    return True
+
+
+def _without_one(p: flint.arb_poly) -> flint.arb_poly:
+    """The quotient by z - 1, which divides it."""
+    import flint
+
+    total, found = flint.arb(0), []
+    for coefficient in reversed(p.coeffs()[1:]):
+        total = total + coefficient
+        found.append(total)
+    return flint.arb_poly(found[::-1])
+
+
+def _polynomials(scene: Any) -> BallPolynomials:
+    import flint
+
+    period = flint.arb(float(scene.timing.period))
+    chain = chain_of(_exact(scene, period))
+    answer, device = _device(chain)
+    top, bottom = _estimate(scene.velocity, period)
+    mass: Any = chain.estimate
+    unit = period * period / mass
+    whole = chain.whole + (1 if chain.d > chain.whole else 0)
+    waiting = flint.arb_poly([0] * whole + device.coeffs())
+    # Exactly 0 is what a sum of exact fractions is; all other estimates are differences.
+    own = isinstance(scene.velocity, VelocityFilter)
+    rest = not own or sum(map(Fraction, scene.velocity.numerator)) == 0
+    return BallPolynomials(waiting * bottom, answer * bottom * unit, answer * top * unit, rest)
+
+
+def _exact(scene: Any, period: flint.arb) -> SimpleNamespace:
+    """The scene's numbers as exact balls, for `chain_of`; in the estimate's place the mass in kg."""
+    import flint
+
+    def part(of: Any, *fields: str, **others: Any) -> SimpleNamespace:
+        return SimpleNamespace(**{name: flint.arb(float(getattr(of, name))) for name in fields}, **others)
+
+    coupling, hand = scene.device.coupling, scene.operator
+    if coupling is not None:
+        coupling = part(coupling, "mass", "stiffness", "damping", sensor=coupling.sensor)
+    if hand is not None:
+        tie = () if hand.rigid else ("coupling_stiffness", "coupling_damping")
+        hand = part(hand, "mass", "damping", "stiffness", *tie, rigid=hand.rigid)
+    device = part(scene.device, "mass", "damping", coupling=coupling)
+    mass = device.mass + (hand.mass if hand is not None and hand.rigid and coupling is None else 0)
+    return SimpleNamespace(
+        device=device,
+        timing=SimpleNamespace(period=period),
+        operator=hand,
+        velocity=SimpleNamespace(estimate=lambda period: mass),
+        d=scene.d,
+        whole_delay=scene.whole_delay,
+    )
+
+
+def _device(chain: Chain) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Numerator and denominator of G without its whole periods of delay."""
+    import flint
+
+    rate, push = (array.tolist() for array in rates(chain))
+    size = len(push)
+
+    def flow(time: flint.arb) -> tuple[flint.arb_mat, flint.arb_mat]:
+        rows = [[time * value for value in (*row, force)] for row, force in zip(rate, push, strict=True)]
+        whole = flint.arb_mat([*rows, [0] * (size + 1)]).exp()
+        return (
+            flint.arb_mat([[whole[i, j] for j in range(size)] for i in range(size)]),
+            flint.arb_mat([[whole[i, size]] for i in range(size)]),
+        )
+
+    step, full = flow(flint.arb(1))
+    device = step.charpoly()
+
+    def numerator(state: flint.arb_mat) -> flint.arb_poly:
+        markov = []
+        for _ in range(size):
+            markov.append(state[0, 0])
+            state = step * state
+        product = (flint.arb_poly(device.coeffs()[::-1]) * flint.arb_poly(markov)).coeffs()[:size]
+        return flint.arb_poly(product[::-1])
+
+    if chain.d == chain.whole:
+        return numerator(full), device
+    late = flow(1 - flint.arb(float(chain.d - chain.whole)))[1]
+    return flint.arb_poly([0, 1]) * numerator(late) + numerator(full - late), device
+
+
+def _estimate(velocity: Any, period: flint.arb) -> tuple[flint.arb_poly, flint.arb_poly]:
+    """Numerator and denominator of F in SI units."""
+    import flint
+
+    arb, z = flint.arb, flint.arb_poly([0, 1])
+    if isinstance(velocity, VelocityFilter):
+        top, bottom = ([arb(value) for value in reversed(part)] for part in (velocity.numerator, velocity.denominator))
+        return flint.arb_poly(top), flint.arb_poly(bottom)
+    coded = period if velocity.coded_period is None else arb(float(velocity.coded_period))
+    if isinstance(velocity, WindowedDifference):
+        n = velocity.samples
+        return (z**n - 1) * (1 / (n * coded)), z**n
+    top, bottom = (z - 1) * (1 / coded), z
+    if isinstance(velocity, LowPass):
+        tau = velocity.time_constant
+        rate = 2 * arb.pi() * arb(float(velocity.cutoff)) * coded if tau is None else coded / arb(float(tau))
+        p = (-rate).exp()
+        top, bottom = top * z ** (velocity.order - 1), (z - p) ** velocity.order
+        return top * (1 - p) ** velocity.order, bottom
+    if isinstance(velocity, Butterworth):
+        size = (arb.pi() * arb(float(velocity.cutoff)) * coded).tan()
+        n, above, below = velocity.order, z - 1, (z + 1) * size
+        for k in range(n // 2):
+            cosine = (arb.pi() * (2 * k + 1) / (2 * n)).sin()
+            bottom = bottom * (above * above + above * below * (2 * cosine) + below * below)
+        if n % 2:
+            bottom = bottom * (above + below)
+        top = top * below**n
+    return top, bottom

@@ -1,0 +1,230 @@
+"""The stiffest wall of any linear loop under JAX: found on the host, finished by optimistix, differentiable.
+
+The unknowns are alpha, beta, w1 and w2; the equations are the two conditions of `loops.linear.ridge`. The search for
+which conditions those are has no derivative and needs none: as a parameter moves, the same conditions hold.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix
+
+from zwidth.arrays.batching import traced_columns
+from zwidth.arrays.circle import circle
+from zwidth.arrays.xp import is_traced, namespace
+from zwidth.loops.domain import poison
+from zwidth.loops.linear.chain import Chain, chain_of, needed, respond
+from zwidth.loops.linear.ridge import Condition
+from zwidth.loops.rigid.ridge import RidgeKind
+from zwidth.parts.paths import replace_parameters
+from zwidth.parts.span import in_periods
+from zwidth.parts.wall import VirtualWall
+from zwidth.scenes.slopes import moving_paths
+from zwidth.scenes.stiffest import StiffestWall, search
+from zwidth.words.errors import InputError, TracedDelayError
+from zwidth.words.status import Status
+from zwidth.words.types import Array
+
+_MAX_STEPS = 16
+# A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
+_NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
+
+
+class Structure(NamedTuple):
+    """What is compiled once: a scene whose moving parameters are placeholders, their paths, and its delay.
+
+    ``held`` tells that the delay is ``whole`` periods and stays so.
+    """
+
+    template: Any
+    paths: tuple[str, ...]
+    whole: int
+    held: bool
+    negative: bool
+
+
+class _Arguments(NamedTuple):
+    """What the equations depend on beside the unknowns."""
+
+    parts: Any
+    gain: Array
+    zeros: Array
+    poles: Array
+    start: Array
+    codes: Array
+    scales: Array
+
+
+def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
+    """What is static of a scene when these parameters move.
+
+    Raises:
+        TracedDelayError: how many whole periods the delay has depends on a traced value.
+    """
+    delay, period = scene.timing.delay, scene.timing.period
+    undelayed = isinstance(delay, float) and delay == 0.0
+    if is_traced(delay, period) and not undelayed:
+        raise TracedDelayError(
+            "timing: got a traced delay or period, but the number of poles depends on the whole periods of the delay; "
+            "pass both as plain numbers, or ask scene.sensitivities() for the derivatives in them"
+        )
+    whole = 0 if undelayed else scene.whole_delay
+    fixed = "delay" not in paths and (undelayed or "period" not in paths)
+    held = fixed and (undelayed or scene.d == whole)
+    template = replace_parameters(scene, {"wall": VirtualWall(0.0), **dict.fromkeys(paths, 1.0)})
+    return Structure(template, paths, whole, held, negative)
+
+
+def traced_wall(scene: Any, negative: bool) -> StiffestWall:
+    """`zwidth.Scene.max_stiffness` inside a transformation."""
+    values = scene.parameters()
+    paths = tuple(path for path in moving_paths(scene) if is_traced(values[path]))
+    if not paths:
+        # Only the wall is traced, on which nothing depends.
+        paths = ("mass",)
+    structure = structure_of(scene, paths, negative)
+    return compiled_wall(structure, *traced_columns(tuple(values[path] for path in paths)))
+
+
+@partial(jax.jit, static_argnums=0)
+def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
+    """The stiffest wall for values of the moving parameters."""
+    dtype = values[0].dtype
+    # As bits: the thread of a callback may have JAX's default precision, which would halve the digits on the way.
+    bits = jax.lax.bitcast_convert_type(jax.lax.stop_gradient(jnp.stack(values)), jnp.int32)
+    shape = jax.ShapeDtypeStruct((len(_NOWHERE) + 1, *bits.shape[1:]), jnp.int32)
+    search_there = partial(_search, structure, np.dtype(dtype))
+    told = jax.pure_callback(search_there, shape, bits, vmap_method="sequential")
+    told = jax.lax.bitcast_convert_type(told, dtype)
+    status = told[-1].astype(jnp.int32)
+    found = status == Status.OK
+    told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
+    scene = _fill(structure, values)
+    alpha, beta, w1, w2, close = _solve(_chain(structure, scene), told[:4], told[4:6].astype(jnp.int32))
+    status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
+    spoiled = poison(status == Status.OK, *values)
+    omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
+    units = scene.units
+    return StiffestWall(
+        alpha * units.stiffness + spoiled,
+        beta * units.virtual_damping + spoiled,
+        omega / (2.0 * math.pi * scene.timing.period) + spoiled,
+        told[6].astype(jnp.int32),
+        status,
+    )
+
+
+def _delay(scene: Any) -> tuple[Any, Any]:
+    return scene.timing.delay, scene.timing.period
+
+
+def _search(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
+    """`_find` for a callback: numbers come and go as their bits."""
+    told = np.array(_find(structure, np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()), dtype)
+    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
+
+
+def _find(structure: Structure, values: list[float]) -> tuple[float, ...]:
+    """The ridge on the host, and its status behind it."""
+    try:
+        found, status = search(_fill(structure, values), structure.negative)
+    except InputError:
+        found, status = None, Status.INVALID_INPUT
+    return *((math.nan,) * len(_NOWHERE) if found is None else (*found, found.kind)), status
+
+
+def _fill(structure: Structure, values: Iterable[Any]) -> Any:
+    """The scene with these values in place of the placeholders."""
+    return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
+
+
+def _chain(structure: Structure, scene: Any) -> Chain:
+    d = float(structure.whole) if structure.held else in_periods(*map(jnp.asarray, _delay(scene)))
+    return chain_of(scene, (d, structure.whole))
+
+
+def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
+    """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
+    args = _prepare(chain, start, codes)
+    begin = start / args.scales
+    tolerance = _tolerance(start.dtype)
+    solution = optimistix.root_find(
+        partial(_residual, chain),
+        optimistix.Newton(rtol=tolerance, atol=tolerance),
+        begin,
+        args=args,
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    close = jnp.all(jnp.abs(solution.value - begin) <= _reach(start.dtype))
+    return *(solution.value * args.scales), close
+
+
+def _tolerance(dtype: Any) -> float:
+    return 16 * float(jnp.finfo(dtype).eps)
+
+
+def _reach(dtype: Any) -> float:
+    """How far Newton may go: it must stay where the search put it; a double root is met to half of the digits."""
+    return 64 * _tolerance(dtype) ** 0.5
+
+
+def _prepare(chain: Chain, start: Array, codes: Array) -> _Arguments:
+    """What `_residual` needs beside the unknowns."""
+    estimate = chain.estimate
+    complexes = jnp.result_type(start.dtype, jnp.complex64)
+    return _Arguments(
+        jax.tree.map(jnp.asarray, respond(chain)),
+        jnp.asarray(estimate.gain, start.dtype),
+        jnp.asarray(estimate.zeros, complexes),
+        jnp.asarray(estimate.poles, complexes),
+        start,
+        codes,
+        _scales(start),
+    )
+
+
+def _scales(start: Array) -> Array:
+    """The size of the unknowns."""
+    xp = namespace(start)
+    scales = xp.stack([start[0], xp.abs(start[0]) + xp.abs(start[1]), start[2], start[3]])
+    return xp.where(scales > 0, scales, 1.0)
+
+
+def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
+    """The four equations, of order one."""
+    alpha, beta, w1, w2 = unknowns * args.scales
+    estimate = replace(chain.estimate, gain=args.gain, zeros=args.zeros, poles=args.poles)
+
+    def distance(w: Array) -> tuple[Array, Array]:
+        """``r = alpha + beta F - q`` over the size of q, and F."""
+        q, f = needed(chain, w, args.parts), estimate.jet(circle(w)).value
+        size = jax.lax.stop_gradient(jnp.abs(q))
+        return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
+
+    def both(w: Array) -> tuple[Array, Array]:
+        (r, f), (slope, _) = jax.jvp(distance, (w,), (jnp.ones_like(w),))
+        across = (jnp.conj(f) * slope).imag
+        size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
+        across = across / jnp.where(size > 0, size, 1.0)
+        # At z = -1 F is real, and may be 0.
+        return r, jnp.where(args.codes[0] == Condition.PAIR, across, slope.imag)
+
+    # One text for both angles, so that the compiler reads it once.
+    r, across = jax.vmap(both)(jnp.stack([w1, w2]))
+    stays = unknowns[2:] - args.start[2:] / args.scales[2:]
+    # A pole pair at w, or a real pole where w stays.
+    meet = jnp.stack([r.real, jnp.where(args.codes == Condition.PAIR, r.imag, stays)], -1)
+    which = jnp.maximum(args.codes[1] - Condition.PLUS_ONE, 0)
+    second = jnp.stack(
+        [meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])],
+    )[which]
+    return jnp.concatenate([meet[0], second])

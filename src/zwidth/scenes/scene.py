@@ -1,0 +1,367 @@
+"""A whole loop as people have it: device, timing, velocity estimate, hand; and every question about its walls."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.batching import as_float64
+from zwidth.loops.linear.border import Border, Outline, outlines
+from zwidth.loops.linear.boundary import Boundary
+from zwidth.loops.linear.chain import Chain, chain_of, linear_loop
+from zwidth.loops.linear.curve import curve_at
+from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
+from zwidth.parts.device import Device
+from zwidth.parts.operator import Operator
+from zwidth.parts.paths import list_parameters, replace_parameters
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import BackwardDifference, Velocity
+from zwidth.parts.wall import NoWall, VirtualWall, resolve_wall
+from zwidth.scenes.answers import SceneAnswers
+from zwidth.scenes.required import RequiredValue, require
+from zwidth.scenes.slopes import SceneSensitivities, differentiate
+from zwidth.scenes.stiffest import StiffestWall, stiffest_wall
+from zwidth.simulation.result import Motion
+from zwidth.simulation.simulate import simulate
+from zwidth.words.errors import InputError
+from zwidth.words.types import Array, ArrayLike
+
+_EXAMPLES = {
+    "device": "zwidth.Device(mass=0.1, damping=10)",
+    "timing": "zwidth.Timing(period=1e-3, delay=1e-3)",
+    "wall": "zwidth.VirtualWall(stiffness=10e3)",
+    "velocity": "zwidth.LowPass(cutoff=100)",
+    "operator": "zwidth.Operator(mass=0.5)",
+}
+
+
+class WallSI(NamedTuple):
+    """Walls by stiffness in N/m and damping in N s/m."""
+
+    stiffness: Array
+    virtual_damping: Array
+
+
+@dataclass(frozen=True)
+class Scene(SceneAnswers):
+    """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
+
+    Args:
+        device: mass and damping, rigid or with a coupling.
+        timing: period and delay.
+        wall: the wall that `zwidth.assess` judges, and that the questions below mean where no other is named. It may be
+            left out.
+        velocity: how the velocity is estimated; the backward difference by default.
+        operator: the hand, None where nobody holds the device.
+
+    Example:
+        >>> import zwidth
+        >>> device, timing = zwidth.Device(mass=0.1, damping=10), zwidth.Timing(period=1e-3, delay=1e-3)
+        >>> scene = zwidth.Scene(device, timing, velocity=zwidth.LowPass(cutoff=100))
+        >>> scene.is_stable(10e3, [5, 40])
+        array([False,  True])
+    """
+
+    device: Device
+    timing: Timing
+    wall: VirtualWall = field(default_factory=NoWall)
+    velocity: Velocity = field(default_factory=BackwardDifference)
+    operator: Operator | None = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.wall, Velocity):
+            self._move_up()
+        kinds = {"device": Device, "timing": Timing, "wall": VirtualWall, "velocity": Velocity}
+        for name, kind in {**kinds, "operator": Operator | None}.items():
+            part = getattr(self, name)
+            if not isinstance(part, kind):
+                raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {_EXAMPLES[name]}")
+
+    def _move_up(self) -> None:
+        """Without a wall the velocity estimate is the third part, and the hand the fourth."""
+        estimate, fourth, hand = self.wall, self.velocity, self.operator
+        if isinstance(fourth, Operator) and hand is None:
+            hand = fourth
+        elif fourth != BackwardDifference():
+            raise InputError(f"wall: got {estimate!r}, and {fourth!r} as the velocity as well; name parts that follow")
+        moved = {"wall": NoWall(), "velocity": estimate, "operator": hand}
+        for name, part in moved.items():
+            object.__setattr__(self, name, part)
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether it is a rigid mass with the backward difference, for which the closed forms hold."""
+        hand = self.operator
+        bare = isinstance(self.velocity, BackwardDifference) and self.velocity.coded_period is None
+        free = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
+        return bare and free and self.device.coupling is None
+
+    @property
+    def mass(self) -> Any:
+        """The mass that the wall's force acts on, in kg: the unit of the normalized stiffness."""
+        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
+        return self.device.mass + (self.operator.mass if held and self.operator is not None else 0.0)
+
+    @property
+    def damping(self) -> Any:
+        """The damping to ground of that mass, in N s/m."""
+        held = self.operator is not None and self.operator.rigid and self.device.coupling is None
+        return self.device.damping + (self.operator.damping if held and self.operator is not None else 0.0)
+
+    @property
+    def normalized(self) -> Normalized:
+        """``alpha``, ``beta``, ``delta``, ``d`` of this scene and its wall."""
+        return normalize(
+            mass=self.mass,
+            damping=self.damping,
+            period=self.timing.period,
+            delay=self.timing.delay,
+            stiffness=self.wall.stiffness,
+            virtual_damping=self.wall.virtual_damping,
+        )._replace(d=self.d)
+
+    @property
+    def alpha(self) -> float:
+        """Normalized stiffness of the wall."""
+        return self.normalized.alpha
+
+    @property
+    def beta(self) -> float:
+        """Normalized damping of the wall."""
+        return self.normalized.beta
+
+    @property
+    def delta(self) -> float:
+        """Normalized damping of the device, with that of a hand held rigidly."""
+        return self.normalized.delta
+
+    @property
+    def own_delta(self) -> float:
+        """The same without the hand: what passivity, which is for any hand, counts on."""
+        return self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
+
+    @property
+    def d(self) -> float:
+        """Delay in periods."""
+        return self.timing.d
+
+    @property
+    def whole_delay(self) -> int:
+        """Whole periods of it."""
+        return int(np.floor(self.d))
+
+    def to_si(self, *, alpha: ArrayLike = 0.0, beta: ArrayLike = 0.0) -> Physical:
+        """Stiffness in N/m and damping in N s/m of a normalized wall on this device."""
+        return denormalize(
+            mass=self.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
+        )
+
+    @property
+    def units(self) -> WallSI:
+        """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
+        rate = self.mass / self.timing.period
+        return WallSI(rate / self.timing.period, rate)
+
+    @cached_property
+    def chain(self) -> Chain:
+        """Its masses, springs and dampers, normalized."""
+        return chain_of(self)
+
+    @cached_property
+    def loop(self) -> LinearLoop:
+        """Its loop without the wall, by roots, normalized."""
+        return linear_loop(self.chain)
+
+    @cached_property
+    def traced_boundary(self) -> Boundary:
+        """The boundary of its walls, normalized, laid out once."""
+        return Boundary.trace(self.loop)
+
+    @cached_property
+    def border(self) -> Border:
+        """The edge of its stable set, normalized."""
+        return Border(self.traced_boundary)
+
+    def normalize_walls(
+        self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
+        units = self.units
+        stiffness, virtual_damping = resolve_wall(self.wall, stiffness, virtual_damping)
+        both = as_float64("stiffness", stiffness), as_float64("virtual_damping", virtual_damping)
+        try:
+            np.broadcast_shapes(both[0].shape, both[1].shape)
+        except ValueError as error:
+            raise InputError(
+                f"shapes do not broadcast: stiffness {both[0].shape}, virtual_damping {both[1].shape}; make each "
+                "axis equal or 1"
+            ) from error
+        with np.errstate(all="ignore"):
+            return both[0] / units.stiffness, both[1] / units.virtual_damping
+
+    def boundary(self, omega: ArrayLike) -> WallSI:
+        """The walls that put a pole pair on the unit circle at a frequency.
+
+        Args:
+            omega: in rad/s, between 0 and half the sampling rate, ``pi/T``.
+
+        Returns:
+            ``stiffness`` in N/m and ``virtual_damping`` in N s/m; NaN for other frequencies.
+        """
+        w = as_float64("omega", omega) * self.timing.period
+        inside = (w > 0) & (w < np.pi)
+        curve = curve_at(self.loop, np.where(inside, w, 1.0))
+        units = self.units
+        numbers = (curve.alpha * units.stiffness, curve.beta * units.virtual_damping)
+        return WallSI(*(np.where(inside, part, np.nan)[()] for part in numbers))
+
+    def stable_region(self) -> list[Outline]:
+        """Closed outlines of the stable set, the largest first, islands and holes told apart.
+
+        Returns:
+            A list of outlines with ``stiffness`` in N/m, ``virtual_damping`` in N s/m, ``hole`` and ``island``, as
+            `islands` means it.
+        """
+        units = self.units
+        return [
+            Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
+            for piece in outlines(self.border)
+        ]
+
+    def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
+        """The stiffest stable wall that soft ones lead to, and what binds it.
+
+        ``sup {K : some B is stable}`` over the pieces of the stable set that contain soft walls, down to K = 0: along a
+        path of stable walls K and B can rise to it. Walls apart from these are `islands`.
+
+        Args:
+            negative_damping: whether walls with B < 0 count. By default they do with the backward difference; behind a
+                filter a negative B is a lead compensator and no damper, and B >= 0 is meant. What is a piece does not
+                depend on it: a path may lead through B < 0.
+
+        Returns:
+            ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,
+            of the higher one at a corner; ``kind``, a code of `zwidth.RidgeKind`; ``status`` of `zwidth.Status`, with
+            NaN where it is not 0: NO_BOUNDARY where no such wall with K > 0 is stable.
+
+        Numerics:
+            Closed form for a rigid device. Otherwise the highest point of all edges of the stable set (50 to 150 ms),
+            about 1e-13 relative, refused where rows of the plane contradict it. Inside a JAX transformation it is
+            finished by optimistix, with implicit derivatives in every parameter of every part. The delay and, with
+            one, the period must be plain numbers there (`TracedDelayError`).
+
+        Example:
+            >>> import zwidth
+            >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=100))
+            >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
+            11942 N/m
+        """
+        return stiffest_wall(self, negative_damping)
+
+    def sensitivities(self, *, negative_damping: bool | None = None) -> SceneSensitivities:
+        """What a little more of every parameter of every part buys.
+
+        Args:
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
+            "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, NOT_CONVERGED where
+            one of them is NaN, as all are without a K_max. Whole numbers and coefficients of a filter have none. At
+            zero they are those from the right, at a whole delay both sides agree.
+
+        Numerics:
+            Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a
+            parameter: right to 1e-6, or where one is nearly 0, to 1e-11 of K_max over the parameter.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print(f"{scene.sensitivities().per['damping']:.0f} N/m per N s/m")
+            572 N/m per N s/m
+        """
+        return differentiate(self, negative_damping)
+
+    def required(
+        self,
+        parameter: str,
+        stiffness: float,
+        *,
+        within: tuple[float, float] | None = None,
+        negative_damping: bool | None = None,
+    ) -> RequiredValue:
+        """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
+
+        Args:
+            parameter: its dotted path, such as "damping" or "velocity.cutoff".
+            stiffness: wanted, in N/m, > 0.
+            within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value.
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``value``, the nearest to the present one, itself enough; ``enough``, the side of it on which there is
+            enough ("above", "below"), or "everywhere" in the range (then ``value`` is the present one, or the end next
+            to it), or "nowhere"; ``crossings``, all that were found, each proved by a K_max on either side; ``range``;
+            ``status``, UNREACHABLE with NaN where the range never reaches the stiffness.
+
+        Numerics:
+            25 values across the range, then each crossing to 1e-11 relative. K_max need not be monotone; two crossings
+            between neighboring values are not seen.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> needed = scene.required("damping", 25e3)
+            >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
+            18.62 N s/m or above
+        """
+        return require(self, parameter, stiffness, within, negative_damping)
+
+    def simulate(
+        self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None, **options: Any
+    ) -> Motion:
+        """Simulate this device on a wall in time, with contact, friction, an encoder and a motor as wanted.
+
+        Args:
+            stiffness, virtual_damping: K in N/m and B in N s/m; neither means the scene's own wall.
+            **options: those of `zwidth.simulate`, which this calls.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> zwidth.MotionKind(scene.simulate(25e3, 40, start_position=1e-4, coulomb=1.0).outcome).name
+            'REST'
+        """
+        return simulate(self, stiffness, virtual_damping, **options)
+
+    def parameters(self) -> dict[str, Any]:
+        """Every number of every part by its dotted path.
+
+        Returns:
+            For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;
+            the wall's ``stiffness`` and ``virtual_damping`` come last. What is left out (None) is not listed.
+        """
+        return list_parameters(self)
+
+    def replace(self, **changes: Any) -> Scene:
+        """A new scene with one or several parameters changed; all others stay as they are, in SI units.
+
+        Args:
+            **changes: by dotted path, as ``**{"velocity.cutoff": 50}``, ``period=5e-4`` or ``rate=2000``; or a whole
+                part, as ``operator=zwidth.Operator(mass=0.5)``.
+
+        Raises:
+            InputError: no part of this scene has such a parameter, or the value is refused.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=100))
+            >>> scene.replace(**{"velocity.cutoff": 50}).parameters()["velocity.cutoff"]
+            50.0
+        """
+        return replace_parameters(self, changes)

@@ -1,0 +1,199 @@
+"""How stiff the wall of a device can be, and what a little more of each property buys (rigid loop)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.batching import elementwise
+from zwidth.arrays.xp import is_traced, namespace
+from zwidth.loops.domain import check_scalars
+from zwidth.loops.normalization import Normalized, normalize, quantity_status
+from zwidth.loops.rigid.delay_classes import Kind, classify_delays
+from zwidth.loops.rigid.polynomial import check_delay_model
+from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel
+from zwidth.parts.span import accept_units
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import with_unit
+from zwidth.words.status import Status
+from zwidth.words.types import Array, ArrayLike, DelayModel
+
+_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
+
+
+def checked_device(**quantities: ArrayLike) -> Normalized:
+    """The normalized device; raises `InputError` also where a scalar delta or d is beyond the range of the model."""
+    device = normalize(**quantities)
+    check_scalars(delta=device.delta, d=device.d)
+    return device
+
+
+def check_stiffness(stiffness: ArrayLike) -> None:
+    """Raise `InputError` for a scalar that no wall can have; what is traced becomes NaN instead."""
+    if is_traced(stiffness):
+        return
+    normalize(mass=1.0, period=1.0, stiffness=stiffness)
+    if np.ndim(stiffness) == 0 and not np.asarray(stiffness) > 0:
+        raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in N/m)")
+
+
+@accept_units
+def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLike, delay: ArrayLike = 0.0) -> Array:
+    """Return the stiffness below which some virtual damping makes the wall stable.
+
+    ``K_max = alpha_max(b T/m, t_d/T) m/T^2``, in N/m, for a held delay.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b, the physical damping of the device, in N s/m, >= 0.
+        period: T in s, > 0.
+        delay: t_d in s, >= 0, whole periods or not. All four broadcast.
+
+    Returns:
+        Array of the broadcast shape, in N/m; an entry of an array that is out of range gives NaN.
+
+    Numerics:
+        About 1e-15 relative. Traceable, with first and second derivatives. How it moves with each quantity stands in
+        `scenes.requirements`.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII.
+
+    Example:
+        >>> from zwidth import max_stiffness
+        >>> print(f"{max_stiffness(mass=0.1, damping=10, period=1e-3, delay=1e-3):.0f} N/m")
+        19865 N/m
+    """
+    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
+    values = (mass, period, device.delta, device.d)
+    return elementwise(_max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (classify_delays(device.d),))
+
+
+def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: Kind) -> Array:
+    return ridge_kernel(delta, d, "held", kind).alpha * (mass / period) / period
+
+
+class Sensitivities(NamedTuple):
+    """K_max in N/m and its derivatives: per kg, per N s/m, per s of period and per s of delay."""
+
+    stiffness_max: Array
+    per_mass: Array
+    per_damping: Array
+    per_period: Array
+    per_delay: Array
+    status: Array
+
+
+@accept_units
+def sensitivities(
+    *,
+    mass: ArrayLike,
+    damping: ArrayLike = 0.0,
+    period: ArrayLike,
+    delay: ArrayLike = 0.0,
+    delay_model: DelayModel = "held",
+) -> Sensitivities:
+    """Return the stiffest stable wall and what it gains per unit of mass, damping, period and delay.
+
+    With ``a = alpha_max(delta, d)``: ``dK/dm = (a - delta a_delta)/T^2``, ``dK/db = a_delta/T``,
+    ``dK/dT = (delta a_delta - d a_d - 2 a) m/T^3``, ``dK/dt_d = a_d m/T^3``; each with the other three held fixed.
+
+    Args:
+        mass: m in kg, > 0.
+        damping: b in N s/m, >= 0.
+        period: T in s, > 0.
+        delay: t_d in s, >= 0. All four broadcast.
+        delay_model: "held" (exact) or "fractional_power" (the paper's z^(1+d)).
+
+    Returns:
+        Sensitivities of the broadcast shape: ``stiffness_max`` in N/m, ``per_mass`` in N/m per kg, ``per_damping``
+        in N/m per N s/m, ``per_period`` and ``per_delay`` in N/m per s; ``status``, with NaN where it is not 0.
+
+    Numerics:
+        Exact derivatives, about 1e-14. Both sides agree at whole d > 0; at zero damping and zero delay they are those
+        from the right (-inf for ``per_delay`` of the fractional power at strong damping). Traceable.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, section VII.
+
+    Example:
+        >>> from zwidth import sensitivities
+        >>> gain = sensitivities(mass=0.1, damping=10, period=1e-3, delay=1e-3)
+        >>> print(f"{gain.per_damping:.0f} N/m per N s/m")
+        572 N/m per N s/m
+    """
+    check_delay_model(delay_model)
+    device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
+    values = (mass, damping, period, delay, device.delta, device.d)
+    return elementwise(_sensitivities_kernel, _NAMES, values, (delay_model, classify_delays(device.d)))
+
+
+def _sensitivities_kernel(
+    mass: Array, damping: Array, period: Array, delay: Array, delta: Array, d: Array, delay_model: str, kind: Kind
+) -> Sensitivities:
+    xp = namespace(mass, delta, d)
+    point, by_delta, by_d = slopes_kernel(delta, d, delay_model, kind)
+    # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
+    given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
+    status = xp.where(given == Status.OK, point.status, given).astype(np.int32)
+    alpha, rate = point.alpha, 1.0 / period
+    return Sensitivities(
+        alpha * mass * rate * rate,
+        (alpha - delta * by_delta) * rate * rate,
+        by_delta * rate,
+        # No delay needs no product, which an infinite slope would make NaN.
+        (delta * by_delta - xp.where(d > 0.0, d * by_d, 0.0) - 2.0 * alpha) * mass * rate**3,
+        by_d * mass * rate**3,
+        status,
+    )
+
+
+def one_percent(value: float) -> float:
+    """A power of ten near one percent of ``value``, as a step people can picture."""
+    return 10.0 ** (math.floor(math.log10(value) + 0.5) - 2)
+
+
+def sensitivity_lines(
+    *, mass: float, damping: float = 0.0, period: float, delay: float = 0.0, delay_model: DelayModel = "held"
+) -> list[str]:
+    """Say in words what a little more of each property of one device buys or costs.
+
+    Each line is a derivative times a step: one N s/m, and about one percent of the mass and of the period.
+
+    Args:
+        mass, damping, period, delay: single numbers as for `sensitivities`.
+        delay_model: "held" or "fractional_power".
+
+    Returns:
+        Four lines: damping, mass, sampling period (at the same delay in seconds), delay.
+
+    Example:
+        >>> from zwidth.scenes.stiffness import sensitivity_lines
+        >>> print(sensitivity_lines(mass=0.1, damping=10, period=1e-3, delay=1e-3)[0])
+        one more N s/m of damping buys 572 N/m
+    """
+    for name, value in (("mass", mass), ("damping", damping), ("period", period), ("delay", delay)):
+        if np.ndim(value) != 0:
+            raise InputError(f"{name}: got an array of shape {np.shape(value)}; a single number is needed")
+    gain = sensitivities(mass=mass, damping=damping, period=period, delay=delay, delay_model=delay_model)
+    if gain.status != Status.OK:
+        raise InputError(f"mass, damping, period, delay: {Status(int(gain.status)).message}")
+    step_m, step_t = one_percent(float(mass)), one_percent(float(period))
+    grams, seconds = with_unit(step_m * 1e3, "g", 1), with_unit(step_t, "s", 1)
+    return [
+        f"one more N s/m of damping {describe_effect(gain.per_damping)}",
+        f"{grams} more mass {describe_effect(gain.per_mass * step_m)}",
+        f"a sampling period {seconds} shorter {describe_effect(-gain.per_period * step_t)} (same delay in seconds)",
+        f"{seconds} more delay {describe_effect(gain.per_delay * step_t)}",
+    ]
+
+
+def describe_effect(change: float) -> str:
+    """ "buys 0.5 kN/m", "costs 3 N/m"."""
+    if change == 0:
+        return "changes nothing"
+    if not math.isfinite(change):
+        return f"{'buys' if change > 0 else 'costs'} stiffness at an infinite rate at first"
+    return f"{'buys' if change > 0 else 'costs'} {with_unit(abs(float(change)), 'N/m', 3)}"

@@ -1,1 +1,0 @@
-"""Stability of the loop: one method a file."""

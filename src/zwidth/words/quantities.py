@@ -1,0 +1,366 @@
+"""Every parameter of the loop and every output of a sweep, declared once.
+
+From here come the admissible range of a value in a configuration and on the command line, its unit in files and stores,
+what a store says of it, and what a figure writes beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+from zwidth.words.status import Status
+
+
+class Range(NamedTuple):
+    """The admissible values of a number; the ends belong to it unless open."""
+
+    low: float = -math.inf
+    high: float = math.inf
+    low_open: bool = False
+    high_open: bool = False
+
+    def holds(self, value: float) -> bool:
+        """Whether a finite value is admissible."""
+        above = value > self.low if self.low_open else value >= self.low
+        return above and (value < self.high if self.high_open else value <= self.high)
+
+    def __str__(self) -> str:
+        ends = []
+        if self.low > -math.inf:
+            ends.append(f"{'greater than' if self.low_open else 'at least'} {self.low:g}")
+        if self.high < math.inf:
+            ends.append(f"{'less than' if self.high_open else 'at most'} {self.high:g}")
+        return " and ".join(ends)
+
+
+ANY = Range()
+NOT_NEGATIVE = Range(low=0.0)
+POSITIVE = Range(low=0.0, low_open=True)
+FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
+# Wide enough for any sampled loop, narrow enough that T^2 and 1/T^2 stay within float64.
+PERIODS = Range(1e-12, 1e9)
+RATES = Range(1e-9, 1e12)
+# Every SI quantity is 0 or of a magnitude in this range.
+SI_RANGE = (1e-30, 1e30)
+MAX_DELAY_PERIODS = 10_000.0
+# Stiffness of a recommended wall over that of the stiffest stable one.
+RECOMMENDED_SHARE = 0.75
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One quantity of the loop.
+
+    Attributes:
+        name: in files and stores.
+        long_name: what it is, for the readers of a store.
+        words, symbol: what a figure calls it; the symbol in mathtext, without dollar signs.
+        allowed: its admissible values, in its unit.
+        unit: SI base unit; "1" for a normalized quantity.
+        definition: of a normalized quantity, in mathtext.
+        whole: whether only whole numbers are admissible.
+    """
+
+    name: str
+    long_name: str
+    words: str
+    symbol: str
+    allowed: Range
+    unit: str = "1"
+    definition: str = ""
+    whole: bool = False
+
+    @property
+    def variable(self) -> str:
+        """Its name in a store: CF has no dots in names."""
+        return self.name.replace(".", "_")
+
+
+# In the order of a store's dimensions: a plane of walls lies together, at the end.
+_PARAMETERS = (
+    Parameter("period", "sampling period T", "sampling period", "T", PERIODS, "s"),
+    Parameter("rate", "sampling rate 1/T", "sampling rate", "1/T", RATES, "Hz"),
+    Parameter("delay", "delay t_d from a sample to the moment its force acts", "delay", "t_d", NOT_NEGATIVE, "s"),
+    Parameter("mass", "mass m of the device", "mass", "m", POSITIVE, "kg"),
+    Parameter("damping", "physical damping b of the device", "physical damping", "b", NOT_NEGATIVE, "N s/m"),
+    Parameter(
+        "d",
+        "delay in sampling periods, t_d/T",
+        "delay in periods",
+        "d",
+        Range(0.0, MAX_DELAY_PERIODS),
+        definition="t_d/T",
+    ),
+    Parameter(
+        "delta",
+        "normalized damping of the device, b T/m",
+        "normalized physical damping",
+        r"\delta",
+        NOT_NEGATIVE,
+        definition="b\\,T/m",
+    ),
+    Parameter("velocity.cutoff", "cut-off of the velocity filter", "cut-off", "f_c", POSITIVE, "Hz"),
+    Parameter(
+        "velocity.time_constant", "time constant of the velocity filter", "time constant", r"\tau", POSITIVE, "s"
+    ),
+    Parameter("velocity.samples", "window of the velocity estimate", "window", "n", Range(1, 1000), whole=True),
+    Parameter("velocity.order", "order of the velocity filter", "filter order", "n_f", Range(1, 8), whole=True),
+    Parameter(
+        "velocity.coded_period", "period written into the velocity estimate", "coded period", "T_c", PERIODS, "s"
+    ),
+    Parameter("operator.mass", "mass of the hand", "mass of the hand", "m_h", NOT_NEGATIVE, "kg"),
+    Parameter("operator.damping", "damping of the hand to ground", "damping of the hand", "b_h", NOT_NEGATIVE, "N s/m"),
+    Parameter(
+        "operator.stiffness", "stiffness of the hand to ground", "stiffness of the hand", "k_h", NOT_NEGATIVE, "N/m"
+    ),
+    Parameter(
+        "operator.coupling_stiffness",
+        "stiffness of the spring between hand and device",
+        "stiffness of the grasp",
+        "k_g",
+        POSITIVE,
+        "N/m",
+    ),
+    Parameter(
+        "operator.coupling_damping",
+        "damping of the damper between hand and device",
+        "damping of the grasp",
+        "c_g",
+        NOT_NEGATIVE,
+        "N s/m",
+    ),
+    Parameter("coupling.mass", "mass beyond the coupling of the device", "mass of the tip", "m_2", POSITIVE, "kg"),
+    Parameter("coupling.stiffness", "stiffness of the coupling", "stiffness of the coupling", "k", POSITIVE, "N/m"),
+    Parameter("coupling.damping", "damping of the coupling", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m"),
+    Parameter("stiffness", "stiffness K of the virtual wall", "stiffness", "K", ANY, "N/m"),
+    Parameter(
+        "alpha",
+        "normalized stiffness of the virtual wall, K T^2/m",
+        "normalized stiffness",
+        r"\alpha",
+        ANY,
+        definition=r"K\,T^2\!/m",
+    ),
+    Parameter("virtual_damping", "damping B of the virtual wall", "virtual damping", "B", ANY, "N s/m"),
+    Parameter(
+        "beta",
+        "normalized damping of the virtual wall, B T/m",
+        "normalized virtual damping",
+        r"\beta",
+        ANY,
+        definition="B\\,T/m",
+    ),
+)
+PARAMETERS = {parameter.name: parameter for parameter in _PARAMETERS}
+NORMALIZED = ("alpha", "beta", "delta", "d")
+PHYSICAL = tuple(name for name in PARAMETERS if name not in NORMALIZED)
+OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
+"""Parameters of the parts beside device and timing, by the path that leads to them in a scene."""
+VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
+"""The same by their names in a store."""
+WALL = ("alpha", "beta", "stiffness", "virtual_damping")
+
+Family: TypeAlias = Literal["wall", "device"]
+"""Whether an output belongs to each wall, or to each device and delay whatever its wall."""
+
+Look: TypeAlias = Literal["truth", "diverging", "sequential", "logarithmic", "steep"]
+"""Truth values; numbers with a good and a bad side; numbers; positive ones; and those that grow without end."""
+
+NOT_COMPUTED = 255
+"""The status of a point whose chunk is not there yet; the other codes are those of `zwidth.Status`."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """One variable of a store.
+
+    Attributes:
+        name: in files and stores.
+        family: what it belongs to.
+        long_name: its definition, for the readers of a store.
+        dtype: how it is kept.
+        units: its unit in a normalized sweep.
+        physical_units: its unit in a sweep over SI quantities; None where that is the same.
+        physical_only: whether a normalized sweep cannot have it.
+        attributes: more CF attributes.
+        words, symbol: what a figure calls it; nothing where it is never a figure's own quantity.
+        look: how its values become colors.
+        center: where a diverging quantity changes sides: the edge of what is stable or passive.
+        below: whether the good side lies below the center.
+    """
+
+    name: str
+    family: Family
+    long_name: str
+    dtype: Literal["bool", "float64", "uint8"] = "float64"
+    units: str = "1"
+    physical_units: str | None = None
+    physical_only: bool = False
+    attributes: dict[str, Any] = field(default_factory=dict)
+    words: str = ""
+    symbol: str = ""
+    look: Look = "truth"
+    center: float = 0.0
+    below: bool = False
+
+    def units_in(self, physical: bool) -> str:
+        """The unit that the store states."""
+        return self.physical_units if physical and self.physical_units else self.units
+
+
+def _truth(name: str, long_name: str, no: str) -> Output:
+    flags = {"flag_values": [0, 1], "flag_meanings": f"{no} {name}"}
+    return Output(name, "wall", long_name, "bool", attributes=flags)
+
+
+_OUTPUTS = (
+    _truth("stable", "whether every pole lies strictly inside the unit circle", "unstable"),
+    Output(
+        "spectral_radius",
+        "wall",
+        "largest pole magnitude",
+        words="spectral radius",
+        symbol=r"\rho",
+        look="diverging",
+        center=1.0,
+        below=True,
+    ),
+    Output(
+        "margin",
+        "wall",
+        "1 - spectral radius, positive for a stable wall",
+        words="margin",
+        symbol=r"1 - \rho",
+        look="diverging",
+    ),
+    Output(
+        "decay_rate",
+        "wall",
+        "rate at which the slowest pole decays, -ln(spectral radius); negative where it grows",
+        units="1/period",
+        physical_units="1/s",
+        words="rate of decay",
+        symbol=r"-\ln\rho",
+        look="diverging",
+    ),
+    Output(
+        "gain_margin",
+        "wall",
+        "factor by which stiffness and damping together may grow; below 1: must fall",
+        words="gain margin",
+        symbol="g_m",
+        look="logarithmic",
+    ),
+    Output(
+        "phase_margin",
+        "wall",
+        "phase above -180 degrees at the gain crossover",
+        units="degree",
+        words="phase margin",
+        symbol=r"\varphi_m",
+        look="diverging",
+    ),
+    Output(
+        "delay_margin",
+        "wall",
+        "delay that the wall bears beyond its own; 0 for an unstable wall",
+        units="sampling periods",
+        physical_units="s",
+        words="delay margin",
+        symbol=r"\tau_m",
+        look="logarithmic",
+    ),
+    Output(
+        "modulus_margin",
+        "wall",
+        "least distance of the open loop from -1",
+        words="modulus margin",
+        symbol="s_m",
+        look="sequential",
+    ),
+    _truth("passive", "whether the wall is passive at its delay", "not_passive"),
+    Output(
+        "passivity_margin",
+        "wall",
+        "physical damping in excess of what a passive wall needs, in units of delta",
+        words="passivity margin, in units of",
+        symbol=r"\delta",
+        look="diverging",
+    ),
+    Output(
+        "settling_time",
+        "wall",
+        "time in which the slowest pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall",
+        units="sampling periods",
+        physical_units="s",
+        words="settling time to 2 %",
+        symbol="t_s",
+        look="steep",
+    ),
+    Output(
+        "alpha_max",
+        "device",
+        "largest normalized stiffness that some virtual damping makes stable",
+        words="maximum stable stiffness",
+        symbol=r"\alpha_{\max}",
+        look="logarithmic",
+    ),
+    Output(
+        "beta_at_max",
+        "device",
+        "normalized virtual damping of that wall",
+        words="virtual damping of that wall",
+        symbol=r"\beta",
+        look="sequential",
+    ),
+    Output(
+        "kind",
+        "device",
+        "kind of that optimum: smooth, or a corner with a double pole at z = -1",
+        "uint8",
+        attributes={"flag_values": [0, 1, NOT_COMPUTED], "flag_meanings": "smooth corner unknown"},
+    ),
+    Output(
+        "stiffness_max",
+        "device",
+        "largest stable stiffness K",
+        units="N/m",
+        physical_only=True,
+        words="maximum stable stiffness",
+        symbol=r"K_{\max}",
+        look="logarithmic",
+    ),
+    Output(
+        "virtual_damping_at_max",
+        "device",
+        "virtual damping B of that wall",
+        units="N s/m",
+        physical_only=True,
+        words="virtual damping of that wall",
+        symbol="B",
+        look="sequential",
+    ),
+)
+OUTPUTS = {output.name: output for output in _OUTPUTS}
+
+RADIUS_OUTPUTS = frozenset({"spectral_radius", "margin", "decay_rate", "settling_time"})
+MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
+"""NaN there means that the wall has no such margin, as `zwidth.margins` says."""
+
+OUTPUTS_WITH_PARTS = ("stable", "spectral_radius", "passive", "stiffness_max", "virtual_damping_at_max")
+"""What is known of devices with a velocity filter, a hand or a coupling."""
+
+STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
+"""The variable that says for each point of a family why it has the values it has."""
+
+
+def status_flags() -> dict[str, Any]:
+    """The CF description of a status."""
+    meanings = [*(status.name.lower() for status in Status), "not_computed"]
+    return {
+        "long_name": "why a point has its values",
+        "flag_values": [*(int(status) for status in Status), NOT_COMPUTED],
+        "flag_meanings": " ".join(meanings),
+    }

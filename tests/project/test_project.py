@@ -1,0 +1,216 @@
+"""The promises that no single module can keep: files that exist, pins, scripts, and a silent import."""
+
+import ast
+import itertools
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+import yaml
+from packaging.requirements import Requirement
+from waiting import LONGEST
+
+import zwidth
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# A folder of the project followed by a path, or one of the files beside the README.
+NAMED_PATH = re.compile(
+    r"(?<![\w./:-])(?:\./)?("
+    r"(?:src|tests|benchmarks|configs|scripts|docs|\.ci)/[\w./*-]*[\w*/]"
+    r"|(?:[A-Z]{4,}\.md|LICENSE|pyproject\.toml|constraints\.txt)(?![\w/])"
+    r")"
+)
+LINK = re.compile(r"\]\((?![a-z]+:|#)([^)#\s]+)")
+# The groups keep these patterns from matching their own text.
+FOREIGN_TEXT = {
+    "a registry's host": re.compile(r"(?:pypi|pythonhosted|npmjs|debian)\.(?:org|com|net)"),
+    "a machine's path": re.compile(r"(?<![\w.~)/-])/(?:home|root|Users|mnt|opt|srv|tmp|work)/"),
+}
+
+
+def documents():
+    names = ["README.md", "CONTRIBUTING.md", "configs/*.yaml"]
+    return [path for name in names for path in sorted(ROOT.glob(name))]
+
+
+def project_files():
+    """Every file that is tracked or about to be; all of them where this is no checkout."""
+    listing = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if listing.returncode == 0:
+        paths = [ROOT / name for name in listing.stdout.split("\0") if name]
+    else:
+        hidden = {".venv", ".venv-oldest", ".venv-newest", ".git", "__pycache__", "runs"}
+        paths = [path for path in ROOT.rglob("*") if not hidden & set(path.relative_to(ROOT).parts)]
+    return [path for path in paths if path.is_file()]
+
+
+def run_python(code):
+    """Run code in a fresh interpreter, since this one has long since imported everything."""
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False, timeout=LONGEST
+    )
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+@pytest.mark.parametrize("document", documents(), ids=lambda path: path.relative_to(ROOT).as_posix())
+def test_every_named_path_exists(document):
+    text = document.read_text(encoding="utf-8")
+    if document.suffix == ".yaml":
+        text = "\n".join(re.findall(r"(?:^|\s)#(.*)", text))
+    named = set(NAMED_PATH.findall(text))
+    missing = {name for name in named if not any(ROOT.glob(name.rstrip("/")))}
+    missing |= {link for link in LINK.findall(text) if not (document.parent / link).exists()}
+    assert not missing
+
+
+def test_constraints_hold_pins_and_nothing_else():
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pin = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*==[0-9][0-9a-z.]*")
+    assert [line for line in lines if not pin.fullmatch(line)] == []
+    names = [line.partition("==")[0] for line in lines]
+    assert names == sorted(set(names))
+
+
+def test_every_dependency_is_pinned_within_its_bounds():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    lines = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pins = dict(line.split("==") for line in lines)
+    texts = [*project["dependencies"], *itertools.chain(*project["optional-dependencies"].values())]
+    requirements = [Requirement(text) for text in texts]
+    outside = [
+        str(requirement)
+        for requirement in requirements
+        if requirement.name != project["name"] and not requirement.specifier.contains(pins[requirement.name])
+    ]
+    assert outside == []
+
+
+def test_the_citation_is_of_this_version():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["version"] == project["version"] == zwidth.__version__
+    assert citation["license"] == project["license"]
+    assert citation["keywords"] == project["keywords"]
+    # What the format, 1.2.0, asks for.
+    assert {"cff-version", "message", "title", "authors"} <= citation.keys()
+    for work in (citation, *citation["references"]):
+        assert work["title"]
+        assert all({"name"} <= author.keys() or {"family-names"} <= author.keys() for author in work["authors"])
+    (paper,) = citation["references"]
+    assert (paper["type"], paper["year"]) == ("conference-paper", 2006)
+    assert [author["family-names"] for author in paper["authors"]] == ["Hulin", "Preusche", "Hirzinger"]
+
+
+@pytest.mark.parametrize("what", FOREIGN_TEXT)
+def test_no_file_names(what):
+    found = []
+    for path in project_files():
+        data = path.read_bytes()
+        if b"\0" in data:
+            continue
+        match = FOREIGN_TEXT[what].search(data.decode("utf-8", errors="replace"))
+        if match:
+            found.append(f"{path.relative_to(ROOT)}: {match.group()}")
+    assert found == []
+
+
+def test_scripts_can_be_executed():
+    scripts = [*(ROOT / "scripts").iterdir(), ROOT / ".ci" / "run"]
+    assert [path.name for path in scripts if path.is_file() and not os.access(path, os.X_OK)] == []
+
+
+def test_import_changes_no_global_setting():
+    output = run_python("""
+import importlib, logging, os, pkgutil, warnings
+
+# What these do to each other's settings when they are imported is no doing of ours.
+with warnings.catch_warnings():
+    warnings.simplefilter("ignore")
+    import click, equinox, jax, jaxopt, lineax, matplotlib.pyplot, numpy, optimistix
+    import pydantic, rich.progress, scipy.linalg, scipy.optimize, yaml
+    for name in ("bokeh.server.server", "dask", "distributed", "flint", "xarray", "zarr"):
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            pass
+
+def settings():
+    root = logging.getLogger()
+    return {
+        "jax": dict(jax.config.values),
+        "numpy errors": numpy.geterr(),
+        "numpy printing": numpy.get_printoptions(),
+        "matplotlib": matplotlib.rcParams.copy(),
+        "logging": (root.level, root.handlers[:], root.filters[:], logging.root.manager.disable),
+        "warnings": warnings.filters[:],
+        "environment": dict(os.environ),
+    }
+
+before = settings()
+import zwidth
+
+for module in pkgutil.walk_packages(zwidth.__path__, "zwidth."):
+    if module.name.endswith("__main__"):
+        continue
+    try:
+        importlib.import_module(module.name)
+    except ImportError as error:
+        # An extra that is not installed.
+        if (error.name or "zwidth").partition(".")[0] == "zwidth":
+            raise
+for name in getattr(zwidth, "__all__", []):
+    getattr(zwidth, name)
+
+after = settings()
+print([name for name in before if before[name] != after[name]])
+""")
+    assert output.strip() == "[]"
+
+
+def test_help_answers_without_jax():
+    output = run_python("""
+import sys
+
+from zwidth.cli import main
+
+sys.argv = ["zwidth", "--help"]
+try:
+    main()
+except SystemExit as end:
+    assert not end.code
+print("heavy:", sorted({"jax", "jaxlib", "matplotlib", "scipy", "zarr"} & set(sys.modules)))
+""")
+    assert "Usage" in output
+    assert output.splitlines()[-1] == "heavy: []"
+
+
+def test_figures_are_drawn_without_jax():
+    output = run_python("""
+import sys
+
+import zwidth.figures
+
+print("jax" in sys.modules)
+""")
+    assert output.strip() == "False"
+
+
+def test_no_two_types_share_a_name():
+    homes = {}
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                homes.setdefault(node.name.strip("_"), []).append(path.name)
+    assert {name: files for name, files in homes.items() if len(files) > 1} == {}

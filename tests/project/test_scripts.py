@@ -1,0 +1,186 @@
+"""What the scripts hand on to pytest and uv: they run for real, beside stand-ins that write their arguments down."""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from waiting import LONGEST
+
+ROOT = Path(__file__).resolve().parents[2]
+QUICK = ROOT / "tests" / "quick.txt"
+ON_EVERY_CORE = ["--numprocesses", "auto", "--dist", "loadfile"]
+# What the quick tests must hold something of; the scene is described by a module, the others by folders.
+ROOMS = (
+    "test_scene.py",
+    "test_loop.py",
+    *[
+        "parts",
+        "linear",
+        "simulation",
+        "stability",
+        "design",
+        "fitting",
+        "sweep",
+        "studies",
+        "config",
+        "cli",
+        "figures",
+        "html_report",
+        "explorer",
+    ],
+)
+
+# Every call becomes a line in the file "calls"; uv makes an environment whose pytest does the same.
+NOTE = """#!/usr/bin/env bash
+printf '%s\\n' "{name} $*" >> "{calls}"
+"""
+MAKE = """if [ "$1" = venv ]; then
+    for folder in "$@"; do :; done
+    rm -rf "$folder" && mkdir -p "$folder/bin" && cp .venv/bin/pytest "$folder/bin/pytest"
+fi
+"""
+
+
+def stand_in(path, calls, more=""):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(NOTE.format(name=path.name, calls=calls) + more, encoding="utf-8")
+    path.chmod(0o755)
+
+
+@pytest.fixture
+def project(tmp_path):
+    """A project with the real scripts, whose programs only write down how they are called."""
+    root = tmp_path / "project"
+    for name in ("test", "test-versions", "test-processors"):
+        (root / "scripts").mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / "scripts" / name, root / "scripts")
+    (root / "pyproject.toml").write_text("# as at first\n", encoding="utf-8")
+    for name in ("tests/unit/scenes/test_scene.py", "tests/unit/loops/rigid/test_polynomial.py"):
+        (root / name).parent.mkdir(parents=True, exist_ok=True)
+        (root / name).touch()
+    calls = tmp_path / "calls"
+    stand_in(root / "scripts" / "setup", calls)
+    stand_in(root / ".venv" / "bin" / "pytest", calls)
+    stand_in(root / ".venv" / "bin" / "uv", calls, MAKE)
+    stand_in(root / ".venv" / "bin" / "python", os.devnull, "echo Python 3.11.7\n")
+    return root
+
+
+def calls_of(root, script, *arguments, cwd=None, path=None):
+    """What a script calls, a list of words for each call."""
+    calls = root.parent / "calls"
+    calls.unlink(missing_ok=True)
+    environment = {**os.environ, "PATH": f"{path}{os.pathsep}{os.environ['PATH']}"} if path else None
+    command = [root / "scripts" / script, *arguments]
+    done = subprocess.run(
+        command, cwd=cwd or root, env=environment, capture_output=True, text=True, check=False, timeout=LONGEST
+    )
+    lines = calls.read_text(encoding="utf-8").splitlines() if calls.exists() else []
+    return done.returncode, [line.split() for line in lines]
+
+
+def test_every_quick_test_exists():
+    lines = QUICK.read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if not (ROOT / line.partition("::")[0]).exists()] == []
+    assert len(lines) == len(set(lines)) > 0
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_every_room_has_a_quick_test(room):
+    lines = QUICK.read_text(encoding="utf-8").splitlines()
+    assert [line for line in lines if f"{line}/".startswith(f"tests/unit/{room}/")]
+
+
+@pytest.mark.parametrize(
+    "given, handed_on",
+    [
+        ([], ON_EVERY_CORE),
+        (["--quick"], [*ON_EVERY_CORE, "@tests/quick.txt"]),
+        (["--quick", "-x"], [*ON_EVERY_CORE, "@tests/quick.txt", "-x"]),
+        (["-k", "scene"], [*ON_EVERY_CORE, "-k", "scene"]),
+        (["{tests}/unit"], [*ON_EVERY_CORE, "{root}/{tests}/unit"]),
+        (["{tests}/unit/test_scene.py", "-x"], ["{root}/{tests}/unit/test_scene.py", "-x"]),
+        (["{tests}/unit/test_scene.py::test_derivatives"], ["{root}/{tests}/unit/test_scene.py::test_derivatives"]),
+        (
+            ["{tests}/unit/test_scene.py", "{tests}/unit/test_loop.py"],
+            [*ON_EVERY_CORE, "{root}/{tests}/unit/test_scene.py", "{root}/{tests}/unit/test_loop.py"],
+        ),
+        (["-n", "3"], ["-n", "3"]),
+        (["-n0", "--quick"], ["-n0", "@tests/quick.txt"]),
+        (["--numprocesses=1"], ["--numprocesses=1"]),
+        (["--dist", "load"], ["--dist", "load"]),
+        (["-p", "no:xdist"], ["-p", "no:xdist"]),
+        (["--pdb"], ["--pdb"]),
+    ],
+)
+def test_the_tests_run_on_every_core_unless_told_otherwise(project, given, handed_on):
+    given = [word.format(tests="tests") for word in given]
+    handed_on = [word.format(tests="tests", root=project) for word in handed_on]
+    code, calls = calls_of(project, "test", *given)
+    assert code == 0
+    assert calls == [["setup", "test"], ["pytest", *handed_on]]
+
+
+def test_a_path_is_looked_for_where_one_is_and_then_in_the_project(project):
+    unit = project / "tests" / "unit"
+    assert calls_of(project, "test", "./test_scene.py", cwd=unit)[1][-1] == ["pytest", f"{unit}/./test_scene.py"]
+    # Not there, so pytest finds it from the root, or says that there is none.
+    assert calls_of(project, "test", "tests/unit", cwd=unit)[1][-1] == ["pytest", *ON_EVERY_CORE, "tests/unit"]
+
+
+@pytest.mark.parametrize("which, resolution", [("oldest", "lowest-direct"), ("newest", "highest")])
+def test_versions_are_installed_once_and_tested_every_time(project, which, resolution):
+    venv = f".venv-{which}"
+    tested = ["pytest", *ON_EVERY_CORE, "@tests/quick.txt", "-x"]
+    made = ["uv", "venv", "--quiet", "--clear", "--python", ".venv/bin/python", venv]
+    code, calls = calls_of(project, "test-versions", which, "-x")
+    assert code == 0
+    assert calls[:2] == [["setup", "dev"], made]
+    assert calls[2][:3] == ["uv", "pip", "install"]
+    assert calls[2][-4:] == ["--resolution", resolution, "-e", ".[test]"]
+    assert f"{venv}/bin/python" in calls[2]
+    assert calls[3:] == [tested]
+    assert calls_of(project, "test-versions", which, "-x") == (0, [["setup", "dev"], tested])
+    (project / "pyproject.toml").write_text("# another bound\n", encoding="utf-8")
+    assert made in calls_of(project, "test-versions", which, "-x")[1]
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the script tries processors of one family")
+def test_every_processor_is_tried_even_when_one_fails(project):
+    calls = project.parent / "calls"
+    held = f"echo ${{XLA_FLAGS##*=}} $OPENBLAS_CORETYPE >> '{calls}'; [ $OPENBLAS_CORETYPE != Haswell ]\n"
+    stand_in(project / ".venv" / "bin" / "pytest", calls, held)
+    code, called = calls_of(project, "test-processors", "-x")
+    pages = ["tests/project/test_readme.py", "tests/project/test_docs.py"]
+    tested = ["pytest", *ON_EVERY_CORE, "@tests/quick.txt", *pages, "-x"]
+    assert (code, called[0]) == (1, ["setup", "test"])
+    assert called[1::2] == [tested, tested]
+    assert called[2::2] == [["AVX2", "Haswell"], ["SSE4_2", "Nehalem"]]
+
+
+@pytest.mark.parametrize("which, again", [("oldest", 0), ("newest", 1)])
+def test_releases_of_another_day_are_installed_where_they_matter(project, which, again):
+    calls_of(project, "test-versions", which)
+    programs = project.parent / "bin"
+    stand_in(programs / "date", os.devnull, "echo 2006-07-03\n")
+    calls = calls_of(project, "test-versions", which, path=programs)[1]
+    assert [call[1] for call in calls if call[0] == "uv"].count("venv") == again
+
+
+def test_versions_that_could_not_be_installed_are_not_taken_for_installed(project):
+    uv = project / ".venv" / "bin" / "uv"
+    stand_in(uv, project.parent / "calls", MAKE + '[ "$1" != pip ]\n')
+    for _ in range(2):
+        code, calls = calls_of(project, "test-versions", "oldest")
+        assert code == 1
+        assert [call[0] for call in calls] == ["setup", "uv", "uv"]
+
+
+@pytest.mark.parametrize("arguments", [[], ["older"]])
+def test_which_versions_must_be_said(project, arguments):
+    assert calls_of(project, "test-versions", *arguments) == (2, [])

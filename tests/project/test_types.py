@@ -1,0 +1,98 @@
+"""Arrays have the axes that their annotations name: checked by jaxtyping, which the program itself never loads."""
+
+from __future__ import annotations
+
+import runpy
+import sys
+import typing
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from jaxtyping import AbstractArray, jaxtyped
+
+import zwidth
+from zwidth.loops.rigid.aberth import aberth_kernel, discs, product_form
+from zwidth.loops.rigid.degrees import find_degree
+from zwidth.loops.rigid.poles import companion, enclose_poles, pole_kernel, radius_kernel, unstable_poles
+from zwidth.loops.rigid.polynomial import affine, closed_loop_transfer, coefficients, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.region import lobe
+from zwidth.loops.rigid.response import step_response
+from zwidth.words import types as _types
+from zwidth.words.types import Reals, Roots
+
+with patch.object(typing, "TYPE_CHECKING", True):
+    ALIASES = {name: value for name, value in runpy.run_path(_types.__file__).items() if name[0] != "_"}
+
+# Arguments that broadcast to the shape (2, 3), and arrays of it.
+WALL = {"alpha": np.array([0.1, 0.2, 0.4]), "beta": np.array([[0.1], [0.3]]), "delta": np.float64(0.2)}
+GRID = dict(zip(WALL, np.broadcast_arrays(*WALL.values()), strict=True))
+DEVICE = {"delta": GRID["delta"], "d": np.full((2, 3), 1.5)}
+HALF = find_degree(1.5)
+KERNEL = {**GRID, **DEVICE, "degree": HALF}
+LOOP = frequency_loop(**DEVICE, delay_model="held")
+ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
+
+CALLS = [
+    (zwidth.char_poly, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
+    (zwidth.poles, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
+    (enclose_poles, {**WALL, "d": np.float64(1.5)}),
+    (unstable_poles, {**WALL, "d": np.float64(1.5)}),
+    (
+        zwidth.count_poles,
+        {"zeros": np.ones((3, 1)), "poles": np.ones((2, 1, 2)), "gain": np.float64(0.1), "lag": np.array([1, 2, 3])},
+    ),
+    (
+        closed_loop_transfer,
+        {name: np.full(3, 0.1) for name in ("mass", "damping", "period", "stiffness", "virtual_damping")} | {"d": 2},
+    ),
+    (zwidth.stable_region, {"delta": 0.1, "d": 1.0, "points": 20}),
+    (lobe, {"delta": 0.1, "d": 1.0, "points": 20}),
+    (step_response, {"alpha": 0.1, "beta": 0.2, "delta": 0.1, "d": 1.0, "periods": 20}),
+    (affine, {**DEVICE, "degree": HALF}),
+    (coefficients, KERNEL),
+    (companion, {"monic": coefficients(**KERNEL)}),
+    (pole_kernel, KERNEL),
+    (radius_kernel, KERNEL),
+    (aberth_kernel, {**KERNEL, "spring": False}),
+    (discs, {"z": ROOTS_FIRST, "form": product_form(**KERNEL, spring=False)}),
+    (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP, "delay_model": "held"}),
+]
+
+
+def hints_of(annotated):
+    return typing.get_type_hints(annotated, {**vars(sys.modules[annotated.__module__]), **ALIASES})
+
+
+def named(value, hint, place):
+    """The arrays in a value whose annotation names their axes: place, array, annotation."""
+    if isinstance(hint, type) and issubclass(hint, AbstractArray):
+        yield place, value, hint
+    elif hasattr(hint, "_fields"):
+        for name, inner in hints_of(hint).items():
+            yield from named(getattr(value, name), inner, f"{place}.{name}")
+    elif typing.get_origin(hint) is tuple and Ellipsis not in typing.get_args(hint):
+        for index, (part, inner) in enumerate(zip(value, typing.get_args(hint), strict=True)):
+            yield from named(part, inner, f"{place}[{index}]")
+
+
+def misfits(function, arguments):
+    """Which arguments and results have other axes or another type than the annotations say."""
+    hints = hints_of(function)
+    given = [found for name, value in arguments.items() for found in named(value, hints[name], name)]
+    returned = list(named(function(**arguments), hints["return"], "result"))
+    assert returned
+    with jaxtyped("context"):
+        return [place for place, value, hint in given + returned if not isinstance(value, hint)]
+
+
+@pytest.mark.parametrize("function, arguments", CALLS, ids=[function.__name__ for function, _ in CALLS])
+def test_arrays_have_the_axes_that_annotations_name(function, arguments):
+    assert misfits(function, arguments) == []
+
+
+def test_other_axes_are_noticed():
+    def turned(alpha: Reals, beta: Reals) -> Roots:
+        return ROOTS_FIRST
+
+    assert misfits(turned, {"alpha": GRID["alpha"], "beta": GRID["beta"].T}) == ["beta", "result"]

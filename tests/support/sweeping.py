@@ -1,0 +1,231 @@
+"""What the tests of sweeps share: small configurations, the command line, and chunks that go wrong."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import patch
+
+import numpy as np
+from waiting import LONGEST
+
+from zwidth import run
+from zwidth.cli import main
+from zwidth.studies.document import Config
+from zwidth.sweep import plan
+from zwidth.sweep.chunks import perform
+from zwidth.sweep.store import find_stores, open_dataset
+from zwidth.sweep.study import SweepStudy
+
+AXES = {
+    "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 40}},
+    "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 300}},
+    "delta": [0.0, 0.1, 1.0, 3.0],
+    "d": [0, 0.5, 1, 2],
+}
+
+
+def study(name="map", axes=None, outputs=("stable",), **fields):
+    return {"kind": "sweep", "name": name, "axes": AXES if axes is None else axes, "outputs": list(outputs), **fields}
+
+
+WALLS = (
+    *("stable", "spectral_radius", "margin", "decay_rate", "settling_time", "passive", "passivity_margin"),
+    *("gain_margin", "phase_margin", "delay_margin", "modulus_margin"),
+)
+DEVICES = ("alpha_max", "beta_at_max", "kind")
+FEW = {"alpha": [0.0, 0.1, 0.5], "beta": [-0.05, 0.1, 0.4, 0.9], "delta": [0.0, 0.3], "d": [0, 0.5, 2]}
+IN_SI = {
+    **{"mass": ["100 g", "1 kg"], "damping": [0, 10], "rate": "1 kHz", "delay": ["1 ms", "2.5 ms"]},
+    **{"stiffness": [0, 1000, 20_000], "virtual_damping": [0, 5, 40]},
+}
+
+
+def config_of_everything():
+    """Every output, in both kinds of units, and radii to an accuracy."""
+    return config_of(
+        study("map", FEW, (*WALLS, *DEVICES)),
+        study("proved", FEW, ("spectral_radius", "settling_time"), accuracy=1e-11),
+        study("si", IN_SI, (*WALLS, "stiffness_max", "virtual_damping_at_max")),
+    )
+
+
+def cut(monkeypatch, walls, devices):
+    """From now on, plan chunks of at most this many points; a run's other processes follow the plan in its store."""
+    whole = plan.chunk_shape
+
+    def chunk_shape(shape, target):
+        # Walls have two dimensions more than their devices.
+        return whole(shape, walls if len(shape) > 3 else devices)
+
+    monkeypatch.setattr(plan, "chunk_shape", chunk_shape)
+
+
+def config_of(*studies, name="test"):
+    return Config.model_validate({"version": 1, "name": name, "studies": list(studies) or [study()]})
+
+
+def sweep_of(described) -> SweepStudy:
+    """A sweep as described, checked and complete."""
+    (sweep,) = config_of(described).studies
+    assert isinstance(sweep, SweepStudy)
+    return sweep
+
+
+def run_sweeps(config, out, **options):
+    """Run a configuration; returns what became of the chunks of all its sweeps together."""
+    result = run(config, out=out, **options)
+    sweeps = result.sweeps.values()
+    counts = {name: sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")}
+    failed = {chunk: error for sweep in sweeps for chunk, error in sweep.failed.items()}
+    more = {name: getattr(result, name) for name in ("ok", "repaired", "hopeless", "interrupted")}
+    return SimpleNamespace(**counts, **more, failed=failed)
+
+
+def values_of(path):
+    """Every variable of a store, in memory."""
+    with open_dataset(path) as dataset:
+        return {name: variable.values for name, variable in dataset.data_vars.items()}
+
+
+def assert_same(first, second):
+    """Two stores, or all stores of two folders, hold the same values, bit by bit."""
+    stores = find_stores(Path(first))
+    assert [store.name for store in stores] == [store.name for store in find_stores(Path(second))]
+    for store, with_it in zip(stores, find_stores(Path(second)), strict=True):
+        one, other = values_of(store), values_of(with_it)
+        assert one.keys() == other.keys()
+        for name in one:
+            assert one[name].dtype == other[name].dtype
+            assert one[name].tobytes() == other[name].tobytes(), (store.name, name)
+
+
+def flags(path):
+    """The marks of finished chunks, each with what would change if it were written again."""
+    marks = [mark for store in find_stores(Path(path)) for mark in store.glob("*_checksum/c/*/0")]
+    return {mark: (mark.stat().st_ino, mark.stat().st_mtime_ns) for mark in marks}
+
+
+def chunk_file(path, variable="stable", number=0):
+    """One file of a variable."""
+    return sorted(file for file in (Path(path) / variable / "c").rglob("*") if file.is_file())[number]
+
+
+def command(*arguments):
+    """The words that start the command line."""
+    return [sys.executable, "-m", "zwidth", *map(str, arguments)]
+
+
+def main_of(*arguments):
+    """The exit code of the command line, run in this process, which its settings do not reach."""
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        # With a folder given, it makes none of the user's.
+        with patch.dict(os.environ, JAX_COMPILATION_CACHE_DIR=""):
+            main([str(argument) for argument in arguments])
+    except SystemExit as end:
+        return end.code or 0
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+    return 0
+
+
+def zwidth(*arguments, **options):
+    """Run the command line to its end."""
+    return subprocess.run(command(*arguments), capture_output=True, text=True, check=False, timeout=LONGEST, **options)
+
+
+def start(*arguments, **options):
+    """Start the command line in a process group of its own."""
+    return subprocess.Popen(
+        command(*arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        **options,
+    )
+
+
+def slowly(path, family, index):
+    """A chunk that takes a moment, so that something can happen meanwhile."""
+    time.sleep(0.02)
+    perform(path, family, index)
+
+
+def failing_on_2(path, family, index):
+    """Chunk 2 always fails."""
+    if index == 2:
+        raise ArithmeticError("no number is good enough")
+    perform(path, family, index)
+
+
+def killed_on_2(path, family, index):
+    """Chunk 2 always kills the process that computes it."""
+    if index == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    perform(path, family, index)
+
+
+def killed_once_on_2(path, family, index):
+    """Chunk 2 kills its first process only."""
+    mark = Path(path).with_suffix(".killed")
+    if index == 2 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    perform(path, family, index)
+
+
+def disturb(path, number):
+    """Send the scheduler a signal, once it has heard of the chunks before."""
+    time.sleep(0.5)
+    os.kill(int((Path(path).parents[1] / "pid").read_text(encoding="utf-8")), number)
+
+
+def killing_the_scheduler_on_2(path, family, index):
+    """The scheduler dies while chunk 2 is computed."""
+    if index == 2:
+        disturb(path, signal.SIGKILL)
+    perform(path, family, index)
+
+
+def stopping_the_scheduler_on_2(path, family, index):
+    """The scheduler falls silent while chunk 2 is computed."""
+    if index == 2:
+        disturb(path, signal.SIGSTOP)
+    perform(path, family, index)
+
+
+def doing_nothing(path, family, index):
+    """A chunk that is called done, and of which nothing is kept."""
+
+
+def interrupted_on_2(path, family, index):
+    """Somebody presses Ctrl-C while chunk 2 is computed."""
+    if index == 2:
+        raise KeyboardInterrupt
+    perform(path, family, index)
+
+
+def disk_full_on_2(path, family, index):
+    """The disk is full when chunk 2 is written."""
+    if index == 2:
+        raise OSError(28, "No space left on device")
+    perform(path, family, index)
+
+
+def flip(file, position=-1):
+    """Flip the bits of one byte of a file."""
+    data = bytearray(file.read_bytes())
+    data[position] ^= 0xFF
+    file.write_bytes(data)
+
+
+def poles_say_stable(alpha, beta, delta, d):
+    """Stability by poles, the slow way."""
+    from zwidth.loops.rigid.poles import radius_by_companion
+
+    return np.asarray(radius_by_companion(alpha, beta, delta, d)) < 1.0

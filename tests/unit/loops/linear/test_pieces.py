@@ -1,0 +1,119 @@
+"""StablePieces of the stable set: the stiffest wall is one that soft walls lead to, whatever islands stand beside them.
+
+The reference floods a grid of walls from K = 0 on; each is stable or not by Jury's table of the polynomial in
+`any_loop.ball_parts`, of which the library knows nothing.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import any_loop
+import numpy as np
+import pytest
+from scipy import ndimage
+
+import zwidth
+from zwidth import Butterworth, Coupling, Device, LowPass, Operator, Scene, Timing, VelocityFilter, WindowedDifference
+
+TIMING = Timing(1e-3, 1e-3)
+PHANTOM = Scene(Device(0.1, 10.0), TIMING)
+
+
+def is_stable(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> np.ndarray:
+    """Whether Jury's table of each wall has no zero outside, for arrays of one shape."""
+    parts = any_loop.ball_parts(scene)
+    degree = max(part.degree() for part in parts)
+    terms = [np.array([float(part[k].real.mid()) for k in range(degree, -1, -1)]) for part in parts]
+    table = terms[0][:, None] + terms[1][:, None] * stiffness.ravel() + terms[2][:, None] * damping.ravel()
+    stable = np.ones(stiffness.size, bool)
+    while len(table) > 1:
+        stable &= np.abs(table[-1]) < np.abs(table[0])
+        share = np.where(stable, table[-1] / np.where(table[0] == 0, 1.0, table[0]), 0.0)
+        table = (table - share * table[::-1])[:-1]
+        table = table / np.where(table[0] == 0, 1.0, np.abs(table[0]))
+    return stable.reshape(stiffness.shape)
+
+
+def flood(scene: Scene, negative: bool, points: int) -> tuple[float, float, float]:
+    """The stiffest wall of a grid that soft walls lead to, the stiffest of all others (NaN), and the grid's step."""
+    outlines = scene.stable_region()
+    most = 1.02 * max(float(outline.stiffness.max()) for outline in outlines)
+    dampings = np.concatenate([outline.virtual_damping for outline in outlines])
+    stiffness = np.union1d(np.geomspace(1e-5 * most, 0.05 * most, points // 6), np.linspace(0.02 * most, most, points))
+    damping = np.append(np.linspace(dampings.min(), dampings.max(), points), 0.0)
+    damping.sort()
+    pieces, _ = ndimage.label(is_stable(scene, *np.meshgrid(stiffness, damping)))  # pyright: ignore
+    main = (pieces > 0) & np.isin(pieces, np.setdiff1d(pieces[:, 0], 0))
+    counts = np.full(damping.shape, True) if negative else damping >= 0
+    reached = [(part & counts[:, None]).any(0) for part in (main, (pieces > 0) & ~main)]
+    tops = [float(stiffness[part].max()) if part.any() else np.nan for part in reached]
+    return tops[0], tops[1], float(np.diff(stiffness)[-1])
+
+
+SCENES: dict[str, tuple[Scene, bool]] = {
+    "an island 47 N/m high": (PHANTOM.replace(velocity=WindowedDifference(21)), False),
+    "no island": (PHANTOM.replace(velocity=WindowedDifference(25)), False),
+    "an island of B < 0": (PHANTOM.replace(velocity=WindowedDifference(34)), True),
+    "a coupling": (
+        Scene(Device(0.1, 2.0, Coupling(0.03, 2.5e4, 0.4, "motor")), TIMING, velocity=Butterworth(60.0)),
+        True,
+    ),
+    "a light link that aliases": (
+        Scene(Device(0.1, 5.0, Coupling(0.02, 1.7e7, 3.0, "tip")), TIMING, velocity=LowPass(cutoff=150.0, order=2)),
+        True,
+    ),
+    "a held device": (
+        Scene(
+            Device(0.1, 1.0),
+            TIMING,
+            velocity=WindowedDifference(12),
+            operator=Operator(0.5, 6.0, 300.0, 2000.0, 4.0),
+        ),
+        True,
+    ),
+    "an estimate that position passes": (
+        Scene(Device(0.1, 10.0), TIMING, velocity=VelocityFilter([700.0, -690.0], [1.0, 0.0])),
+        True,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_the_stiffest_wall_is_the_top_of_what_a_flood_from_soft_walls_reaches(name):
+    scene, negative = SCENES[name]
+    top, other, step = flood(scene, negative, 160)
+    wall = scene.max_stiffness(negative_damping=negative)
+    # A grid misses what is thinner than its steps.
+    assert wall.stiffness == pytest.approx(top, abs=2.0 * step)
+    islands = scene.islands(negative_damping=negative)
+    assert bool(islands) >= np.isfinite(other)
+    if np.isfinite(other):
+        assert islands[0].stiffness[1] == pytest.approx(other, abs=2.0 * step)
+
+
+def test_the_island_of_a_window_of_21_samples_is_apart():
+    scene = SCENES["an island 47 N/m high"][0]
+    wall = scene.max_stiffness()
+    assert (wall.stiffness, wall.virtual_damping) == (pytest.approx(6846.3642, abs=1e-3), 0.0)
+    (island,) = scene.islands()
+    assert island.stiffness == pytest.approx((10549.409, 10596.153), abs=1e-2)
+    assert island.virtual_damping == pytest.approx((74.3447, 75.4938), abs=1e-3)
+    # Walls of it are stable, and no row or column of it is so from soft walls on.
+    assert scene.is_stable(10595.5, np.linspace(*island.virtual_damping, 4001)).any()
+    low = 0.999 * island.stiffness[0]
+    assert not scene.is_stable(low, np.linspace(*island.virtual_damping, 401)).any()
+    assert [outline.island for outline in scene.stable_region()] == [False, True]
+
+
+def test_what_asks_for_the_stiffest_wall_leaves_islands_out():
+    scene = SCENES["an island 47 N/m high"][0]
+    most = float(scene.max_stiffness().stiffness)
+    assert scene.sensitivities().stiffness == pytest.approx(most, rel=1e-12)
+    verdict: Any = zwidth.assess(scene.replace(wall=zwidth.VirtualWall(1e3, 10.0)))
+    assert verdict.stiffness_max == most
+
+
+def test_a_rigid_scene_has_no_islands():
+    assert PHANTOM.islands() == []
+    assert [outline.island for outline in PHANTOM.stable_region()] == [False]

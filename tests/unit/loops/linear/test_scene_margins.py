@@ -1,0 +1,147 @@
+"""Margins of scenes: by a fine grid, by python-control, and for the delay by a state space of its own at each delay."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from independent_scenes import KINDS, closed_loop_matrix, random_scene, random_walls
+
+import zwidth
+
+FILTERED = zwidth.Scene(
+    zwidth.Device(mass=0.1, damping=3.0), zwidth.Timing(period=1e-3, delay=1e-3), velocity=zwidth.LowPass(cutoff=100.0)
+)
+
+
+def radius_at(scene, stiffness, damping, delay):
+    timing = zwidth.Timing(scene.timing.period, delay)
+    moved = dataclasses.replace(scene, timing=timing)
+    return np.abs(np.linalg.eigvals(closed_loop_matrix(moved, stiffness, damping))).max()
+
+
+def grid_margins(scene, stiffness, damping):
+    """Gain and phase margins of both signs, and the least distance from -1, on 60,000 frequencies."""
+    half = 0.5 / scene.timing.period
+    frequency = np.concatenate(
+        [np.geomspace(1e-7 * half, 0.05 * half, 30000), np.linspace(0.05, 1.0, 30001)[1:] * half]
+    )
+    L = scene.frequency_response(stiffness, damping, frequency)
+    length = np.maximum(np.abs(L), 1e-300)
+    size, turn = np.log(length), L.imag / length
+    gain, phase = crossings(size), crossings(turn[:-1])
+    phase = [(k, share) for k, share in phase if L.real[k] < 0]
+    factors = [np.exp(-between(size, *at)) for at in phase] + ([np.exp(-size[-1])] if L.real[-1] < 0 else [])
+    phases = [abs(np.angle(-L[k], deg=True) + share * np.angle(L[k + 1] / L[k], deg=True)) for k, share in gain]
+    return np.array(factors), np.array(phases), np.abs(1 + L).min()
+
+
+def crossings(values):
+    """Where values change their sign: before which place, and at which share of the way."""
+    k = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
+    return list(zip(k, values[k] / (values[k] - values[k + 1]), strict=True))
+
+
+def between(values, k, share):
+    return values[k] + share * (values[k + 1] - values[k])
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "rigid"])
+def test_margins_by_a_fine_grid_and_by_other_delays(kind):
+    rng = np.random.default_rng(5)
+    for _ in range(2):
+        scene = random_scene(kind, rng)
+        stiffness, damping = random_walls(scene, rng, 60)
+        stable = np.flatnonzero(scene.is_stable(stiffness, damping))[0]
+        K, B = stiffness[stable], damping[stable]
+        found = scene.margins(K, B)
+        factors, phases, distance = grid_margins(scene, K, B)
+        # A resonance is sharper than the grid.
+        assert 0.98 * distance <= found.modulus_margin <= distance * (1 + 1e-9)
+        if phases.size:
+            assert found.phase_margin == pytest.approx(phases.min(), rel=1e-3)
+        if factors.size:
+            nearest = factors[np.argmin(np.abs(np.log(factors)))]
+            assert np.log(found.gain_margin) == pytest.approx(np.log(nearest), rel=1e-3, abs=1e-4)
+            # At that factor a pole is on the circle.
+            edge = closed_loop_matrix(scene, K * found.gain_margin, B * found.gain_margin)
+            assert np.abs(np.abs(np.linalg.eigvals(edge)) - 1).min() < 1e-6
+        if np.isfinite(found.delay_margin) and found.delay_margin < 40 * scene.timing.period:
+            delay = scene.timing.delay + found.delay_margin * (1 + np.array([-1e-4, 1e-4]))
+            before, beyond = (radius_at(scene, K, B, t) for t in delay)
+            assert before < 1 < beyond
+            for share in np.linspace(0.05, 0.95, 10):
+                assert radius_at(scene, K, B, scene.timing.delay + share * found.delay_margin) < 1
+
+
+def test_python_control_agrees():
+    control = pytest.importorskip("control")
+    # Its polynomials lose their digits in discrete time: it is given the frequency response.
+    hertz = np.geomspace(0.1, 499.0, 4000)
+    response = control.FRD(FILTERED.frequency_response(3e3, 4.0, hertz), 2 * np.pi * hertz, smooth=True)
+    gain, phase, modulus, at_phase, at_gain, at_modulus = control.stability_margins(response)
+    found = FILTERED.margins(3e3, 4.0)
+    expected = [gain, phase, modulus, *(np.array([at_phase, at_gain, at_modulus]) / (2 * np.pi))]
+    got = [
+        found.gain_margin, found.phase_margin, found.modulus_margin, found.phase_crossover, found.gain_crossover,
+        found.modulus_frequency,
+    ]  # fmt: skip
+    np.testing.assert_allclose(got, expected, rtol=1e-4)
+
+
+def test_an_undamped_device_answers_nothing_at_half_the_rate():
+    scene = zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=100))
+    response = scene.frequency_response(1e3, 5.0, [499.9, 500.0])
+    assert response[1] == 0
+    assert abs(response[0]) < 1e-3
+
+
+def test_a_wall_whose_loop_is_zero_at_half_the_rate():
+    """The filter has a zero there, which a wall without stiffness shares."""
+    scene = zwidth.Scene(
+        zwidth.Device(0.1, 1.0), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.Butterworth(cutoff=120.0, order=1)
+    )
+    assert scene.frequency_response(0.0, 30.0, 500.0) == 0
+    found = scene.margins(0.0, 30.0)
+    factors, phases, distance = grid_margins(scene, 0.0, 30.0)
+    assert found.gain_margin == pytest.approx(factors[np.argmin(np.abs(np.log(factors)))], rel=1e-3)
+    assert abs(found.phase_margin) == pytest.approx(phases.min(), rel=1e-3)
+    assert 0.98 * distance <= found.modulus_margin <= distance * (1 + 1e-9)
+
+
+def test_an_unstable_wall():
+    found = FILTERED.margins(60e3, 4.0)
+    assert found.gain_margin < 1
+    assert found.phase_margin < 0
+    assert found.delay_margin == 0
+    assert FILTERED.is_stable(60e3 * found.gain_margin * 0.999, 4.0 * found.gain_margin * 0.999)
+
+
+def test_of_several_crossovers_the_nearest_counts():
+    """Behind a lightly damped spring the resonance crosses |L| = 1 twice more."""
+    coupling = zwidth.Coupling(mass=0.1, stiffness=4e3, damping=0.05)
+    scene = zwidth.Scene(zwidth.Device(0.1, 0.3, coupling), zwidth.Timing(1e-3))
+    factors, phases, _ = grid_margins(scene, 2e3, 1.0)
+    assert phases.size > 1
+    found = scene.margins(2e3, 1.0)
+    assert abs(found.phase_margin) == pytest.approx(phases.min(), rel=1e-2)
+    assert found.gain_margin == pytest.approx(factors[np.argmin(np.abs(np.log(factors)))], rel=1e-2)
+
+
+def test_where_nothing_crosses():
+    """A hand holds the device by a stiff spring: the wall's loop gain stays below 1."""
+    scene = dataclasses.replace(FILTERED, operator=zwidth.Operator(0.1, 30.0, 5e3))
+    found = scene.margins(10.0, 0.0)
+    assert np.isinf(found.phase_margin)
+    assert np.isinf(found.delay_margin)
+    assert found.gain_margin > 1
+
+
+def test_rigid_scenes_and_walls_out_of_range():
+    scene = zwidth.Scene(zwidth.Device(0.1, 3.0), zwidth.Timing(1e-3, 1.5e-3))
+    walls = scene.normalize_walls(np.array([500.0, 2e4]), 4.0)
+    expected = zwidth.margins(*walls, scene.delta, scene.d)
+    found = scene.margins([500.0, 2e4], 4.0)
+    np.testing.assert_array_equal(found.gain_margin, expected.gain_margin)
+    np.testing.assert_array_equal(found.delay_margin, expected.delay_margin * 1e-3)
+    for wall in ((np.nan, 0.0), (np.inf, 0.0), (1e-80, 0.0), (0.0, 1e160)):
+        assert all(np.isnan(part) for part in FILTERED.margins(*wall))

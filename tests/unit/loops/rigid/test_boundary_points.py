@@ -1,0 +1,255 @@
+"""Boundary points in the corners of the domain, by every route, against verdicts, mpmath and an independent solver."""
+
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+import tolerances as tol
+from mpmath import mpf
+
+import oracles
+import zwidth
+from zwidth.words.status import Status
+from zwidth.words.types import DELAY_MODELS, DelayModel
+
+COUNT = 10_000
+
+
+@cache
+def devices(count=COUNT, seed=5):
+    """delta and d: whole and held delays, beside whole numbers too; no, weak, moderate and strong damping."""
+    random = np.random.default_rng(seed)
+    n = np.where(random.random(count) < 0.6, random.integers(0, 5, count), np.floor(10 ** random.uniform(0, 5, count)))
+    near = random.choice([-1, 1], count) * 10 ** random.uniform(-12, -0.1, count) % 1
+    f = np.choose(random.integers(0, 4, count), [0 * n, 0 * n, random.random(count), near])
+    delta = np.choose(
+        random.integers(0, 4, count),
+        [0 * n, 10 ** random.uniform(-30, 12, count), 10 ** random.uniform(-4, 4, count), random.uniform(0, 10, count)],
+    )
+    return delta, np.minimum(n + f, 1e5)
+
+
+def in_parts(function, *columns, **lines):
+    """Calls of few points, which NumPy answers."""
+    size = 4096
+    parts = []
+    for start in range(0, columns[0].size, size):
+        cut = slice(start, start + size)
+        named = {
+            name: tuple(part[cut] for part in line) if isinstance(line, tuple) else line[cut]
+            for name, line in lines.items()
+            if not isinstance(line, str)
+        }
+        words = {name: line for name, line in lines.items() if isinstance(line, str)}
+        parts.append(function(*(column[cut] for column in columns), **named, **words))
+    return type(parts[0])(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def judged(stable, alpha, beta, use):
+    """How many walls of ``use`` have not this verdict."""
+    delta, d = devices()
+    alpha, beta = (np.where(np.abs(part) < 1e-60, 0.0, part) for part in (alpha, beta))
+    return np.flatnonzero(use & (np.asarray(zwidth.is_stable(alpha, beta, delta, d)) != stable))
+
+
+@pytest.mark.parametrize("side", ["lower", "upper"])
+def test_columns_end_where_stability_does(side):
+    delta, d = devices()
+    random = np.random.default_rng(1)
+    soft = 10 ** random.uniform(-45, 0, COUNT)
+    alpha = np.where(random.random(COUNT) < 0.5, soft, 10 ** random.uniform(-1, 1, COUNT)) / (d + 1) ** 2
+    points = in_parts(zwidth.boundary_point, delta, d, alpha=alpha, side=side)
+    found = points.status == Status.OK
+    assert np.isin(points.status, [Status.OK, Status.NO_BOUNDARY]).all()
+    assert 0.6 < found.mean() < 1
+    # 1e-9 of b, or what float64 can tell apart there.
+    step = np.maximum(1e-9 * np.abs(points.beta + delta), 16 * tol.EPS64 * np.maximum(delta, np.abs(points.beta)))
+    step = step if side == "lower" else -step
+    # Beside the ridge float64 knows alpha better than beta: a stiffer column by 1e-6 has no end there.
+    clear = in_parts(zwidth.boundary_point, delta, d, alpha=alpha * (1 + 1e-6)).status == Status.OK
+    assert not judged(True, alpha, points.beta + step, found & clear).size
+    assert not judged(False, alpha, points.beta - step, found).size
+    # Where there is no end, the row of the ridge is unstable at this stiffness.
+    assert not judged(False, alpha, zwidth.alpha_max(delta, d).beta, ~found).size
+
+
+def test_rows_end_where_stability_does():
+    delta, d = devices()
+    random = np.random.default_rng(2)
+    share = np.where(random.random(COUNT) < 0.5, 10 ** random.uniform(-30, 0, COUNT), random.uniform(0, 4, COUNT))
+    # The verdict itself loses digits closer to -delta: there the next test judges.
+    b = np.maximum(share * (delta + 1 / (d + 1)), 1e-5 * delta)
+    beta = np.where(b < 1e-60, 0.0, b - delta)
+    points = in_parts(zwidth.boundary_point, delta, d, beta=beta)
+    found = points.status == Status.OK
+    assert 0.5 < found.mean() < 1
+    assert not judged(True, points.alpha * (1 - 1e-9), beta, found).size
+    assert not judged(False, points.alpha * (1 + 1e-9), beta, found).size
+    for alpha in (1e-9, 1e-3, 1.0):
+        assert not judged(False, np.full(COUNT, alpha) / (d + 1) ** 2, beta, ~found).size
+
+
+def test_rays_end_where_stability_does():
+    delta, d = devices()
+    random = np.random.default_rng(3)
+    b = random.uniform(1e-3, 1.0, COUNT) * (delta + 0.5 / (d + 1))
+    beta = b - delta
+    alpha = in_parts(zwidth.boundary_point, delta, d, beta=beta).alpha * random.uniform(0.01, 0.99, COUNT)
+    angle = random.uniform(-np.pi, np.pi, COUNT)
+    ray = (alpha, beta, np.cos(angle) * alpha, np.sin(angle) * b)
+    points = in_parts(zwidth.boundary_point, delta, d, ray=ray)
+    started = np.isfinite(alpha)
+    assert (points.status[~started] == Status.INVALID_INPUT).all()
+    found = points.status == Status.OK
+    assert (started & ~found).sum() <= 0.002 * COUNT
+    assert np.isin(points.status[started & ~found], [Status.UNDECIDED]).all()
+    lengths = np.where(np.abs(np.cos(angle)) > 0.7, (points.alpha - alpha) / ray[2], (points.beta + delta - b) / ray[3])
+    clear = found & (lengths > 1e-4) & (lengths < 1e4)
+    assert clear.mean() > 0.8
+    for share, stable in ((1e-3, True), (0.5, True), (0.9, True), (1 - 1e-7, True), (1 + 1e-7, False), (1.01, False)):
+        a, b = (part + share * lengths * step for part, step in zip(ray[:2], ray[2:], strict=True))
+        assert not judged(stable, a, b, clear).size, share
+
+
+@pytest.mark.parametrize(
+    "device, line, want",
+    [
+        ((0.5, 1), {"alpha": 1e-17, "side": "upper"}, 1.240063540320605),
+        ((0.5, 1), {"alpha": 1e-60, "side": "upper"}, 1.240063540320605),
+        ((0.5, 1), {"alpha": 1e-60}, -0.5),
+        # b = w^2 and alpha = 2 w^2 at the start of the undamped curve without delay.
+        ((0.0, 0), {"beta": 1e-16}, 2e-16),
+        # 1/(1/2 + d) of b: the linear rule, which holds for soft walls.
+        ((0.0, 1.3), {"beta": 1e-16}, 1e-16 / 1.8),
+        ((0.0, 20), {"beta": 1e-40}, 1e-40 / 20.5),
+        ((2.3, 0), {"beta": -2.2999999999999967}, 3.17253817793562e-14),
+    ],
+)
+def test_soft_walls(device, line, want):
+    point = zwidth.boundary_point(*device, **line)
+    assert point.status == Status.OK
+    got = point.alpha if "beta" in line else point.beta
+    assert got == pytest.approx(want, rel=1e-15)
+
+
+@pytest.mark.parametrize("fixed", ["alpha", "beta"])
+def test_points_by_mpmath(fixed):
+    delta, d = (part[:400] for part in devices(seed=8))
+    random = np.random.default_rng(6)
+    b = 10 ** random.uniform(-12, -0.5, 400) * (delta + 1 / (d + 1))
+    if fixed == "beta":
+        points = zwidth.boundary_point(delta, d, beta=b - delta)
+    else:
+        alpha = 10 ** random.uniform(-30, -1.5, 400) / (d + 1) ** 2
+        points = zwidth.boundary_point(delta, d, alpha=alpha, side="upper")
+    rows = np.flatnonzero((points.status == Status.OK) & (points.omega < 3) & (d < 1e3) & (delta < 1e6))[:60]
+    assert rows.size == 60
+    for row in rows:
+        omega, here = mpf(float(points.omega[row])), (float(delta[row]), float(d[row]))
+        with mp.workdps(160 + oracles.digits_for(here[0])):
+            axis = 1 if fixed == "beta" else 0
+            given = mpf(float((points.beta if axis else points.alpha)[row]))
+
+            def offset(w, here=here, axis=axis, given=given):
+                return oracles.boundary(w, *here)[axis] - given
+
+            exact_omega = mp.findroot(
+                offset, (omega, omega * (1 - mpf(10) ** -9)), solver="secant", tol=mpf(10) ** -150
+            )
+            exact = oracles.boundary(exact_omega, *here)
+            assert abs(omega / exact_omega - 1) < 1e-12
+            if axis:
+                assert oracles.relative_error(points.alpha[row], exact[0]) < 8e-15
+            else:
+                assert abs(mpf(float(points.beta[row])) - exact[1]) < 1e-14 * (abs(exact[1]) + here[0])
+
+
+def test_rows_without_a_stable_wall_are_empty_by_every_route():
+    for delay in DELAY_MODELS:
+
+        def status(b, d, delay: DelayModel = delay):
+            return zwidth.boundary_point(0.1, d, beta=b, delay=delay).status
+
+        traced = jax.jit(status)
+        beta = np.array([5.0, 50.0, -0.1, -0.2, 0.3])
+        for d in (0.5, 20.0, 7.4):
+            direct = zwidth.boundary_point(0.1, d, beta=beta, delay=delay).status
+            assert (direct[:4] == Status.NO_BOUNDARY).all()
+            np.testing.assert_array_equal(traced(beta, d), direct)
+
+
+def test_a_ray_starts_at_a_stable_wall_by_every_route():
+    traced = jax.jit(lambda a: zwidth.boundary_point(0.1, 1, ray=(a, 0.3, 1.0, 0.2)).status)
+    for alpha, status in ((0.05, Status.OK), (5.0, Status.NO_BOUNDARY), (-1.0, Status.NO_BOUNDARY)):
+        assert zwidth.boundary_point(0.1, 1, ray=(alpha, 0.3, 1.0, 0.2)).status == traced(alpha) == status
+
+
+def test_a_ray_may_be_an_array():
+    ray = (0.05, 0.3, 1.0, 0.2)
+    for same in (np.array(ray), list(ray), np.array(ray)[:, None]):
+        assert np.all(zwidth.boundary_point(0.1, 1, ray=same).alpha == zwidth.boundary_point(0.1, 1, ray=ray).alpha)
+
+
+def test_float32_answers_as_float64_does():
+    random = np.random.default_rng(9)
+    delta, d = 10 ** random.uniform(-3, 2, 2400), random.choice([0.0, 0.3, 1.0, 2.5, 8.0], 2400)
+    beta = np.float32(-delta + random.uniform(0.01, 2, 2400) * (delta + 1 / (d + 1))).astype(float)
+    delta = np.float32(delta).astype(float)
+    d = np.float32(d).astype(float)
+    direct = zwidth.boundary_point(delta, d, beta=beta)
+    got = jax.jit(lambda *values: zwidth.boundary_point(values[0], values[1], beta=values[2]))(
+        *(jnp.asarray(part, jnp.float32) for part in (delta, d, beta))
+    )
+    assert got.alpha.dtype == jnp.float32
+    # A row that ends within rounding of the lobe's end may fall on either side.
+    assert np.mean(np.asarray(got.status) != direct.status) < 0.002
+    both = (direct.status == Status.OK) & (np.asarray(got.status) == Status.OK)
+    near = np.isclose(np.asarray(got.alpha), direct.alpha, rtol=1e-3, atol=2e-4 * np.nanmax(direct.alpha))
+    assert near[both].all()
+
+
+def test_statuses():
+    assert zwidth.boundary_point(np.array([1e13]), 1, beta=0.1).status[0] == Status.OUT_OF_RANGE
+    assert zwidth.boundary_point(0.1, 1, beta=np.array([1e-61])).status[0] == Status.OUT_OF_RANGE
+    assert zwidth.boundary_point(0.1, 1, ray=(0.05, 0.3, np.array([0.0]), 0.0)).status[0] == Status.INVALID_INPUT
+    with pytest.raises(zwidth.InputError, match="delta: got 1"):
+        zwidth.boundary_point(1e13, 1, beta=0.1)
+
+
+def test_optimistix_agrees():
+    random = np.random.default_rng(4)
+    count = 300
+    d, delta = random.choice([0, 0.5, 1, 1.3, 4, 20.5], count), 10 ** random.uniform(-3, 2, count)
+    top = zwidth.alpha_max(delta, d)
+    alpha = top.alpha * random.uniform(1e-3, 0.98, count)
+    beta = -delta + (top.beta + delta) * random.uniform(0.05, 1.2, count)
+    ray = (0.5 * alpha, top.beta, random.normal(size=count) * top.alpha, random.normal(size=count) * (top.beta + delta))
+    lines: tuple[dict[str, Any], ...] = (
+        {"beta": beta},
+        {"alpha": alpha},
+        {"alpha": alpha, "side": "upper"},
+        {"ray": ray},
+    )
+    for line in lines:
+        mine = zwidth.boundary_point(delta, d, **line)
+        other = zwidth.boundary_point(delta, d, **line, method="optimistix")
+        np.testing.assert_array_equal(mine.status, other.status)
+        # Next to -delta the general solver knows b to an ulp of delta only.
+        size = (np.abs(mine.alpha) + np.abs(mine.beta)) * (1 + delta / (mine.beta + delta)) ** 2
+        for one, two in zip(mine[:2], other[:2], strict=True):
+            assert (np.abs(one - two) <= tol.BOUNDARY_POINT.float64 * size)[mine.status == Status.OK].all()
+
+
+def test_scalars_need_no_jax():
+    code = "import sys, zwidth; zwidth.boundary_point(.1, 1.3, alpha=.1); zwidth.boundary_point(.1, 0, beta=.1)"
+    code += (
+        "; zwidth.boundary_point(.1, 2, ray=(.01, .1, 1, 1)); zwidth.stable_region(.5, 1); zwidth.boundary(1, .1, 1)"
+    )
+    code += "; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)

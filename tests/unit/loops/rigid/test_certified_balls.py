@@ -1,0 +1,135 @@
+"""Ball arithmetic: verdicts against independent poles, and what is exactly on the unit circle."""
+
+import itertools
+from fractions import Fraction
+
+import mpmath as mp
+import numpy as np
+import pytest
+
+import oracles
+from zwidth.loops.rigid import balls
+from zwidth.loops.rigid.balls import _rational
+from zwidth.words.status import Status
+
+flint = pytest.importorskip("flint")
+
+
+@pytest.mark.parametrize("d", [0.0, 5e-324, 0.3, 1.0 - 2.0**-53, 1.0, 1.75, 4.0])
+@pytest.mark.parametrize("delta", [0.0, 1e-8, 0.4, 6.0])
+def test_verdict_is_that_of_the_poles(d, delta):
+    rng = np.random.default_rng(31)
+    for alpha, beta in zip(rng.uniform(0, 1 + delta, 6), rng.uniform(-delta, 2 + delta, 6), strict=True):
+        with mp.workdps(oracles.digits_for(delta)):
+            p = oracles.polynomial(alpha, beta, delta, d)[::-1]
+            radius = max(abs(z) for z in mp.polyroots(p, maxsteps=400, asc=True))
+            decision = balls.decide(float(alpha), float(beta), delta, d, 4096)
+            assert decision.status == Status.OK
+            assert decision.stable == (radius < 1)
+
+
+@pytest.mark.parametrize("d", [0.0, 0.3, 1.0, 1.75, 4.0])
+@pytest.mark.parametrize("delta", [0.0, 0.4])
+def test_without_stiffness_the_other_poles_decide(d, delta):
+    # P = (z - 1) R; the roots of R by synthetic division of the polynomial as printed.
+    rng = np.random.default_rng(41)
+    seen = set()
+    for beta in delta + rng.uniform(0.01, 4.0, 8) / (1.0 + d):
+        with mp.workdps(60):
+            p = oracles.polynomial(0.0, beta, delta, d)
+            r = list(itertools.accumulate(p, lambda total, value: total + value))[:-1]
+            radius = max(abs(z) for z in mp.polyroots(r[::-1], maxsteps=400, asc=True))
+        decision = balls.decide(0.0, float(beta), delta, d, 4096)
+        assert (decision.status, decision.stable) == (Status.ON_BOUNDARY if radius < 1 else Status.OK, False)
+        seen.add(decision.status)
+    assert len(seen) == 2
+
+
+@pytest.mark.parametrize(("delta", "d"), [(0.0, 0.0), (0.4, 0.6), (0.0, 1.0), (0.4, 2.5), (6.0, 4.0)])
+def test_polynomial_is_the_printed_one(delta, d):
+    with mp.workdps(60):
+        exact = oracles.polynomial(0.3, 0.2, delta, d)[::-1]
+        found = balls.polynomial(0.3, 0.2, delta, d, 200)
+        assert len(found) == len(exact)
+        for ball, value in zip(found, exact, strict=True):
+            assert abs(float(ball) - float(value)) <= 1e-15 * (1 + abs(float(value)))
+
+
+def test_enclosures_shrink_with_the_precision():
+    for delta, d in itertools.product((5e-324, 1e-300, 1e-8, 0.5, 750.0, 1e12), (0.0, 0.5, 1.0 - 2.0**-53, 1.5)):
+        for bits in (128, 512):
+            here = balls.device(delta, d, bits)
+            assert min(a.rel_accuracy_bits() for a in here if isinstance(a, flint.arb) and a != 0) >= bits - 45
+
+
+@pytest.mark.parametrize("bits", [128, 1024, 4096])
+def test_zeros_on_the_circle_are_never_labelled_by_precision(bits):
+    # R = z^2 + 1 is left of P at alpha = 0, beta = 2, without delay and damping.
+    found = balls.verdict(0.0, 2.0, 0.0, 0.0, bits)
+    assert not found.stable
+    assert not found.unstable
+
+
+def curve(n, x):
+    """The rational wall of delta = 0, whole d = n whose loop has a pole at ``e^(j w)``, ``cos w = x``, by its formula.
+
+    There ``alpha + beta (1 - 1/z) = -2 z^n (z - 1)^2/(z + 1)``.
+    """
+    chebyshev, second = [flint.fmpq(1), x], [flint.fmpq(0), flint.fmpq(1)]
+    for _ in range(n):
+        chebyshev.append(2 * x * chebyshev[-1] - chebyshev[-2])
+        second.append(2 * x * second[-1] - second[-2])
+    beta = -2 * (chebyshev[n + 1] - chebyshev[n]) / (1 + x)
+    real = 2 * (1 - x) * (second[n + 1] - second[n])
+    return real - beta * (1 - x), beta
+
+
+@pytest.mark.parametrize(("n", "x"), [(0, (1, 2)), (1, (3, 4)), (1, (9, 10)), (4, (98, 100)), (40, (99999, 100000))])
+def test_poles_exactly_on_the_circle_are_recognized(n, x):
+    x, nothing = flint.fmpq(*x), flint.fmpq(0)
+    alpha, beta = curve(n, x)
+    assert alpha > 0
+    tiny = flint.fmpq(1, 2**400)
+    assert balls._crosses_exactly(alpha, beta, n, nothing, 512)
+    for a, b in ((alpha + tiny, beta), (alpha, beta - tiny)):
+        assert not balls._crosses_exactly(a, b, n, nothing, 512)
+
+
+def test_what_is_exactly_on_the_circle_has_its_status():
+    assert balls.decide(0.0, 2.0, 0.0, 0.0, 512) == (False, Status.ON_BOUNDARY, 512)
+    assert balls.decide(0.0, 2.0, 0.0, 0.0, 128) == (False, Status.ON_BOUNDARY, 128)
+    # Poles exactly at +-j, others outside.
+    assert balls.decide(0.0, 2.0, 0.0, 4.0, 512).status == Status.OK
+    for beta in (np.nextafter(2.0, 1.0), np.nextafter(2.0, 3.0)):
+        expected = Status.ON_BOUNDARY if beta < 2 else Status.OK
+        assert balls.decide(0.0, float(beta), 0.0, 0.0, 512)[1:] == (expected, 128)
+
+
+def at_precision(alpha, beta, bits):
+    """The verdict of a rational wall at delta = 0, d = 1."""
+    with flint.ctx.workprec(bits):
+        wall = flint.arb(alpha), flint.arb(beta)
+        return balls.long_verdict(*wall, 1, balls.device(0.0, 1.0, bits), balls._enclose_zero, balls._take_lag)
+
+
+@pytest.mark.parametrize("bits", [64, 256, 1024])
+def test_twice_the_precision_decides_what_is_so_close(bits):
+    alpha, beta = curve(1, flint.fmpq(3, 4))
+    for side in (-1, 1):
+        near = alpha + flint.fmpq(side, 2 ** (bits + 10))
+        assert not any(at_precision(near, beta, bits))
+        assert at_precision(near, beta, 2 * bits) == (side < 0, side > 0)
+
+
+@pytest.mark.parametrize("f", ["0", "1/3", "1/2", "5/7"])
+def test_the_exact_wall_without_damping_is_that_of_a_mass_under_a_held_force(f):
+    """One period by hand: the old force acts for a share f, the new one for the rest, and each adds speed and way."""
+    f, alpha, beta = Fraction(f), Fraction(3, 10), Fraction(1, 5)
+    _, wall, lead = _rational(*(flint.fmpq(q.numerator, q.denominator) for q in (alpha, beta, f)))
+    for z in (Fraction(2), Fraction(-1), Fraction(3, 7)):
+        speed = f / z + 1 - f
+        way = (f - f * f / 2) / z + (1 - f) ** 2 / 2
+        # The wall pulls with alpha x + beta (x - x/z); x (z - 1)^2 = speed + (z - 1) way, and z^lead clears 1/z.
+        expected = z**lead * (speed + (z - 1) * way) * (alpha + beta - beta / z)
+        got = wall(flint.fmpq(z.numerator, z.denominator))
+        assert Fraction(int(got.p), int(got.q)) == expected

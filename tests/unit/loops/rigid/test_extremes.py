@@ -1,0 +1,63 @@
+"""The corners of the model: which method still tells stable from unstable, judged by proofs."""
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.bench import extremes
+from zwidth.loops.rigid.spectral_radius import bound_radius
+from zwidth.words.status import Status
+
+# method -> the farthest relative distance from the boundary at which a label may be wrong.
+HELD = {
+    "crossover": 1e-15,
+    # Where poles nearly coincide, eigenvalues keep half of their digits, and a quarter at delta = 1e12.
+    "companion": 1e-2,
+}
+DELAYS = [0.0, float(np.nextafter(1.0, 0.0)), 1.0, 50.0, 500.0, 1e5]
+
+
+@pytest.mark.parametrize("d", DELAYS, ids=str)
+def test_every_method_holds_where_it_says(d, monkeypatch):
+    if d >= 50:
+        # All poles of long delays take long, and show nothing new.
+        monkeypatch.setattr(extremes, "METHODS", ["crossover"])
+    outcomes = list(extremes.judge(d))
+    assert {outcome.points >= 60 for outcome in outcomes} == {True}
+    for outcome in outcomes:
+        if outcome.method == "crossover" and np.isnan(outcome.farthest):
+            pytest.fail(f"{outcome}: beside the start and for soft walls the closed form is exact")
+        # Soft walls and those beside the start are told apart by less than a rounding error of the coefficients.
+        assert np.isnan(outcome.farthest) or outcome.farthest <= HELD[outcome.method], outcome
+
+
+@pytest.mark.parametrize("method", ["crossover", "companion", "certified"])
+def test_bad_input_among_good(method):
+    bad = [np.nan, np.inf, -np.inf]
+    alpha = np.array([0.1, *bad, 0.1, 0.1, 0.1, 0.1, 0.1])
+    delta = np.array([0.1, 0.1, 0.1, 0.1, *bad, -1.0, 0.1])
+    found = zwidth.decide_stability(alpha, 0.3, delta, 1.0, method=method)
+    assert found.status.tolist() == [0, *[Status.INVALID_INPUT] * 7, 0]
+    assert found.stable.tolist() == [True, *[False] * 7, True]
+    for d in (np.nan, np.inf, -1.0):
+        assert zwidth.decide_stability(0.1, 0.3, 0.1, d, method=method).status == Status.INVALID_INPUT
+
+
+@pytest.mark.parametrize("delta", extremes.DELTAS, ids=str)
+def test_the_radius_of_a_stiff_wall_and_a_soft_one(delta):
+    walls = (np.array([1e-30, 1e3 * (1 + delta)]), 0.1 * (1 + delta), delta, 0.0)
+    found = bound_radius(*walls, method="newton")
+    assert (found.status == Status.OK).all()
+    # The soft wall's slowest pole is at 1, to rounding; the stiff one's is far outside.
+    assert found.radius[0] == pytest.approx(1.0, abs=1e-8)
+    assert found.radius[1] > 1
+    exact = zwidth.spectral_radius(*walls, method="companion")
+    np.testing.assert_allclose(found.radius, exact, rtol=1e-7)
+
+
+def test_the_report_names_every_method_and_delay():
+    text = extremes.report((0.0,))
+    for method in extremes.METHODS:
+        assert f"| {method} | " in text
+    assert text.count("## ") == 4
+    assert "d = 0" in text

@@ -1,0 +1,127 @@
+"""Closed-form derivatives of the plant and the ridge against 60 digits, and through JAX's transformations."""
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.loops.rigid.plant import held_plant
+from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel
+from zwidth.loops.rigid.ridge_slopes import plant_slopes
+
+DELTAS = [0.0, 1e-9, 0.1, 1.0, 2.4, 2.6, 10.0, 100.0, 1e4]
+FRACTIONS = [0.0, 1e-8, 0.3, 0.99]
+
+
+def precise_plant(delta, f):
+    """a2, a1, a0 and gap from superposed position and velocity responses: a route of its own."""
+
+    def held_for(t):
+        if delta == 0:
+            return t * t / 2, t
+        speed = -mp.expm1(-delta * t) / delta
+        return (t - speed) / delta, speed
+
+    c = mp.exp(-delta)
+    (x, v), (late, speed) = held_for(mp.mpf(1)), held_for(1 - f)
+    a2, a1, a0 = late, v * speed - c * late + x - late, v * (v - speed) - c * (x - late)
+    return a2, a1, a0, a2 - a1 + a0
+
+
+@pytest.mark.parametrize("f", FRACTIONS)
+@pytest.mark.parametrize("delta", DELTAS)
+def test_plant_slopes(delta, f):
+    by_delta, by_f = plant_slopes(np.float64(delta), np.float64(f))
+    # Of each derivative's own scale: the coefficients sum up to phi1, about 1/(1 + delta).
+    for slopes, size in ((by_delta, (1 + delta) ** -2), (by_f, 1 / (1 + delta))):
+        with mp.workdps(90):
+            step = mp.mpf(10) ** -30
+            center = (mp.mpf(delta), mp.mpf(f))
+            side = (step, 0) if slopes is by_delta else (0, step)
+            # At the ends the derivative is that of the same formula, which holds beyond.
+            up, down = (precise_plant(*(c + sign * s for c, s in zip(center, side, strict=True))) for sign in (1, -1))
+            exact = [float((a - b) / (2 * step)) for a, b in zip(up, down, strict=True)]
+        np.testing.assert_allclose((slopes.a2, slopes.a1, slopes.a0, slopes.gap), exact, rtol=2e-14, atol=4e-16 * size)
+    assert by_delta.c == pytest.approx(-held_plant(np.float64(delta), np.float64(f)).c, rel=1e-15)
+
+
+def precise_alpha(delta, d, guess, model):
+    """alpha_max by 60-digit Newton steps on the curve of the definitions."""
+    n = mp.floor(d) if model == "held" else d
+    a2, a1, a0, _ = precise_plant(delta, d - n)
+    c = mp.exp(-delta)
+
+    def height(omega):
+        z = mp.expj(omega)
+        wall = -(z - 1) * (z - c) * mp.expj(omega * n) / (a2 * z + a1 + a0 / z)
+        return mp.re(wall) - mp.tan(omega / 2) * mp.im(wall)
+
+    return height(mp.findroot(lambda w: mp.diff(height, w), guess, tol=1e-30))
+
+
+POINTS = [(0.0, 0.5), (0.1, 1.3), (0.1, 1.0), (3.0, 0.25), (20.0, 0.6), (0.7, 6.5), (50.0, 3.5)]
+
+
+@pytest.mark.parametrize("model", ["held", "fractional_power"])
+def test_gradient_and_hessian_outside_jit_against_60_digits(model, x64):
+    step = mp.mpf(10) ** -9
+    for delta, d in POINTS:
+        point = zwidth.alpha_max(delta, d, delay=model)
+        with mp.workdps(60):
+            # From the right, as documented; four points each way leave an error of step^3 and less.
+            at = [
+                [precise_alpha(delta + i * step, d + j * step, point.omega, model) for j in range(4)] for i in range(4)
+            ]
+            first, second = (
+                (mp.mpf(-11) / 6, 3, mp.mpf(-3) / 2, mp.mpf(1) / 3),
+                (2, -5, 4, -1),
+            )
+            gradient = [
+                sum(w * at[i][0] for i, w in enumerate(first)) / step,
+                sum(w * at[0][i] for i, w in enumerate(first)) / step,
+            ]
+            mixed = sum(first[i] * first[j] * at[i][j] for i in range(4) for j in range(4)) / step**2
+            hessian = [
+                [sum(w * at[i][0] for i, w in enumerate(second)) / step**2, mixed],
+                [mixed, sum(w * at[0][i] for i, w in enumerate(second)) / step**2],
+            ]
+        size = 1 + abs(float(point.alpha))
+        exact = np.array(gradient, dtype=float)
+        by_hand = slopes_kernel(np.float64(delta), np.float64(d), model)
+        np.testing.assert_allclose((by_hand.by_delta, by_hand.by_d), exact, rtol=1e-13, atol=1e-14 * size)
+
+        def alpha(p):
+            return zwidth.alpha_max(p[0], p[1], delay=model).alpha
+
+        p = jnp.array([delta, d])
+        np.testing.assert_allclose(jax.grad(alpha)(p), exact, rtol=1e-13, atol=1e-14 * size)
+        curvature = np.array(hessian, dtype=float)
+        np.testing.assert_allclose(jax.hessian(alpha)(p), curvature, rtol=1e-10, atol=1e-11 * size)
+
+
+def test_grad_vmap_and_jit_agree(x64):
+    rng = np.random.default_rng(3)
+    delta, d = 10 ** rng.uniform(-3, 2, 40), rng.uniform(0, 6, 40)
+    by_hand = slopes_kernel(delta, d, "held")
+    slope = jax.grad(lambda a, b: zwidth.alpha_max(a, b).alpha, (0, 1))
+    mapped, compiled = jax.vmap(slope)(delta, d), jax.jit(jax.vmap(slope))(delta, d)
+    for by in (mapped, compiled):
+        np.testing.assert_allclose(by[0], by_hand.by_delta, rtol=1e-12)
+        np.testing.assert_allclose(by[1], by_hand.by_d, rtol=1e-12)
+
+
+def test_a_start_is_close_everywhere():
+    """The last of three steps leaves rounding only if the one before left less than its root, over the whole domain."""
+    rng = np.random.default_rng(5)
+    for low, high in ((0.0, 1.0), (1.0, 2.0), (2.0, 9.0), (9.0, 1e5)):
+        d = rng.uniform(low, high, 20000) if high < 10 else 10 ** rng.uniform(1, 5, 20000)
+        edge = rng.random(20000)
+        d = np.where(edge < 0.2, np.floor(d), np.where(edge < 0.4, np.floor(d) + 10 ** rng.uniform(-16, -1, 20000), d))
+        d = np.where(edge > 0.8, np.floor(d) + 1 - 10 ** rng.uniform(-16, -1, 20000), d)
+        delta = np.minimum(np.where(rng.random(20000) < 0.1, 0.0, 10 ** rng.uniform(-8, 12, 20000)), 1e12)
+        delta[:5000] = 10 ** rng.uniform(-1, 2, 5000)
+        point = ridge_kernel(delta, np.minimum(d, 1e5), "held")
+        assert (point.status == 0).all()
+        assert np.isfinite(point.alpha).all()

@@ -1,0 +1,151 @@
+"""What the page shows is what the library answers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from tolerances import CONTOUR, EDGE_RADIUS, QUICK_EDGE, RESPONSE, RIDGE
+
+import zwidth
+from zwidth.pages.explorer import model
+from zwidth.pages.explorer.controls import Controls, normalized_controls
+
+CHOICES = {
+    "rigid": {},
+    "held": {"delay": 1.3},
+    "hand": {"operator": "rigid"},
+    "grasp": {"operator": "grasp"},
+    "low-pass": {"velocity": "LowPass"},
+    "window": {"velocity": "WindowedDifference", "velocity.samples": 5},
+    "tip": {"coupling": "tip", "damping": 2},
+    "all": {"velocity": "Butterworth", "operator": "grasp", "coupling": "motor"},
+}
+
+
+@pytest.fixture(params=CHOICES)
+def scene(request):
+    return Controls().change(CHOICES[request.param]).scene
+
+
+def test_the_edge_of_a_rigid_device_is_its_boundary():
+    scene = Controls().scene
+    region = zwidth.stable_region(scene.delta, scene.d)
+    edge, units = model.quick_edge(scene), scene.units
+    np.testing.assert_array_equal(edge, (region.alpha * units.stiffness, region.beta * units.virtual_damping))
+    inner = (region.omega > 0) & (region.omega < np.pi)
+    exact = scene.boundary(region.omega[inner] / scene.timing.period)
+    np.testing.assert_allclose(edge[0][inner], exact.stiffness, rtol=RIDGE.float64, atol=1e-9 * exact.stiffness.max())
+
+
+def test_the_quick_edge_is_the_edge(scene):
+    x, y = model.quick_edge(scene)
+    known = np.isfinite(x)
+    radius = np.abs(scene.poles(x[known], y[known])).max(-1)
+    assert np.abs(radius - 1.0).max() < EDGE_RADIUS.float64
+    # No place of the exact outlines is far from the line that is drawn.
+    line = np.stack([x, y], -1)
+    start, along = line[:-1], np.diff(line, axis=0)
+    drawn = np.isfinite(along).all(1)
+    outlines = model.outlines(scene)
+    size = np.array([np.ptp(part) for part in outlines[0]])
+    for outline in outlines:
+        places, first, way = np.stack(outline, -1)[:, None] / size, start[drawn] / size, along[drawn] / size
+        share = np.clip(((places - first) * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-300), 0, 1)
+        away = np.linalg.norm(first + share[..., None] * way - places, axis=-1).min(1)
+        assert away.max() < QUICK_EDGE.float64
+
+
+def test_the_verdict_at_once_is_that_of_assess(scene):
+    for stiffness in (-100.0, 3e3, 9e3, 60e3):
+        moved = scene.replace(stiffness=stiffness)
+        stable, poles = model.judge_quickly(moved)
+        verdict = zwidth.assess(moved)
+        assert stable == verdict.stable
+        assert np.abs(poles).max() == pytest.approx(verdict.spectral_radius, rel=1e-9)
+
+
+def test_the_passive_set_ends_where_walls_cease_to_be_passive(scene):
+    edge: Any = model.passive_set(scene)
+    if scene.device.coupling is not None and scene.device.coupling.sensor == "tip":
+        assert edge is None
+        return
+    inner = slice(1, -1)
+    for scale, expected in ((1 - 1e-6, True), (1 + 1e-6, False)):
+        assert np.all(scene.is_passive(edge[0][inner] * scale, edge[1][inner] * scale) == expected)
+
+
+def test_without_damping_nothing_is_passive():
+    edge: Any = model.passive_set(Controls().change({"damping": 0}).scene)
+    assert edge[0].size == edge[1].size == 0
+
+
+def test_the_step_response_is_that_of_the_library():
+    scene = Controls().change({"delay": 1.3}).scene
+    time, position = model.step_motion(scene, 60)
+    units = scene.units
+    exact = zwidth.step_response(*scene.normalized, periods=61, substeps=1)
+    np.testing.assert_allclose(time, exact.time * scene.timing.period, rtol=1e-14)
+    np.testing.assert_allclose(position * units.stiffness, exact.position, atol=RESPONSE.float64 * exact.position.max())
+
+
+def test_the_crossover_lies_on_the_unit_circle(scene):
+    verdict = zwidth.assess(scene)
+    cross = model.crossover(scene, verdict)
+    assert abs(cross) == pytest.approx(1.0, rel=1e-9)
+    # The sign of the margin is the verdict's.
+    assert abs(np.degrees(np.angle(-cross))) == pytest.approx(abs(verdict.phase_margin), rel=1e-6)
+
+
+def test_the_ridge_path_goes_through_the_stiffest_wall():
+    for change in ({}, {"velocity": "LowPass"}):
+        scene = Controls().change(change).scene
+        best = scene.max_stiffness()
+        x, y = model.ridge_path(scene)
+        middle = (x.size - 1) // 4
+        assert x[middle] == pytest.approx(float(best.stiffness), rel=1e-9)
+        assert y[middle] == pytest.approx(float(best.virtual_damping), rel=1e-6)
+        assert np.all(np.diff(x) > 0)
+
+
+def test_contours_are_where_they_say(scene):
+    across, up = model.frame(model.quick_edge(scene), (10e3, 40.0))
+    found = model.contours(scene, across, up)
+    levels = {}
+    for x, y in zip(found["xs"], found["ys"], strict=True):
+        radius = scene.spectral_radius(x, y)
+        level = min(model.LEVELS, key=lambda one: abs(one - np.median(radius)))
+        levels[level] = float(np.median(np.abs(radius - level)))
+    assert levels
+    assert max(levels.values()) < CONTOUR.float64
+
+
+def test_the_frame_holds_the_edge_and_the_wall():
+    edge = model.quick_edge(Controls().scene)
+    for wall in ((0.0, 0.0), (30e3, 150.0), (-9e3, 40.0)):
+        across, up = model.frame(edge, wall)
+        assert across[0] <= min(edge[0].min(), wall[0]) < max(edge[0].max(), wall[0]) <= across[1]
+        assert up[0] <= min(edge[1].min(), wall[1]) < max(edge[1].max(), wall[1]) <= up[1]
+    # What is far away does not make the set a dot.
+    assert model.frame(edge, (1e9, 40.0)) == model.frame(edge, (10e3, 40.0))
+    nothing = np.empty(0), np.empty(0)
+    assert all(low < high for low, high in model.frame(nothing, (0.0, 0.0)))
+
+
+def test_a_contact_is_the_simulation():
+    scene = Controls().scene
+    _, position, force, words = model.contact_motion(scene, 50)
+    hit = scene.simulate(start_position=-5e-4, start_velocity=0.1, contact="unilateral", periods=50)
+    np.testing.assert_array_equal(position, hit.position)
+    np.testing.assert_array_equal(force, hit.wall_force)
+    assert f"{int(hit.bounces)} times" in words
+    assert position[0] < 0 < position.max()
+
+
+def test_normalized_words_have_the_numbers_of_the_verdict():
+    verdict: Any = zwidth.assess(normalized_controls(0.1, 0.4, 0.1, 1.0).scene)
+    text = "\n".join(model.normalized_lines(verdict))
+    for number in (verdict.alpha_max, verdict.beta_at_max, verdict.stiffness_limit, verdict.gain_margin):
+        assert f"{number:.4g}" in text
+    assert "N/m" not in text

@@ -1,0 +1,140 @@
+"""The page without a browser: messages in, figures and texts out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
+
+from click.testing import CliRunner
+from open_pages import open_page, say
+
+from zwidth.cli.commands import cli
+from zwidth.pages.explorer import details, model
+from zwidth.pages.explorer.controls import Controls
+
+
+@pytest.fixture
+def page():
+    return open_page(Controls())
+
+
+def test_a_drag_shows_edge_wall_poles_and_verdict_alone(page):
+    say(page, serial=1, set={"damping": 20})
+    scene = Controls().change({"damping": 20}).scene
+    edge = model.quick_edge(scene)
+    closed = [*edge[0], edge[0][0], np.nan]
+    np.testing.assert_array_equal(page.sources["edge"].data["x"], closed)
+    assert page.sources["wall"].data == {"x": [10e3], "y": [40.0]}
+    assert page.sources["poles"].data["x"].size == 4
+    assert page.texts["word"] == "stable"
+    assert page.texts["serial"] == 1
+    assert page.queue.tasks == []
+    assert len(page.sources["contours"].data["xs"]) == 0
+
+
+@pytest.mark.parametrize("parts", [{}, {"velocity": "LowPass"}])
+def test_at_rest_the_words_are_those_of_check(page, parts):
+    say(page, set=parts, rest=True)
+    page.queue.work()
+    options = ["--velocity-cutoff", "100"] if parts else []
+    device = ["--mass", "0.1", "--damping", "10", "--period", "1e-3", "--delay", "1e-3"]
+    done = CliRunner().invoke(cli, ["check", "--stiffness", "10e3", "--virtual-damping", "40", *device, *options])
+    assert page.texts["verdict"] + "\n" == done.stdout
+    assert page.texts["busy"] is False
+    assert len(page.sources["contours"].data["xs"]) > 3
+    assert len(page.sources["passive"].data["x"]) > 3
+
+
+def test_at_rest_the_edge_of_a_scene_with_parts_is_its_outlines(page):
+    say(page, set={"velocity": "LowPass"})
+    assert page.sources["area"].data == {"xs": [], "ys": []}
+    say(page, rest=True)
+    page.queue.work()
+    (outline,) = page.controls.scene.stable_region()
+    np.testing.assert_array_equal(page.sources["edge"].data["x"][:-2], outline.stiffness)
+    np.testing.assert_array_equal(page.sources["area"].data["ys"][0][0][0][:-1], outline.virtual_damping)
+
+
+def test_what_is_of_another_device_is_taken_away_at_once(page):
+    say(page, set={}, rest=True)
+    page.queue.work()
+    assert len(page.sources["ridge"].data["x"]) > 0
+    say(page, set={"stiffness": 5e3})
+    assert len(page.sources["ridge"].data["x"]) > 0
+    say(page, set={"damping": 11})
+    for name in ("contours", "passive", "ridge", "best"):
+        assert not any(len(column) for column in page.sources[name].data.values())
+    assert page.texts["slopes"] == ""
+
+
+def test_what_is_no_longer_wanted_is_not_shown(page):
+    say(page, set={"damping": 20}, rest=True)
+    say(page, set={"damping": 30}, rest=True)
+    (old, _), page.queue.tasks = page.queue.tasks, page.queue.tasks[1:]
+    old[0](*old[1])
+    assert "verdict" not in page.texts
+    page.queue.work()
+    assert "b = 30.00 N s/m" in page.texts["verdict"]
+
+
+def test_parts_show_their_ridge_and_slopes_on_demand(page, monkeypatch):
+    say(page, set={"velocity": "LowPass"}, rest=True)
+    page.queue.work()
+    assert len(page.sources["ridge"].data["x"]) == 0
+    monkeypatch.setattr(model, "_FEW_RIDGE_POINTS", 3)
+    say(page, costly=True, rest=True)
+    page.queue.work()
+    assert len(page.sources["ridge"].data["x"]) == 3
+    assert "velocity.cutoff" in page.texts["slopes"]
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        {},
+        {"json": []},
+        {"json": ["{"]},
+        {"json": ["[]"]},
+        {"json": ['{"set": 1}']},
+        {"json": [7]},
+        {"json": ["[" * 3000]},
+        {"json": ['{"set": {"mass": 100}}' + " " * 5000]},
+        {"x": [1.0]},
+        None,
+    ],
+)
+def test_what_is_no_message_is_said_and_changes_nothing(page, data):
+    before = page.controls
+    page.receive(data)
+    assert "no message" in page.texts["error"]
+    assert page.controls == before
+    say(page, set={"mass": 200})
+    assert page.texts["error"] == ""
+
+
+def test_a_refused_number_leaves_the_last_good_view(page):
+    say(page, set={"mass": 200})
+    say(page, set={"mass": -1})
+    assert page.texts["error"].startswith("mass: got -0.001")
+    assert page.texts["state"]["mass"] == 200
+    assert page.controls.scene.mass == 0.2
+
+
+def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
+    def fail(scene):
+        raise ZeroDivisionError("far away")
+
+    monkeypatch.setattr(details, "assess", fail)
+    say(page, rest=True)
+    page.queue.work()
+    assert page.texts["error"] == "ZeroDivisionError: far away"
+    assert page.texts["busy"] is False
+
+
+def test_a_dark_page_has_other_inks(page):
+    say(page, dark=True)
+    dark = [getattr(glyph, name) for glyph, name, _ in page.inks]
+    say(page, dark=False)
+    assert all(before != getattr(glyph, name) for before, (glyph, name, _) in zip(dark, page.inks, strict=True))

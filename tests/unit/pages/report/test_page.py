@@ -1,0 +1,127 @@
+"""A run as one page: what it shows, what it lets a browser do, and what it refuses."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+from zwidth.studies import Config
+from zwidth.words.errors import StoreError
+
+PLANE = {
+    "kind": "sweep",
+    "name": "plane",
+    "axes": {
+        "alpha": {"linear": {"start": 0.01, "stop": 0.3, "num": 30}},
+        "beta": {"linear": {"start": -0.2, "stop": 1.0, "num": 20}},
+        "delta": [0.1, 0.5],
+        "d": 1,
+    },
+    "outputs": ["stable", "spectral_radius"],
+}
+TOP = {"kind": "ridge", "name": "top", "delta": [0, 1], "d": 1}
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("run") / "it"
+    text = "<script>alert('x')</script>"
+    config = {"version": 1, "name": "example", "description": text, "studies": [TOP, PLANE]}
+    zwidth.run(Config.model_validate(config), out=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def page(run):
+    return zwidth.write_report(run).read_text(encoding="utf-8")
+
+
+def test_the_page_asks_for_nothing_and_allows_its_own_script_and_style_alone(page):
+    policy = re.search(r'Content-Security-Policy" content="([^"]+)"', page)
+    assert policy is not None
+    assert policy[1].startswith("default-src 'none'; img-src data:;")
+    assert "unsafe" not in policy[1]
+    for element in ("style", "script"):
+        (text,) = re.findall(rf"<{element}>(.*?)</{element}>", page, re.DOTALL)
+        digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+        assert f"{element}-src 'sha256-{digest}'" in policy[1]
+    assert not re.findall(r'(?:src|href)="(?!data:|#)', page)
+
+
+def test_texts_of_the_configuration_are_shown_and_not_run(page):
+    assert "<script>alert" not in page
+    assert "&lt;script&gt;alert" in page
+
+
+def test_figures_versions_and_studies_are_there(page):
+    assert 'src="data:image/svg+xml;base64,' in page
+    assert 'id="top"' in page
+    assert 'id="plane"' in page
+    assert zwidth.__version__ in page
+
+
+def test_slices_hold_what_the_store_holds(run, page):
+    blocks = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page)]
+    named = {block["name"]: block for block in blocks}
+    found = named["spectral_radius"]
+    values = np.frombuffer(base64.b64decode(found["values"]), "<f4").reshape(2, 20, 30)
+    with zwidth.open_dataset(run / "plane.zarr") as data:
+        stored = data["spectral_radius"].squeeze("d", drop=True) if "d" in data.dims else data["spectral_radius"]
+        expected = stored.transpose("delta", "beta", "alpha").values
+    np.testing.assert_allclose(values, expected, rtol=1e-6)
+    assert found["others"][0]["values"] == [0.1, 0.5]
+    assert named["stable"]["truth"] is True
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path):
+    with pytest.raises(StoreError, match="holds no run"):
+        zwidth.write_report(tmp_path)
+
+
+def test_the_command_names_its_file(run, tmp_path):
+    result = CliRunner().invoke(cli, ["report", str(run), "--out", str(tmp_path / "it.html"), "--json"])
+    assert result.exit_code == 0
+    assert json.loads(result.output)["bytes"] == (tmp_path / "it.html").stat().st_size
+
+
+def test_what_is_damaged_or_missing_is_named_and_not_shown(run, tmp_path):
+    damages = {
+        "run.json is damaged": lambda out: edit(out / "run.json", '"seconds": ', '"seconds": 1'),
+        "config.yaml is damaged": lambda out: edit(out / "config.yaml", "num: 30", "num: 31"),
+        "config.yaml is missing": lambda out: (out / "config.yaml").unlink(),
+        "plane.zarr is missing": lambda out: shutil.rmtree(out / "plane.zarr"),
+        "plane.zarr: chunks are missing": lambda out: shutil.rmtree(out / "plane.zarr" / "wall_checksum" / "c"),
+        "top.svg is damaged": lambda out: edit(out / "top.svg", "</svg>", "</svg> "),
+    }
+    for number, (says, damage) in enumerate(damages.items()):
+        out = tmp_path / str(number)
+        shutil.copytree(run, out, ignore=shutil.ignore_patterns("report.html"))
+        damage(out)
+        with pytest.raises(StoreError, match=f"{re.escape(says)}.*'zwidth run CONFIG --resume'"):
+            zwidth.write_report(out)
+        assert not (out / "report.html").exists()
+
+
+def edit(file, old, new):
+    text = file.read_text(encoding="utf-8")
+    assert old in text
+    file.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def test_labelled_devices_are_sliders_by_name(tmp_path):
+    devices = {"label": ["=one", "two"], "mass": [0.1, 0.2], "damping": [1, 2]}
+    axes = {"devices": devices, "rate": "1 kHz", "delay": "1 periods", "stiffness": [1e3, 2e3, 3e3]}
+    study = {"kind": "sweep", "name": "s", "axes": axes | {"virtual_damping": [0, 1, 2]}, "outputs": ["stable"]}
+    zwidth.run({"version": 1, "name": "n", "studies": [study]}, out=tmp_path / "out")
+    text = zwidth.write_report(tmp_path / "out").read_text(encoding="utf-8")
+    slices = [json.loads(found) for found in re.findall(r'<script type="application/json">(.*?)</script>', text)]
+    assert [other["values"] for other in slices[0]["others"]] == [["=one", "two"]]

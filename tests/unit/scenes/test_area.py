@@ -1,0 +1,165 @@
+"""Areas against the outlined region, a Monte Carlo count of poles, and Colgate's triangle."""
+
+import jax
+import mpmath as mp
+import numpy as np
+import pytest
+from compiling import QUICKLY
+from mpmath import mpf
+
+import oracles
+import zwidth
+from zwidth import passive_area, stable_area
+from zwidth.loops.rigid.poles import unstable_poles
+from zwidth.loops.rigid.region import Piece
+
+# Undamped; cut by the line of z = -1 before and after the corner becomes the ridge; delayed; held.
+POINTS = [(0.0, 0.0), (0.5, 0.0), (3.0, 0.0), (10.0, 0.0), (0.1, 1.0), (1.0, 4.0), (40.0, 0.125), (2.0, 0.6)]
+
+
+def test_the_area_is_that_of_the_outline():
+    delta, d = np.array(POINTS).T
+    outlines = [zwidth.stable_region(*point, points=1200) for point in POINTS]
+    assert all(outline.verified for outline in outlines)
+    # A chord polygon of 1200 points misses about 1e-5 of the area, and touches the line only to its sampling.
+    np.testing.assert_allclose(stable_area(delta, d), [outline.area for outline in outlines], rtol=5e-5)
+
+
+def test_the_undamped_area_without_delay_has_a_closed_form():
+    # alpha = 2 beta (2 - beta)/(2 + beta) from beta = 0 to 2: 2 (4 beta - beta^2/2 - 8 ln(2 + beta)) between them.
+    assert stable_area(np.array([0.0]), 0.0)[0] == pytest.approx(2.0 * (6.0 - 8.0 * np.log(2.0)), rel=1e-13)
+
+
+@pytest.mark.parametrize("delta, d", [*POINTS, (0.01, 0.97), (1e4, 2.3), (1e-3, 30.0)])
+def test_the_area_by_quadrature_in_mpmath(delta, d):
+    with mp.workdps(40 + oracles.digits_for(delta)):
+        region = zwidth.stable_region(delta, d, points=8)
+        # The last point of the curve, in front of the line to alpha = 0.
+        rises = region.piece[-1] == Piece.MINUS_ONE
+        end, corner, h = mp.pi, mpf(0), mpf(10) ** -20
+        if rises:
+            corner = oracles.boundary(mp.pi - mpf(10) ** -18, delta, d)[0] ** 2 / 4
+        else:
+            near = mpf(float(region.omega[-1]))
+            end = mp.findroot(lambda w: oracles.boundary(w, delta, d)[0], (near, near * (1 - mpf(10) ** -9)))
+
+        def height(omega):
+            before, after = (oracles.boundary(omega * (1 + sign * h), delta, d)[1] for sign in (-1, 1))
+            return oracles.boundary(omega, delta, d)[0] * (after - before) / (2 * h * omega)
+
+        exact = mp.quad(height, mp.linspace(end * mpf(10) ** -12, end * (1 - mpf(10) ** -15), 4), maxdegree=5) + corner
+        assert oracles.relative_error(stable_area(delta, d), exact) < 1e-12
+
+
+@pytest.mark.parametrize("delta, d", [(3.0, 0.0), (0.5, 1.0)])
+def test_the_area_is_the_share_of_stable_walls(delta, d):
+    outline = zwidth.stable_region(delta, d)
+    random = np.random.default_rng(7)
+    low, high = outline.beta.min(), outline.beta.max()
+    alpha, beta = random.uniform(0, outline.alpha.max(), 20_000), random.uniform(low, high, 20_000)
+    share = np.mean(np.asarray(unstable_poles(alpha, beta, delta, d)) == 0)
+    box = outline.alpha.max() * (high - low)
+    # Four standard deviations of the count.
+    assert abs(share - stable_area(np.array([delta]), d)[0] / box) < 4 * np.sqrt(share * (1 - share) / 20_000)
+
+
+def test_the_slope_of_the_area(x64):
+    step = 1e-5
+    delta = np.array([1.0 - step, 1.0 + step])
+    area = stable_area(delta, 1.3)
+    slope = jax.jit(jax.grad(stable_area), compiler_options=QUICKLY)
+    assert float(slope(1.0, 1.3)) == pytest.approx((area[1] - area[0]) / (2 * step), rel=1e-8)
+
+
+def test_the_passive_set_without_delay_is_a_triangle():
+    np.testing.assert_allclose(passive_area(np.array([0.0, 0.5, 3.0]), 0), [0.0, 0.5, 18.0], rtol=1e-12)
+
+
+def test_the_passive_area_lies_between_two_polygons():
+    angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 4001)
+    for d in (1.0, 0.5):
+        needed = 1.0 - zwidth.passivity_margin(np.abs(np.cos(angle)), np.sin(angle), 1.0, d)
+        x, y = np.cos(angle) / needed, np.sin(angle) / needed
+        inner = 0.5 * np.sum(x[:-1] * y[1:] - x[1:] * y[:-1])
+        # A convex set exceeds its chords; of 4,000 of them by less than 1e-6 of the area.
+        assert inner <= passive_area(1.0, d) < inner * (1 + 1e-6)
+
+
+def test_passive_walls_are_fewer_than_stable_ones():
+    delta, d = np.array(POINTS).T
+    assert np.all(passive_area(delta, d) < stable_area(delta, d))
+
+
+def test_bad_points_are_nan():
+    assert np.isnan(stable_area(np.array([-1.0, 1.0, np.inf]), 1.0)).tolist() == [True, False, True]
+    assert np.isnan(passive_area(np.array([-1.0, 1.0]), np.array([0.0, np.nan]))).all()
+
+
+def test_the_passive_area_is_that_of_a_search_over_all_frequencies():
+    # Gauss-Legendre panels, halved where that changes the result, of the largest of many samples of the frequency.
+    d = np.array([0.03, 0.15, 0.4, 1.0, 1.7, 20.0])
+    reference = [adaptive_integral(lambda theta, d=d_: inverse_square(theta, d), -np.pi / 2, np.pi / 2) for d_ in d]
+    # The quadrature of the reference stops at 1e-9 a panel.
+    np.testing.assert_allclose(passive_area(1.0, d), 0.5 * np.array(reference), rtol=1e-8)
+
+
+def inverse_square(theta, d):
+    """1/needed^2 in a direction of the (alpha, beta) plane, by the condition for each frequency as it is derived."""
+    count = int(600 * (d + 1))
+    omega = (np.arange(count)[:, None] + 0.5) * np.pi / count
+    n, f = np.floor(d), d - np.floor(d)
+    step = 1 - np.exp(-1j * omega)
+    force = np.maximum(np.cos(theta), 0.0) + np.sin(theta) * step
+    g = np.conj(force) * (np.exp(1j * omega) - 1) * np.exp(1j * omega * n) / 2
+    # a delta^2 + b delta - c > 0 from its larger zero on
+    a, b, c = 2 * (1 - np.cos(omega)), 2 * np.real(((1 - f) + f * np.exp(1j * omega)) * g), f * (1 - f) * np.abs(g) ** 2
+    needed = (-b + np.sqrt(b * b + 4 * a * c)) / (2 * a)
+    # A parabola through the highest sample and its neighbors; the samples are symmetric about both ends.
+    padded = np.pad(needed, ((1, 1), (0, 0)), mode="edge")
+    top, column = np.argmax(needed, axis=0), np.arange(theta.size)
+    left, middle, right = (padded[top + i, column] for i in range(3))
+    return (middle - (right - left) ** 2 / (8 * (right + left - 2 * middle))) ** -2
+
+
+def adaptive_integral(function, low, high):
+    """Integrate a function with kinks: panels on which halving changes the result are halved, all at once."""
+    node, weight = np.polynomial.legendre.leggauss(12)
+
+    def panels(left, right):
+        half = 0.5 * (right - left)
+        points = (0.5 * (left + right))[:, None] + half[:, None] * node
+        return (function(points.ravel()).reshape(points.shape) @ weight) * half
+
+    edges = np.linspace(low, high, 17)
+    left, right = edges[:-1], edges[1:]
+    coarse, total = panels(left, right), 0.0
+    while left.size:
+        middle = 0.5 * (left + right)
+        lower, upper = panels(left, middle), panels(middle, right)
+        fine = lower + upper
+        done = (np.abs(fine - coarse) <= 1e-9 * (abs(total) + fine.sum())) | (right - left < 1e-6)
+        total += float(fine[done].sum())
+        left, right = np.concatenate([left[~done], middle[~done]]), np.concatenate([middle[~done], right[~done]])
+        coarse = np.concatenate([lower[~done], upper[~done]])
+    return total
+
+
+def test_the_passive_area_in_single_precision():
+    # Inside somebody's own jit the ambient precision holds; the triangle and the closed tip need no more.
+    assert float(jax.jit(passive_area, compiler_options=QUICKLY)(0.5, 0.0)) == pytest.approx(0.5, rel=1e-5)
+
+
+def test_the_passive_area_with_a_traced_delay(x64):
+    d = np.array([0.0, 0.3, 1.0, 2.5, 0.1, 1.3])
+    direct = passive_area(0.7, d)
+    area, slope = jax.jit(jax.vmap(jax.value_and_grad(lambda d: passive_area(0.7, d))), compiler_options=QUICKLY)(d)
+    np.testing.assert_allclose(area, direct, rtol=1e-14)
+    # One bad entry leaves the others alone, to the last bit.
+    spoiled = passive_area(0.7, np.where(np.arange(6) == 1, np.nan, d))
+    assert np.isnan(spoiled[1])
+    assert np.array_equal(np.delete(spoiled, 1), np.delete(direct, 1))
+    step = 1e-5
+    for at, by_d in zip(d[4:], slope[4:], strict=True):
+        # A maximum over frequency is found to the square root of a rounding error only.
+        low, high = passive_area(0.7, np.array([at - step, at + step]))
+        assert float(by_d) == pytest.approx((high - low) / (2 * step), abs=1e-7)

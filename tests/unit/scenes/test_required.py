@@ -1,0 +1,66 @@
+"""Values of one parameter at which the stiffest wall reaches a wanted stiffness."""
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth import Device, LowPass, Scene, Status, Timing
+from zwidth.words.errors import InputError
+
+RIGID = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
+FILTERED = RIGID.replace(velocity=LowPass(cutoff=30.0))
+
+
+def test_a_rigid_scene_needs_what_the_closed_form_says():
+    got = RIGID.required("damping", 25e3)
+    exact = float(zwidth.required_damping(mass=0.1, period=1e-3, delay=1e-3, stiffness=25e3).value)
+    assert (got.status, got.enough) == (Status.OK, "above")
+    assert got.value == pytest.approx(exact, rel=1e-10)
+
+
+@pytest.mark.parametrize("parameter, stiffness, side", [("velocity.cutoff", 9e3, "above"), ("period", 8.5e3, "below")])
+def test_both_sides_are_what_is_told(parameter, stiffness, side):
+    value = FILTERED.parameters()[parameter]
+    got = FILTERED.required(parameter, stiffness, within=(0.2 * value, 4.0 * value))
+    assert got.status == Status.OK
+    assert got.enough == side
+    for crossing in got.crossings:
+        turn = 1.0 if crossing.enough == "above" else -1.0
+        for there in (crossing.value, crossing.value * (1.0 + 1e-4 * turn)):
+            assert FILTERED.replace(**{parameter: there}).max_stiffness().stiffness >= stiffness
+        beyond = FILTERED.replace(**{parameter: crossing.value * (1.0 - 1e-4 * turn)})
+        assert beyond.max_stiffness().stiffness < stiffness
+
+
+def test_out_of_reach_and_everywhere():
+    never = FILTERED.required("mass", 1e9, within=(0.05, 0.2))
+    assert (never.status, never.enough, never.crossings) == (Status.UNREACHABLE, "nowhere", ())
+    assert np.isnan(never.value)
+    always = FILTERED.required("mass", 1.0, within=(0.05, 0.2))
+    assert (always.status, always.enough, always.value) == (Status.OK, "everywhere", 0.1)
+
+
+def test_the_range_ends_where_values_are_refused():
+    got = FILTERED.required("velocity.cutoff", 9e3, within=(20.0, 5e3))
+    assert got.range[1] < 500.0
+    assert [crossing.enough for crossing in got.crossings] == ["above"]
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (("velocity.cutof", 1e3), "parameter: got 'velocity.cutof'.*did you mean 'velocity.cutoff'"),
+        (("stiffness", 1e3), "parameter: got 'stiffness'"),
+        (("velocity.order", 1e3), "a whole number"),
+        (("mass", -1.0), "stiffness: got -1.0"),
+        (("mass", 1e3, (2.0, 1.0)), "within: got"),
+    ],
+)
+def test_what_is_refused(arguments, message):
+    with pytest.raises(InputError, match=message):
+        FILTERED.required(*arguments[:2], within=arguments[2] if len(arguments) > 2 else None)
+
+
+def test_a_parameter_that_is_zero_needs_a_range():
+    with pytest.raises(InputError, match="within: delay is 0 now"):
+        FILTERED.replace(delay=0.0).required("delay", 1e3)

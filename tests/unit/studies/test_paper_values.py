@@ -1,0 +1,86 @@
+"""The comparison with the paper's numbers."""
+
+import json
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.studies import paper_values as report
+
+
+def comparison(printed, computed):
+    return report.Comparison("x", "here", printed, computed)
+
+
+@pytest.mark.parametrize(
+    "printed, computed, agrees",
+    [
+        ("0.6863", 0.68629150, True),
+        ("0.6863", 0.68634999, True),
+        ("0.6863", 0.68635001, False),
+        ("2.3", 2.3105713, True),
+        ("2.3", 2.36, False),
+        ("6", 6.055, True),
+        ("0", 0.0, True),
+        ("0.1", float("nan"), False),
+    ],
+)
+def test_a_number_agrees_within_half_a_unit_of_its_last_digit(printed, computed, agrees):
+    assert comparison(printed, computed).agrees is agrees
+
+
+def test_every_printed_number_agrees():
+    rows = report.published_numbers()
+    # Eqs. (24), (25); nine numbers and two factors of section VIII; remark 3.
+    assert len(rows) == 14
+    assert [row.quantity for row in rows if not row.agrees] == []
+
+
+def test_the_numbers_are_those_of_the_library():
+    computed = {row.quantity: row.computed for row in report.published_numbers()}
+    ridge = zwidth.alpha_max(np.array([0.0, 0.1, 1.0]), 1)
+    for index, damping in enumerate((0, 10, 100)):
+        assert computed[f"0.75 alpha_max, b = {damping} N s/m"] == pytest.approx(0.75 * ridge.alpha[index], rel=1e-13)
+        assert computed[f"beta at alpha_max, b = {damping} N s/m"] == pytest.approx(ridge.beta[index], rel=1e-7)
+
+
+def test_remark_3_is_sharpened():
+    # 60-digit arithmetic: 2.31057135675369424..., 3.659361627421783507...
+    assert report.line_appears() == pytest.approx(2.310571356753694, abs=4e-15)
+    assert report.corner_takes_over() == pytest.approx(3.6593616274217835, abs=4e-15)
+
+
+def test_the_corner_takes_over_where_the_ridge_says_so():
+    switch = report.corner_takes_over()
+    below, above = zwidth.alpha_max(np.array([switch - 1e-6, switch + 1e-6]), 0).kind
+    assert (below, above) == (zwidth.RidgeKind.SMOOTH, zwidth.RidgeKind.CORNER)
+
+
+def test_the_line_bounds_the_stable_set_where_the_root_says_so():
+    touch = report.line_appears()
+    without = zwidth.stable_region(touch - 1e-3, 0)
+    beyond = zwidth.stable_region(touch + 1e-3, 0)
+    assert np.count_nonzero(without.piece == 1) == 0
+    assert np.count_nonzero(beyond.piece == 1) > 0
+
+
+def test_exact_values_stand_among_the_sharpened_numbers():
+    computed = {row.quantity: row.computed for row in report.sharpened_numbers()}
+    assert computed["alpha_max(delta = 0, d = 0)"] == pytest.approx(12 - 8 * np.sqrt(2), rel=1e-14)
+    assert computed["beta at alpha_max(delta = 0, d = 0)"] == pytest.approx(2 * np.sqrt(2) - 2, rel=1e-7)
+    assert computed["slope g, d = 0"] == pytest.approx(4.0, rel=1e-12)
+    assert computed["slope g, d = 1"] == pytest.approx(1.0, rel=1e-12)
+
+
+def test_both_forms_say_the_same():
+    rows = [comparison("0.5", 0.51), comparison("0.5", 0.6)]
+    sharpened = [report.Sharpened("y", "there", 1.25, "solved")]
+    content = json.loads(report.as_json(rows, sharpened))
+    assert content["all_agree"] is False
+    assert [row["agrees"] for row in content["published"]] == [True, False]
+    assert content["sharpened"][0]["computed"] == 1.25
+    text = report.as_markdown(rows, sharpened)
+    assert "1 of 2 printed numbers agree" in text
+    assert "| x | here | 0.5 | 0.6000000000 | **NO** |" in text
+    assert "| y | there | 1.250000000000000 | solved |" in text

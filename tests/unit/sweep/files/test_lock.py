@@ -1,0 +1,214 @@
+"""Who computes in a folder: one run, or the shards of one run; a killed one never stands in the way."""
+
+import errno
+import fcntl
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+
+import pytest
+import yaml
+from sweeping import assert_same, config_of, main_of, run_sweeps, study, values_of
+
+import zwidth
+from zwidth.sweep.files import lock
+from zwidth.sweep.files.lock import held_briefly, holding
+from zwidth.sweep.verify import verify
+from zwidth.words.errors import InputError, StoreBusyError
+
+# Holds the folder until it is killed, and says when it does.
+HOLD = """
+import sys, time
+from pathlib import Path
+from zwidth.sweep.files.lock import holding
+shard = tuple(map(int, sys.argv[2:])) or None
+with holding(Path(sys.argv[1]), shard):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture(autouse=True)
+def _impatient(monkeypatch):
+    monkeypatch.setattr(lock, "_PATIENCE", 0.1)
+
+
+@pytest.fixture
+def holder():
+    """Starts processes that hold a folder; whatever becomes of the test, they end with it."""
+    started = []
+
+    def start(folder, *shard):
+        words = [sys.executable, "-c", HOLD, str(folder), *map(str, shard)]
+        process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        started.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "held\n"
+        return process
+
+    yield start
+    for process in started:
+        kill(process)
+
+
+def kill(process):
+    if process.poll() is None:
+        process.send_signal(signal.SIGKILL)
+        process.communicate()
+
+
+def test_a_second_run_is_refused_and_told_who_holds_the_folder(holder, tmp_path):
+    process = holder(tmp_path)
+    with pytest.raises(StoreBusyError) as caught:
+        run_sweeps(config_of(), tmp_path, resume=True)
+    message = str(caught.value)
+    assert message.startswith(f"out: {tmp_path}: another run computes in this folder (process {process.pid} on ")
+    assert f" on {socket.gethostname()}, since 20" in message
+    assert message.endswith(" UTC); wait until it ends, stop that process, or choose another folder with --out DIR")
+    assert list(tmp_path.glob("*.zarr")) == []
+
+
+def test_a_killed_holder_does_not_block_a_run(holder, tmp_path):
+    kill(holder(tmp_path))
+    # Its files are still there.
+    assert f" on {socket.gethostname()}, since " in (tmp_path / ".locks" / "run").read_text(encoding="utf-8")
+    assert run_sweeps(config_of(), tmp_path, resume=True).ok
+
+
+def test_the_folder_is_free_again_after_a_run_and_after_one_that_failed(tmp_path):
+    assert run_sweeps(config_of(), tmp_path).ok
+    with pytest.raises(ZeroDivisionError), holding(tmp_path):
+        raise ZeroDivisionError
+    assert run_sweeps(config_of(), tmp_path, resume=True).ok
+
+
+def test_two_runs_of_one_process_exclude_each_other(tmp_path):
+    with holding(tmp_path), pytest.raises(StoreBusyError, match=f"process {os.getpid()} on"), holding(tmp_path):
+        pass
+
+
+def test_shards_share_a_folder(holder, tmp_path):
+    first, third = holder(tmp_path, 1, 3), holder(tmp_path, 3, 3)
+    assert run_sweeps(config_of(), tmp_path, shard=(2, 3)).ok
+    with pytest.raises(StoreBusyError) as caught:
+        run_sweeps(config_of(), tmp_path, resume=True)
+    assert f"(shard 1/3, process {first.pid} on " in str(caught.value)
+    assert "UTC, and 1 more); wait until it ends, stop that process, or" in str(caught.value)
+    kill(first)
+    kill(third)
+    assert run_sweeps(config_of(), tmp_path, resume=True).ok
+    assert verify(tmp_path)[0].ok
+
+
+def test_one_shard_runs_only_once_at_a_time(holder, tmp_path):
+    process = holder(tmp_path, 2, 3)
+    with pytest.raises(
+        StoreBusyError, match=rf"shard 2 computes in this folder already \(shard 2/3, process {process.pid} "
+    ):
+        run_sweeps(config_of(), tmp_path, shard=(2, 3))
+    kill(process)
+    assert run_sweeps(config_of(), tmp_path, shard=(2, 3)).ok
+
+
+def test_shards_of_another_number_are_refused_while_the_first_run(holder, tmp_path):
+    process = holder(tmp_path, 2, 3)
+    says = rf"3 shards compute in this folder, not 4 \(shard 2/3, process {process.pid} .*; wait until it ends, stop"
+    with pytest.raises(StoreBusyError, match=says):
+        run_sweeps(config_of(), tmp_path, shard=(1, 4))
+    kill(process)
+    assert run_sweeps(config_of(), tmp_path, shard=(1, 4)).ok
+
+
+def test_a_run_keeps_shards_out(holder, tmp_path):
+    process = holder(tmp_path)
+    with pytest.raises(StoreBusyError, match=rf"another run computes in this folder \(process {process.pid} "):
+        run_sweeps(config_of(), tmp_path, shard=(1, 2))
+
+
+def test_the_command_line_says_it_in_one_line_and_ends_with_exit_code_2(holder, tmp_path, capsys):
+    path, out = tmp_path / "sweep.yaml", tmp_path / "out"
+    path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
+    assert main_of("run", path, "--out", out) == 0
+    before = values_of(out)
+    process = holder(out)
+    capsys.readouterr()
+    for words in (["--resume"], ["--overwrite"], ["--shard", "1/2"]):
+        assert main_of("run", path, "--out", out, *words) == 2
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"zwidth: out: {out}: another run computes in this folder (process {process.pid} on ")
+    # Who only reads has nothing to wait for.
+    assert main_of("verify", out) == 0
+    assert main_of("export", out, "--csv", tmp_path / "table.csv") == 0
+    assert main_of("run", path, "--out", out, "--dry-run") == 0
+    assert values_of(out).keys() == before.keys()
+    kill(process)
+    assert main_of("run", path, "--out", out, "--overwrite") == 0
+
+
+def test_other_studies_neither_replace_nor_enter_a_folder_that_is_held(holder, tmp_path, capsys):
+    ridge = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0}
+    path, out = tmp_path / "both.yaml", tmp_path / "out"
+    path.write_text(yaml.safe_dump({"version": 1, "name": "both", "studies": [ridge, study()]}), encoding="utf-8")
+    process = holder(out)
+    assert main_of("run", path, "--out", out) == 2
+    assert f"another run computes in this folder (process {process.pid} " in capsys.readouterr().err
+    kill(process)
+    assert main_of("run", path, "--out", out) == 0
+    holder(out)
+    with pytest.raises(StoreBusyError):
+        zwidth.run(path, out=out, overwrite=True)
+    assert (out / "run.json").is_file()
+    assert verify(out)[0].ok
+
+
+def test_overwriting_starts_again(tmp_path):
+    assert run_sweeps(config_of(), tmp_path / "out").ok
+    changed = config_of(study(axes={"alpha": [0.1, 0.2], "beta": 0.1, "delta": 0.1, "d": 1}))
+    assert run_sweeps(changed, tmp_path / "out", overwrite=True).computed == 1
+    assert run_sweeps(changed, tmp_path / "fresh").ok
+    assert_same(tmp_path / "fresh", tmp_path / "out")
+    with pytest.raises(InputError, match="overwrite: it starts again"):
+        run_sweeps(changed, tmp_path / "out", overwrite=True, resume=True)
+
+
+@pytest.mark.parametrize("number", [errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_file_system_without_locks_is_no_obstacle(tmp_path, monkeypatch, number):
+    def refused(file, how):
+        raise OSError(number, os.strerror(number))
+
+    monkeypatch.setattr(fcntl, "flock", refused)
+    with holding(tmp_path), holding(tmp_path, (1, 2)):
+        pass
+
+
+def test_a_damaged_file_of_a_lock_costs_only_the_name_of_its_holder(holder, tmp_path):
+    holder(tmp_path)
+    for content in (b"", b"\xff{", b"[1]", b'{"who": 1}'):
+        (tmp_path / ".locks" / "run").write_bytes(content)
+        with pytest.raises(StoreBusyError, match="another run computes in this folder; wait until"), holding(tmp_path):
+            pass
+
+
+def test_who_writes_the_record_waits_for_the_other(tmp_path):
+    order = []
+
+    def other():
+        with held_briefly(tmp_path, "record"):
+            order.append("other")
+
+    with held_briefly(tmp_path, "record"):
+        thread = threading.Thread(target=other)
+        thread.start()
+        thread.join(0.2)
+        order.append("first")
+    thread.join()
+    assert order == ["first", "other"]
+
+
+def test_a_file_in_the_place_of_the_folder(tmp_path):
+    (tmp_path / "out").touch()
+    with pytest.raises(InputError, match="is a file"), holding(tmp_path / "out"):
+        pass

@@ -1,0 +1,63 @@
+"""Numbers for people, against texts written by hand from the rule: so many digits, no exponent from 1e-4 below 1e6."""
+
+import math
+
+import pytest
+
+from zwidth.words.formatting import plain, tell_apart, with_unit
+
+
+@pytest.mark.parametrize(
+    "value, text",
+    [
+        (0.0, "0"),
+        (-0.0, "0"),
+        (0.5, "0.5000"),
+        (-12.34, "-12.34"),
+        (1234.4, "1234"),
+        (999960.0, "1.000e+06"),
+        (999940.0, "999900"),
+        (1e-4, "0.0001000"),
+        (-1.04e-4, "-0.0001040"),
+        (9.9994e-5, "9.999e-05"),
+        (9.99996e-5, "0.0001000"),
+        (math.nan, "none"),
+        (math.inf, "infinite"),
+        (-math.inf, "-infinite"),
+    ],
+)
+def test_plain(value, text):
+    assert plain(value) == text
+
+
+@pytest.mark.parametrize(
+    "value, text",
+    [
+        (19870.0, "19.87 kN/m"),
+        (-0.0213, "-21.30 mN/m"),
+        (999.94, "999.9 N/m"),
+        (999.96, "1.000 kN/m"),
+        (1000.0, "1.000 kN/m"),
+        (1e-9, "1.000 nN/m"),
+        (2e-11, "0.02000 nN/m"),
+        (5e13, "50000 GN/m"),
+        (999.96e9, "1000 GN/m"),
+        (0.0, "0 N/m"),
+        (math.nan, "none"),
+    ],
+)
+def test_with_unit(value, text):
+    assert with_unit(value, "N/m") == text
+
+
+def test_digits_are_those_asked_for():
+    assert (plain(2 / 3, 2), with_unit(2 / 3, "s", 2), with_unit(996.0, "s", 2)) == ("0.67", "670 ms", "1.0 ks")
+
+
+def test_two_ends_that_differ_read_differently():
+    assert tell_apart(10.5953e3, 10.5961e3, "N/m") == ("10.595 kN/m", "10.596 kN/m")
+    assert tell_apart(1.0, 2.0) == ("1.000", "2.000")
+    assert tell_apart(3.0, 3.0, "N/m") == ("3.000 N/m", "3.000 N/m")
+    assert tell_apart(-float("inf"), 1.0, "N/m") == ("-infinite", "1.000 N/m")
+    low, high = tell_apart(1.0, 1.0 + 2.3e-16)
+    assert low != high
