@@ -86,7 +86,8 @@ def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) ->
     zero, far = np.zeros(x.size), np.full((1 + WINDOWS, count // 2, x.size), np.inf)
     program = Program(positions, _settle(lanes, positions[0], v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
     turns = np.zeros((1 + WINDOWS, x.size))
-    summary = Summary(zero, zero, zero, zero + np.nan, zero, Extent(far, -far), turns, zero, zero)
+    never = zero + np.nan
+    summary = Summary(zero, zero, zero, never, zero, Extent(far, -far), turns, never, never)
     return State(BodyState(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
 
 
@@ -134,9 +135,11 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     (body, work), frames = jax.lax.scan(substep, (state.body, state.work), np.arange(options.substeps))
     summary = _summarize(lanes, state, reading, body, work, given.k, ends, motion)
     after = State(body, program, work, summary)
-    # A block goes on behind the last period.
+    # A block goes on behind the last period. There is no window behind the last one, and what is written there is
+    # dropped; to choose between old and new windows would copy all of them each period.
     going = given.k < ends[-1]
-    after = jax.tree.map(partial(jnp.where, going), after, state)
+    old = state._replace(summary=state.summary._replace(extent=summary.extent, turns=summary.turns))
+    after = jax.tree.map(partial(jnp.where, going), after, old)
     return after, (reading, frames) if options.record else (reading.measured,)
 
 
@@ -162,7 +165,7 @@ def _summarize(
             known.extent.high.at[window].set(jnp.fmax(high, places)),
         ),
         known.turns.at[window].add(turning),
-        jnp.where(turning & (window > 0) & (known.turns[1:].sum(0) == 0), moment, known.first_turn),
+        jnp.where(turning & (window > 0) & jnp.isnan(known.first_turn), moment, known.first_turn),
         jnp.where(turning & (window > 0), moment, known.last_turn),
     )
 
