@@ -104,9 +104,9 @@ def to_caller(result: Any, values: tuple[ArrayLike, ...]) -> Any:
 _NUMBERS = frozenset({float, int, np.float64})
 
 
-def is_number(value: ArrayLike) -> bool:
-    """Whether a value is a plain number, whose conversion needs no check."""
-    return type(value) in _NUMBERS
+def are_numbers(*values: ArrayLike) -> bool:
+    """Whether all values are plain numbers, whose conversion needs no check."""
+    return _NUMBERS.issuperset(map(type, values))
 
 
 def elementwise(
@@ -122,9 +122,9 @@ def elementwise(
 
     The kernel is elementwise: it gets arrays of one shape (or plain numbers) and returns one or a tuple of that shape.
     """
-    if _NUMBERS.issuperset(map(type, values)):
+    if are_numbers(*values):
         try:
-            numbers = [np.float64(value) for value in values]
+            numbers = list(map(np.float64, values))
         except OverflowError:
             pass  # An integer beyond float64: the long way names it.
         else:

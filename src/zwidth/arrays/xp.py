@@ -33,10 +33,14 @@ def is_traced(*values: Any) -> bool:
 
 def namespace(*values: Any) -> Any:
     """`jax.numpy` where any argument is a JAX array, NumPy otherwise."""
-    if any(map(is_jax, values)):
-        import jax.numpy
+    # As `is_jax`, which a call for each argument would take half of the time of a single wall.
+    kind = getattr(sys.modules.get("jax"), "Array", None)
+    if kind is not None:
+        for value in values:
+            if not isinstance(value, _HOST_TYPES) and isinstance(value, kind):
+                import jax.numpy
 
-        return jax.numpy
+                return jax.numpy
     return np
 
 
@@ -78,6 +82,8 @@ def horner(x: Any, coefficients: Sequence[Any]) -> Any:
     return total
 
 
-def root(x: Any) -> Any:
-    """The square root of an array, or of a number of another arithmetic."""
-    return x.sqrt() if hasattr(x, "sqrt") else namespace(x).sqrt(x)
+def roots(*values: Any) -> tuple[Any, ...]:
+    """The square roots of arrays, or of numbers of another arithmetic."""
+    if hasattr(values[0], "sqrt"):
+        return tuple([value.sqrt() for value in values])
+    return tuple(map(namespace(*values).sqrt, values))

@@ -6,6 +6,7 @@ infinite or negative where it must not be is INVALID_INPUT, one beyond the range
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -24,10 +25,10 @@ LONGEST_DELAY = 1e5
 
 def within(value: Array, limits: tuple[float, float]) -> Array:
     """Whether a value is 0 or of a magnitude within ``limits``."""
-    xp = namespace(value)
-    size = xp.abs(value)
+    size = abs(value)
     # In single precision the limits lie outside of what there is.
-    return (size == 0) | ((size >= limits[0]) & (size <= min(limits[1], float(np.finfo(size.dtype).max))))
+    most = limits[1] if size.dtype == np.float64 else min(limits[1], float(np.finfo(size.dtype).max))
+    return (size == 0) | ((size >= limits[0]) & (size <= most))
 
 
 def device_status(delta: Array, d: Array) -> Array:
@@ -53,12 +54,13 @@ def _status(valid: Array, inside: Array, xp: Any) -> Array:
 
 def valid_device(delta: Array, d: Array) -> Array:
     """Whether a device and its delay lie where the model is computed."""
-    return device_status(delta, d) == Status.OK
+    # What is NaN or infinite compares as outside.
+    return (delta >= 0) & (delta <= LARGEST_DAMPING) & (d >= 0) & (d <= LONGEST_DELAY)
 
 
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     """Whether a wall on a device lies where the model is computed."""
-    return wall_status(alpha, beta, delta, d) == Status.OK
+    return valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
 
 
 # A bad point is NaN, and so are its derivatives: `where(ok, value, nan)` alone would give it the derivative 0, a finite
@@ -70,7 +72,7 @@ def void(ok: Array, *values: Array) -> tuple[Array, ...]:
     """The values where ``ok``, else NaN: so is what is computed with them, derivatives included."""
     xp = namespace(ok, *values)
     factor = xp.where(ok, 1.0, np.nan)
-    return tuple(value * factor for value in values)
+    return tuple([value * factor for value in values])
 
 
 def poison(ok: Array, *inputs: Array) -> Array:
@@ -82,18 +84,19 @@ def poison(ok: Array, *inputs: Array) -> Array:
 
 
 # Every other name is one of a wall's numbers.
+_NUMBERS = (int, float, np.floating, np.integer)
 _LARGEST = {"delta": LARGEST_DAMPING, "d": LONGEST_DELAY}
 
 
 def check_scalars(**values: Any) -> None:
     """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
     for name, value in values.items():
-        if not isinstance(value, int | float | np.floating | np.integer) or not np.isfinite(value):
+        if not isinstance(value, _NUMBERS):
             continue
+        size = abs(value)
         if name in _LARGEST:
-            inside, allowed = value <= _LARGEST[name], f"0 to {_LARGEST[name]:g}"
-        else:
-            inside = bool(within(np.float64(value), WALL_RANGE))
-            allowed = f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude"
-        if not inside:
-            raise InputError(f"{name}: got {value!r}; it must be {allowed}")
+            if _LARGEST[name] < value < math.inf:
+                raise InputError(f"{name}: got {value!r}; it must be 0 to {_LARGEST[name]:g}")
+        elif 0 < size < WALL_RANGE[0] or WALL_RANGE[1] < size < math.inf:
+            least, most = WALL_RANGE
+            raise InputError(f"{name}: got {value!r}; it must be 0 or {least:g} to {most:g} in magnitude")

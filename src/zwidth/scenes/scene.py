@@ -92,7 +92,7 @@ class Scene(SceneAnswers):
         for name, part in moved.items():
             object.__setattr__(self, name, part)
 
-    @property
+    @cached_property
     def is_rigid(self) -> bool:
         """Whether it is a rigid mass with the backward difference, for which the closed forms hold."""
         hand = self.operator
@@ -100,19 +100,19 @@ class Scene(SceneAnswers):
         free = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
         return bare and free and self.device.coupling is None
 
-    @property
+    @cached_property
     def mass(self) -> Any:
         """The mass that the wall's force acts on, in kg: the unit of the normalized stiffness."""
         held = self.operator is not None and self.operator.rigid and self.device.coupling is None
         return self.device.mass + (self.operator.mass if held and self.operator is not None else 0.0)
 
-    @property
+    @cached_property
     def damping(self) -> Any:
         """The damping to ground of that mass, in N s/m."""
         held = self.operator is not None and self.operator.rigid and self.device.coupling is None
         return self.device.damping + (self.operator.damping if held and self.operator is not None else 0.0)
 
-    @property
+    @cached_property
     def normalized(self) -> Normalized:
         """``alpha``, ``beta``, ``delta``, ``d`` of this scene and its wall."""
         return normalize(
@@ -144,7 +144,7 @@ class Scene(SceneAnswers):
         """The same without the hand: what passivity, which is for any hand, counts on."""
         return self.delta if self.operator is None else self.device.damping / self.units.virtual_damping
 
-    @property
+    @cached_property
     def d(self) -> float:
         """Delay in periods."""
         return self.timing.d
@@ -160,7 +160,7 @@ class Scene(SceneAnswers):
             mass=self.mass, period=self.timing.period, alpha=alpha, beta=beta, delta=self.delta, d=self.d
         )
 
-    @property
+    @cached_property
     def units(self) -> WallSI:
         """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
         rate = self.mass / self.timing.period

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.xla import ARCSINE, COSINE, SINE
-from zwidth.arrays.xp import horner, namespace, root
+from zwidth.arrays.xp import horner, namespace, roots
 from zwidth.loops.domain import WALL_RANGE, within
 from zwidth.loops.rigid.delay_classes import ANY, DeviceTerms, Kind, device
 from zwidth.loops.rigid.row_limit import long_curve, short_curve
@@ -69,7 +69,7 @@ def short_verdict(alpha: Any, beta: Any, here: Any) -> Verdict:
     # Where on the lobe this beta is: lead y^2 - linear y + start = 0, the first zero.
     start, linear, lead = size[0] * b, u0 - b * size[1], b * size[2] - u1
     square = linear * linear - start * lead * 4.0
-    y = start * 2.0 / (linear + root(square))
+    y = start * 2.0 / (linear + roots(square)[0])
     left, right = alpha * horner(y, size), y * horner(y, shape) * 4.0
     reached, missed = (square > 0) & (y < 1.0), (square < 0) | (y > 1.0)
     # Beyond the lobe's end a row is stable up to the line, if the lobe ends at z = -1, or nowhere. It ends before where
@@ -103,7 +103,7 @@ def long_verdict(alpha: Any, beta: Any, whole: Any, here: Any, solve: Solve, tak
     cubic = gain_cubic(alpha, beta, here)
     u, found = solve(cubic)
     y = u * 0.5
-    sine, cosine = root(y), root(1.0 - y)
+    sine, cosine = roots(y, 1.0 - y)
     lag = take_lag(u, whole)
     g, h, v, base = long_curve(here)
     E, F = horner(y, g), sine * cosine * horner(y, h) * 2.0
@@ -199,14 +199,13 @@ def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind 
 
 def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: Kind) -> Array:
     """The same on a discretized device."""
-    xp = namespace(alpha, here.c)
     plain = here._replace(a0=None)
     if not kind.fractional:
         here = plain
     early = short_verdict(alpha, beta, here).stable if kind.short else None
     if early is not None and kind.fractional:
         # At its corner the lobe of d = 0 is better known by its own formula.
-        early = xp.where(here.f == 0, short_verdict(alpha, beta, plain).stable, early)
+        early = namespace(here.f).where(here.f == 0, short_verdict(alpha, beta, plain).stable, early)
     late = long_verdict(alpha, beta, here.whole, here, _solve, _take_lag).stable if kind.long else early
-    stable = late if early is None else xp.where(here.whole < 1, early, late)
+    stable = late if early is None else namespace(here.whole).where(here.whole < 1, early, late)
     return stable & (alpha > 0) & (beta + here.delta > 0) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)

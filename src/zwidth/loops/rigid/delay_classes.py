@@ -28,10 +28,10 @@ ANY = Kind(True, True, True)
 
 def classify_delays(d: Any) -> Kind:
     """The `Kind` of an array of delays, `ANY` where they are traced; what is no delay counts as short."""
-    if is_traced(d):
-        return ANY
     if isinstance(d, float | int):
         return Kind(not d >= 1, d >= 1, d % 1.0 != 0)
+    if is_traced(d):
+        return ANY
     d = as_float64("d", d)
     long = d >= 1
     return Kind(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
@@ -63,7 +63,7 @@ def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.
     whole, f = split_delay(d)
     at = functions(delta)
     late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at
-    plant = discretize(delta, f if kind.fractional else None, functions)
+    plant = discretize(delta, f if kind.fractional else None, functions, at)
     tilt = tilt_at_minus_one(plant, whole)
     return DeviceTerms(
         *(delta, whole, f, plant.c, plant.em, at.phi1, at.phi2, at.psi, late.phi1, late.psi),

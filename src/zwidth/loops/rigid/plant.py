@@ -50,9 +50,12 @@ def undelayed_plant(delta: Array) -> Plant:
     return discretize(delta, None, phi.phi_functions)
 
 
-def discretize(delta: Any, fraction: Any, functions: Functions) -> Plant:
-    """The plant in any arithmetic whose phi-functions are given; ``fraction`` is None for whole delays."""
-    at = functions(delta)
+def discretize(delta: Any, fraction: Any, functions: Functions, at: Any = None) -> Plant:
+    """The plant in any arithmetic whose phi-functions are given; ``fraction`` is None for whole delays.
+
+    ``at`` are the functions at delta, where somebody has them.
+    """
+    at = functions(delta) if at is None else at
     if fraction is None:
         return Plant(at.c, delta * at.phi1, at.phi2, at.psi, 0.0 * at.gap, at.gap)
     f = fraction

@@ -165,7 +165,7 @@ def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole:
 
 def tilt_at_minus_one(plant: Plant, whole: Array) -> Array:
     """P(-1) has the stable sign where ``tilt (alpha + 2 beta) < 1`` (held delay); 0 where N(-1) = 0."""
-    return (1.0 - 2.0 * namespace(whole).mod(whole, 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
+    return (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
 
 
 def line_at_minus_one(delta: Array, d: Array) -> Array:

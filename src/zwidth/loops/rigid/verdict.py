@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.batching import BLOCK, FEW, compile_strips, elementwise, is_number, map_blocks, to_caller
+from zwidth.arrays.batching import BLOCK, FEW, are_numbers, compile_strips, elementwise, map_blocks, to_caller
 from zwidth.arrays.xp import is_traced
 from zwidth.loops.domain import check_scalars, wall_status
 from zwidth.loops.rigid.boundary_map import boundary_map
@@ -79,10 +79,10 @@ def is_stable(
     """
     values = (alpha, beta, delta, d)
     _check(method, delay, values)
+    if method in ("auto", "crossover") and are_numbers(*values):
+        return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
     if is_traced(*values):
         return _traced(values, method)
-    if method in ("auto", "crossover") and all(map(is_number, values)):
-        return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
     laid = lay_out(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
 
@@ -134,8 +134,10 @@ stability_of = decide_stability
 
 
 def _check(method: str, delay_model: str, values: tuple[ArrayLike, ...]) -> None:
-    check_has_poles(delay_model)
-    check_choice("method", method, STABILITY_METHODS)
+    if delay_model != "held":
+        check_has_poles(delay_model)
+    if method != "auto":
+        check_choice("method", method, STABILITY_METHODS)
     check_scalars(**dict(zip(NAMES, values, strict=True)))
 
 
