@@ -85,3 +85,16 @@ def test_doctests_are_part_of_the_test_run():
     options = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["pytest"]["ini_options"]
     assert "src" in options["testpaths"]
     assert "--doctest-modules" in options["addopts"]
+
+
+def test_theorems_are_cited_by_their_names():
+    """A citation of docs/theory in the code names a theorem or lemma that stands on that page."""
+    cited = 0
+    for path in sorted((ROOT / "src").rglob("*.py")):
+        text = re.sub(r"\s+", " ", path.read_text(encoding="utf-8"))
+        for page, kind, names in re.findall(r"docs/theory/([\w-]+\.md), (Theorem|Lemma)s? (\w+(?: and \w+)?)", text):
+            known = (ROOT / "docs" / "theory" / page).read_text(encoding="utf-8")
+            for name in names.split(" and "):
+                cited += 1
+                assert re.search(rf"^#+ {kind} {name}:", known, re.MULTILINE), (path.name, page, kind, name)
+    assert cited >= 6

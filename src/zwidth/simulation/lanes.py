@@ -155,7 +155,7 @@ def find_longest_steps(machine: Mechanics) -> np.ndarray:
 
 
 def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, options: Options) -> dict[str, Any]:
-    """What of `Lanes` hangs on the bodies."""
+    """The fields of `Lanes` that the bodies and the links between them decide."""
     ways = (machine.rate, machine.held) if options.friction else (machine.rate,)
     digits = Flow(*(np.zeros((1, 1, 1, 1, 1)) for _ in Flow._fields))
     if options.friction or options.jitter:

@@ -53,7 +53,7 @@ def cut_arcs(
         leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
         first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
         last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
-        # What the ends' alpha is no one asks: next to them every wall is compared with the crossing itself.
+        # The ends have no alpha: next to them every wall is compared with the crossing itself.
         with np.errstate(all="ignore"):
             slope = curve.turn / curve.fall**2
         parts = [nodes, curve.beta, curve.alpha, curve.alpha_slope, slope, curve.size]

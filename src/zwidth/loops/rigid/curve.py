@@ -2,8 +2,8 @@
 
 The curve starts at (0, -delta), omega = 0, and bounds the stable set until it returns to alpha = 0 or, for short
 delays and strong damping, until omega = pi, where a double pole sits at z = -1 (the corner). ``b = beta + delta`` grows
-along it and alpha has one maximum (docs/theory/one-lobe.md, Theorem 3), so that rows and columns are intervals, and
-each root below is the only one where it is sought.
+along it and alpha has one maximum (docs/theory/one-lobe.md, Theorems A and B), so that rows and columns are intervals
+(Theorem C), and each root below is the only one where it is sought.
 
 Places on the lobe are counted by ``x``: ``y = sin^2(omega/2)`` for n = 0, where alpha and b are rational in y, and
 omega itself from one period on. Notation of `loops.rigid.row_limit`.

@@ -101,7 +101,7 @@ def pick_points(points: Points, mask: np.ndarray) -> Points:
 
 
 class Part(NamedTuple):
-    """Arguments that belong to one value of a key, and where their results go."""
+    """The arguments of all points with one value of a key, and the places of their results in the whole array."""
 
     value: Any
     arrays: tuple[np.ndarray, ...]

@@ -16,7 +16,7 @@ tau is the Chebyshev polynomial U_(D-1) of cos omega for whole D, kappa is T_D, 
     kappa' = -2 D tau     tau' = (D kappa - tau cos omega)/(2 y q)
     tau'' = -((3/2) cos omega tau' + (D^2 - 1) tau)/(y q)          and for D = 1: tau = 1, kappa = 1 - 2 y
 
-The lobe has one maximum (docs/theory/one-lobe.md, Theorem 3b), so nothing is searched. The number of steps is fixed:
+The lobe has one maximum (docs/theory/one-lobe.md, Theorem B), so nothing is searched. The number of steps is fixed:
 no point waits for another.
 """
 

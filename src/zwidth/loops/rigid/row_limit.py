@@ -1,8 +1,8 @@
 """Where a row of the (alpha, beta) plane ends: the stiffest wall of each damping, in closed form (rigid loop).
 
 For a held delay d = n + f the stable walls of one (beta, delta, d) are ``0 < alpha < limit``: the limit is the first
-lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md, Theorem
-3a).
+lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md,
+Theorem C).
 
 Notation: ``N(z) = a2 z^2 + a1 z + a0`` of `loops.rigid.plant`, ``em = 1 - c``, ``sigma = a2 + a0``, ``mu = a2 - a0``,
 ``y = sin(w/2)^2``, ``k = n + 1/2``, and the boundary at ``z = e^(j w)`` in the form
