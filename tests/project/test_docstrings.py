@@ -6,8 +6,6 @@ import re
 import tomllib
 from pathlib import Path
 
-import pytest
-
 import zwidth
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -16,6 +14,23 @@ FUNCTIONS = sorted(name for name in zwidth.__all__ if inspect.isfunction(getattr
 CLASSES = sorted(name for name in zwidth.__all__ if inspect.isclass(getattr(zwidth, name)))
 # What handles files holds no formula that somebody published.
 WITHOUT_REFERENCES = {"limits_of", "load_config", "open_dataset", "run", "use_compilation_cache"}
+
+
+def each(names):
+    """One test of many names, which says where it failed."""
+
+    def decorate(check):
+        def test():
+            for name in names:
+                try:
+                    check(name)
+                except AssertionError as error:
+                    raise AssertionError(f"{name}: {error}") from error
+
+        test.__name__ = check.__name__
+        return test
+
+    return decorate
 
 
 def sections(text):
@@ -30,7 +45,7 @@ def sections(text):
     return found
 
 
-@pytest.mark.parametrize("name", zwidth.__all__)
+@each(zwidth.__all__)
 def test_every_public_name_says_what_it_is(name):
     if name == "__version__":
         return
@@ -41,7 +56,7 @@ def test_every_public_name_says_what_it_is(name):
     assert re.fullmatch(r"[A-Z`].*[.:]", text.splitlines()[0]), "the first line is one sentence"
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@each(FUNCTIONS)
 def test_functions_have_their_sections_in_order(name):
     function = getattr(zwidth, name)
     found = sections(function.__doc__)
@@ -51,7 +66,7 @@ def test_functions_have_their_sections_in_order(name):
     assert needed <= set(present)
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@each(FUNCTIONS)
 def test_functions_describe_every_parameter(name):
     function = getattr(zwidth, name)
     described = set(re.findall(r"^    (\w+(?:, \w+)*):", "\n".join(sections(function.__doc__)["Args"]), re.MULTILINE))
@@ -59,14 +74,14 @@ def test_functions_describe_every_parameter(name):
     assert described == set(inspect.signature(function).parameters)
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@each(FUNCTIONS)
 def test_references_name_author_and_year(name):
     for line in sections(getattr(zwidth, name).__doc__).get("References", [])[1:]:
         if line.strip() and not line.startswith(" " * 8):
             assert re.search(r"\b(18|19|20)\d\d\b|method|D-decomposition", line), line
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@each(FUNCTIONS)
 def test_examples_are_short_and_run(name):
     examples = doctest.DocTestParser().get_examples(getattr(zwidth, name).__doc__)
     assert examples
@@ -75,7 +90,7 @@ def test_examples_are_short_and_run(name):
     assert any(example.want for example in examples)
 
 
-@pytest.mark.parametrize("name", CLASSES)
+@each(CLASSES)
 def test_classes_keep_the_order_too(name):
     present = [section for section in sections(getattr(zwidth, name).__doc__) if section != "summary"]
     assert present == sorted(present, key=ORDER.index)
