@@ -19,11 +19,12 @@ os.environ["MPLBACKEND"] = "Agg"
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Most of the time would go into compiling: the processes that run tests share what one of them has compiled.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(Path(__file__).parents[1] / ".cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 
 import jax
 import pytest
+from _pytest.doctest import DoctestModule
 from hypothesis import HealthCheck, settings
 from leftovers import what_is_open
 from waiting import wait_for
@@ -47,6 +48,12 @@ settings.load_profile("zwidth")
 def pytest_configure(config: pytest.Config) -> None:
     """Most tests inside transformations keep JAX's default precision on purpose."""
     config.addinivalue_line("filterwarnings", "ignore::zwidth.words.errors.PrecisionWarning")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file(file_path: Path):
+    """Examples are those of the package's docstrings: nobody reads tests for examples."""
+    return [found for found in (yield) if not isinstance(found, DoctestModule)]
 
 
 @pytest.fixture(scope="module", autouse=True)
