@@ -8,19 +8,44 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import fields, replace
-from typing import Any
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from zwidth.arrays.xp import is_jax
+from zwidth.parts.device import Device
+from zwidth.parts.operator import Operator
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import Velocity
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError, describe_choice
+
+
+class Parts(Protocol):
+    """A scene as those see it who are below it: its parts, and nothing that is asked of them."""
+
+    # Of dataclasses.
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def device(self) -> Device: ...
+    @property
+    def timing(self) -> Timing: ...
+    @property
+    def wall(self) -> VirtualWall: ...
+    @property
+    def velocity(self) -> Velocity: ...
+    @property
+    def operator(self) -> Operator | None: ...
+
+
+AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")
 _NAMED = ("velocity", "operator")
 
 
-def _parts(scene: Any) -> Iterator[tuple[str, str, Any]]:
+def _parts(scene: Parts) -> Iterator[tuple[str, str, Any]]:
     """Every part there is: what its paths begin with, its field of the scene, and itself."""
     for name in _BARE:
         yield "", name, getattr(scene, name)
@@ -31,7 +56,7 @@ def _parts(scene: Any) -> Iterator[tuple[str, str, Any]]:
         yield "coupling.", "coupling", scene.device.coupling
 
 
-def list_parameters(scene: Any) -> dict[str, Any]:
+def list_parameters(scene: Parts) -> dict[str, Any]:
     """Every number of a scene by its dotted path, those of the wall last."""
     found = {
         (prefix + item.name, name): getattr(part, item.name)
@@ -46,7 +71,7 @@ def _is_number(value: Any) -> bool:
     return is_jax(value) or isinstance(value, int | float | np.number)
 
 
-def replace_parameters(scene: Any, changes: dict[str, Any]) -> Any:
+def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     """A new scene with some parameters, or whole parts, changed; everything else stays as it is in SI units."""
     changed: dict[str, dict[str, Any]] = {}
     whole = {name: changes[name] for name in (*_BARE, *_NAMED) if name in changes}
@@ -71,7 +96,7 @@ def replace_parameters(scene: Any, changes: dict[str, Any]) -> Any:
         changed["timing"].setdefault("period", None)
     if "wall" in changed and isinstance(scene.wall, NoWall):
         scene = replace(scene, wall=VirtualWall(0.0))
-    if "coupling" in changed:
+    if scene.device.coupling is not None and "coupling" in changed:
         coupling = replace(scene.device.coupling, **changed.pop("coupling"))
         changed.setdefault("device", {})["coupling"] = coupling
     return replace(scene, **{part: replace(getattr(scene, part), **own) for part, own in changed.items()})

@@ -108,7 +108,7 @@ def _polynomials(scene: Any) -> BallPolynomials:
     import flint
 
     period = flint.arb(float(scene.timing.period))
-    chain = chain_of(_exact(scene, period))
+    chain = chain_of(_exact(scene, period), (scene.d, scene.whole_delay))
     answer, device = _device(chain)
     top, bottom = _estimate(scene.velocity, period)
     mass: Any = chain.estimate
@@ -121,7 +121,7 @@ def _polynomials(scene: Any) -> BallPolynomials:
     return BallPolynomials(waiting * bottom, answer * bottom * unit, answer * top * unit, rest)
 
 
-def _exact(scene: Any, period: flint.arb) -> SimpleNamespace:
+def _exact(scene: Any, period: flint.arb) -> Any:
     """The scene's numbers as exact balls, for `chain_of`; in the estimate's place the mass in kg."""
     import flint
 
@@ -141,8 +141,6 @@ def _exact(scene: Any, period: flint.arb) -> SimpleNamespace:
         timing=SimpleNamespace(period=period),
         operator=hand,
         velocity=SimpleNamespace(estimate=lambda period: mass),
-        d=scene.d,
-        whole_delay=scene.whole_delay,
     )
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from zwidth.arrays.batching import compute_concretely, processors
 from zwidth.loops.linear.chain import Chain, chain_of
 from zwidth.parts.estimate import Estimate
+from zwidth.parts.paths import Parts, replace_parameters
 from zwidth.parts.velocity import FOAW, BackwardDifference
 from zwidth.simulation.flow import Mechanics, mechanics
 from zwidth.simulation.lanes import (
@@ -54,23 +55,23 @@ class Numbers:
         return replace(self, **{name: part[places] for name, part in vars(self).items() if part is not None})
 
 
-def structure(scene: Any) -> tuple[Any, ...]:
+def structure(scene: Parts) -> tuple[Any, ...]:
     """What the scenes of one program share: their bodies, which of them is sensed, and FOAW's longest window."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
     return *name_bodies(scene), sensor, scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
 
 
-def name_bodies(scene: Any) -> tuple[str, ...]:
+def name_bodies(scene: Parts) -> tuple[str, ...]:
     """The position of every body by its name in `Motion`."""
     tip = ("tip_position",) if scene.device.coupling is not None else ()
     hand = ("hand_position",) if scene.operator is not None and not scene.operator.rigid else ()
     return "position", *tip, *hand
 
 
-def _chain(scene: Any) -> Chain:
-    d = scene.d
-    linear = replace(scene, velocity=BackwardDifference()) if isinstance(scene.velocity, FOAW) else scene
-    return chain_of(linear, (d, int(np.floor(d))))
+def _chain(scene: Parts) -> Chain:
+    if isinstance(scene.velocity, FOAW):
+        scene = replace_parameters(scene, {"velocity": BackwardDifference()})
+    return chain_of(scene)
 
 
 def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, course: Course) -> dict[str, np.ndarray]:

@@ -219,7 +219,7 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     for place, scene in np.ndenumerate(array):
         if not (hasattr(scene, "device") and hasattr(scene, "timing")):
             raise InputError(f"scenes: got {scene!r}; a zwidth.Scene or a list of them is needed")
-        if is_traced(scene.mass, scene.timing.period):
+        if is_traced(scene.device.mass, scene.timing.period):
             raise InputError("scenes: got one of values that JAX traces; simulate outside of jit, vmap and grad")
         which[place] = known.setdefault(id(scene), len(known))
     return [array.flat[np.flatnonzero(which.ravel() == k)[0]] for k in range(len(known))], which

@@ -25,6 +25,7 @@ from zwidth.arrays.xp import namespace
 from zwidth.loops.linear.loop import LinearLoop
 from zwidth.loops.rigid.plant import Plant, held_plant, undelayed_plant
 from zwidth.parts.estimate import Estimate
+from zwidth.parts.paths import Parts
 from zwidth.words.errors import InputError
 
 # Stiffer links than this, in units of the first mass over T^2, move so fast that e^A keeps no digits.
@@ -67,7 +68,7 @@ class Chain:
         return len(self.bodies) == 1 and _is_zero(self.bodies[0].stiffness)
 
 
-def chain_of(scene: Any, delay: tuple[Any, int] | None = None) -> Chain:
+def chain_of(scene: Parts, delay: tuple[Any, int] | None = None) -> Chain:
     """The chain of a scene, normalized by its period and by the mass the wall's force acts on.
 
     ``delay`` is the delay in periods and its whole part, where a trace hides them.
@@ -92,7 +93,7 @@ def chain_of(scene: Any, delay: tuple[Any, int] | None = None) -> Chain:
     bodies = tuple(Body(m / unit, b * rub, 0.0 if _is_zero(k) else k * force) for m, b, k in masses)
     tied = tuple(Link(k * force, c * rub) for k, c in links)
     sensor = 1 if device.coupling is not None and device.coupling.sensor == "tip" else 0
-    d, whole = delay or (scene.d, scene.whole_delay)
+    d, whole = delay or (timing.d, int(np.floor(timing.d)))
     return Chain(bodies, tied, sensor, d, whole, scene.velocity.estimate(period))
 
 
