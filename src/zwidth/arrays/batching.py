@@ -32,6 +32,8 @@ CHUNK = 1 << 15
 FEW = 1 << 12
 # What an elementwise kernel holds at one time then stays in the cache; smaller blocks cost as much in calls.
 BLOCK = 1 << 16
+# The same of kernels that make hundreds of samples of each point.
+SAMPLED = 1 << 9
 # The compiler treats shorter arrays differently, to the last place.
 _LEAST = 1 << 4
 
@@ -117,10 +119,13 @@ def elementwise(
     *,
     few: int = FEW,
     block: int = BLOCK,
+    samples: bool = False,
 ) -> Any:
     """Broadcast ``values`` and apply ``kernel(*arrays, *static)``, whose text serves NumPy and JAX.
 
     The kernel is elementwise: it gets arrays of one shape (or plain numbers) and returns one or a tuple of that shape.
+    With ``samples`` it makes hundreds of samples of a point, and is compiled for traced values only: that takes many
+    seconds and then wins nothing over NumPy.
     """
     if are_numbers(*values):
         try:
@@ -133,14 +138,26 @@ def elementwise(
     if is_traced(*values):
         return _compile_elementwise(kernel, static)(*traced_columns(values))
     arrays = broadcast(names, values)
+    few, block = (SAMPLED, SAMPLED) if samples else (few, block)
     if arrays[0].size <= few:
         with np.errstate(all="ignore"):
             result = kernel(*arrays, *static)
         # A copy: a view of an argument, or of one value, could not be written to.
         return to_caller(tree_map(lambda leaf: np.array(np.broadcast_to(leaf, arrays[0].shape)), result), values)
     shape = arrays[0].shape
-    flat = map_blocks(_compile_elementwise(kernel, static), [array.reshape(-1) for array in arrays], block)
+    function = _quietly(kernel, static) if samples else _compile_elementwise(kernel, static)
+    flat = map_blocks(function, [array.reshape(-1) for array in arrays], block)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)
+
+
+def _quietly(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+    """A kernel for NumPy's arrays that warns of nothing."""
+
+    def function(*arrays: np.ndarray) -> Any:
+        with np.errstate(all="ignore"):
+            return kernel(*arrays, *static)
+
+    return function
 
 
 def _plain(leaf: Any) -> Any:

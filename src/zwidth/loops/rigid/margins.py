@@ -10,13 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.batching import elementwise
 from zwidth.arrays.roots import false_position, follow_root
 from zwidth.arrays.xp import along, epsilon, frozen, namespace
 from zwidth.loops.domain import check_scalars, poison, valid_wall
 from zwidth.loops.rigid.crossover import gain_crossover, stable_at
 from zwidth.loops.rigid.delay_classes import ANY, DeviceTerms, device
 from zwidth.loops.rigid.modulus import modulus
-from zwidth.loops.rigid.open_loop import by_samples, find_angle, size_and_phase
+from zwidth.loops.rigid.open_loop import find_angle, size_and_phase
 from zwidth.loops.rigid.plant import split_delay
 from zwidth.words.types import Array, ArrayLike
 
@@ -88,7 +89,7 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
     """
     check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
     values = (alpha, beta, delta, d)
-    return by_samples(margins_kernel, _NAMES, values)
+    return elementwise(margins_kernel, _NAMES, values, samples=True)
 
 
 def margins_kernel(

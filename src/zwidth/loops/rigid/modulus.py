@@ -12,11 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.arrays.batching import elementwise
 from zwidth.arrays.xp import along, frozen, namespace, repeat
 from zwidth.loops.domain import check_scalars, poison, valid_wall
 from zwidth.loops.rigid.crossover import gain_crossover
 from zwidth.loops.rigid.delay_classes import DeviceTerms, device
-from zwidth.loops.rigid.open_loop import by_samples, find_angle, size_and_phase
+from zwidth.loops.rigid.open_loop import find_angle, size_and_phase
 from zwidth.words.types import Array, ArrayLike
 
 # Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
@@ -51,7 +52,7 @@ def modulus_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Array
         0.5898
     """
     check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
-    return by_samples(margin_kernel, ("alpha", "beta", "delta", "d"), (alpha, beta, delta, d))
+    return elementwise(margin_kernel, ("alpha", "beta", "delta", "d"), (alpha, beta, delta, d), samples=True)
 
 
 def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:

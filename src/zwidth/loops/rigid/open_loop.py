@@ -11,16 +11,12 @@ each argument principal and continuous in w, so that the phase needs no unwrappi
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 
-from zwidth.arrays.batching import broadcast, elementwise, map_blocks, to_caller, tree_map
-from zwidth.arrays.xp import is_traced, namespace
+from zwidth.arrays.xp import namespace
 from zwidth.loops.rigid.crossover import Crossover
 from zwidth.loops.rigid.delay_classes import DeviceTerms
-from zwidth.words.types import Array, ArrayLike
+from zwidth.words.types import Array
 
 
 def find_angle(crossover: Crossover) -> Array:
@@ -45,27 +41,3 @@ def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tu
     size = xp.sqrt(top / (2.0 * u * (here.em * here.em + 2.0 * here.c * u)))
     phase = xp.arctan2(wall_im, wall_re) + xp.arctan2(m_im, m_re) + xp.arctan2(here.em - u, s)
     return size, phase - (here.whole + 0.5) * w
-
-
-# A point becomes some hundreds of samples.
-_BLOCK = 1 << 9
-
-
-def by_samples(kernel: Callable[..., Any], names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> Any:
-    """`elementwise` for a kernel that makes hundreds of samples of a point: compiled for traced values only.
-
-    Compiling takes many seconds and then wins nothing over NumPy.
-    """
-    if is_traced(*values):
-        return elementwise(kernel, names, values)
-    arrays = broadcast(names, values)
-    shape = arrays[0].shape
-    if arrays[0].size <= _BLOCK:
-        return elementwise(kernel, names, values)
-
-    def quietly(*columns: np.ndarray) -> Any:
-        with np.errstate(all="ignore"):
-            return kernel(*columns)
-
-    flat = map_blocks(quietly, [array.reshape(-1) for array in arrays], _BLOCK)
-    return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)
