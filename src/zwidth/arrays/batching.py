@@ -12,7 +12,7 @@ import os
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
@@ -76,11 +76,18 @@ def as_float64(name: str, value: ArrayLike) -> np.ndarray:
 def broadcast(names: tuple[str, ...], values: tuple[ArrayLike, ...]) -> list[np.ndarray]:
     """Convert concrete arguments to float64 arrays of one common shape."""
     arrays = [as_float64(name, value) for name, value in zip(names, values, strict=True)]
+    join_shapes(zip(names, (array.shape for array in arrays), strict=True))
+    return list(np.broadcast_arrays(*arrays))
+
+
+def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shapes") -> tuple[int, ...]:
+    """The shape that arguments of these shapes broadcast to; an `InputError` with all of them where they do not."""
+    named = list(named)
     try:
-        return list(np.broadcast_arrays(*arrays))
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(names, arrays, strict=True))
-        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+        return np.broadcast_shapes(*(shape for _, shape in named))
+    except ValueError:
+        shapes = ", ".join(f"{name} {shape}" for name, shape in named)
+        raise InputError(f"{what} do not broadcast: {shapes}; make each axis equal or 1") from None
 
 
 def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import refuse_masked
+from zwidth.arrays.batching import join_shapes, refuse_masked
 from zwidth.arrays.xp import is_jax, is_traced, namespace
 from zwidth.loops.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE, void, within
 from zwidth.parts.span import accept_units, in_periods
@@ -102,11 +102,7 @@ def quantity_status(**values: Array) -> Array:
 def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: ArrayLike) -> tuple[Array, ...]:
     """Check the arguments, put NaN where an array's entry is out of range, and apply ``formula``."""
     checked = {name: _check_quantity(name, value) for name, value in values.items()}
-    try:
-        np.broadcast_shapes(*(np.shape(value) for value in checked.values()))
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {np.shape(value)}" for name, value in checked.items())
-        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+    join_shapes((name, np.shape(value)) for name, value in checked.items())
     if any(map(is_jax, values.values())):
         from zwidth.arrays.batching import elementwise
 

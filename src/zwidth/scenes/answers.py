@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64
+from zwidth.arrays.batching import as_float64, join_shapes
 from zwidth.arrays.circle import circle
 from zwidth.loops.linear import state_space
 from zwidth.loops.linear.chain import Chain
@@ -69,12 +69,9 @@ def tabulate_poles(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, period
 
 def respond(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: ArrayLike, period: float) -> Array:
     """``L = (alpha + beta F) G`` at frequencies in Hz up to half the sampling rate; NaN for others."""
-    try:
-        hertz, a, b = np.broadcast_arrays(as_float64("frequency", frequency), alpha, beta)
-    except ValueError as error:
-        raise InputError(
-            f"shapes do not broadcast: frequency {np.shape(frequency)}, walls {alpha.shape}; make each axis equal or 1"
-        ) from error
+    hertz = as_float64("frequency", frequency)
+    join_shapes([("frequency", hertz.shape), ("stiffness", alpha.shape), ("virtual_damping", beta.shape)])
+    hertz, a, b = np.broadcast_arrays(hertz, alpha, beta)
     w = 2.0 * np.pi * hertz * period
     # Half the sampling rate is half a turn, whatever the rounding of the quotient.
     w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64
+from zwidth.arrays.batching import as_float64, join_shapes
 from zwidth.arrays.roots import bisect
 from zwidth.arrays.xp import is_traced
 from zwidth.loops.domain import within
@@ -163,11 +163,8 @@ def _each_box(
         if low.ndim == high.ndim == 0 and low > high:
             raise InputError(f"{name}: got {value!r}; the first number must not be greater than the second")
         ends += [low, high]
-    try:
-        columns = np.broadcast_arrays(*ends)
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {np.shape(end)}" for name, end in zip(np.repeat(_NAMES, 2), ends, strict=True))
-        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+    join_shapes(zip(map(str, np.repeat(_NAMES, 2)), map(np.shape, ends), strict=True))
+    columns = np.broadcast_arrays(*ends)
     shape = columns[0].shape
     rows = np.stack([column.ravel() for column in columns], axis=-1)
     results = []

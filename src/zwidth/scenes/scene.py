@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64
+from zwidth.arrays.batching import as_float64, join_shapes
 from zwidth.loops.linear.border import Border, Outline, outlines
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import Chain, chain_of, linear_loop
@@ -193,13 +193,7 @@ class Scene(SceneAnswers):
         units = self.units
         stiffness, virtual_damping = resolve_wall(self.wall, stiffness, virtual_damping)
         both = as_float64("stiffness", stiffness), as_float64("virtual_damping", virtual_damping)
-        try:
-            np.broadcast_shapes(both[0].shape, both[1].shape)
-        except ValueError as error:
-            raise InputError(
-                f"shapes do not broadcast: stiffness {both[0].shape}, virtual_damping {both[1].shape}; make each "
-                "axis equal or 1"
-            ) from error
+        join_shapes(zip(("stiffness", "virtual_damping"), (part.shape for part in both), strict=True))
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 

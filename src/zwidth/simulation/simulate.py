@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, processors
+from zwidth.arrays.batching import as_float64, join_shapes, processors
 from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole
 from zwidth.parts.wall import resolve_wall
@@ -248,15 +248,9 @@ def _read(
                 f"{periods} periods"
             )
         outer = [pushes.shape[:-1]]
-    try:
-        shape = np.broadcast_shapes(which.shape, seeds.shape, *(array.shape for array in arrays.values()), *outer)
-    except ValueError as error:
-        known_shapes = {**{name: array.shape for name, array in arrays.items()}, "seed": seeds.shape}
-        known_shapes |= dict.fromkeys(["push_history without its last axis"], outer[0]) if outer else {}
-        shapes = ", ".join(f"{name} {shape}" for name, shape in known_shapes.items() if shape)
-        raise InputError(
-            f"shapes do not broadcast: scenes {which.shape}, {shapes}; make each axis equal or 1"
-        ) from error
+    known_shapes = {"scenes": which.shape, **{name: array.shape for name, array in arrays.items()}, "seed": seeds.shape}
+    known_shapes |= dict.fromkeys(["push_history without its last axis"], outer[0]) if outer else {}
+    shape = join_shapes((name, part) for name, part in known_shapes.items() if part or name == "scenes")
     if not math.prod(shape):
         raise InputError(f"scenes: got a batch of shape {shape}; one simulation at least is needed")
     which = np.broadcast_to(which, shape)

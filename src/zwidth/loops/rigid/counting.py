@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import to_caller
+from zwidth.arrays.batching import join_shapes, to_caller
 from zwidth.arrays.xp import is_traced, namespace
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array, ArrayLike, Counts, RootsLike
@@ -140,12 +140,7 @@ def _in_range(name: str, value: Array, xp: Any) -> Array:
 def _align_coefficients(arrays: list[Array], xp: Any) -> list[Array]:
     """Give every argument the common leading shape."""
     heads = [array.shape[:-1] for array in arrays[:2]] + [array.shape for array in arrays[2:]]
-    try:
-        shape = np.broadcast_shapes(*heads)
-    except ValueError as error:
-        named = zip(("zeros", "poles", "gain", "lag", "radius"), heads, strict=True)
-        shapes = ", ".join(f"{name} {head}" for name, head in named)
-        raise InputError(f"leading shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+    shape = join_shapes(zip(("zeros", "poles", "gain", "lag", "radius"), heads, strict=True), "leading shapes")
     roots = [xp.broadcast_to(array, (*shape, array.shape[-1])) for array in arrays[:2]]
     return roots + [xp.broadcast_to(array, shape) for array in arrays[2:]]
 

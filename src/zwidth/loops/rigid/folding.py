@@ -12,9 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64
+from zwidth.arrays.batching import as_float64, join_shapes
 from zwidth.loops.rigid.degrees import NAMES
-from zwidth.words.errors import InputError
 
 # Below this many values an argument is too small for looking for repetition to pay.
 _WORTH_FOLDING = 2048
@@ -65,11 +64,7 @@ class Laid(NamedTuple):
 def lay_out(values: tuple[Any, Any, Any, Any]) -> Laid:
     """Convert concrete arguments, check that they broadcast, and fold what repeats."""
     arrays = [as_float64(name, value) for name, value in zip(NAMES, values, strict=True)]
-    try:
-        shape = np.broadcast_shapes(*(array.shape for array in arrays))
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(NAMES, arrays, strict=True))
-        raise InputError(f"shapes do not broadcast: {shapes}; make each axis equal or 1") from error
+    shape = join_shapes(zip(NAMES, (array.shape for array in arrays), strict=True))
     ranked = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
     points = Points(*map(fold, ranked))
     # An axis along which nothing varies has nothing to compute; `Laid.spread` restores it.
