@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.bench import extremes
+from methods import extremes
 from zwidth.stability.radii import bound_radius
 from zwidth.status import Status
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import zwidth
+from methods.problems import exact_radius
 from sweeping import study, sweep_of
-from zwidth.bench.problems import exact_radius
 from zwidth.status import Status
 from zwidth.sweep.compute import compute
 from zwidth.sweep.grid import Grid

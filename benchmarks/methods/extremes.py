@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.bench.problems import Walls
+from methods.problems import Walls
 from zwidth.stability.boundary import boundary
 from zwidth.stability.certified import certified_stable
 from zwidth.stability.labels import StabilityMethod, is_stable
