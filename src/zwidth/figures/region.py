@@ -33,7 +33,7 @@ def draw_region(ax: Axes, outlines: Outlines, face: Any, *, under: float = 1.0, 
 
 def shade_region(ax: Axes, outlines: Outlines, face: Any, *, alpha: float | None = None, zorder: float = 1.0) -> None:
     """Shade what lies within outlines, and not in their holes."""
-    if outlines:
+    if outlines and face != "none":
         ax.add_patch(PathPatch(to_path(outlines), facecolor=face, alpha=alpha, linewidth=0.0, zorder=zorder))
 
 
