@@ -16,10 +16,11 @@ import resource
 import statistics
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
+
+from methods.clock import time_calls
 
 SETTINGS = {
     "none": "",
@@ -51,7 +52,7 @@ LARGE = [
 def call(quantity: str, method: str, layout: str, d: float, points: int):
     """The function to measure, and how many points it computes."""
     import zwidth
-    from zwidth.bench import problems
+    from methods import problems
 
     walls = problems.grid(d, points) if layout == "map" else problems.scattered(d, points)
     function = {"stable": zwidth.is_stable, "spectral_radius": zwidth.spectral_radius, "passive": zwidth.is_passive}
@@ -65,12 +66,7 @@ def time_cases(quick: bool) -> list[float]:
     for quantity, method, layout, d, points in CASES:
         function, count = call(quantity, method, layout, d, points // (16 if quick else 1))
         function()
-        durations = []
-        for _ in range(3 if quick else 15):
-            start = time.perf_counter()
-            function()
-            durations.append(time.perf_counter() - start)
-        rates.append(count / statistics.median(durations))
+        rates.append(count / statistics.median(time_calls(function, 3 if quick else 15)[0]))
     return rates
 
 
@@ -100,7 +96,7 @@ def in_program(arguments: list[str], flags: str = "") -> list:
 
 def report(quick: bool) -> str:
     """Both tables as Markdown."""
-    from zwidth.bench.report import environment
+    from methods.report import environment
 
     rates = {name: [] for name in SETTINGS}
     for _ in range(1 if quick else 5):

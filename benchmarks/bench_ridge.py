@@ -14,7 +14,6 @@ import argparse
 import json
 import os
 import platform
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +24,7 @@ import numpy as np
 import optimistix
 
 import zwidth
+from methods.clock import time_calls
 from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge import ridge_kernel
 
@@ -69,13 +69,7 @@ def by_optimistix(delta: jax.Array, d: jax.Array) -> jax.Array:
 
 def timed(call: Callable[[], Any]) -> tuple[float, float]:
     """The best time of one call, and the least processor time of one, in seconds."""
-    best, least, runs = np.inf, np.inf, 0
-    begin = time.perf_counter()
-    while runs < LEAST_RUNS or time.perf_counter() - begin < LEAST_SECONDS:
-        start, busy = time.perf_counter(), time.process_time()
-        jax.block_until_ready(call())
-        best, least = min(best, time.perf_counter() - start), min(least, time.process_time() - busy)
-        runs += 1
+    best, least = time_calls(lambda: jax.block_until_ready(call()), LEAST_RUNS, seconds=LEAST_SECONDS).min(axis=1)
     return best, least
 
 
@@ -95,11 +89,10 @@ def errors(alpha: Any, by_delta: Any, by_d: Any, rows: list[dict[str, str]]) -> 
 def traced_row(name: str, kernel: Callable[..., Any], points: tuple[np.ndarray, ...], rows: list) -> Row:
     """Value and gradient of one kernel as one program of its own."""
     function = jax.jit(jax.vmap(jax.value_and_grad(kernel, (0, 1))))
-    start, busy = time.perf_counter(), time.process_time()
-    compiled = function.lower(*points).compile()
-    seconds = time.perf_counter() - start, time.process_time() - busy
+    programs: list[Any] = []
+    seconds = time_calls(lambda: programs.append(function.lower(*points).compile()), 1)[:, 0]
     arguments = [jnp.asarray(column) for column in points]
-    speeds = (points[0].size / best for best in timed(lambda: compiled(*arguments)))
+    speeds = (points[0].size / best for best in timed(lambda: programs[0](*arguments)))
     alpha, (by_delta, by_d) = function(*reference_points(rows))
     return Row._make((name, *seconds, *speeds, *errors(alpha, by_delta, by_d, rows)))
 
@@ -114,9 +107,7 @@ def public_row(points: tuple[np.ndarray, ...], rows: list) -> Row:
     def call(delta: np.ndarray, d: np.ndarray) -> zwidth.Sensitivities:
         return zwidth.sensitivities(mass=1.0, damping=delta, period=1.0, delay=d)
 
-    start, busy = time.perf_counter(), time.process_time()
-    call(*points)
-    first = time.perf_counter() - start, time.process_time() - busy
+    first = time_calls(lambda: call(*points), 1)[:, 0]
     best = timed(lambda: call(*points))
     gain = call(*reference_points(rows))
     return Row._make(
@@ -137,12 +128,7 @@ def one_query() -> dict[str, float]:
 
     def many(call: Callable[[], Any]) -> float:
         """The tenth percentile of single calls: on a busy machine the rest wait for a processor."""
-        times = np.empty(QUERIES)
-        for index in range(QUERIES):
-            start = time.perf_counter()
-            call()
-            times[index] = time.perf_counter() - start
-        return float(np.quantile(times, 0.1)) * 1e6
+        return float(np.quantile(time_calls(call, QUERIES)[0], 0.1)) * 1e6
 
     return {
         "zwidth.alpha_max": many(lambda: zwidth.alpha_max(0.1, 1.0)),

@@ -15,7 +15,6 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import argparse
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +22,7 @@ from typing import Any
 import numpy as np
 
 import zwidth
+from methods.clock import time_calls
 from zwidth.loops.linear.polynomial import affine_polynomial
 from zwidth.loops.rigid.poles import companion
 
@@ -55,12 +55,7 @@ SCENES = {
 
 def seconds(call: Callable[[], Any], runs: int = 5) -> float:
     """Of the fastest run."""
-    best = np.inf
-    for _ in range(runs):
-        start = time.perf_counter()
-        call()
-        best = min(best, time.perf_counter() - start)
-    return best
+    return time_calls(call, runs)[0].min()
 
 
 def fresh(scene: zwidth.Scene) -> zwidth.Scene:

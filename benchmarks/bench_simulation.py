@@ -10,7 +10,6 @@ largest difference of the positions from those of the loop and of dlsim, relativ
 from __future__ import annotations
 
 import argparse
-import time
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +20,7 @@ import scipy.linalg
 import scipy.signal
 
 import zwidth
+from methods.clock import time_calls
 
 SCENES, PERIODS, BESIDE = 10_000, 1000, 20
 PUSH = 0.5
@@ -67,12 +67,7 @@ def dlsim(scene: zwidth.Scene, stiffness: float, virtual_damping: float) -> np.n
 
 def seconds(call: Callable[[], Any], runs: int = 3) -> float:
     """Of the fastest run."""
-    best = np.inf
-    for _ in range(runs):
-        start = time.perf_counter()
-        call()
-        best = min(best, time.perf_counter() - start)
-    return best
+    return time_calls(call, runs)[0].min()
 
 
 def report() -> str:
@@ -80,9 +75,7 @@ def report() -> str:
     scenes, stiffness, damping = random_scenes()
     walls = list(zip(scenes[:BESIDE], stiffness[:BESIDE].tolist(), damping[:BESIDE].tolist(), strict=True))
     options: dict[str, Any] = {"periods": PERIODS, "push": PUSH, "record": False}
-    start = time.perf_counter()
-    zwidth.simulate(scenes, stiffness, damping, **options)
-    cold = time.perf_counter() - start
+    cold = seconds(lambda: zwidth.simulate(scenes, stiffness, damping, **options), 1)
     each = SCENES * PERIODS
     own = seconds(lambda: zwidth.simulate(scenes, stiffness, damping, **options)) / each
     few = zwidth.simulate(scenes[:BESIDE], stiffness[:BESIDE], damping[:BESIDE], periods=PERIODS, push=PUSH)
@@ -136,9 +129,7 @@ def report_parts() -> list[str]:
     ]
     stiffness = np.linspace(100.0, 10e3, 1000)
     for name, (scene, options) in cases.items():
-        start = time.perf_counter()
-        scene.simulate(stiffness, 10.0, record=False, **options)
-        cold = time.perf_counter() - start
+        cold = seconds(lambda s=scene, o=options: s.simulate(stiffness, 10.0, record=False, **o), 1)
         scene.simulate(5e3, 10.0, **options)
         many = seconds(lambda s=scene, o=options: s.simulate(stiffness, 10.0, record=False, **o)) / 1e6
         one = seconds(lambda s=scene, o=options: s.simulate(5e3, 10.0, **o))

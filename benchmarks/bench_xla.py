@@ -9,7 +9,6 @@ A line gives the time without over the time with, to compile and to run (the bes
 from __future__ import annotations
 
 import argparse
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -19,6 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from methods.clock import time_calls
 from zwidth.arrays import batching, xla
 from zwidth.loops.rigid import (
     certified_filter,
@@ -39,19 +39,18 @@ Make = Callable[[], Callable[..., Any]]
 
 def compile_and_run(makes: list[Make], columns: tuple[Any, ...], runs: int) -> list[tuple[float, float]]:
     """Seconds to the first result and of the fastest run, for each of several ways."""
-    functions, first = [], []
-    for make in makes:
-        start = time.perf_counter()
+    functions: list[Callable[..., Any]] = []
+
+    def begin(make: Make) -> None:
         functions.append(make())
         jax.block_until_ready(functions[-1](*columns))
-        first.append(time.perf_counter() - start)
-    best = [np.inf] * len(makes)
-    for _ in range(runs):
-        for k, function in enumerate(functions):
-            start = time.perf_counter()
-            jax.block_until_ready(function(*columns))
-            best[k] = min(best[k], time.perf_counter() - start)
-    return list(zip(first, best, strict=True))
+
+    first = [time_calls(lambda m=make: begin(m), 1)[0].min() for make in makes]
+    turns = [
+        [time_calls(lambda f=function: jax.block_until_ready(f(*columns)), 1)[0].min() for function in functions]
+        for _ in range(runs)
+    ]
+    return list(zip(first, np.min(turns, axis=0).tolist(), strict=True))
 
 
 def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, **instead: Any) -> Make:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import sys
 from pathlib import Path
 
 import click
@@ -24,24 +24,18 @@ from zwidth.cli.options import json_option
 def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
     """Measure speed against error of every method, beside NumPy, JAX and python-control.
 
-    Errors are measured against ball arithmetic: python-flint must be installed (extra "certified").
+    It needs a checkout of the project, whose benchmarks/methods it runs, and for the errors the extra "test".
     """
-    from zwidth.words.errors import InputError, ResourceError
+    from zwidth.words.errors import ResourceError
 
-    # A file in the place of the folder would otherwise be found after minutes of work.
-    if any(part.is_file() for part in (out, *out.parents)):
-        raise InputError(f"--out: got {str(out)!r}, which is not a folder; choose another with --out DIR")
-    if (out / "bench.json").exists() and not overwrite:
-        raise InputError(f"--out: {out} holds results already; give --overwrite or choose another folder")
+    # Beside the package's sources; nothing of it is installed with a wheel.
+    folder = Path(__file__).parents[3] / "benchmarks"
+    if not (folder / "methods").is_dir():
+        raise ResourceError(
+            "bench: needs a checkout of the project, with its folder benchmarks/; there: scripts/setup test, then "
+            ".venv/bin/zwidth bench"
+        )
+    sys.path.insert(0, str(folder))
+    from methods.report import run
 
-    from zwidth.bench import report, suite
-
-    if not suite.can_measure():
-        raise ResourceError("bench: python-flint is not installed; install the extra: pip install 'zwidth[certified]'")
-    rows = suite.measure(suite.QUICK if quick else suite.FULL, lambda text: click.echo(f"  {text}", err=True))
-    written = report.write(rows, out)
-    if as_json:
-        click.echo(json.dumps(report.document(rows), indent=1, allow_nan=False))
-        return
-    click.echo(report.summary(rows))
-    click.echo("\n".join(f"wrote {path}" for path in written))
+    run(quick, out, overwrite, as_json)

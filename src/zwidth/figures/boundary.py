@@ -11,6 +11,7 @@ from matplotlib.colors import ListedColormap, Normalize
 from matplotlib.lines import Line2D
 
 from zwidth.figures import style
+from zwidth.figures.region import draw_zeros, mark_wall, shade_region
 from zwidth.figures.table import Table, curves, select, si_scale
 from zwidth.words.errors import InputError
 
@@ -77,8 +78,7 @@ def _draw_panel(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[f
         ax.plot(passive.alpha, passive.beta, label=f"passive, delta = {passive.delta:g}, d = {passive.d:g}", **look)
     if len(edges) == 1:
         _mark_maximum(ax, edges[0], scale)
-    ax.axvline(0.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
-    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
+    draw_zeros(ax)
     low, high = style.span(0.0, max(float(edge.alpha.max()) for edge in edges), 0.06)
     ax.set_xlim(0.4 * low, high)
     betas = np.concatenate([edge.beta for edge in edges])
@@ -87,7 +87,7 @@ def _draw_panel(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[f
 
 def _draw_edge(ax: Axes, edge: Any, color: Any, shade: float) -> None:
     """The shaded region, its curve, and the straight part where a real pole is at z = -1."""
-    ax.fill(edge.alpha, edge.beta, facecolor=color, alpha=shade, linewidth=0.0, zorder=1)
+    shade_region(ax, [(np.stack([edge.alpha, edge.beta], -1), False)], color, alpha=shade)
     dash = style.SOLID if edge.delay_model == "held" else style.DASHED
     line = np.flatnonzero(edge.omega >= np.pi)
     curve = slice(None) if line.size < 2 else slice(0, line[0] + 1)
@@ -103,12 +103,11 @@ def _mark_maximum(ax: Axes, edge: Any, scale: tuple[float, float] | None) -> Non
     """A dot at the stiffest stable wall, labelled inside the region."""
     top = int(np.argmax(edge.alpha))
     place = (edge.alpha[top], edge.beta[top])
-    ax.plot(*place, "o", color=style.BLACK, markersize=4.0, label="alpha_max", zorder=5, clip_on=False)
     text = rf"$\alpha_{{\max}} = {place[0]:.4g}$"
     if scale is not None:
         factor, unit = style.si_unit(place[0] * scale[0], "N/m")
         text += "\n" + rf"$K_{{\max}} = {place[0] * scale[0] * factor:.4g}$ {unit}"
-    ax.annotate(text, place, xytext=(-8, 0), textcoords="offset points", ha="right", va="center", fontsize=8)
+    mark_wall(ax, place, "alpha_max", kind="stiffest", text=text)
 
 
 def _legend_handles(table: Table, colors: dict[float, Any]) -> list[Line2D]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.figures import grid, style
 from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
-from zwidth.figures.region import agrees, fit_axes
+from zwidth.figures.region import agrees, draw_region, fit_axes
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, WALL
 
@@ -121,8 +121,7 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
             stable = np.ma.filled(shown < level if OUTPUTS[name].below else shown > level, False)
             known = find_outlines(device, edges).get("stable")
             if known is not None and agrees(known, part[x].values, part[y].values, stable):
-                for points, _ in fit_axes(known, ax):
-                    ax.plot(*np.append(points, points[:1], 0).T, color=color, linewidth=1.4, label="exact edge")
+                draw_region(ax, fit_axes(known, ax), "none", color=color, linewidth=1.4, label="exact edge")
             elif shown.count() and shown.min() < level < shown.max():
                 ax.contour(part[x].values, part[y].values, shown, levels=[level], colors=[color], linewidths=1.4)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import style
+from zwidth.figures.region import MARKS, mark_wall, name_axes
 from zwidth.figures.table import Table, curves, select
 from zwidth.words.formatting import header
 
@@ -189,8 +190,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     # Room for the legend.
     highest = float(dampings.max()) * to.damping
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
-    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-    ax.set(xlabel=f"stiffness  $K$  in {to.spring}", ylabel=f"virtual damping  $B$  in {to.damper}")
+    name_axes(ax, to.spring, to.damper)
     ax.legend(handles=handles, loc="upper right")
 
 
@@ -204,13 +204,12 @@ def _mark_walls(ax: Axes, walls: Table, to: _Scales) -> list[Any]:
             _column(found, "stiffness")[0] * to.stiffness,
             _column(found, "virtual_damping")[0] * to.damping,
         )
-    for kind, marker, size, words in (("stiffest", "o", 4.5, "stiffest wall"), ("set", "D", 5.0, "wall to set")):
+    for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "wall to set")):
         _, K, B = kinds[kind]
-        look = {"marker": marker, "markersize": size, "color": style.BLACK}
-        ax.plot(K, B, linestyle="", label=kind, zorder=5, **look)
+        mark_wall(ax, (K, B), kind, kind=mark)
         if K.size:
             text = f": $K = {K[0]:.3g}$ {to.spring}, $B = {B[0]:.3g}$ {to.damper}" if K.size == 1 else ""
-            handles.append(style.line(words + text, "", **look))
+            handles.append(style.line(words + text, "", color=style.BLACK, **MARKS[mark]))
     if not kinds["set"][1].size:
         handles.append(style.line("no wall to set: a doubt, or none holds", ""))
     found, K, B = kinds["buzzing"]

@@ -158,4 +158,6 @@ def _count_columns(motions: list[Any]) -> int:
 
 
 def _explain(motions: Iterable[Any]) -> list[Any]:
-    return [style.line(_in_math(each.label), each.look["linestyle"], color=each.look["color"]) for each in motions]
+    """An entry of a legend for each motion that has a name."""
+    named = [each for each in motions if each.label]
+    return [style.line(_in_math(each.label), each.look["linestyle"], color=each.look["color"]) for each in named]

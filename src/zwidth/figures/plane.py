@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, LogNorm, Normalize, TwoSlopeNorm
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch, PathPatch
+from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from zwidth.figures import grid, region, style
@@ -196,12 +196,8 @@ def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[s
 
 def _draw_outline(ax: Axes, outlines: region.Outlines, dash: Any, shade: Any = "none") -> None:
     """The boundary where it is known, and what lies within."""
-    fitted = region.fit_axes(outlines, ax)
-    if fitted:
-        ax.add_patch(PathPatch(region.to_path(fitted), facecolor=shade, linewidth=0.0, zorder=1.5))
-    for points, _ in fitted:
-        closed = np.append(points, points[:1], 0)
-        ax.plot(*closed.T, color=style.BLACK, linewidth=1.3, linestyle=dash, label="exact edge", zorder=2.2)
+    look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.3, "linestyle": dash, "zorder": 2.2}
+    region.draw_region(ax, region.fit_axes(outlines, ax), shade, under=1.5, label="exact edge", **look)
 
 
 def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> Any:

@@ -19,18 +19,21 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import Circle, PathPatch
+from matplotlib.patches import Circle
 
 from zwidth.arrays.batching import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import logarithmic
-from zwidth.figures.region import to_path
+from zwidth.figures.motion import draw_motion
+from zwidth.figures.stable_set import draw_stable_set, tabulate_walls, trace_outlines
+from zwidth.figures.step import draw_step
+from zwidth.figures.table import stack
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError
+from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
 _ANGLES = 181
@@ -49,14 +52,6 @@ def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[
     return ax
 
 
-def _units(scene: Scene, normalized: bool, largest: float = math.nan) -> tuple[tuple[float, float], tuple[str, str]]:
-    """What stiffness and damping are divided by, and the labels of their axes."""
-    if normalized:
-        return tuple(scene.units), (style.ALPHA_LABEL, style.BETA_LABEL)
-    factor, unit = style.si_unit(largest, "N/m")
-    return (1.0 / factor, 1.0), (f"stiffness  $K$  in {unit}", "virtual damping  $B$  in N s/m")
-
-
 @style.house_style()
 def region(
     scene: Scene | Mapping[str, Scene], ax: Axes | None = None, *, normalized: bool = False, passive: bool = False
@@ -70,45 +65,22 @@ def region(
         passive: also the walls that are passive, with stiffness > 0 (dash-dotted).
 
     Returns:
-        The Axes. Solid: outlines; islands and holes alike, what is stable is shaded.
+        The Axes. Solid: the largest outline; dashed: islands; dotted: holes; what is stable is shaded.
 
     Raises:
         InputError: no passivity condition holds for the scene, with ``passive``.
     """
-    scenes = dict(scene) if isinstance(scene, Mapping) else {"": scene}
-    pieces = {label: each.stable_region() for label, each in scenes.items()}
-    largest = max((float(np.max(part.stiffness)) for found in pieces.values() for part in found), default=1.0)
-    ax = _axes(ax)
-    names = _units(next(iter(scenes.values())), normalized, largest)[1]
-    handles = []
-    for k, (label, each) in enumerate(scenes.items()):
-        (x_unit, y_unit), _ = _units(each, normalized, largest)
-        color = style.DISTINCT[k % len(style.DISTINCT)]
-        paths = [np.stack([part.stiffness / x_unit, part.virtual_damping / y_unit], -1) for part in pieces[label]]
-        if paths:
-            shape = to_path([(path, part.hole) for path, part in zip(paths, pieces[label], strict=True)])
-            ax.add_patch(PathPatch(shape, facecolor=color, alpha=0.15, linewidth=0.0, zorder=1))
-        for path in paths:
-            ax.plot(*np.append(path, path[:1], 0).T, color=color, zorder=3, label=label or "edge of what is stable")
-        top = each.max_stiffness()
-        if top.status == Status.OK:
-            at = top.stiffness / x_unit, top.virtual_damping / y_unit
-            ax.plot(*at, "o", color=color, markersize=4.5, zorder=5, clip_on=False, label="stiffest stable wall")
+    outlines, walls = [], []
+    for label, each in (scene if isinstance(scene, Mapping) else {"": scene}).items():
+        outlines += trace_outlines(each, label=label)
         if passive:
-            walls = _passive_edge(each)
-            ax.plot(walls[0] / x_unit, walls[1] / y_unit, color=color, linestyle=style.DASH_DOTTED, zorder=3)
-        handles.append(style.line(label or "stable", color=color))
-    handles += [style.line("passive", style.DASH_DOTTED)] if passive else []
-    handles.append(style.line("stiffest stable wall", "", marker="o", markersize=4.5))
-    ax.axvline(0.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
-    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-    ax.set(xlabel=names[0], ylabel=names[1])
-    ax.margins(0.04)
-    ax.legend(handles=handles, loc="best")
-    return ax
+            edge = tabulate_walls(each, *_find_passive(each))
+            outlines.append({"label": label, "number": len(outlines) + 1, "piece": "passive", **edge})
+        walls.append({"label": label, "wall": "stiffest", **tabulate_walls(each, *each.max_stiffness()[:2])})
+    return draw_stable_set(stack(outlines), stack(walls), _axes(ax), normalized=normalized)[0]
 
 
-def _passive_edge(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+def _find_passive(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     """The edge of the passive walls with stiffness > 0: the damping that a wall needs grows as the wall does."""
     angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, _ANGLES)[1:-1]
     units = scene.units
@@ -138,7 +110,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     ax.plot(grid, top * factor, color=style.BLUE, label="stiffest stable wall")
     ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
     known = PARAMETERS.get(parameter)
-    words = f"{known.words}  ${known.symbol}$  in {known.unit}" if known else parameter
+    words = f"{known.words}  ${known.symbol}$  in {known.unit}" if known else style.literal(parameter)
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     if logarithmic(grid):
         style.use_logarithmic(ax, "x", float(grid.min()), float(grid.max()))
@@ -164,24 +136,19 @@ def step(
         ax: an Axes of yours.
         periods: how many sampling periods.
     """
-    stiffness, virtual_damping = resolve_wall(scene.wall, stiffness, virtual_damping)
-    loop = scene.state_space(stiffness, virtual_damping)
+    K, B = map(float, resolve_wall(scene.wall, stiffness, virtual_damping))
+    loop = scene.state_space(K, B)
     state, positions = np.zeros(loop.A.shape[0]), np.empty(periods)
     for k in range(periods):
         positions[k] = (loop.C @ state)[0]
         state = loop.A @ state + loop.B[:, 0]
-    ax = _axes(ax, 5.2, 3.4)
-    second, clock = style.si_unit(periods * loop.dt, "s")
-    final = 1.0 / stiffness if stiffness else math.nan
-    meter, length = style.si_unit(abs(final) if math.isfinite(final) else float(np.abs(positions).max()), "m")
-    ax.plot(
-        np.arange(periods) * loop.dt * second, positions * meter, ".-", color=style.BLUE, markersize=3, linewidth=1.0
-    )
-    if math.isfinite(final):
-        ax.axhline(final * meter, color=style.GRAY, linewidth=0.6, zorder=1)
-    ax.set(xlabel=f"time  $t$  in {clock}", ylabel=f"position  $x$  in {length} for 1 N")
-    ax.margins(x=0.0)
-    return ax
+    columns = tabulate_walls(scene, K, B)
+    columns |= {"time_s": np.arange(periods) * loop.dt, "position_m": positions}
+    columns["final_position_m"] = 1.0 / K if K else math.nan
+    columns["label"] = f"K = {with_unit(K, 'N/m')}, B = {with_unit(B, 'N s/m')}"
+    drawn = draw_step(stack([columns]), _axes(ax, 5.2, 3.4))[0]
+    drawn.lines[0].set(marker=".", markersize=3)
+    return drawn
 
 
 @style.house_style()
@@ -258,18 +225,9 @@ def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ())
     rows = found.position.reshape(-1, found.position.shape[-1])
     if labels and len(labels) != len(rows):
         raise InputError(f"labels: got {len(labels)} for {len(rows)} motions; give one for each")
-    names = list(labels) or [f"motion {k}" for k in range(len(rows))]
     times = np.broadcast_to(found.time.reshape(-1, rows.shape[-1]), rows.shape)
-    ax = _axes(ax, 5.6, 3.4)
-    second, clock = style.si_unit(float(times[0, -1]), "s")
-    meter, length = style.si_unit(float(np.nanmax(np.abs(rows), initial=0.0)), "m")
-    for k, (time, row) in enumerate(zip(times, rows, strict=True)):
-        ax.plot(
-            time * second, row * meter, color=style.DISTINCT[k % len(style.DISTINCT)], linewidth=1.1, label=names[k]
-        )
-    ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=1)
-    ax.set(xlabel=f"time  $t$  in {clock}", ylabel=f"position  $x$  in {length}")
-    ax.margins(x=0.0)
-    if labels:
-        ax.legend(loc="best")
-    return ax
+    contact = found.contact.reshape(len(rows), -1)
+    touching = np.repeat(contact, rows.shape[-1] // contact.shape[-1], axis=1)
+    columns = zip(list(labels) or [""] * len(rows), times, rows, touching, strict=True)
+    names = ("label", "time_s", "position_m", "contact")
+    return draw_motion(stack(dict(zip(names, each, strict=True)) for each in columns), _axes(ax, 5.6, 3.4))[0]

@@ -10,10 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from zwidth.figures import style
+from zwidth.figures.region import mark_wall, name_axes, shade_region
 from zwidth.figures.step import draw_positions
 from zwidth.figures.table import SI_COLUMNS, Table, curves
-
-_TEXT: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8, "zorder": 6}
 
 
 @style.house_style()
@@ -43,25 +42,24 @@ def _draw_region(ax: Axes, found: Mapping[str, Any], region: Table) -> None:
         if curve.curve == "passive":
             _draw_passive(ax, stiffness, damping)
         elif curve.curve == "boundary":
-            ax.fill(stiffness, damping, facecolor=style.SKY, alpha=0.25, linewidth=0.0, zorder=1)
+            shade_region(ax, [(np.stack([stiffness, damping], -1), False)], style.SKY, alpha=0.25)
             ax.plot(stiffness, damping, color=style.BLUE, label="boundary", zorder=3)
             ax.set_xlim(-0.02 * float(stiffness.max()), 1.26 * float(stiffness.max()))
     _mark_walls(ax, found, factor, unit)
-    ax.axvline(0.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
-    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-    ax.set(xlabel=f"stiffness  $K$  in {unit}", ylabel="virtual damping  $B$  in N s/m")
+    name_axes(ax, unit)
 
 
 def _draw_passive(ax: Axes, stiffness: np.ndarray, virtual_damping: np.ndarray) -> None:
     """The passive walls among the stable ones."""
-    ax.fill(stiffness, virtual_damping, facecolor=style.VERMILION, alpha=0.15, linewidth=0.0, zorder=1.5)
-    look = {"color": style.VERMILION, "linestyle": style.DASH_DOTTED, "linewidth": 1.2, "zorder": 3}
+    look: dict[str, Any] = {"color": style.VERMILION, "linestyle": style.DASH_DOTTED, "linewidth": 1.2, "zorder": 3}
+    shade_region(ax, [(np.stack([stiffness, virtual_damping], -1), False)], style.VERMILION, alpha=0.15, zorder=1.5)
     ax.plot(stiffness, virtual_damping, label="passive", **look)
     # Above the upper edge, which runs from the stiffest passive wall back to K = 0.
     tip = int(np.argmax(stiffness))
     middle = tip + int(np.argmin(np.abs(stiffness[tip:] - 0.5 * stiffness[tip])))
     place = (stiffness[middle], virtual_damping[middle])
-    ax.annotate("passive", place, xytext=(0, 8), ha="center", color=style.VERMILION, **_TEXT)
+    above: dict[str, Any] = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center", "va": "center"}
+    ax.annotate("passive", place, color=style.VERMILION, fontsize=8, zorder=6, **above)
 
 
 def _mark_walls(ax: Axes, found: Mapping[str, Any], factor: float, unit: str) -> None:
@@ -72,12 +70,11 @@ def _mark_walls(ax: Axes, found: Mapping[str, Any], factor: float, unit: str) ->
     interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)
     ax.plot([stiffness, stiffness], interval, color=style.GRAY, linewidth=1.0, label="virtual_damping_interval")
     top = (maximum["stiffness"] * factor, maximum["virtual_damping"])
-    ax.plot(*top, "o", color=style.BLACK, markersize=4.5, label="stiffness_max", zorder=5, clip_on=False)
-    ax.annotate(r"$K_{\max} =$" + f"\n{top[0]:.3g} {unit}", top, xytext=(6, 0), **_TEXT)
-    ax.plot(stiffness, damping, "D", color=style.BLACK, markersize=5.0, label="recommended", zorder=5)
+    words = r"$K_{\max} =$" + f"\n{top[0]:.3g} {unit}"
+    mark_wall(ax, top, "stiffness_max", kind="stiffest", text=words, right=True)
     share = f"{100 * wall['stiffness_fraction']:g} %"
     text = f"recommended ({share}):\n$K = {stiffness:.3g}$ {unit}\n$B = {damping:.3g}$ N s/m"
-    ax.annotate(text, (stiffness, damping), xytext=(-8, 0), ha="right", **_TEXT)
+    mark_wall(ax, (stiffness, damping), "recommended", kind="recommended", text=text)
 
 
 def _draw_response(ax: Axes, found: Mapping[str, Any], response: Table) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import ListedColormap, TwoSlopeNorm
-from matplotlib.patches import Patch, PathPatch
+from matplotlib.patches import Patch
 
 from zwidth.figures import region, style
 from zwidth.figures.table import si_scale
@@ -76,9 +76,7 @@ def _draw_region(
     alpha, beta, good = arrays["alpha"], arrays["beta"], arrays[output][place].T.astype(bool)
     look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
     if exact is not None and region.agrees(exact, alpha, beta, good):
-        ax.add_patch(PathPatch(region.to_path(exact), facecolor=SHADES[output], linewidth=0.0, zorder=1))
-        for points, _ in exact:
-            ax.plot(*np.append(points, points[:1], 0).T, label="exact edge", **look)
+        region.draw_region(ax, exact, SHADES[output], label="exact edge", **look)
         return True
     radius = arrays["spectral_radius"][place].T if output == "stable" and "spectral_radius" in arrays else None
     # On alpha = 0 a pole sits at z = 1 whatever beta is, and the contour would follow that column.

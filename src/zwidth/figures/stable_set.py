@@ -1,82 +1,90 @@
-"""Stable sets of devices with parts, in SI units: outlines with their islands and holes, and walls that matter."""
+"""Stable sets in the plane of stiffness and damping: outlines with their islands and holes, and walls that matter."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.patches import PathPatch
 
 from zwidth.figures import style
-from zwidth.figures.region import to_path
+from zwidth.figures.region import MARKS, mark_wall, name_axes, shade_region
 from zwidth.figures.table import SI_COLUMNS, Table, curves, select
 
-_MARKS: dict[str, dict[str, Any]] = {
-    "stiffest": {"marker": "o", "markersize": 4.5},
-    "recommended": {"marker": "D", "markersize": 5.0},
-}
+if TYPE_CHECKING:
+    from zwidth.scenes.scene import Scene
+
+_DASHES = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED, "passive": style.DASH_DOTTED}
+
+
+def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
+    """The outlines of the stable set, the largest first, as columns; the hole of an island lies inside of it."""
+    for number, outline in enumerate(scene.stable_region(), start=1):
+        piece = "hole" if outline.hole else ("island" if outline.island else "outline")
+        # Closed: the first point comes again at the end.
+        closed = (np.append(part, part[0]) for part in outline[:2])
+        yield {**columns, "number": number, "piece": piece, **tabulate_walls(scene, *closed)}
+
+
+def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[str, Any]:
+    """Walls as columns, normalized and in SI units."""
+    normalized = {"alpha": stiffness / scene.units.stiffness, "beta": virtual_damping / scene.units.virtual_damping}
+    return {**normalized, **dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))}
 
 
 @style.house_style()
-def draw_stable_set(outlines: Table, walls: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
+def draw_stable_set(
+    outlines: Table, walls: Table, axes: style.AnyAxes | None = None, *, normalized: bool = False
+) -> np.ndarray:
     """Draw the stable walls of one or several devices over stiffness and virtual damping.
 
-    Solid: the largest outline; dashed: islands, stable walls apart from it; dotted: holes, unstable walls within.
+    Solid: the largest outline; dashed: islands, stable walls apart from it; dotted: holes, unstable walls within;
+    dash-dotted: passive walls.
 
     Args:
-        outlines: columns label, number, piece (outline, island or hole), stiffness_N_per_m, virtual_damping_N_s_per_m.
+        outlines: columns label, number, piece (outline, island, hole or passive), stiffness_N_per_m,
+            virtual_damping_N_s_per_m.
         walls: columns label, wall (stiffest or recommended) and the same two.
         axes: an Axes of yours.
+        normalized: from the columns alpha and beta in place of those two.
     """
-    labels = list(dict.fromkeys(np.asarray(outlines["label"]).tolist()))
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
+    tables = [table for table in (walls, outlines) if "label" in table]
+    labels = list(dict.fromkeys(label for table in tables for label in np.asarray(table["label"]).tolist()))
     colors = {label: style.DISTINCT[k % len(style.DISTINCT)] for k, label in enumerate(labels)}
-    factor, unit = style.si_unit(float(np.max(np.abs(outlines[SI_COLUMNS[0]]))), "N/m")
+    names = ("alpha", "beta") if normalized else SI_COLUMNS
+    largest = max(float(np.nanmax(np.abs(table[names[0]]), initial=0.0)) for table in tables)
+    factor, unit = (1.0, "") if normalized else style.si_unit(largest, "N/m")
     pieces = set()
-    for label in labels:
-        pieces |= _draw_pieces(ax, select(outlines, label=label), colors[label], factor, 0.5 / (1 + len(labels)))
-    for label in labels:
-        _mark_walls(ax, select(walls, label=label), colors[label], factor, unit, spell=len(labels) == 1)
-    ax.axvline(0.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
-    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-    ax.set(xlabel=f"stiffness  $K$  in {unit}", ylabel="virtual damping  $B$  in N s/m")
+    for label, color in colors.items() if "label" in outlines else ():
+        pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factor, 0.5 / (1 + len(labels)))
+    symbols = ((r"\alpha", ""), (r"\beta", "")) if normalized else (("K", f" {unit}"), ("B", " N s/m"))
+    alone = len(labels) == 1
+    rows = select(walls)
+    for kind, label, *wall in zip(*(rows[name] for name in ("wall", "label", *names)), strict=True):
+        wall[0] *= factor
+        numbers = [f"${symbol} = {value:.3g}${own}" for value, (symbol, own) in zip(wall, symbols, strict=True)]
+        text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
+        mark_wall(ax, wall, kind, kind=kind, color=style.BLACK if alone else colors[label], text=text)
+    name_axes(ax, unit)
     ax.margins(0.04)
-    handles = [style.line(style.literal(label), color=color) for label, color in colors.items() if len(labels) > 1]
-    dashes = {"island": style.DASHED, "hole": style.DOTTED}
-    handles += [style.line(name, dash) for name, dash in dashes.items() if name in pieces]
-    if len(labels) > 1:
-        handles.append(style.line("stiffest wall", "", color=style.GRAY, marker="o", markersize=4.5))
+    handles = [style.line(style.literal(label), color=color) for label, color in colors.items() if not alone]
+    handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
+    if not alone:
+        handles.append(style.line("stiffest wall", "", color=style.GRAY, **MARKS["stiffest"]))
     style.legend(panels, handles, outside=axes is None, ncols=3)
     return panels
 
 
-def _draw_pieces(ax: Axes, table: Table, color: Any, factor: float, shade: float) -> set[str]:
-    """One device's outlines, shaded inside; returns which kinds of them there are."""
+def _draw_pieces(ax: Axes, table: Table, names: tuple[str, ...], color: Any, factor: float, shade: float) -> set[str]:
+    """One device's outlines, what is stable shaded; returns which kinds of them there are."""
     found = curves(table, "number", "piece")
-    paths = [np.stack([getattr(one, SI_COLUMNS[0]) * factor, getattr(one, SI_COLUMNS[1])], -1) for one in found]
-    inside = to_path([(path, one.piece == "hole") for path, one in zip(paths, found, strict=True)])
-    ax.add_patch(PathPatch(inside, facecolor=color, alpha=shade, linewidth=0.0, zorder=1))
-    dashes = {"outline": style.SOLID, "island": style.DASHED, "hole": style.DOTTED}
-    for path, one in zip(paths, found, strict=True):
-        look = {"color": color, "linestyle": dashes[one.piece], "zorder": 3}
-        ax.plot(path[:, 0], path[:, 1], label=f"{one.piece} {one.number}", **look)
+    edges = []
+    for one in found:
+        path = np.stack([getattr(one, names[0]) * factor, getattr(one, names[1])], -1)
+        look = {"color": color, "linestyle": _DASHES[one.piece], "zorder": 3}
+        ax.plot(*path.T, label=f"{one.piece} {one.number}", **look)
+        edges += [(path, one.piece == "hole")] if one.piece != "passive" else []
+    shade_region(ax, edges, color, alpha=shade)
     return {str(one.piece) for one in found}
-
-
-def _mark_walls(ax: Axes, walls: Table, color: Any, factor: float, unit: str, *, spell: bool) -> None:
-    rows = zip(walls["wall"], walls[SI_COLUMNS[0]] * factor, walls[SI_COLUMNS[1]], strict=True)
-    for name, stiffness, damping in rows:
-        shade = style.BLACK if spell else color
-        ax.plot(stiffness, damping, linestyle="", color=shade, label=name, zorder=5, clip_on=False, **_MARKS[str(name)])
-        if spell:
-            text = f"{name}\n$K = {stiffness:.3g}$ {unit}\n$B = {damping:.3g}$ N s/m"
-            ax.annotate(
-                text,
-                (stiffness, damping),
-                xytext=(-8, 0),
-                textcoords="offset points",
-                ha="right",
-                va="center",
-                fontsize=8,
-            )

@@ -23,7 +23,8 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
 
     Args:
         table: columns of a step study: label, alpha, beta, time, position, wall_force, final_position, settling_time;
-            those of a device in SI units have their units behind their names, as in time_s and position_m.
+            those of a device in SI units have their units behind their names, as in time_s and position_m. The times
+            of settling may be left out, and for positions alone the forces.
         axes: an Axes of yours for the positions alone, or two.
     """
     panels = style.panels(axes, 2, 5.6, 5.0, height_ratios=(1.8, 1.2), sharex=True)
@@ -52,10 +53,11 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
         clock, unit = style.si_unit(max(float(each.time[-1]) for each in responses), "s")
         # The final position: an unstable response has no largest one worth a unit.
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
-        factor, length = style.si_unit(max(finals, default=0.0), "m")
+        largest = max(float(np.nanmax(np.abs(each.position))) for each in responses)
+        factor, length = style.si_unit(max(finals, default=largest), "m")
     for each, color, dash in _assign_colors(responses):
         text = rf"{style.literal(each.label)}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
-        text += "" if each.settled else ", not settled"
+        text += ", not settled" if each.settled is False else ""
         ax.plot(each.time * clock, each.position * factor, color=color, linestyle=dash, label=text, zorder=3)
         if np.isfinite(each.final_position):
             ax.axhline(each.final_position * factor, color=color, linewidth=0.5, zorder=2)
@@ -68,16 +70,17 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
 
 
 def _read_responses(table: Table) -> list[Any]:
-    """The responses in a table; ``settled`` tells that one has settled, for good, at the end of the time shown."""
-    columns = {name: np.asarray(table[name + unit if name + unit in table else name]) for name, unit in _UNITS.items()}
+    """The responses in a table; ``settled``: for good, at the end of the time shown; None where that is not known."""
+    spelled = ((name, key) for name, unit in _UNITS.items() for key in (name + unit, name))
+    columns = {name: np.asarray(table[key]) for name, key in spelled if key in table}
     columns |= {name: np.asarray(table[name]) for name in ("label", "alpha", "beta")}
     # Each begins at time 0: two of them may be alike in all but that.
     columns["number"] = np.cumsum(columns["time"] == 0.0)
     responses = curves(columns, "number")
     for each in responses:
-        for name in ("label", "alpha", "beta", "final_position", "settling_time"):
+        for name in {"label", "alpha", "beta", "final_position", "settling_time"} & set(columns):
             setattr(each, name, getattr(each, name)[0])
-        each.settled = bool(each.settling_time <= each.time[-1])
+        each.settled = bool(each.settling_time <= each.time[-1]) if "settling_time" in columns else None
     return responses
 
 

@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import matplotlib
 import numpy as np
+from matplotlib import rc_params_from_file
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
@@ -47,45 +48,7 @@ PNG_DPI = 180
 # Dates and versions out of the files, for the same figure is to give the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
-_RC: Any = {
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "mathtext.fontset": "dejavusans",
-    "font.size": 9.0,
-    "axes.labelsize": 9.0,
-    "axes.titlesize": 9.5,
-    "axes.titlelocation": "left",
-    "axes.titlepad": 5.0,
-    "axes.linewidth": 0.7,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.axisbelow": True,
-    "axes.grid": False,
-    "xtick.labelsize": 8.0,
-    "ytick.labelsize": 8.0,
-    "xtick.direction": "out",
-    "ytick.direction": "out",
-    "xtick.major.width": 0.7,
-    "ytick.major.width": 0.7,
-    "xtick.major.size": 3.0,
-    "ytick.major.size": 3.0,
-    "lines.linewidth": 1.5,
-    "lines.solid_capstyle": "round",
-    "lines.solid_joinstyle": "round",
-    "legend.fontsize": 8.0,
-    "legend.frameon": False,
-    "legend.handlelength": 2.4,
-    "legend.borderaxespad": 0.4,
-    "figure.facecolor": "white",
-    "figure.dpi": 100.0,
-    "savefig.facecolor": "white",
-    # Text as outlines: without DejaVu Sans, a browser sets formulas, and the words beside them, in a serif, letter by
-    # letter at places that fit another font. Text as text saves a sixth of a file; `save` writes it where it is wanted.
-    "svg.fonttype": "path",
-    "svg.hashsalt": "zwidth",
-}
-
-
+_RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_default_template=False))
 # What a user's style sheet changes of it, and the size of new figures that a user wants.
 _changes: ContextVar[Any] = ContextVar("changes", default=None)
 _size: ContextVar[tuple[float, float] | None] = ContextVar("size", default=None)
@@ -104,7 +67,7 @@ def style_sheet(file: Path | None, size: tuple[float, float] | None = None) -> I
     token, sized = None, _size.set(size)
     if file is not None:
         try:
-            token = _changes.set(dict(matplotlib.rc_params_from_file(file, use_default_template=False)))
+            token = _changes.set(dict(rc_params_from_file(file, use_default_template=False)))
         except OSError as error:
             _size.reset(sized)
             raise InputError(f"style: {file}: {error.strerror}; name a style sheet of matplotlib") from error

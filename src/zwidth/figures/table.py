@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from types import SimpleNamespace
 from typing import Any, Protocol
 
@@ -50,6 +50,23 @@ def curves(table: Table, *keys: str, **wanted: object) -> list[Any]:
     for curve in found if columns[keys[0]].size else ():
         vars(curve).update({key: getattr(curve, key)[0] for key in keys})
     return found if columns[keys[0]].size else []
+
+
+def stack(parts: Iterable[Mapping[str, object]]) -> dict[str, np.ndarray]:
+    """Put curves below each other: a number or text is repeated along its curve, a column that lacks is NaN."""
+    blocks = []
+    for part in parts:
+        arrays = [np.asarray(value) for value in part.values()]
+        rows = max(array.size for array in arrays)
+        blocks.append({name: np.broadcast_to(array, rows) for name, array in zip(part, arrays, strict=True)})
+    names = list(dict.fromkeys(name for block in blocks for name in block))
+    table = {}
+    for name in names:
+        like = next(block[name] for block in blocks if name in block)
+        absent = "" if like.dtype.kind == "U" else np.nan
+        columns = [block.get(name, np.full(next(iter(block.values())).size, absent)) for block in blocks]
+        table[name] = np.concatenate(columns)
+    return table
 
 
 def held_or_all(found: list[Any]) -> list[Any]:

@@ -15,13 +15,13 @@ from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels
+from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.loops.rigid.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device, stack
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
-from zwidth.studies.stable_set import tabulate_walls, trace_outlines
 from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
@@ -162,7 +162,7 @@ def outline_device(device: PhysicalDevice, label: str) -> Outcome:
     table = stack({"curve": "boundary", "delay_model": "held", **one} for one in found)
     if not table:
         return Outcome(notes=("no wall of this device is stable",))
-    walls = tabulate_walls(label, {"stiffest": scene.max_stiffness()})
+    walls = stack([{"label": label, "wall": "stiffest", **tabulate_walls(scene, *scene.max_stiffness()[:2])}])
     return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
 
 

@@ -13,9 +13,10 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
+from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, stack
-from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
+from zwidth.studies.stable_set import name_kind
 
 # An outline has some hundreds of points, of which an estimate of the size may rest on.
 _POINTS_PER_OUTLINE = 1000
@@ -78,7 +79,7 @@ class CompareStudy(ComputedStudy):
                 }
             )
             outlines += pieces
-            walls.append(tabulate_walls(label, {"stiffest": top}))
+            walls.append({"label": label, "wall": "stiffest", **tabulate_walls(loop, *top[:2])})
         bare = [row["label"] for row in rows if row["kind"] == "none"]
         table = stack(outlines)
         return Outcome(

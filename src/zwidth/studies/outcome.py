@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
@@ -16,6 +16,7 @@ from zwidth.config.axes import Axis
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import Study
 from zwidth.figures.table import SI_COLUMNS
+from zwidth.figures.table import stack as stack
 from zwidth.words.formatting import to_cell
 
 Table: TypeAlias = dict[str, np.ndarray]
@@ -106,23 +107,6 @@ def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Phy
 
 def _is_single(axis: Axis, value: float) -> bool:
     return axis.size == 1 and float(axis.values()[0]) == value
-
-
-def stack(parts: Iterable[Mapping[str, object]]) -> Table:
-    """Put curves below each other: a number or text is repeated along its curve, a column that lacks is NaN."""
-    blocks = []
-    for part in parts:
-        arrays = [np.asarray(value) for value in part.values()]
-        rows = max(array.size for array in arrays)
-        blocks.append({name: np.broadcast_to(array, rows) for name, array in zip(part, arrays, strict=True)})
-    names = list(dict.fromkeys(name for block in blocks for name in block))
-    table = {}
-    for name in names:
-        like = next(block[name] for block in blocks if name in block)
-        absent = "" if like.dtype.kind == "U" else np.nan
-        columns = [block.get(name, np.full(next(iter(block.values())).size, absent)) for block in blocks]
-        table[name] = np.concatenate(columns)
-    return table
 
 
 def csv_text(table: Table) -> str:

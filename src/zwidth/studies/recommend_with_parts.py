@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from zwidth import figures
+from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.scenes.limits import describe_islands
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall, choose_damping
 from zwidth.studies.outcome import Outcome, stack
-from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
+from zwidth.studies.stable_set import name_kind
 from zwidth.words.formatting import plain, tell_apart, with_unit
 from zwidth.words.status import Status
 
@@ -37,6 +38,7 @@ def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -
     found = _summarize(scene, top, wall, fraction, stable, ends)
     outlines = stack(trace_outlines(scene, label=label))
     marked = {"stiffest": top, "recommended": wall} if stable else {"stiffest": top}
+    walls = stack({"label": label, "wall": kind, **tabulate_walls(scene, *one[:2])} for kind, one in marked.items())
     notes = describe_islands(scene)
     if not stable:
         notes.append(f"no stable wall was found at {fraction:g} of the largest stiffness; choose another share")
@@ -46,7 +48,7 @@ def recommend_with_parts(scene: Scene, label: str, fraction: float, stem: str) -
         )
     return Outcome(
         table=outlines,
-        figures={} if not outlines else {"": partial(figures.draw_stable_set, outlines, tabulate_walls(label, marked))},
+        figures={} if not outlines else {"": partial(figures.draw_stable_set, outlines, walls)},
         documents={
             f"{stem}.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
             f"{stem}.md": _describe(found),

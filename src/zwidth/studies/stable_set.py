@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from zwidth.figures.table import SI_COLUMNS
 from zwidth.loops.rigid.passivity import passivity_margin
 from zwidth.loops.rigid.region import stable_region
 from zwidth.loops.rigid.ridge import RidgeKind
-from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
-from zwidth.studies.outcome import Table
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -23,34 +19,9 @@ if TYPE_CHECKING:
 _ANGLES = 721
 
 
-def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
-    """The outlines of the stable set, the largest first, as columns; the hole of an island lies inside of it."""
-    units = scene.units
-    for number, outline in enumerate(scene.stable_region(), start=1):
-        piece = "hole" if outline.hole else ("island" if outline.island else "outline")
-        # Closed: the first point comes again at the end.
-        stiffness, damping = (np.append(part, part[0]) for part in outline[:2])
-        walls = {"alpha": stiffness / units.stiffness, "beta": damping / units.virtual_damping}
-        yield {
-            **columns,
-            "number": number,
-            "piece": piece,
-            **walls,
-            **dict(zip(SI_COLUMNS, (stiffness, damping), strict=True)),
-        }
-
-
 def name_kind(wall: StiffestWall) -> str:
     """The kind of a stiffest wall in words, "none" where there is no such wall."""
     return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
-
-
-def tabulate_walls(label: str, walls: Mapping[str, StiffestWall]) -> Table:
-    """The walls that a figure marks on one device, by what each is."""
-    table: Table = {"label": np.array([label] * len(walls)), "wall": np.array(list(walls))}
-    table[SI_COLUMNS[0]] = np.array([wall.stiffness for wall in walls.values()])
-    table[SI_COLUMNS[1]] = np.array([wall.virtual_damping for wall in walls.values()])
-    return table
 
 
 def find_edges(delta: float, d: float) -> dict[str, Outlines]:

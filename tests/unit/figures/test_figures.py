@@ -29,7 +29,7 @@ from matplotlib.axis import Tick
 from matplotlib.colors import to_rgb
 from matplotlib.contour import ContourSet
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
+from matplotlib.patches import PathPatch
 from matplotlib.text import Annotation, Text
 
 from zwidth import figures
@@ -201,7 +201,7 @@ def test_boundaries_show_the_given_curves_in_one_panel_for_each_delay():
             given = outline(delta, d)
             assert_drawn(ax, f"boundary, delta = {delta:g}, d = {d:g}", given["alpha"], given["beta"])
         assert_drawn(ax, f"path of alpha_max, d = {d:g}", path(d)["alpha"], path(d)["beta"])
-        shaded = [patch.get_xy() for patch in ax.patches if isinstance(patch, Polygon)]
+        shaded = [patch.get_path().vertices for patch in ax.patches if isinstance(patch, PathPatch)]
         assert any(np.array_equal(xy[:21], np.c_[outline(1.0, d)["alpha"], outline(1.0, d)["beta"]]) for xy in shaded)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 import pytest
+from matplotlib import cbook
 from matplotlib.figure import Figure
 
 import zwidth
@@ -26,7 +27,7 @@ def line(ax, label):
 @pytest.mark.parametrize("normalized", [False, True])
 def test_the_edge_parts_stable_from_unstable_walls(scene, normalized):
     ax = plot.region(scene, normalized=normalized)
-    x, y = line(ax, "edge of what is stable")
+    x, y = line(ax, "outline 1")
     units = tuple(scene.units) if normalized else (1e3, 1.0)
     K, B = x * units[0], y * units[1]
     inside = 1e-3 * K.max() < K
@@ -36,7 +37,7 @@ def test_the_edge_parts_stable_from_unstable_walls(scene, normalized):
     )
     assert np.all(scene.is_stable(*shrunk))
     assert not np.any(scene.is_stable(*grown))
-    top = line(ax, "stiffest stable wall")
+    top = line(ax, "stiffest")
     assert float(top[0][0]) * units[0] == pytest.approx(float(scene.max_stiffness().stiffness))
 
 
@@ -53,6 +54,21 @@ def test_several_scenes_have_their_labels():
     legend = ax.get_legend()
     assert legend is not None
     assert {"difference", "low-pass"} <= {text.get_text() for text in legend.get_texts()}
+
+
+@pytest.mark.parametrize("label", ["$a_$", "$x$", "_hidden", "50 $ a_b"])
+def test_labels_are_text(label):
+    drawn = [
+        plot.region({label: RIGID, "other": FILTERED}),
+        plot.motion(RIGID.simulate(5e3, 20.0, push=1.0, periods=50), labels=[label]),
+    ]
+    for ax in drawn:
+        figures.style.figure_of(ax).draw_without_rendering()
+        legend = ax.get_legend()
+        assert legend is not None
+        (shown, *_) = [text for text in legend.get_texts() if label in text.get_text().replace(r"\$", "$")]
+        # No pair of dollars that matplotlib takes for mathematics.
+        assert not cbook.is_math_text(shown.get_text())
 
 
 def test_a_ridge_over_equal_ratios_has_plain_numbers_within_a_decade():

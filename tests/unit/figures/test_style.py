@@ -2,6 +2,7 @@
 
 from itertools import combinations
 
+import matplotlib.style
 import numpy as np
 import pytest
 from figure_tables import EVERY_FIGURE, RIDGE
@@ -37,6 +38,13 @@ def test_a_legend_fits_the_size_that_is_wanted():
     figure = style.figure_of(panels)
     assert figure.get_size_inches().tolist() == [3.0, 2.0]
     assert style.figure_of(style.panels(None, 1, 6.4, 4.0)).get_size_inches().tolist() == [6.4, 4.0]
+
+
+def test_the_look_is_a_style_of_matplotlib():
+    with style.house_style():
+        ours = dict(matplotlib.rcParams)
+    with matplotlib.style.context("zwidth.figures.house"):
+        assert dict(matplotlib.rcParams) == ours
 
 
 @pytest.mark.parametrize("low, high", [(2.1, 4.9), (1.1, 1.9), (2.0, 8.0), (2.1, 10.4), (0.3, 40.0), (1e-3, 1e4)])

@@ -5,7 +5,7 @@ import pytest
 from sweeping import study, sweep_of
 
 import zwidth
-from zwidth.bench.problems import exact_radius
+from methods.problems import exact_radius
 from zwidth.sweep.compute import compute
 from zwidth.sweep.grid import Grid
 from zwidth.words.status import Status

@@ -131,27 +131,26 @@ def _section(where: Path, entry: dict[str, Any]) -> str:
 def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
     """Figures, slices and tables of a study."""
     for file in sorted(entry.get("files", {})):
-        # The record holds plain names; what a link leads to may be anybody's.
         path = where / file
-        if path.is_symlink():
-            yield f'<p class="soft">{escape(file)} is a link, and not shown.</p>'
-        elif file.endswith(".svg") and path.is_file():
+        if file.endswith(".svg"):
             data = base64.b64encode(path.read_bytes()).decode()
-            text = f"Figure {Path(file).stem} of the study {entry['name']}"
+            text = f"Figure {path.stem} of the study {entry['name']}"
             yield (
                 f'<figure><img alt="{escape(text)}" src="data:image/svg+xml;base64,{data}">'
-                f"<figcaption>{escape(Path(file).stem)}</figcaption></figure>"
+                f"<figcaption>{escape(path.stem)}</figcaption></figure>"
             )
-        elif file == "published.json" and path.is_file():
+        elif file == "published.json":
             yield _published(json.loads(path.read_text(encoding="utf-8")))
-    store = where / f"{entry['name']}{SUFFIX}"
-    if store.is_dir() and not store.is_symlink():
-        from zwidth.pages.report.slices import find_slices
+        elif file.endswith(SUFFIX) and path.is_symlink():
+            # Stores are not read through links: what one leads to may be anybody's.
+            yield f'<p class="soft">{escape(file)} is a link, and not shown.</p>'
+        elif file.endswith(SUFFIX):
+            from zwidth.pages.report.slices import find_slices
 
-        with open_dataset(store) as data:
-            if not data.attrs["complete"]:
-                raise StoreError(f"{store}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
-            yield from find_slices(data)
+            with open_dataset(path) as data:
+                if not data.attrs["complete"]:
+                    raise StoreError(f"{path}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
+                yield from find_slices(data)
 
 
 def _published(content: dict[str, Any]) -> str:

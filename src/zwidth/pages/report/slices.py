@@ -23,9 +23,8 @@ _ALONG, _OTHERS, _MOST = 120, 9, 120_000
 
 def find_slices(data: xarray.Dataset) -> Iterator[str]:
     """The maps of a store, as HTML."""
-    for name in map(str, data.data_vars):
-        if name not in OUTPUTS or name == "kind":
-            continue
+    # A store lists its variables in any order.
+    for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
         if len(axes) == 2 and "device" not in axes:
             yield _draw(data[name], name, *axes)

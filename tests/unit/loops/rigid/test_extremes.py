@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.bench import extremes
+from methods import extremes
 from zwidth.loops.rigid.spectral_radius import bound_radius
 from zwidth.words.status import Status
 

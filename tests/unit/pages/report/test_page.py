@@ -71,6 +71,8 @@ def test_figures_versions_and_studies_are_there(page):
 
 def test_slices_hold_what_the_store_holds(run, page):
     blocks = [json.loads(text) for text in re.findall(r'<script type="application/json">(.*?)</script>', page)]
+    # In their order among all outputs, whatever that of the store.
+    assert [block["name"] for block in blocks] == ["stable", "spectral_radius"]
     named = {block["name"]: block for block in blocks}
     found = named["spectral_radius"]
     values = np.frombuffer(base64.b64decode(found["values"]), "<f4").reshape(2, 20, 30)
@@ -115,6 +117,15 @@ def edit(file, old, new):
     text = file.read_text(encoding="utf-8")
     assert old in text
     file.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+
+def test_a_store_behind_a_link_is_not_shown(run, tmp_path):
+    shutil.copytree(run, tmp_path / "out")
+    (tmp_path / "out" / "plane.zarr").rename(tmp_path / "elsewhere.zarr")
+    (tmp_path / "out" / "plane.zarr").symlink_to(tmp_path / "elsewhere.zarr")
+    text = zwidth.write_report(tmp_path / "out").read_text(encoding="utf-8")
+    assert "plane.zarr is a link, and not shown" in text
+    assert "application/json" not in text
 
 
 def test_labelled_devices_are_sliders_by_name(tmp_path):

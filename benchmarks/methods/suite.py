@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
-from zwidth.bench import problems
-from zwidth.bench.baselines import available
-from zwidth.bench.problems import Walls
+from methods import problems
+from methods.baselines import available
+from methods.clock import time_calls
+from methods.problems import Walls
 from zwidth.loops.rigid import balls
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.passivity import is_passive, passivity_margin
@@ -72,15 +73,8 @@ Error = tuple[float, int, int]
 
 def clock(call: Callable[[], Any]) -> tuple[float, float]:
     """Seconds that the first call took longer, and the median of the later ones."""
-    start = time.perf_counter()
-    call()
-    first = time.perf_counter() - start
-    durations: list[float] = []
-    while len(durations) < _LEAST or (sum(durations) < _SECONDS and len(durations) < _MOST):
-        start = time.perf_counter()
-        call()
-        durations.append(time.perf_counter() - start)
-    warm = float(np.median(durations))
+    first = time_calls(call, 1)[0].item()
+    warm = float(np.median(time_calls(call, _LEAST, _MOST, _SECONDS)[0]))
     return max(0.0, first - warm), warm
 
 
@@ -240,4 +234,4 @@ def _growing_maps(sizes: Sizes) -> Iterator[Row]:
 
 def can_measure() -> bool:
     """Whether what errors are measured against is installed."""
-    return balls.available()
+    return balls.available() and find_spec("mpmath") is not None

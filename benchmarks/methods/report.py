@@ -1,4 +1,4 @@
-"""The results as JSON, Markdown and a picture."""
+"""`zwidth bench`, and its results as JSON, Markdown and a picture."""
 
 from __future__ import annotations
 
@@ -11,7 +11,12 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from zwidth.bench.suite import Row
+import click
+
+from methods import pareto, suite
+from methods.suite import Row
+from zwidth.figures import style
+from zwidth.words.errors import InputError, ResourceError
 
 _TITLES = {
     "stable": "Stable or not",
@@ -141,8 +146,6 @@ def _error(row: Row) -> str:
 
 def write(rows: Sequence[Row], folder: Path) -> list[Path]:
     """Write ``bench.json``, ``bench.md``, ``summary.txt`` and ``pareto.png`` into a folder."""
-    from zwidth.figures import pareto, style
-
     folder.mkdir(parents=True, exist_ok=True)
     texts = {
         "bench.json": json.dumps(document(rows), indent=1, allow_nan=False) + "\n",
@@ -154,3 +157,21 @@ def write(rows: Sequence[Row], folder: Path) -> list[Path]:
     shown = [row for row in rows if row.layout != "one"]
     marks = [pareto.Mark(row.quantity, row.method, row.layout, row.d, row.rate, row.error) for row in shown]
     return [*(folder / name for name in texts), *style.save(pareto.draw_pareto(marks), folder / "pareto")]
+
+
+def run(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
+    """Measure, write and print what `zwidth bench` is asked for."""
+    # A file in the place of the folder would otherwise be found after minutes of work.
+    if any(part.is_file() for part in (out, *out.parents)):
+        raise InputError(f"--out: got {str(out)!r}, which is not a folder; choose another with --out DIR")
+    if (out / "bench.json").exists() and not overwrite:
+        raise InputError(f"--out: {out} holds results already; give --overwrite or choose another folder")
+    if not suite.can_measure():
+        raise ResourceError("bench: python-flint or mpmath is not installed; install both: scripts/setup test")
+    rows = suite.measure(suite.QUICK if quick else suite.FULL, lambda text: click.echo(f"  {text}", err=True))
+    written = write(rows, out)
+    if as_json:
+        click.echo(json.dumps(document(rows), indent=1, allow_nan=False))
+        return
+    click.echo(summary(rows))
+    click.echo("\n".join(f"wrote {path}" for path in written))

@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.text import Text
 
-from zwidth.bench import problems, report, suite
-from zwidth.bench.baselines import available
+from methods import problems, report, suite
+from methods.baselines import available
+from methods.pareto import Mark, draw_pareto
 from zwidth.cli.commands import cli
-from zwidth.figures.pareto import Mark, draw_pareto
-from zwidth.words.errors import InputError
+from zwidth.words.errors import InputError, ResourceError
 
 
 def test_labels_near_the_boundary_are_those_of_their_side():
@@ -103,8 +103,14 @@ def test_results_are_not_overwritten(tmp_path):
         CliRunner().invoke(cli, ["bench", "--out", str(tmp_path / "bench.json" / "x")], catch_exceptions=False)
 
 
+def test_without_a_checkout_one_line_says_what_is_needed(monkeypatch, tmp_path):
+    monkeypatch.setattr("zwidth.cli.bench.__file__", str(tmp_path / "lib" / "zwidth" / "cli" / "bench.py"))
+    with pytest.raises(ResourceError, match=r"bench: needs a checkout .*zwidth bench$"):
+        CliRunner().invoke(cli, ["bench"], catch_exceptions=False)
+
+
 def test_names_of_methods_are_apart_and_on_the_page():
-    kept = Path(__file__).parents[3] / "benchmarks" / "results" / "bench.json"
+    kept = Path(__file__).parents[2] / "benchmarks" / "results" / "bench.json"
     rows = [row for row in json.loads(kept.read_text(encoding="utf-8"))["rows"] if row["layout"] != "one"]
     axes = draw_pareto([Mark(*(row[name] for name in Mark._fields)) for row in rows])
     figure = axes[0].figure

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.bench.problems import Walls
+from methods.problems import Walls
 from zwidth.loops.rigid.boundary import boundary
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.region import lobe

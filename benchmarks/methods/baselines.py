@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth.bench.problems import Walls
+from methods.problems import Walls
 from zwidth.loops.rigid.polynomial import char_poly
 
 
