@@ -12,9 +12,8 @@ from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, Wr
 
 from zwidth.config.axes import read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Damping, Mass, Strict, unit_schema
+from zwidth.config.fields import Quantity, Strict
 from zwidth.config.numbers import number, whole_number
-from zwidth.config.units import quantity
 from zwidth.errors import InputError
 from zwidth.formatting import describe, suggestion
 from zwidth.parts.coupling import Coupling
@@ -29,7 +28,6 @@ from zwidth.parts.velocity import (
     WindowedDifference,
 )
 from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
-from zwidth.units import LENGTH, MASS, RATE, STIFFNESS, TIME
 
 PARTS = ("velocity", "operator", "coupling")
 
@@ -63,13 +61,15 @@ class PartSection(Strict):
             yield path[1:], what
 
 
-Frequency = Annotated[float, BeforeValidator(quantity(RATE, POSITIVE)), unit_schema(RATE)]
-Time = Annotated[float, BeforeValidator(quantity(TIME, POSITIVE)), unit_schema(TIME)]
 Samples = Annotated[int, BeforeValidator(whole_number(PARAMETERS["velocity.samples"].allowed))]
 Order = Annotated[int, BeforeValidator(whole_number(PARAMETERS["velocity.order"].allowed))]
-Spring = Annotated[float, BeforeValidator(quantity(STIFFNESS, POSITIVE)), unit_schema(STIFFNESS)]
-GroundSpring = Annotated[float, BeforeValidator(quantity(STIFFNESS, NOT_NEGATIVE)), unit_schema(STIFFNESS)]
-HandMass = Annotated[float, BeforeValidator(quantity(MASS, NOT_NEGATIVE)), unit_schema(MASS)]
+Frequency = Annotated[float, Quantity("Hz", POSITIVE)]
+Time = Annotated[float, Quantity("s", POSITIVE)]
+Spring = Annotated[float, Quantity("N/m", POSITIVE)]
+GroundSpring = Annotated[float, Quantity("N/m", NOT_NEGATIVE)]
+HandMass = Annotated[float, Quantity("kg", NOT_NEGATIVE)]
+Damping = Annotated[float, Quantity("N s/m", NOT_NEGATIVE)]
+Mass = Annotated[float, Quantity("kg", POSITIVE)]
 
 
 def _read_coefficients(raw: Any) -> tuple[float, ...]:
@@ -170,7 +170,7 @@ class FOAWSection(PartSection):
 
     kind: Literal["foaw"]
 
-    noise: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)]
+    noise: Annotated[float, Quantity("m", POSITIVE)]
     """The largest error of a measured position in m or with a unit, > 0: one count of an encoder."""
 
     samples: Annotated[int, BeforeValidator(whole_number(Range(1, 64)))] = 15

@@ -7,21 +7,11 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WrapValidator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth._types import DelayModel
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import (
-    Damping,
-    Delay,
-    Mass,
-    NonNegative,
-    Number,
-    Stiffness,
-    Strict,
-    VirtualDamping,
-    unit_schema,
-)
+from zwidth.config.fields import Delay, NonNegative, Number, Strict, describe_entry, quantity_of
 from zwidth.config.numbers import number
 from zwidth.config.parts import (
     PARTS,
@@ -34,7 +24,7 @@ from zwidth.config.parts import (
     list_parts,
     locate_refusal,
 )
-from zwidth.config.units import quantity
+from zwidth.config.units import make_entry_reader
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.errors import InputError
 from zwidth.formatting import describe, short
@@ -42,9 +32,9 @@ from zwidth.normalization import normalize
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.parts.wall import VirtualWall
-from zwidth.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
+from zwidth.quantities import MAX_DELAY_PERIODS, PARAMETERS
 from zwidth.scene import Scene
-from zwidth.units import RATE, TIME, Span
+from zwidth.units import Span
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PARTS})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
@@ -77,7 +67,7 @@ class _OneKind(Strict):
 def _period(value: Any, info: ValidationInfo) -> float:
     """The period itself, or one over the rate."""
     if value is not None:
-        return quantity(TIME, PERIODS)(value)
+        return make_entry_reader("period")(value)
     # A rate that failed its own check is absent from the data; that fault is enough.
     rate = info.data.get("rate", 1.0)
     if rate is None:
@@ -96,18 +86,18 @@ class _PhysicalPlant(_OneKind):
             return super().missing(name)
         return f"{cls.what} has mass and period or rate, or, normalized, delta", "add 'mass: 0.1 kg'"
 
-    mass: Mass
+    mass: Annotated[float, quantity_of("mass")]
     """Moving mass m of the device in kg, > 0."""
 
-    damping: Damping = 0.0
+    damping: Annotated[float, quantity_of("damping")] = 0.0
     """Physical damping b of the device in N s/m, >= 0."""
 
-    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), unit_schema(RATE)] | None = Field(
-        default=None, exclude=True
-    )
+    rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     """Sampling rate 1/T in Hz; give it or the period."""
 
-    period: Annotated[float, BeforeValidator(_period), unit_schema(TIME)] = Field(default=None, validate_default=True)
+    period: Annotated[float, BeforeValidator(_period), WithJsonSchema(describe_entry("s"))] = Field(
+        default=None, validate_default=True
+    )
     """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
 
     delay: Delay = Span(0.0, "s")
@@ -197,7 +187,7 @@ class _NormalizedPlant(_OneKind):
     delta: NonNegative
     """Normalized damping b T/m of the device, >= 0."""
 
-    d: Annotated[float, BeforeValidator(number(Range(0.0, MAX_DELAY_PERIODS)))] = 0.0
+    d: Annotated[float, BeforeValidator(number(PARAMETERS["d"].allowed))] = 0.0
     """Delay in periods, whole or not, >= 0."""
 
 
@@ -243,10 +233,10 @@ class PhysicalScene(_PhysicalPlant):
 
     what: ClassVar[str] = "a scene"
 
-    stiffness: Stiffness | None = None
+    stiffness: Annotated[float, quantity_of("stiffness")] | None = None
     """Stiffness K of the wall in N/m."""
 
-    virtual_damping: VirtualDamping | None = None
+    virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
     """Damping B of the wall in N s/m."""
 
     velocity: SimulatedVelocityField | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
@@ -324,10 +314,10 @@ class PhysicalWall(_OneKind):
     what: ClassVar[str] = "a wall"
     foreign: ClassVar[frozenset[str]] = _NORMALIZED
 
-    stiffness: Stiffness
+    stiffness: Annotated[float, quantity_of("stiffness")]
     """Stiffness K in N/m."""
 
-    virtual_damping: VirtualDamping = 0.0
+    virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
     """Damping B in N s/m."""
 
 
