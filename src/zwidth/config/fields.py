@@ -27,7 +27,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, 
 from zwidth.config.numbers import number
 from zwidth.config.units import quantity, span
 from zwidth.formatting import describe, resembling, suggestion
-from zwidth.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Parameter, Range
 from zwidth.units import PERIOD_WORDS, Span, find_dimension
 
 
@@ -202,11 +202,9 @@ def quantity_of(name: str) -> Quantity:
     return Quantity(PARAMETERS[name].unit, PARAMETERS[name].allowed)
 
 
-def describe_parameter(name: str) -> str:
+def describe_parameter(parameter: Parameter) -> str:
     """What a schema says of a parameter."""
-    parameter = PARAMETERS[name]
-    units = "" if parameter.unit == "1" else f", in {parameter.unit} or with a unit"
-    return parameter.long_name[0].upper() + parameter.long_name[1:] + units
+    return parameter.sentence + ("" if parameter.unit == "1" else f", in {parameter.unit} or with a unit")
 
 
 _SPAN = PlainSerializer(str, return_type=str), WithJsonSchema(describe_entry("s", *PERIOD_WORDS))

@@ -14,15 +14,12 @@ from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import Delay, NonNegative, Number, Strict, describe_entry, quantity_of
 from zwidth.config.numbers import number
 from zwidth.config.parts import (
-    PARTS,
-    CouplingSection,
-    FOAWSection,
-    OperatorSection,
+    PART_NAMES,
     SimulatedVelocityField,
-    VelocityField,
-    build_velocity,
+    build_parts,
     list_parts,
     locate_refusal,
+    make_parts_base,
 )
 from zwidth.config.units import make_entry_reader
 from zwidth.domain import LARGEST_DAMPING, WALL_RANGE, within
@@ -31,12 +28,13 @@ from zwidth.formatting import describe, short
 from zwidth.normalization import normalize
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import FOAW
 from zwidth.parts.wall import VirtualWall
 from zwidth.quantities import MAX_DELAY_PERIODS, PARAMETERS
 from zwidth.scene import Scene
 from zwidth.units import Span
 
-_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PARTS})
+_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
 
 
@@ -49,7 +47,7 @@ class _OneKind(Strict):
     def unknown(cls, name: str) -> tuple[str, str, str]:
         if name not in cls.foreign:
             return super().unknown(name)
-        if name in PARTS:
+        if name in PART_NAMES:
             allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
             return (
                 f"got {name!r} after normalized keys",
@@ -75,7 +73,7 @@ def _period(value: Any, info: ValidationInfo) -> float:
     return 1.0 / rate
 
 
-class _PhysicalPlant(_OneKind):
+class _Mass(_OneKind):
     """A mass with damping, sampled, in SI units."""
 
     foreign: ClassVar[frozenset[str]] = _NORMALIZED
@@ -103,21 +101,19 @@ class _PhysicalPlant(_OneKind):
     delay: Delay = Span(0.0, "s")
     """Delay t_d from the sample to the moment its force acts, in s or in periods, >= 0."""
 
-    velocity: VelocityField | None = None
-    """How the velocity is estimated; the difference of two samples where left out."""
-
-    operator: OperatorSection | None = None
-    """The hand that holds the device; nobody's where left out."""
-
-    coupling: CouplingSection | None = None
-    """The mass beyond a spring and damper of the device; a rigid one where left out."""
-
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
         if "period" in raw and "rate" in raw:
             second = [key for key in raw if key in ("period", "rate")][1]
             allowed = "the sampling period and its rate say the same"
             yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+
+
+_Parts: Any = make_parts_base("the difference of two samples", "none")
+
+
+class _PhysicalPlant(_Parts, _Mass):
+    """The same with the parts that it may have beside."""
 
     def limits(self) -> Iterable[LocatedProblem]:
         delay = self.delay.value / (self.period if self.delay.unit == "s" else 1.0)
@@ -128,7 +124,7 @@ class _PhysicalPlant(_OneKind):
         try:
             scene = self.to_scene()
             # Where it is not rigid: what the parts refuse only together, such as a cut-off beyond half the rate.
-            _ = scene.is_rigid or isinstance(self.velocity, FOAWSection) or scene.loop
+            _ = scene.is_rigid or is_adaptive(self) or scene.loop
         except InputError as error:
             yield locate_refusal(error)
             return
@@ -173,10 +169,7 @@ class _PhysicalPlant(_OneKind):
     def to_scene(self) -> Scene:
         """The device and its timing in SI units."""
         timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
-        coupling = None if self.coupling is None else self.coupling.to_part()
-        operator = None if self.operator is None else self.operator.to_part()
-        device = Device(mass=self.mass, damping=self.damping, coupling=coupling)
-        return Scene(device, timing, velocity=build_velocity(self.velocity), operator=operator)
+        return Scene(Device(mass=self.mass, damping=self.damping), timing).replace(**build_parts(self))
 
 
 class _NormalizedPlant(_OneKind):
@@ -203,7 +196,7 @@ class PhysicalDevice(_PhysicalPlant):
 class SimulatedDevice(PhysicalDevice):
     """A device in SI units whose velocity estimate need not be linear."""
 
-    velocity: SimulatedVelocityField | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; the difference of two samples where left out."""
 
 
@@ -239,7 +232,7 @@ class PhysicalScene(_PhysicalPlant):
     virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
     """Damping B of the wall in N s/m."""
 
-    velocity: SimulatedVelocityField | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; the difference of two samples where left out."""
 
     delay_model: DelayModel = "held"
@@ -334,9 +327,10 @@ class NormalizedWall(_OneKind):
     """Normalized damping B T/m."""
 
 
-def is_adaptive(owner: AnyScene | AnyDevice) -> bool:
+def is_adaptive(owner: Any) -> bool:
     """Whether the velocity estimate of a scene or a device has no linear form."""
-    return isinstance(getattr(owner, "velocity", None), FOAWSection)
+    velocity = getattr(owner, "velocity", None)
+    return velocity is not None and velocity.part is FOAW
 
 
 def is_with_parts(owner: AnyScene | AnyDevice) -> bool:

@@ -28,6 +28,7 @@ from zwidth.formatting import plain, with_unit
 from zwidth.linear_loop import circle
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity
+from zwidth.quantities import POSITIVE
 from zwidth.scene import Scene
 from zwidth.status import Status
 
@@ -98,7 +99,7 @@ def fit_buzz(
         >>> print(f"{fit.mass * 1e3:.0f} g")
         100 g
     """
-    period = check_number("period", period, "s", low_open=True)
+    period = check_number("period", period, "s", POSITIVE)
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")

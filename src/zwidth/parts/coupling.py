@@ -10,8 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from zwidth.errors import check_choice
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,4 @@ class Coupling:
     sensor: Literal["motor", "tip"] = "motor"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mass", check_number("coupling.mass", self.mass, "kg", low_open=True))
-        object.__setattr__(self, "stiffness", check_number("coupling.stiffness", self.stiffness, "N/m", low_open=True))
-        object.__setattr__(self, "damping", check_number("coupling.damping", self.damping, "N s/m"))
-        check_choice("coupling.sensor", self.sensor, ("motor", "tip"))
+        check_fields(self, "coupling")

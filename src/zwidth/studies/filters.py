@@ -7,19 +7,21 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
+from pydantic import BeforeValidator
 
 from zwidth import figures
 from zwidth.config.axes import Axis
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Quantity
+from zwidth.config.numbers import whole_number
 from zwidth.config.parameters import parameter_axis
-from zwidth.config.parts import Order, locate_refusal
+from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.errors import InputError
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
-from zwidth.quantities import POSITIVE
+from zwidth.quantities import PARAMETERS, POSITIVE
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, stack
 from zwidth.studies.stable_set import name_kind
 
@@ -42,7 +44,7 @@ class FiltersStudy(ComputedStudy):
     cutoff: Annotated[Axis, *parameter_axis("velocity.cutoff")] | None = None
     """Cut-offs of a low-pass, in Hz or with a unit."""
 
-    order: Order = 1
+    order: Annotated[int, BeforeValidator(whole_number(PARAMETERS["velocity.order"].allowed))] = 1
     """Order of the low-pass, 1 or 2."""
 
     samples: Annotated[Axis, *parameter_axis("velocity.samples")] | None = None

@@ -16,7 +16,7 @@ from zwidth import figures
 from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Fraction, Quantity, Strict, describe_entry, members, quantity_of
-from zwidth.config.parts import VelocityField, build_velocity, locate_refusal
+from zwidth.config.parts import VelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene
 from zwidth.errors import InputError
 from zwidth.fitting.buzz import BuzzPoint, fit_buzz
@@ -25,6 +25,7 @@ from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
 from zwidth.formatting import describe, header, plain, with_unit
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.quantities import POSITIVE
 from zwidth.status import Status
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
@@ -275,7 +276,7 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        velocity, fits = build_velocity(self.velocity), []
+        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.to_part(), []
         period = self.period
         if self.log:
             options = {"max_delay": self.max_delay, "resample": self.resample}

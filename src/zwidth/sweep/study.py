@@ -15,12 +15,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Generated, describe_parameter, members
 from zwidth.config.numbers import number
 from zwidth.config.parameters import parameter_axis
-from zwidth.config.parts import (
-    CouplingSection,
-    OperatorSection,
-    VelocityField,
-    list_parts,
-)
+from zwidth.config.parts import list_parts, make_parts_base
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study
 from zwidth.quantities import (
@@ -57,7 +52,7 @@ def _axis_field(name: str) -> tuple[Any, Any]:
         rows = "Parameters that move together, one row a device: lists of equal length, or a CSV file."
         return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
     axis: Any = Annotated[Axis, *parameter_axis(name)]
-    words = describe_parameter(name) + ("." if name in WALL else "; the scene's where left out.")
+    words = describe_parameter(PARAMETERS[name]) + ("." if name in WALL else "; the scene's where left out.")
     return axis | None, Field(default=None, description=words)
 
 
@@ -146,26 +141,24 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
         yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
 
 
-class SweepStudy(Study):
-    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
-
-    what: ClassVar[str] = "a sweep study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
-    takes_parts: ClassVar[bool] = True
+class _Grid(Study):
+    """What is swept."""
 
     kind: Literal["sweep"]
 
     axes: Axes
     """The parameters and their values; every combination is computed."""
 
-    velocity: VelocityField | None = None
-    """How the velocity is estimated; the scene's where left out. Its keys may be axes, as ``velocity.cutoff``."""
 
-    operator: OperatorSection | None = None
-    """The hand that holds the device; the scene's where left out. Its keys may be axes, as ``operator.mass``."""
+_Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
 
-    coupling: CouplingSection | None = None
-    """The mass beyond a spring and damper; the scene's where left out. Its keys may be axes as well."""
+
+class SweepStudy(_Parts, _Grid):
+    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
+
+    what: ClassVar[str] = "a sweep study"
+    from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
+    takes_parts: ClassVar[bool] = True
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""
