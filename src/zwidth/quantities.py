@@ -94,10 +94,10 @@ class Parameter:
 # In the order of a store's dimensions: a plane of walls lies together, at the end.
 _PARAMETERS = (
     Parameter("period", "sampling period T", "T", PERIODS, "s", (5e-5, 0.02), short_name="sampling period"),
-    Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", short_name="sampling rate"),
+    Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", None, "in place of the period", "sampling rate"),
     Parameter(
         "delay", "delay t_d from a sample to the moment its force acts", "t_d", NOT_NEGATIVE, "s", (0.0, 0.02),
-        short_name="delay",
+        "or in periods", "delay",
     ),
     Parameter("mass", "mass m of the device", "m", POSITIVE, "kg", (1e-3, 10.0), short_name="mass"),
     Parameter(
@@ -191,7 +191,7 @@ class Choice(NamedTuple):
 
 _KINDS = ("backward_difference", "windowed_difference", "low_pass", "butterworth")
 CHOICES = {
-    "velocity.kind": Choice(_KINDS, "Velocity estimate; told by the numbers below where it can be"),
+    "velocity.kind": Choice(_KINDS, "Velocity estimate; told by the options below where it can be"),
     "coupling.sensor": Choice(("motor", "tip"), "Where the position is measured; at the motor by default"),
 }
 

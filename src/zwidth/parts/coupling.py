@@ -8,7 +8,7 @@ the tip.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
 from zwidth.parts.checks import check_fields
 
@@ -28,6 +28,12 @@ class Coupling:
         >>> zwidth.Coupling(mass=0.05, stiffness=20e3, damping=1.0).sensor
         'motor'
     """
+
+    # Forms that the explorer offers.
+    usual: ClassVar[dict[str, dict[str, Any]]] = {
+        "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},
+        "tip": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0, "sensor": "tip"},
+    }
 
     mass: Any
     stiffness: Any

@@ -7,11 +7,14 @@ Behind a spring and damper the hand is a further mass, with its own damper and s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from zwidth.errors import InputError
 from zwidth.parts.checks import check_fields, check_number
 from zwidth.quantities import POSITIVE
+
+# That of the reference below.
+_HAND = {"mass": 0.554, "damping": 6.45, "stiffness": 135.0}
 
 
 @dataclass(frozen=True)
@@ -33,6 +36,12 @@ class Operator:
         >>> zwidth.Operator(mass=0.554, damping=6.45, stiffness=135).rigid
         True
     """
+
+    # Forms that the explorer offers.
+    usual: ClassVar[dict[str, dict[str, float]]] = {
+        "rigid": _HAND,
+        "grasp": {**_HAND, "coupling_stiffness": 1e3, "coupling_damping": 5.0},
+    }
 
     mass: Any = 0.0
     damping: Any = 0.0
