@@ -138,7 +138,7 @@ def read_velocity(raw: Any, known: dict[str, type[PartSection]] = _LINEAR) -> An
 
 
 @dataclass(frozen=True)
-class _Estimate:
+class _AnyEstimate:
     """Makes a section one of a velocity estimate, of any kind that the linear loop knows or of all kinds."""
 
     linear: bool
@@ -150,8 +150,8 @@ class _Estimate:
         return read(lambda raw, _: read_velocity(raw, known), handler.generate_schema(every))
 
 
-VelocityField = Annotated[PartSection, _Estimate(linear=True)]
-SimulatedVelocityField = Annotated[PartSection, _Estimate(linear=False)]
+VelocityField = Annotated[PartSection, _AnyEstimate(linear=True)]
+SimulatedVelocityField = Annotated[PartSection, _AnyEstimate(linear=False)]
 _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }

@@ -6,7 +6,7 @@ from dataclasses import MISSING, fields
 from typing import Any
 
 from zwidth.parts.paths import PARTS, find_parts
-from zwidth.parts.velocity import BackwardDifference, Velocity, name_kind
+from zwidth.parts.velocity import BackwardDifference, Velocity, name_estimate
 
 
 def spell_scene(scene: Any) -> dict[str, Any]:
@@ -19,7 +19,7 @@ def spell_scene(scene: Any) -> dict[str, Any]:
 
 def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]:
     """The key ``velocity``, nothing for the difference of two samples; ``every`` writes defaults as well."""
-    given = {"kind": name_kind(velocity), **spell_part(velocity, every=every)}
+    given = {"kind": name_estimate(velocity), **spell_part(velocity, every=every)}
     return {} if velocity == BackwardDifference() else {"velocity": given}
 
 

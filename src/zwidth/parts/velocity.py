@@ -235,7 +235,7 @@ ESTIMATES = {
 }
 
 
-def name_kind(velocity: Velocity) -> str:
+def name_estimate(velocity: Velocity) -> str:
     """What configurations call the kind of an estimate."""
     return next(kind for kind, part in ESTIMATES.items() if type(velocity) is part)
 

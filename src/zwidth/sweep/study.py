@@ -141,7 +141,7 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
         yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
 
 
-class _Grid(Study):
+class _Swept(Study):
     """What is swept."""
 
     kind: Literal["sweep"]
@@ -153,7 +153,7 @@ class _Grid(Study):
 _Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
 
 
-class SweepStudy(_Parts, _Grid):
+class SweepStudy(_Parts, _Swept):
     """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
 
     what: ClassVar[str] = "a sweep study"
