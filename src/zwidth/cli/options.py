@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import MISSING, fields
 from functools import wraps
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
-from zwidth.words.quantities import ANY, NOT_NEGATIVE, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, NOT_NEGATIVE, OF_PARTS, PARAMETERS, Range
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
 Command: TypeAlias = Callable[..., Any]
 
-VELOCITY_KINDS = ("backward_difference", "windowed_difference", "low_pass", "butterworth")
+# By path in a scene, as in configuration files, one part after the other.
+_PART_NAMES = tuple(dict.fromkeys(path.partition(".")[0] for path in OF_PARTS))
+_PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.partition(".")[0]))
 
 
 class QuantityType(click.ParamType):
@@ -44,34 +47,23 @@ class QuantityType(click.ParamType):
             self.fail(str(error), param, ctx)
 
 
-def _parameter_type(name: str) -> QuantityType:
-    parameter = PARAMETERS[name]
-    return QuantityType(parameter.unit, parameter.allowed, periods=name == "delay")
-
-
-# Path in a scene, as in configuration files: what the option takes, and what it is. The parts check the ranges.
-_PARTS: dict[str, tuple[Any, str]] = {
-    "velocity.kind": (click.Choice(VELOCITY_KINDS), "Velocity estimate; told by the options below where it can be."),
-    "velocity.samples": (click.INT, "Window of the velocity difference, in samples."),
-    "velocity.cutoff": (QuantityType("Hz"), "Cut-off of a low-pass on the velocity, in Hz."),
-    "velocity.time_constant": (QuantityType("s"), "Its time constant, in s, in place of the cut-off."),
-    "velocity.order": (click.INT, "Its order: low-pass 1 or 2, Butterworth 1 to 8."),
-    "velocity.coded_period": (QuantityType("s"), "The period that the estimate was written for, where it is another."),
-    "operator.mass": (QuantityType("kg"), "Mass of the hand, in kg."),
-    "operator.damping": (QuantityType("N s/m"), "Damping of the hand to ground, in N s/m."),
-    "operator.stiffness": (QuantityType("N/m"), "Stiffness of the hand to ground, in N/m."),
-    "operator.coupling_stiffness": (QuantityType("N/m"), "Spring between hand and device; rigid where left out."),
-    "operator.coupling_damping": (QuantityType("N s/m"), "Damper beside that spring, in N s/m."),
-    "coupling.mass": (QuantityType("kg"), "Mass of the tip, beyond a spring and damper of the device."),
-    "coupling.stiffness": (QuantityType("N/m"), "That spring, in N/m."),
-    "coupling.damping": (QuantityType("N s/m"), "That damper, in N s/m."),
-    "coupling.sensor": (click.Choice(("motor", "tip")), "Where the position is measured; at the motor by default."),
-}
-
-
 def flag_of(path: str) -> str:
     """The option of a parameter: ``--velocity-cutoff`` for ``velocity.cutoff``."""
     return "--" + path.replace(".", "-").replace("_", "-")
+
+
+def _add_option(command: Command, path: str, required: bool = False) -> Command:
+    """The option of a parameter or of a choice."""
+    if path in CHOICES:
+        kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
+    else:
+        known = PARAMETERS[path]
+        # The parts themselves check the ranges of theirs.
+        allowed = ANY if path in OF_PARTS else known.allowed
+        kind = click.INT if known.whole else QuantityType(known.unit, allowed, periods=path == "delay")
+        unit, note = "" if known.whole else f", in {known.unit}", f"; {known.note}" if known.note else ""
+        text = f"{known.sentence}{unit}{note}"
+    return click.option(flag_of(path), path.replace(".", "__"), type=kind, required=required, help=f"{text}.")(command)
 
 
 def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]:
@@ -91,17 +83,8 @@ def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]
             return function(scene=scene, **given)
 
         command = with_scene
-        for path, (kind, words) in reversed(_PARTS.items()):
-            command = click.option(flag_of(path), path.replace(".", "__"), type=kind, help=words)(command)
-        for name in reversed(bare):
-            parameter = PARAMETERS[name]
-            text = f"{parameter.symbol}, in {parameter.unit}."
-            if name == "delay":
-                text = "t_d, in s or in periods."
-            elif name == "rate":
-                text = "1/T, in Hz, in place of the period."
-            must = name == "stiffness" or (required and name == "mass")
-            command = click.option(flag_of(name), type=_parameter_type(name), required=must, help=text)(command)
+        for path in reversed((*bare, *_PARTS)):
+            command = _add_option(command, path, required=path == "stiffness" or (required and path == "mass"))
         return command
 
     return decorate
@@ -120,17 +103,15 @@ def velocity_options(function: Command) -> Command:
 
     command = with_velocity
     for path in reversed(paths):
-        kind, words = _PARTS[path]
-        command = click.option(flag_of(path), path.replace(".", "__"), type=kind, help=words)(command)
+        command = _add_option(command, path)
     return command
 
 
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
     from zwidth.cli.doubts import doubts_of
-    from zwidth.parts.coupling import Coupling
     from zwidth.parts.device import Device
-    from zwidth.parts.operator import Operator
+    from zwidth.parts.paths import PARTS
     from zwidth.parts.timing import Timing
     from zwidth.parts.wall import VirtualWall
     from zwidth.scenes.scene import Scene
@@ -150,17 +131,13 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
         return {name: given[name] for name in names if name in given}
 
     try:
-        tip, hand = part("coupling"), part("operator")
-        for name in ("mass", "stiffness") if tip else ():
-            if name not in tip:
-                raise click.UsageError(f"a coupling has a mass and a stiffness; give {flag_of(f'coupling.{name}')}")
+        parts = {name: _make_part(name, kind, part(name)) for name, kind in PARTS.items() if part(name)}
         scene = Scene(
-            Device(**own("mass", "damping"), coupling=Coupling(**tip) if tip else None),
+            Device(**own("mass", "damping")),
             Timing(**own("period", "rate", "delay")),
             VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
             velocity=_velocity(part("velocity")),
-            operator=Operator(**hand) if hand else None,
-        )
+        ).replace(**parts)
         # What parts refuse only together, as a cut-off beyond half the sampling rate.
         _ = scene.is_rigid or scene.loop
         return scene
@@ -170,26 +147,35 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
         raise click.BadParameter(text, param_hint=f"'{flag_of(field)}'") if known else error from None
 
 
+def _list_needed(kind: Any) -> list[str]:
+    """The fields without which there is no such part."""
+    return [item.name for item in fields(kind) if item.default is MISSING]
+
+
+def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
+    needed = _list_needed(kind)
+    for key in needed:
+        if key not in given:
+            has = " and ".join(f"a {each}" for each in needed)
+            raise click.UsageError(f"a {name} has {has}; give {flag_of(f'{name}.{key}')}")
+    return kind(**given)
+
+
 def _velocity(given: dict[str, Any]) -> Any:
-    from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
+    from zwidth.parts.velocity import ESTIMATES
 
     kind = given.pop("kind", None)
     if kind is None:
         low = {"cutoff", "time_constant"} & set(given)
         kind = "windowed_difference" if "samples" in given else "low_pass" if low else "backward_difference"
-    parts = dict(zip(VELOCITY_KINDS, (BackwardDifference, WindowedDifference, LowPass, Butterworth), strict=True))
-    takes = {
-        "backward_difference": set(),
-        "windowed_difference": {"samples"},
-        "low_pass": {"cutoff", "time_constant", "order"},
-        "butterworth": {"cutoff", "order"},
-    }[kind] | {"coded_period"}
-    needs = {"windowed_difference": "samples", "butterworth": "cutoff", "low_pass": "cutoff"}.get(kind)
-    if needs and needs not in given and not (kind == "low_pass" and "time_constant" in given):
-        raise click.UsageError(f"a velocity estimate of kind {kind} needs {flag_of(f'velocity.{needs}')}")
-    for name in sorted(set(given) - takes):
+    part = ESTIMATES[kind]
+    needed = ["cutoff"] if kind == "low_pass" and "time_constant" not in given else _list_needed(part)
+    for name in needed:
+        if name not in given:
+            raise click.UsageError(f"a velocity estimate of kind {kind} needs {flag_of(f'velocity.{name}')}")
+    for name in sorted(set(given) - set(part.__dataclass_fields__)):
         raise click.UsageError(f"{flag_of(f'velocity.{name}')} does not belong to a velocity estimate of kind {kind}")
-    return parts[kind](**given)
+    return part(**given)
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")

@@ -6,15 +6,15 @@ from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from zwidth.cli.words import Slope, margin_lines, passivity_words, pole_words, row, stability_word
+from zwidth.parts.paths import find_parts
 from zwidth.words.formatting import plain, short, tell_apart, with_unit
+from zwidth.words.quantities import PARAMETERS
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import SceneAssessment
     from zwidth.scenes.friction import FrictionRule
     from zwidth.scenes.limits import Limit
     from zwidth.scenes.scene import Scene
-
-_UNITS = {"mass": "kg", "damping": "N s/m", "stiffness": "N/m", "cutoff": "Hz", "time_constant": "s"}
 
 
 def scene_lines(scene: Scene) -> list[str]:
@@ -28,27 +28,27 @@ def scene_lines(scene: Scene) -> list[str]:
         ),
     ]
     velocity = type(scene.velocity).__name__
-    parts = {"velocity": scene.velocity, "coupling": device.coupling, "operator": scene.operator}
-    values = scene.parameters()
-    for name, part in parts.items():
-        own = {path.partition(".")[2]: value for path, value in values.items() if path.startswith(f"{name}.")}
-        if part is None or (name == "velocity" and velocity == "BackwardDifference" and not own):
+    parts, values = find_parts(scene), scene.parameters()
+    # From the motor outwards.
+    for name in (name for name in dict.fromkeys(("velocity", "coupling", *parts)) if name in parts):
+        own = {path: value for path, value in values.items() if path.startswith(f"{name}.")}
+        if name == "velocity" and velocity == "BackwardDifference" and not own:
             continue
-        words = [f"{key.replace('_', ' ')} {_amount(key, value)}" for key, value in own.items() if value]
+        keys = {path: path.partition(".")[2].replace("_", " ") for path in own}
+        words = [f"{keys[path]} {_amount(path, value)}" for path, value in own.items() if value]
         if name == "coupling":
-            words.append(f"sensor at the {part.sensor}")
+            words.append(f"sensor at the {parts[name].sensor}")
         lines.append(row(name, ", ".join([*([velocity] if name == "velocity" else []), *words])))
     return lines
 
 
 def unit_of(path: str) -> str:
     """The SI unit of a parameter by its path; nothing for whole numbers."""
-    key = path.rpartition(".")[2].removeprefix("coupling_").removeprefix("virtual_")
-    return _UNITS.get(key, "s" if key in ("period", "delay", "coded_period") else "")
+    return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
 
 
-def _amount(key: str, value: Any) -> str:
-    unit = unit_of(key)
+def _amount(path: str, value: Any) -> str:
+    unit = unit_of(path)
     if unit == "kg":
         return with_unit(value * 1e3, "g")
     return with_unit(value, unit) if unit else short(value)

@@ -1,7 +1,6 @@
 """Axes of a study: the values that one quantity takes.
 
 An axis is written as one number, a list, ``{linear: {start, stop, num}}`` or ``{log: {start, stop, num}}``.
-A new spelling is one more class here and one more entry in `_spellings`.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ from typing import Annotated, Any, TypeAlias
 import numpy as np
 from pydantic import (
     BeforeValidator,
-    ConfigDict,
     PlainSerializer,
     PlainValidator,
     ValidationError,
@@ -24,10 +22,10 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
-from zwidth.config.fields import Strict, repeated
+from zwidth.config.fields import Generated, repeated
 from zwidth.config.numbers import number, whole_number
 from zwidth.words.formatting import describe, short, suggestion
-from zwidth.words.quantities import ANY, MAX_DELAY_PERIODS, NOT_NEGATIVE, Range
+from zwidth.words.quantities import ANY, NOT_NEGATIVE, PARAMETERS, Range
 
 LONGEST_AXIS = 10_000_000
 """More values than any result could use, few enough to be laid out in memory."""
@@ -67,11 +65,8 @@ class Axis:
         return written if self.form == "list" else written[0]
 
 
-class _Spacing(Strict):
+class _Spacing(Generated):
     """Base of the mappings below ``linear`` and ``log``."""
-
-    # No source has docstrings of their fields; pydantic would look for it in every frame, for all modules each time.
-    model_config = ConfigDict(use_attribute_docstrings=False)
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
@@ -179,8 +174,13 @@ def axis_schema(entry: dict[str, Any], positive: dict[str, Any]) -> WithJsonSche
 
 
 SPELLED = PlainSerializer(lambda value: value.spelling(), return_type=Any)
-_DELAYS = Range(0.0, MAX_DELAY_PERIODS)
 
-AnyAxis = Annotated[Axis, PlainValidator(axis()), SPELLED, _schema(ANY)]
-DeltaAxis = Annotated[Axis, PlainValidator(axis(NOT_NEGATIVE)), SPELLED, _schema(NOT_NEGATIVE)]
-DelayAxis = Annotated[Axis, PlainValidator(axis(_DELAYS)), SPELLED, _schema(_DELAYS)]
+
+def number_axis(allowed: Range) -> tuple[Any, ...]:
+    """What makes an `Axis` one of plain numbers: its validator, its spelling and its schema."""
+    return PlainValidator(axis(allowed)), SPELLED, _schema(allowed)
+
+
+AnyAxis = Annotated[Axis, *number_axis(ANY)]
+DeltaAxis = Annotated[Axis, *number_axis(NOT_NEGATIVE)]
+DelayAxis = Annotated[Axis, *number_axis(PARAMETERS["d"].allowed)]

@@ -8,23 +8,16 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator
 
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Delay, Duration, Strict, unit_schema
+from zwidth.config.fields import Delay, Duration, Quantity, Strict
 from zwidth.config.numbers import whole_number
 from zwidth.config.parts import SimulatedVelocityField
-from zwidth.config.units import quantity
 from zwidth.parts.span import Span
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.simulate import Contact
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
-from zwidth.words.units import FORCE, FORCE_RATE, LENGTH, SPEED
 
-Position = Annotated[float, BeforeValidator(quantity(LENGTH)), unit_schema(LENGTH)]
-Velocity = Annotated[float, BeforeValidator(quantity(SPEED)), unit_schema(SPEED)]
-Push = Annotated[float, BeforeValidator(quantity(FORCE)), unit_schema(FORCE)]
-Length = Annotated[float, BeforeValidator(quantity(LENGTH, NOT_NEGATIVE)), unit_schema(LENGTH)]
-Friction = Annotated[float, BeforeValidator(quantity(FORCE, NOT_NEGATIVE)), unit_schema(FORCE)]
-LargestForce = Annotated[float, BeforeValidator(quantity(FORCE, POSITIVE)), unit_schema(FORCE)]
-LargestRate = Annotated[float, BeforeValidator(quantity(FORCE_RATE, POSITIVE)), unit_schema(FORCE_RATE)]
+Length = Annotated[float, Quantity("m", NOT_NEGATIVE)]
+Friction = Annotated[float, Quantity("N", NOT_NEGATIVE)]
 Seed = Annotated[int, BeforeValidator(whole_number(NOT_NEGATIVE))]
 
 LONGEST = 1_000_000
@@ -40,13 +33,13 @@ class Circumstances(Strict):
     velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; as the device has it where left out."""
 
-    start_position: Position = 0.0
+    start_position: Annotated[float, Quantity("m")] = 0.0
     """Where the motion starts, in m or with a unit; the wall's surface is at 0 and positive is into the wall."""
 
-    start_velocity: Velocity = 0.0
+    start_velocity: Annotated[float, Quantity("m/s")] = 0.0
     """Its velocity there, in m/s or with a unit."""
 
-    push: Push = 0.0
+    push: Annotated[float, Quantity("N")] = 0.0
     """Constant force of the hand on the device, in N or with a unit."""
 
     contact: Contact = "bilateral"
@@ -64,10 +57,10 @@ class Circumstances(Strict):
     static: Friction | None = None
     """Dry friction that holds the device, at least coulomb, which it is where left out."""
 
-    max_force: LargestForce | None = None
+    max_force: Annotated[float, Quantity("N", POSITIVE)] | None = None
     """The most that the motor gives, in N or with a unit; no limit where left out."""
 
-    max_rate: LargestRate | None = None
+    max_rate: Annotated[float, Quantity("N/s", POSITIVE)] | None = None
     """The fastest that the command changes, in N/s or with a unit; no limit where left out."""
 
     jitter: Delay = Span(0.0, "s")

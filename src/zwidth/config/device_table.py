@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -19,6 +17,8 @@ from zwidth.config.axes import SPELLED, Entry, read_entries
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.parameters import make_delay_readers
 from zwidth.config.units import make_entry_reader
+from zwidth.sweep.files.cells import read_rows, split_title
+from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.units import looks_like_number
@@ -27,7 +27,6 @@ LABEL = "label"
 MAX_ROWS = 100_000
 MAX_CSV_BYTES = 2**25
 
-_HEADER = re.compile(r"\s*([^\[(]*?)\s*(?:[\[(]\s*(.*?)\s*[\])])?\s*")
 _FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
 
 # Names of files in a configuration are relative to its folder, which no value of it knows.
@@ -157,20 +156,12 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
 
 
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
-    """The lines of a CSV file that hold something, with their numbers; the first one is the header."""
-    path = find_file(name)
+    """The header of a CSV file, and its rows; further lines that begin with # are remarks as well."""
     try:
-        if not path.is_file():
-            raise problem(f"no such file: {printable(str(path))}", "names are relative to this file", "check the path")
-        if path.stat().st_size > MAX_CSV_BYTES:
-            raise problem(f"{printable(name)} is too large", f"at most {MAX_CSV_BYTES} bytes", "split the table")
-        text = path.read_text(encoding="utf-8-sig")
-        lines = csv.reader(text.splitlines(), strict=True, skipinitialspace=True)
-        rows = [(lines.line_num, cells) for cells in lines if any(cells) and not cells[0].lstrip().startswith("#")]
-    except (OSError, ValueError, csv.Error) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        remedy = "check the path, and save it as UTF-8 with commas"
-        raise problem(f"{printable(name)} cannot be read ({printable(reason)})", "", remedy) from None
+        rows = [row for row in read_rows(find_file(name), MAX_CSV_BYTES)[0] if not row[1][0].startswith("#")]
+    except InputError as error:
+        what, _, remedy = str(error).partition("; ")
+        raise problem(printable(what), "names are relative to this file", remedy) from None
     if len(rows) < 2:
         raise problem(f"{printable(name)} has {len(rows)} rows", "a header and one row at least", "fill the file")
     return rows
@@ -183,7 +174,7 @@ def _choose_columns(header: list[str], mapping: Any, name: str) -> dict[str, tup
     chosen: dict[str, tuple[int, str]] = {}
     known = (LABEL, *PARAMETERS)
     for index, title in enumerate(header):
-        key, unit = _split_header(title)
+        key, unit = split_title(title)
         if key in chosen:
             raise problem(f"{printable(name)}: the column {describe(key)} comes twice", "each once", "remove one")
         if key in known:
@@ -200,22 +191,15 @@ def _map_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[
     known = (LABEL, *PARAMETERS)
     if not isinstance(mapping, dict) or not mapping:
         raise problem(f"got columns: {describe(mapping)}", f"a mapping from {listing(known)} to headers", "write one")
-    titles = [title.strip() for title in header]
     chosen = {}
     for key, title in mapping.items():
         if key not in known:
             raise problem(f"columns: got {describe(key)}", f"the keys are {listing(known)}", suggestion(key, known, ""))
-        if not isinstance(title, str) or title.strip() not in titles:
-            allowed = f"the headers of {printable(name)} are {listing(titles[:20])}"
-            raise problem(f"columns: got {describe(title)}", allowed, suggestion(title, titles, "write one of these"))
-        chosen[key] = titles.index(title.strip()), _split_header(title)[1]
+        if not isinstance(title, str) or title.strip() not in header:
+            allowed = f"the headers of {printable(name)} are {listing(header[:20])}"
+            raise problem(f"columns: got {describe(title)}", allowed, suggestion(title, header, "write one of these"))
+        chosen[key] = header.index(title.strip()), split_title(title)[1]
     return chosen
-
-
-def _split_header(title: str) -> tuple[str, str]:
-    """The name of a column and its unit, which stands in brackets."""
-    match = _HEADER.fullmatch(title)
-    return (match.group(1), match.group(2) or "") if match else (title, "")
 
 
 def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
@@ -225,10 +209,10 @@ def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, 
     for key, (index, unit) in chosen.items():
         cells = []
         for line, row in rows[1:]:
-            if index >= len(row) or not row[index].strip():
+            if index >= len(row) or not row[index]:
                 allowed = "every device has a value for every parameter"
                 raise problem(f"{printable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
-            cells.append((f"{printable(name)}, line {line}: {key}", row[index].strip()))
+            cells.append((f"{printable(name)}, line {line}: {key}", row[index]))
         if key == LABEL:
             columns[key] = tuple(from_cell(cell) for _, cell in cells)
             continue

@@ -148,7 +148,7 @@ def locate(
 ) -> list[Fault]:
     """Give problems their places, from the places of the file's values and keys.
 
-    A field that is missing stands nowhere: it gets the place of the mapping that lacks it.
+    A field that is missing stands nowhere: it gets the place of the mapping that lacks it. Without a file none has one.
     """
     faults = []
     for path, what in problems:
@@ -156,7 +156,7 @@ def locate(
         place = keys.get(path) if context["on_key"] else None
         above = path
         while place is None:
-            place = values.get(above) or (None if above else (1, 1))
+            place = values.get(above) or (None if above else (None, None))
             above = above[:-1]
         line, column = place
         parts = (context["what"], context["allowed"], context["remedy"])

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar
 
 from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
     PlainSerializer,
     PlainValidator,
     ValidationError,
@@ -17,14 +20,16 @@ from pydantic import (
     model_validator,
 )
 from pydantic import ModelWrapValidatorHandler as Handler
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import no_info_before_validator_function
 
 from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, validation_error
 from zwidth.config.numbers import number
 from zwidth.config.units import quantity, span
 from zwidth.parts.span import Span
 from zwidth.words.formatting import describe, resembling, suggestion
-from zwidth.words.quantities import FRACTION, NOT_NEGATIVE, POSITIVE
-from zwidth.words.units import DAMPING, MASS, PERIOD_WORDS, STIFFNESS, TIME, Dimension
+from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Parameter, Range
+from zwidth.words.units import PERIOD_WORDS, find_dimension
 
 
 class Strict(BaseModel):
@@ -106,6 +111,12 @@ class Strict(BaseModel):
             yield path, problem("missing", *cls.missing(str(path[0]))) if detail["type"] == "missing" else what
 
 
+class Generated(Strict):
+    """Base of models whose fields no source has: pydantic would look for their docstrings in every frame."""
+
+    model_config = ConfigDict(use_attribute_docstrings=False)
+
+
 def _name(value: Any) -> str:
     allowed = "a name is 1 to 64 of the characters a-z, 0-9, '_' and '-', since it names a folder"
     if not isinstance(value, str):
@@ -162,26 +173,41 @@ Fraction = Annotated[
 ]
 
 
-def unit_schema(dimension: Dimension, *more: str) -> WithJsonSchema:
-    units = ", ".join((*dimension.units, *more))
-    text = f"A number in {dimension.base}, or a number with one of the units {units}."
+def describe_entry(unit: str, *more: str) -> dict[str, Any]:
+    """The JSON Schema of a number in an SI unit, or with one of the units beside it."""
+    dimension = find_dimension(unit)
     pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
-    return WithJsonSchema(
-        {
-            "description": text,
-            "examples": [dimension.example],
-            "anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}],
-        }
-    )
+    return {
+        "description": f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}.",
+        "examples": [dimension.example],
+        "anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}],
+    }
 
 
-Mass = Annotated[float, BeforeValidator(quantity(MASS, POSITIVE)), unit_schema(MASS)]
-Damping = Annotated[float, BeforeValidator(quantity(DAMPING, NOT_NEGATIVE)), unit_schema(DAMPING)]
-VirtualDamping = Annotated[float, BeforeValidator(quantity(DAMPING)), unit_schema(DAMPING)]
-Stiffness = Annotated[float, BeforeValidator(quantity(STIFFNESS)), unit_schema(STIFFNESS)]
-Delay = Annotated[
-    Span, PlainValidator(span(NOT_NEGATIVE)), PlainSerializer(str, return_type=str), unit_schema(TIME, *PERIOD_WORDS)
-]
-Duration = Annotated[
-    Span, PlainValidator(span(POSITIVE)), PlainSerializer(str, return_type=str), unit_schema(TIME, *PERIOD_WORDS)
-]
+@dataclass(frozen=True)
+class Quantity:
+    """Makes a float a quantity: read in its SI unit or with a unit, checked, and described in the schema."""
+
+    unit: str
+    allowed: Range = ANY
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return no_info_before_validator_function(quantity(find_dimension(self.unit), self.allowed), handler(source))
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        return describe_entry(self.unit)
+
+
+def quantity_of(name: str) -> Quantity:
+    """The unit and range of a parameter."""
+    return Quantity(PARAMETERS[name].unit, PARAMETERS[name].allowed)
+
+
+def describe_parameter(parameter: Parameter) -> str:
+    """What a schema says of a parameter."""
+    return parameter.sentence + ("" if parameter.unit == "1" else f", in {parameter.unit} or with a unit")
+
+
+_SPAN = PlainSerializer(str, return_type=str), WithJsonSchema(describe_entry("s", *PERIOD_WORDS))
+Delay = Annotated[Span, PlainValidator(span(NOT_NEGATIVE)), *_SPAN]
+Duration = Annotated[Span, PlainValidator(span(POSITIVE)), *_SPAN]

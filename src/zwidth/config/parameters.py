@@ -1,20 +1,20 @@
-"""The parameters of `words.quantities` as values and axes of a configuration."""
+"""The parameters of `words.quantities` as axes of a configuration."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Any
 
-from pydantic import PlainValidator, WithJsonSchema
+from pydantic import PlainValidator
 
-from zwidth.config.axes import SPELLED, Axis, Entry, axis_schema, make_axis_reader
+from zwidth.config.axes import SPELLED, Axis, Entry, axis_schema, make_axis_reader, number_axis
 from zwidth.config.faults import problem
-from zwidth.config.fields import unit_schema
+from zwidth.config.fields import describe_entry
 from zwidth.config.units import make_entry_reader, quantity, span
 from zwidth.words.formatting import describe, short
-from zwidth.words.quantities import NOT_NEGATIVE, OF_PARTS, PARAMETERS, POSITIVE, Range
-from zwidth.words.units import DAMPING, MASS, RATE, STIFFNESS, TIME, Dimension, find_dimension
+from zwidth.words.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
+from zwidth.words.units import PERIOD_WORDS, find_dimension
 
 
 def make_delay_readers() -> tuple[Entry, Entry, Callable[[], bool]]:
@@ -42,17 +42,6 @@ def _delays(raw: Any) -> Axis:
     return raw if isinstance(raw, Axis) else replace(make_axis_reader(entry, positive)(raw), in_periods=in_periods())
 
 
-def _reader(name: str) -> Callable[[Any], Axis]:
-    """A validator for an axis of a parameter in SI units."""
-    parameter, allowed = PARAMETERS[name], PARAMETERS[name].allowed
-    if parameter.whole:
-        entry = _accept_whole_floats(make_entry_reader(name))
-        return _whole_axis(make_axis_reader(entry, entry))
-    low = max(allowed.low, 0.0)
-    positive = Range(low, allowed.high, low_open=low == 0.0)
-    return make_axis_reader(make_entry_reader(name), quantity(find_dimension(parameter.unit), positive))
-
-
 def _accept_whole_floats(entry: Entry) -> Entry:
     """A validator that takes 5.0 for 5, as a store spells the ends of equal steps."""
     return lambda raw: entry(int(raw) if isinstance(raw, float) and raw.is_integer() else raw)
@@ -72,32 +61,22 @@ def _whole_axis(read: Callable[[Any], Axis]) -> Callable[[Any], Axis]:
     return validate
 
 
-def _schema(dimension: Dimension, *more: str) -> WithJsonSchema:
-    entry = unit_schema(dimension, *more).json_schema
-    assert entry is not None, "a schema for validation is given"
-    return axis_schema(entry, entry)
+def quantity_axis(unit: str, allowed: Range) -> tuple[Any, ...]:
+    """What makes an `Axis` one of a quantity: its validator, its spelling and its schema."""
+    low = max(allowed.low, 0.0)
+    positive = Range(low, allowed.high, low_open=low == 0.0)
+    read = [quantity(find_dimension(unit), ends) for ends in (allowed, positive)]
+    return PlainValidator(make_axis_reader(*read)), SPELLED, axis_schema(*2 * (describe_entry(unit),))
 
 
-PeriodAxis = Annotated[Axis, PlainValidator(_reader("period")), SPELLED, _schema(TIME)]
-RateAxis = Annotated[Axis, PlainValidator(_reader("rate")), SPELLED, _schema(RATE)]
-MassAxis = Annotated[Axis, PlainValidator(_reader("mass")), SPELLED, _schema(MASS)]
-DampingAxis = Annotated[Axis, PlainValidator(_reader("damping")), SPELLED, _schema(DAMPING)]
-StiffnessAxis = Annotated[Axis, PlainValidator(_reader("stiffness")), SPELLED, _schema(STIFFNESS)]
-VirtualDampingAxis = Annotated[Axis, PlainValidator(_reader("virtual_damping")), SPELLED, _schema(DAMPING)]
-TimeAxis = Annotated[Axis, PlainValidator(_delays), SPELLED, _schema(TIME, "periods", "period")]
-
-
-def _schema_of(name: str) -> WithJsonSchema:
-    parameter = PARAMETERS[name]
+def parameter_axis(name: str) -> tuple[Any, ...]:
+    """The same of a parameter."""
+    parameter, allowed = PARAMETERS[name], PARAMETERS[name].allowed
+    if name == "delay":
+        entry = describe_entry(parameter.unit, *PERIOD_WORDS)
+        return PlainValidator(_delays), SPELLED, axis_schema(entry, entry)
     if not parameter.whole:
-        return _schema(find_dimension(parameter.unit))
-    entry = {"type": "integer", "minimum": int(parameter.allowed.low), "maximum": int(parameter.allowed.high)}
-    return axis_schema(entry, entry)
-
-
-CutoffAxis = Annotated[Axis, PlainValidator(_reader("velocity.cutoff")), SPELLED, _schema_of("velocity.cutoff")]
-WindowAxis = Annotated[Axis, PlainValidator(_reader("velocity.samples")), SPELLED, _schema_of("velocity.samples")]
-# Of the parameters of parts, by path.
-PART_AXES: dict[str, Any] = {
-    name: Annotated[Axis, PlainValidator(_reader(name)), SPELLED, _schema_of(name)] for name in OF_PARTS
-}
+        return number_axis(allowed) if parameter.unit == "1" else quantity_axis(parameter.unit, allowed)
+    entry = {"type": "integer", "minimum": int(allowed.low), "maximum": int(allowed.high)}
+    reader = _accept_whole_floats(make_entry_reader(name))
+    return PlainValidator(_whole_axis(make_axis_reader(reader, reader))), SPELLED, axis_schema(entry, entry)

@@ -6,32 +6,33 @@ Each section below has the keys of the part of that name in `zwidth.parts`, and 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from dataclasses import MISSING, dataclass, fields
+from math import isfinite
+from typing import Annotated, Any, ClassVar, Literal, Union
 
-from pydantic import BeforeValidator, Field, PlainSerializer, WithJsonSchema, WrapValidator
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetCoreSchemaHandler,
+    PlainSerializer,
+    WithJsonSchema,
+    create_model,
+)
+from pydantic_core import CoreSchema
+from pydantic_core.core_schema import no_info_wrap_validator_function
 
 from zwidth.config.axes import read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Damping, Mass, Strict, unit_schema
+from zwidth.config.fields import Generated, Quantity, describe_parameter
 from zwidth.config.numbers import number, whole_number
-from zwidth.config.units import quantity
-from zwidth.parts.coupling import Coupling
-from zwidth.parts.operator import Operator
-from zwidth.parts.velocity import (
-    FOAW,
-    BackwardDifference,
-    Butterworth,
-    LowPass,
-    Velocity,
-    VelocityFilter,
-    WindowedDifference,
-)
+from zwidth.parts.checks import find_range
+from zwidth.parts.paths import PARTS
+from zwidth.parts.velocity import ESTIMATES, FOAW
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, suggestion
-from zwidth.words.quantities import NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
-from zwidth.words.units import LENGTH, MASS, RATE, STIFFNESS, TIME
+from zwidth.words.quantities import CHOICES, FIELDS
 
-PARTS = ("velocity", "operator", "coupling")
+PART_NAMES = ("velocity", *PARTS)
 
 NO_LINEAR_FORM = "FOAW chooses its window by the motion and has no linear form"
 SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such as 'windowed_difference'"
@@ -45,7 +46,7 @@ def locate_refusal(error: InputError) -> LocatedProblem:
     return tuple(field.split(".")), problem(what, allowed, remedy)
 
 
-class PartSection(Strict):
+class PartSection(Generated):
     """Base of the sections: what the keys give is checked by the part itself."""
 
     part: ClassVar[Any]
@@ -63,15 +64,6 @@ class PartSection(Strict):
             yield path[1:], what
 
 
-Frequency = Annotated[float, BeforeValidator(quantity(RATE, POSITIVE)), unit_schema(RATE)]
-Time = Annotated[float, BeforeValidator(quantity(TIME, POSITIVE)), unit_schema(TIME)]
-Samples = Annotated[int, BeforeValidator(whole_number(PARAMETERS["velocity.samples"].allowed))]
-Order = Annotated[int, BeforeValidator(whole_number(PARAMETERS["velocity.order"].allowed))]
-Spring = Annotated[float, BeforeValidator(quantity(STIFFNESS, POSITIVE)), unit_schema(STIFFNESS)]
-GroundSpring = Annotated[float, BeforeValidator(quantity(STIFFNESS, NOT_NEGATIVE)), unit_schema(STIFFNESS)]
-HandMass = Annotated[float, BeforeValidator(quantity(MASS, NOT_NEGATIVE)), unit_schema(MASS)]
-
-
 def _read_coefficients(raw: Any) -> tuple[float, ...]:
     if not isinstance(raw, list | tuple):
         raise problem(f"got {describe(raw)}", "coefficients are a list, highest power first", "write [1000, -1000]")
@@ -86,115 +78,50 @@ Coefficients = Annotated[
 ]
 
 
-class _CodedSection(PartSection):
-    """What all estimates but a free filter have."""
-
-    coded_period: Time | None = None
-    """The period that the formula was written for, in s or with a unit; the loop's where left out."""
-
-
-class BackwardDifferenceSection(_CodedSection):
-    """The difference of two samples over the period, the default."""
-
-    what: ClassVar[str] = "a velocity estimate of kind backward_difference"
-    part: ClassVar[Any] = BackwardDifference
-
-    kind: Literal["backward_difference"]
+def make_section(part: Any, owner: str, what: str, kind: str = "") -> type[PartSection]:
+    """The section of a part: a key a field, as `words.quantities` declares it under the name of its ``owner``."""
+    keys: Any = {"kind": (Literal[kind], ...)} if kind else {}  # pyright: ignore[reportInvalidTypeForm]
+    for item in fields(part):
+        form, words = _describe(f"{owner}.{item.name}", item)
+        default: Any = ... if item.default is MISSING else item.default
+        keys[item.name] = (form | None if default is None else form, Field(default, description=words))
+    section = create_model(f"{part.__name__}Section", __base__=PartSection, __doc__=_head(part), **keys)
+    section.what, section.part = what, part
+    return section
 
 
-class WindowedDifferenceSection(_CodedSection):
-    """The mean velocity of the last n periods."""
-
-    what: ClassVar[str] = "a velocity estimate of kind windowed_difference"
-    part: ClassVar[Any] = WindowedDifference
-
-    kind: Literal["windowed_difference"]
-
-    samples: Samples
-    """Length n of the window in periods, 1 to 1000."""
+def _head(part: Any) -> str:
+    """What a part says of itself, in one line."""
+    return part.__doc__.partition("\n")[0]
 
 
-class LowPassSection(_CodedSection):
-    """The difference behind one or two equal first-order low-passes."""
-
-    what: ClassVar[str] = "a velocity estimate of kind low_pass"
-    part: ClassVar[Any] = LowPass
-
-    kind: Literal["low_pass"]
-
-    cutoff: Frequency | None = None
-    """Cut-off in Hz or with a unit, below half the sampling rate; give it or time_constant."""
-
-    time_constant: Time | None = None
-    """Time constant in s or with a unit; give it or cutoff."""
-
-    order: Order = 1
-    """Number of low-passes, 1 or 2."""
+def _describe(path: str, item: Any) -> tuple[Any, str]:
+    """How a key is read, and what the schema says of it."""
+    if path in CHOICES:
+        return Literal[CHOICES[path].names], f"{CHOICES[path].sentence}."
+    if path not in FIELDS:
+        return Coefficients, f"Coefficients of the {path.rpartition('.')[2]}, highest power of z first."
+    known, allowed = FIELDS[path], find_range(item, path)
+    low, high, low_open, _ = allowed
+    bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
+    words = f"{describe_parameter(known)}, {bounds}{'; ' if known.note else ''}{known.note}."
+    if known.whole:
+        return Annotated[int, BeforeValidator(whole_number(allowed))], words
+    return Annotated[float, Quantity(known.unit, allowed)], words
 
 
-class ButterworthSection(_CodedSection):
-    """The difference behind a Butterworth low-pass."""
-
-    what: ClassVar[str] = "a velocity estimate of kind butterworth"
-    part: ClassVar[Any] = Butterworth
-
-    kind: Literal["butterworth"]
-
-    cutoff: Frequency
-    """Cut-off in Hz or with a unit, below half the sampling rate."""
-
-    order: Order = 2
-    """Order, 1 to 8."""
-
-
-class FilterSection(PartSection):
-    """Any linear estimate, from position in m to velocity in m/s."""
-
-    what: ClassVar[str] = "a velocity estimate of kind filter"
-    part: ClassVar[Any] = VelocityFilter
-
-    kind: Literal["filter"]
-
-    numerator: Coefficients
-    """Coefficients of the numerator in 1/s, highest power of z first."""
-
-    denominator: Coefficients
-    """Coefficients of the denominator, highest power of z first; its roots lie inside the unit circle."""
-
-
-class FOAWSection(PartSection):
-    """First-order adaptive windowing, for simulations."""
-
-    what: ClassVar[str] = "a velocity estimate of kind foaw"
-    part: ClassVar[Any] = FOAW
-
-    kind: Literal["foaw"]
-
-    noise: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)]
-    """The largest error of a measured position in m or with a unit, > 0: one count of an encoder."""
-
-    samples: Annotated[int, BeforeValidator(whole_number(Range(1, 64)))] = 15
-    """The longest window in periods, 1 to 64."""
-
-
-LinearVelocity: TypeAlias = (
-    BackwardDifferenceSection | WindowedDifferenceSection | LowPassSection | ButterworthSection | FilterSection
-)
-_LINEAR: dict[str, type[PartSection]] = {
-    "backward_difference": BackwardDifferenceSection,
-    "windowed_difference": WindowedDifferenceSection,
-    "low_pass": LowPassSection,
-    "butterworth": ButterworthSection,
-    "filter": FilterSection,
+_ESTIMATES = {
+    kind: make_section(part, "velocity", f"a velocity estimate of kind {kind}", kind)
+    for kind, part in ESTIMATES.items()
 }
-_ESTIMATES = {**_LINEAR, "foaw": FOAWSection}
+_LINEAR = {kind: section for kind, section in _ESTIMATES.items() if section.part is not FOAW}
 
 
 def read_velocity(raw: Any, known: dict[str, type[PartSection]] = _LINEAR) -> Any:
     """A velocity estimate, read as what its kind names."""
     if isinstance(raw, tuple(known.values())):
         return raw
-    if isinstance(raw, FOAWSection):
+    if isinstance(raw, _ESTIMATES["foaw"]):
         raise problem("got a velocity estimate of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
     kinds = f"a velocity estimate is a mapping with one of the kinds {listing(known)}"
     if not isinstance(raw, dict):
@@ -210,62 +137,43 @@ def read_velocity(raw: Any, known: dict[str, type[PartSection]] = _LINEAR) -> An
     return known[kind].model_validate(raw)
 
 
-VelocityField = Annotated[
-    Annotated[LinearVelocity, Field(discriminator="kind")], WrapValidator(lambda raw, _: read_velocity(raw))
-]
-SimulatedVelocityField = Annotated[
-    Annotated[LinearVelocity | FOAWSection, Field(discriminator="kind")],
-    WrapValidator(lambda raw, _: read_velocity(raw, _ESTIMATES)),
-]
+@dataclass(frozen=True)
+class _AnyEstimate:
+    """Makes a section one of a velocity estimate, of any kind that the linear loop knows or of all kinds."""
+
+    linear: bool
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        known = _LINEAR if self.linear else _ESTIMATES
+        every = Annotated[Union[tuple(known.values())], Field(discriminator="kind")]  # noqa: UP007
+        read = no_info_wrap_validator_function
+        return read(lambda raw, _: read_velocity(raw, known), handler.generate_schema(every))
 
 
-class OperatorSection(PartSection):
-    """The hand that holds the device."""
-
-    what: ClassVar[str] = "an operator"
-    part: ClassVar[Any] = Operator
-
-    mass: HandMass = 0.0
-    """Mass of the hand in kg or with a unit, >= 0; > 0 behind a spring."""
-
-    damping: Damping = 0.0
-    """Damping of the hand to ground in N s/m or with a unit, >= 0."""
-
-    stiffness: GroundSpring = 0.0
-    """Stiffness of the hand to ground in N/m or with a unit, >= 0."""
-
-    coupling_stiffness: Spring | None = None
-    """Spring between hand and device in N/m or with a unit, > 0; a rigid grasp where left out."""
-
-    coupling_damping: Damping = 0.0
-    """Damper beside that spring in N s/m or with a unit, >= 0."""
+VelocityField = Annotated[PartSection, _AnyEstimate(linear=True)]
+SimulatedVelocityField = Annotated[PartSection, _AnyEstimate(linear=False)]
+_SECTIONS: Any = {
+    name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
+}
 
 
-class CouplingSection(PartSection):
-    """The mass beyond a spring and damper of the device itself."""
-
-    what: ClassVar[str] = "a coupling"
-    part: ClassVar[Any] = Coupling
-
-    mass: Mass
-    """Mass on the tip's side in kg or with a unit, > 0."""
-
-    stiffness: Spring
-    """Spring between motor and tip in N/m or with a unit, > 0."""
-
-    damping: Damping = 0.0
-    """Damper between motor and tip in N s/m or with a unit, >= 0."""
-
-    sensor: Literal["motor", "tip"] = "motor"
-    """Where the position is measured."""
+def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Generated]:
+    """A base of what has a section for each of the parts that a scene need not have."""
+    known: dict[str, Any] = {"velocity": ("How the velocity is estimated", VelocityField, no_estimate)}
+    known |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
+    keys: Any = {
+        name: (form | None, Field(default=None, description=f"{words}; {absent} where left out.{more}"))
+        for name, (words, form, absent) in known.items()
+    }
+    return create_model("Parts", __base__=Generated, **keys)
 
 
-def list_parts(owner: Any) -> dict[str, Any]:
+def list_parts(owner: Any) -> dict[str, PartSection]:
     """The parts that a device, a scene or a study has, by name."""
-    found = {name: getattr(owner, name, None) for name in PARTS}
-    return {name: part for name, part in found.items() if part is not None}
+    found = {name: getattr(owner, name, None) for name in PART_NAMES}
+    return {name: section for name, section in found.items() if section is not None}
 
 
-def build_velocity(section: PartSection | None) -> Velocity:
-    """The velocity estimate of a section, the backward difference where there is none."""
-    return section.to_part() if section is not None else BackwardDifference()
+def build_parts(owner: Any) -> dict[str, Any]:
+    """The same as parts of a scene."""
+    return {name: section.to_part() for name, section in list_parts(owner).items()}

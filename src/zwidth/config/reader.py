@@ -80,9 +80,7 @@ def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
     except ValidationError as error:
         problems += problems_of(error)
     if found is None or problems:
-        texts = [(path, what.context or {}) for path, what in problems]
-        parts = [(dotted(path), *(text[key] for key in ("what", "allowed", "remedy"))) for path, text in texts]
-        raise ConfigFileError.of(Fault("", None, None, *part) for part in parts)
+        raise ConfigFileError.of(locate("", problems, {}, {}))
     return found
 
 
@@ -146,16 +144,15 @@ def _read_text(file: str) -> str:
             raise _fail(file, None, "got no regular file", "a configuration is one file", "save it to a file first")
         with open(file, "rb") as stream:
             data = stream.read(MAX_FILE_BYTES + 1)
-    except FileNotFoundError as error:
-        raise _fail(file, None, "no such file", "", "check the path") from error
-    except PermissionError as error:
-        raise _fail(file, None, "permission denied", "", "make the file readable") from error
     except ConfigFileError:
         raise
+    except PermissionError as error:
+        raise _fail(file, None, "permission denied", "", "make the file readable") from error
     except (OSError, ValueError) as error:
         # ValueError: a path with a null character.
-        reason = getattr(error, "strerror", None) or str(error)
-        raise _fail(file, None, f"cannot be read ({reason})", "", "check the path") from error
+        reason = f"cannot be read ({getattr(error, 'strerror', None) or error})"
+        missing = isinstance(error, FileNotFoundError)
+        raise _fail(file, None, "no such file" if missing else reason, "", "check the path") from error
     if len(data) > MAX_FILE_BYTES:
         allowed = f"at most {MAX_FILE_BYTES} bytes"
         raise _fail(file, None, "the file is too large", allowed, "write long axes as linear or log")

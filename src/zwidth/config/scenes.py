@@ -7,47 +7,34 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WrapValidator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import (
-    Damping,
-    Delay,
-    Mass,
-    NonNegative,
-    Number,
-    Stiffness,
-    Strict,
-    VirtualDamping,
-    unit_schema,
-)
+from zwidth.config.fields import Delay, NonNegative, Number, Strict, describe_entry, quantity_of
 from zwidth.config.numbers import number
 from zwidth.config.parts import (
-    PARTS,
-    CouplingSection,
-    FOAWSection,
-    OperatorSection,
+    PART_NAMES,
     SimulatedVelocityField,
-    VelocityField,
-    build_velocity,
+    build_parts,
     list_parts,
     locate_refusal,
+    make_parts_base,
 )
-from zwidth.config.units import quantity
+from zwidth.config.units import make_entry_reader
 from zwidth.loops.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.loops.normalization import normalize
 from zwidth.parts.device import Device
 from zwidth.parts.span import Span
 from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import FOAW
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
-from zwidth.words.quantities import MAX_DELAY_PERIODS, PERIODS, RATES, Range
+from zwidth.words.quantities import MAX_DELAY_PERIODS, PARAMETERS
 from zwidth.words.types import DelayModel
-from zwidth.words.units import RATE, TIME
 
-_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PARTS})
+_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES})
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
 
 
@@ -60,7 +47,7 @@ class _OneKind(Strict):
     def unknown(cls, name: str) -> tuple[str, str, str]:
         if name not in cls.foreign:
             return super().unknown(name)
-        if name in PARTS:
+        if name in PART_NAMES:
             allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
             return (
                 f"got {name!r} after normalized keys",
@@ -78,7 +65,7 @@ class _OneKind(Strict):
 def _period(value: Any, info: ValidationInfo) -> float:
     """The period itself, or one over the rate."""
     if value is not None:
-        return quantity(TIME, PERIODS)(value)
+        return make_entry_reader("period")(value)
     # A rate that failed its own check is absent from the data; that fault is enough.
     rate = info.data.get("rate", 1.0)
     if rate is None:
@@ -86,7 +73,7 @@ def _period(value: Any, info: ValidationInfo) -> float:
     return 1.0 / rate
 
 
-class _PhysicalPlant(_OneKind):
+class _Mass(_OneKind):
     """A mass with damping, sampled, in SI units."""
 
     foreign: ClassVar[frozenset[str]] = _NORMALIZED
@@ -97,31 +84,22 @@ class _PhysicalPlant(_OneKind):
             return super().missing(name)
         return f"{cls.what} has mass and period or rate, or, normalized, delta", "add 'mass: 0.1 kg'"
 
-    mass: Mass
+    mass: Annotated[float, quantity_of("mass")]
     """Moving mass m of the device in kg, > 0."""
 
-    damping: Damping = 0.0
+    damping: Annotated[float, quantity_of("damping")] = 0.0
     """Physical damping b of the device in N s/m, >= 0."""
 
-    rate: Annotated[float, BeforeValidator(quantity(RATE, RATES)), unit_schema(RATE)] | None = Field(
-        default=None, exclude=True
-    )
+    rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     """Sampling rate 1/T in Hz; give it or the period."""
 
-    period: Annotated[float, BeforeValidator(_period), unit_schema(TIME)] = Field(default=None, validate_default=True)
+    period: Annotated[float, BeforeValidator(_period), WithJsonSchema(describe_entry("s"))] = Field(
+        default=None, validate_default=True
+    )
     """Sampling period T in s; give it or the rate. Always set once the file is loaded."""
 
     delay: Delay = Span(0.0, "s")
     """Delay t_d from the sample to the moment its force acts, in s or in periods, >= 0."""
-
-    velocity: VelocityField | None = None
-    """How the velocity is estimated; the difference of two samples where left out."""
-
-    operator: OperatorSection | None = None
-    """The hand that holds the device; nobody's where left out."""
-
-    coupling: CouplingSection | None = None
-    """The mass beyond a spring and damper of the device; a rigid one where left out."""
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
@@ -129,6 +107,13 @@ class _PhysicalPlant(_OneKind):
             second = [key for key in raw if key in ("period", "rate")][1]
             allowed = "the sampling period and its rate say the same"
             yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+
+
+_Parts: Any = make_parts_base("the difference of two samples", "none")
+
+
+class _PhysicalPlant(_Parts, _Mass):
+    """The same with the parts that it may have beside."""
 
     def limits(self) -> Iterable[LocatedProblem]:
         delay = self.delay.value / (self.period if self.delay.unit == "s" else 1.0)
@@ -139,7 +124,7 @@ class _PhysicalPlant(_OneKind):
         try:
             scene = self.to_scene()
             # Where it is not rigid: what the parts refuse only together, such as a cut-off beyond half the rate.
-            _ = scene.is_rigid or isinstance(self.velocity, FOAWSection) or scene.loop
+            _ = scene.is_rigid or is_adaptive(self) or scene.loop
         except InputError as error:
             yield locate_refusal(error)
             return
@@ -184,10 +169,7 @@ class _PhysicalPlant(_OneKind):
     def to_scene(self) -> Scene:
         """The device and its timing in SI units."""
         timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
-        coupling = None if self.coupling is None else self.coupling.to_part()
-        operator = None if self.operator is None else self.operator.to_part()
-        device = Device(mass=self.mass, damping=self.damping, coupling=coupling)
-        return Scene(device, timing, velocity=build_velocity(self.velocity), operator=operator)
+        return Scene(Device(mass=self.mass, damping=self.damping), timing).replace(**build_parts(self))
 
 
 class _NormalizedPlant(_OneKind):
@@ -198,7 +180,7 @@ class _NormalizedPlant(_OneKind):
     delta: NonNegative
     """Normalized damping b T/m of the device, >= 0."""
 
-    d: Annotated[float, BeforeValidator(number(Range(0.0, MAX_DELAY_PERIODS)))] = 0.0
+    d: Annotated[float, BeforeValidator(number(PARAMETERS["d"].allowed))] = 0.0
     """Delay in periods, whole or not, >= 0."""
 
 
@@ -214,7 +196,7 @@ class PhysicalDevice(_PhysicalPlant):
 class SimulatedDevice(PhysicalDevice):
     """A device in SI units whose velocity estimate need not be linear."""
 
-    velocity: SimulatedVelocityField | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; the difference of two samples where left out."""
 
 
@@ -244,13 +226,13 @@ class PhysicalScene(_PhysicalPlant):
 
     what: ClassVar[str] = "a scene"
 
-    stiffness: Stiffness | None = None
+    stiffness: Annotated[float, quantity_of("stiffness")] | None = None
     """Stiffness K of the wall in N/m."""
 
-    virtual_damping: VirtualDamping | None = None
+    virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
     """Damping B of the wall in N s/m."""
 
-    velocity: SimulatedVelocityField | None = None  # pyright: ignore[reportIncompatibleVariableOverride]
+    velocity: SimulatedVelocityField | None = None
     """How the velocity is estimated; the difference of two samples where left out."""
 
     delay_model: DelayModel = "held"
@@ -325,10 +307,10 @@ class PhysicalWall(_OneKind):
     what: ClassVar[str] = "a wall"
     foreign: ClassVar[frozenset[str]] = _NORMALIZED
 
-    stiffness: Stiffness
+    stiffness: Annotated[float, quantity_of("stiffness")]
     """Stiffness K in N/m."""
 
-    virtual_damping: VirtualDamping = 0.0
+    virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
     """Damping B in N s/m."""
 
 
@@ -345,9 +327,10 @@ class NormalizedWall(_OneKind):
     """Normalized damping B T/m."""
 
 
-def is_adaptive(owner: AnyScene | AnyDevice) -> bool:
+def is_adaptive(owner: Any) -> bool:
     """Whether the velocity estimate of a scene or a device has no linear form."""
-    return isinstance(getattr(owner, "velocity", None), FOAWSection)
+    velocity = getattr(owner, "velocity", None)
+    return velocity is not None and velocity.part is FOAW
 
 
 def is_with_parts(owner: AnyScene | AnyDevice) -> bool:

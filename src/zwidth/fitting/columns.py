@@ -1,14 +1,10 @@
 """Logs in CSV files: columns in any order, under any names, in any units, read into SI units.
 
-A file has a line of column names and a line a sample; lines before the names that begin with # are remarks, and so is
-the ``sep=;`` of spreadsheets. Columns are separated by tabs, else semicolons, else commas: the first of these that the
-line of names holds. Where commas do not separate, they may be decimal signs.
+A file has a line of column names and a line a sample, as `sweep.files.cells` reads it.
 """
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -18,6 +14,7 @@ import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.log import fit_log
+from zwidth.sweep.files.cells import read_rows, split_title
 from zwidth.words.errors import InputError, UnusableValueError
 from zwidth.words.formatting import describe, suggestion, with_unit
 from zwidth.words.quantities import POSITIVE
@@ -34,12 +31,9 @@ _NAMES = {
     "position": ("position", "pos", "x", "encoder", "angle", "phi", "theta", "q"),
     "force": ("force", "f", "torque", "tau"),
 }
-_SEPARATORS = ("\t", ";", ",")
 _MOST_BYTES = 2**28
 # Periods that differ by more are two.
 _OTHER = 0.1
-_REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
-_HEADER = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +106,7 @@ def read_log(
 
 def _compare_period(file: str | Path, lines: list[tuple[int, list[str]]], period: float) -> None:
     """Raise `InputError` where a column of times, in a unit that it says, is of another period than the one given."""
-    heads = [split_header(head) for head in lines[0][1]]
+    heads = [split_title(head) for head in lines[0][1]]
     found = [(at, unit) for at, (name, unit) in enumerate(heads) if name.lower() in _NAMES["time"] and unit]
     if len(found) != 1:
         return
@@ -131,64 +125,33 @@ def _compare_period(file: str | Path, lines: list[tuple[int, list[str]]], period
 
 
 def _read_lines(file: Path) -> list[tuple[int, list[str]]]:
-    """The line of names and those of samples, each with its number, cells without blanks around them."""
-    try:
-        # A pipe would be waited for.
-        if not file.is_file():
-            raise InputError(f"{file}: {'it is no file' if file.exists() else 'no such file'}; check the path")
-        if file.stat().st_size > _MOST_BYTES:
-            raise InputError(f"{file}: it has more than {_MOST_BYTES >> 20} MiB; fit a part of it")
-        text = file.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: it is no text in UTF-8; save it as CSV in UTF-8") from None
-    except OSError as error:
-        raise InputError(f"{file}: {error.strerror or error}; check the path") from None
-    lines = text.splitlines()
-    first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), None)
-    if first is None:
+    """The row of names and those of samples."""
+    rows, separator = read_rows(file, _MOST_BYTES)
+    if not rows:
         raise InputError(f"{file}: it is empty; a line of column names and a line a sample are needed")
-    head = lines[first]
-    separator = next((mark for mark in _SEPARATORS if mark in head), None)
-    if separator is None:
-        raise InputError(f"{file}:{first + 1}: got {head[:60]!r}; separate the columns by commas, semicolons or tabs")
-    reader = csv.reader(lines[first:], delimiter=separator, skipinitialspace=True)
-    try:
-        rows = [(first + reader.line_num, [cell.strip() for cell in row]) for row in reader]
-    except csv.Error as error:
-        raise InputError(f"{file}:{first + reader.line_num}: {error}; check the quotes") from None
-    rows = [(number, row) for number, row in rows if any(row)]
-    heads = rows[0][1]
+    line, heads = rows[0]
+    if len(heads) == 1:
+        raise InputError(f"{file}:{line}: got {heads[0][:60]!r}; separate the columns by commas, semicolons or tabs")
     if all(looks_like_number(name.replace(",", ".")) for name in heads if name):
         raise InputError(
-            f"{file}:{first + 1}: got numbers where the names of the columns are expected; add a line such as "
+            f"{file}:{line}: got numbers where the names of the columns are expected; add a line such as "
             f"{separator.join(('time [s]', 'position [m]', 'force [N]'))!r}, without # before it"
         )
     if len(rows) < 2:
         raise InputError(f"{file}: it has names of columns and no samples; record some")
-    for number, row in rows[1:]:
-        if any(row[len(heads) :]):
+    for number, cells in rows[1:]:
+        if any(cells[len(heads) :]):
             hint = "; a comma as decimal sign needs semicolons between the columns" if separator == "," else ""
-            raise InputError(f"{file}:{number}: got {len(row)} cells for {len(heads)} columns{hint}")
-    return rows if separator == "," else [rows[0], *((number, _with_points(row)) for number, row in rows[1:])]
-
-
-def _with_points(row: list[str]) -> list[str]:
-    """Numbers with a decimal point; what holds a comma and a point stays, and is refused as a number."""
-    return [cell.replace(",", ".") if "." not in cell else cell for cell in row]
-
-
-def split_header(title: str) -> tuple[str, str]:
-    """The name of a column, and its unit, which stands in brackets at its end."""
-    match = _HEADER.fullmatch(title.strip())
-    return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")
+            raise InputError(f"{file}:{number}: got {len(cells)} cells for {len(heads)} columns{hint}")
+    return rows
 
 
 def _find_column(file: str | Path, heads: Sequence[str], name: str, wanted: str | None) -> tuple[int, str]:
     """The column's index and its unit, "" where nothing says it."""
     if wanted is None:
-        found = [k for k, head in enumerate(heads) if split_header(head)[0].lower() in _NAMES[name]]
+        found = [k for k, head in enumerate(heads) if split_title(head)[0].lower() in _NAMES[name]]
         if len(found) == 1:
-            return found[0], split_header(heads[found[0]])[1]
+            return found[0], split_title(heads[found[0]])[1]
         what = f"may be any of {_listing(heads[k] for k in found)}" if found else f"is none of {_listing(heads)}"
         raise InputError(f"{name}: by its name it {what} in {file}; say which column it is")
     title, unit = wanted.strip(), None
@@ -200,16 +163,16 @@ def _find_column(file: str | Path, heads: Sequence[str], name: str, wanted: str 
         title = title or wanted.strip()
         if found:
             raise InputError(f"{name}: {file} has {len(found)} columns {title!r}; give each a name of its own")
-        known = [*heads, *(split_header(head)[0] for head in heads)]
+        known = [*heads, *(split_title(head)[0] for head in heads)]
         hint = suggestion(title, known, f"it has {_listing(heads)}")
         raise InputError(f"{name}: {file} has no column {title!r}; {hint}")
-    return found[0], split_header(heads[found[0]])[1] if unit is None else unit
+    return found[0], split_title(heads[found[0]])[1] if unit is None else unit
 
 
 def _matches(heads: Sequence[str], title: str) -> list[int]:
     """Columns of this header; else those of this name before the brackets."""
     whole = [k for k, head in enumerate(heads) if head == title]
-    return whole or [k for k, head in enumerate(heads) if title and split_header(head)[0] == title]
+    return whole or [k for k, head in enumerate(heads) if title and split_title(head)[0] == title]
 
 
 def _listing(heads: Any) -> str:

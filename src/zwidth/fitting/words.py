@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterable
-from dataclasses import fields
 from typing import NamedTuple
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
-from zwidth.parts.velocity import VELOCITY_KINDS
+from zwidth.parts.spelling import spell_estimate
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import Status
@@ -198,13 +198,9 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     for key, unit in (("mass", "kg"), ("damping", "N s/m"), ("delay", "s")):
         lines.append(f"  {key}: {_write(fit, key)} {unit} # fitted, {_between(fit, key, units)}")
     lines.append(f"  period: {fit.period!r} s # as given")
-    kind = VELOCITY_KINDS.get(type(fit.velocity).__name__)
-    if kind not in (None, "backward_difference"):
-        given = {part.name: getattr(fit.velocity, part.name) for part in fields(fit.velocity)}
-        spelled = {key: list(value) if isinstance(value, tuple) else value for key, value in given.items()}
-        inside = ", ".join(f"{key}: {value}" for key, value in spelled.items() if value is not None)
-        whence = "its cut-off fitted" if "cutoff" in fit.errors else "as given"
-        lines.append(f"  velocity: {{kind: {kind}, {inside}}} # {whence}")
+    for key, section in spell_estimate(fit.velocity, every=True).items():
+        inside = ", ".join(f"{name}: {json.dumps(value).strip(chr(34))}" for name, value in section.items())
+        lines.append(f"  {key}: {{{inside}}} # {'its cut-off fitted' if 'cutoff' in fit.errors else 'as given'}")
     if fit.is_doubted:
         lines += [f"studies: [] # {NO_WALL}"]
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import Field, fields
 from numbers import Real
 from typing import Any
 
@@ -10,20 +11,42 @@ import numpy as np
 
 from zwidth.arrays.xp import is_jax
 from zwidth.parts.span import Span, read_span
-from zwidth.words.errors import InputError, UnusableValueError
+from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe
-from zwidth.words.quantities import NOT_NEGATIVE, Range
+from zwidth.words.quantities import CHOICES, FIELDS, NOT_NEGATIVE, Range
 from zwidth.words.units import find_dimension, read_quantity, to_float
 
 
-def check_number(field: str, value: Any, unit: str, *, low: float = 0.0, low_open: bool = False) -> Any:
+def check_fields(part: Any, owner: str = "") -> None:
+    """Put every number of a part in its SI unit, where `words.quantities` allows it; else raise `InputError`.
+
+    ``owner`` begins the names of its quantities. A number that is None by default may be left out.
+    """
+    for item in fields(part):
+        path, value = f"{owner}.{item.name}" if owner else item.name, getattr(part, item.name)
+        if path in CHOICES:
+            check_choice(path, value, CHOICES[path].names)
+        elif path in FIELDS and not (value is None and item.default is None):
+            unit, allowed = FIELDS[path].unit, find_range(item, path)
+            if FIELDS[path].whole:
+                value = check_whole(path, value, int(allowed.low), int(allowed.high))
+            else:
+                value = check_number(path, value, unit, allowed)
+            object.__setattr__(part, item.name, value)
+
+
+def find_range(item: Field[Any], path: str) -> Range:
+    """The admissible values of a field of a part: the quantity's, or fewer where the part says so."""
+    return item.metadata.get("allowed", FIELDS[path].allowed)
+
+
+def check_number(field: str, value: Any, unit: str, allowed: Range = NOT_NEGATIVE) -> Any:
     """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`.
 
     A text is a number with a unit, as in configuration files: "70 g".
     """
     if is_jax(value):
         return value
-    allowed = Range(low, low_open=low_open)
     return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed)[0])
 
 

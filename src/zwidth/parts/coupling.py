@@ -8,10 +8,9 @@ the tip.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from zwidth.parts.checks import check_number
-from zwidth.words.errors import check_choice
+from zwidth.parts.checks import check_fields
 
 
 @dataclass(frozen=True)
@@ -30,13 +29,16 @@ class Coupling:
         'motor'
     """
 
+    # Forms that the explorer offers.
+    usual: ClassVar[dict[str, dict[str, Any]]] = {
+        "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},
+        "tip": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0, "sensor": "tip"},
+    }
+
     mass: Any
     stiffness: Any
     damping: Any = 0.0
     sensor: Literal["motor", "tip"] = "motor"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mass", check_number("coupling.mass", self.mass, "kg", low_open=True))
-        object.__setattr__(self, "stiffness", check_number("coupling.stiffness", self.stiffness, "N/m", low_open=True))
-        object.__setattr__(self, "damping", check_number("coupling.damping", self.damping, "N s/m"))
-        check_choice("coupling.sensor", self.sensor, ("motor", "tip"))
+        check_fields(self, "coupling")

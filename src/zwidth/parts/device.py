@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_fields
 from zwidth.parts.coupling import Coupling
 from zwidth.words.errors import InputError
 
@@ -25,7 +25,6 @@ class Device:
     coupling: Coupling | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mass", check_number("mass", self.mass, "kg", low_open=True))
-        object.__setattr__(self, "damping", check_number("damping", self.damping, "N s/m"))
+        check_fields(self)
         if self.coupling is not None and not isinstance(self.coupling, Coupling):
             raise InputError(f"coupling: got {self.coupling!r}; a zwidth.Coupling is needed, or None")

@@ -7,10 +7,14 @@ Behind a spring and damper the hand is a further mass, with its own damper and s
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_fields, check_number
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import POSITIVE
+
+# That of the reference below.
+_HAND = {"mass": 0.554, "damping": 6.45, "stiffness": 135.0}
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,12 @@ class Operator:
         True
     """
 
+    # Forms that the explorer offers.
+    usual: ClassVar[dict[str, dict[str, float]]] = {
+        "rigid": _HAND,
+        "grasp": {**_HAND, "coupling_stiffness": 1e3, "coupling_damping": 5.0},
+    }
+
     mass: Any = 0.0
     damping: Any = 0.0
     stiffness: Any = 0.0
@@ -40,20 +50,14 @@ class Operator:
     coupling_damping: Any = 0.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("mass", "kg"), ("damping", "N s/m"), ("stiffness", "N/m"), ("coupling_damping", "N s/m")):
-            least_open = name == "mass" and not self.rigid
-            value = check_number(f"operator.{name}", getattr(self, name), unit, low_open=least_open)
-            object.__setattr__(self, name, value)
-        if self.rigid:
-            damped = self.coupling_damping
-            if isinstance(damped, float) and damped:
-                raise InputError(
-                    f"operator.coupling_damping: got {damped!r} without a spring beside it; give "
-                    "operator.coupling_stiffness as well, or add the damping to the device"
-                )
-            return
-        value = check_number("operator.coupling_stiffness", self.coupling_stiffness, "N/m", low_open=True)
-        object.__setattr__(self, "coupling_stiffness", value)
+        if not self.rigid:
+            check_number("operator.mass", self.mass, "kg", POSITIVE)
+        check_fields(self, "operator")
+        if self.rigid and isinstance(self.coupling_damping, float) and self.coupling_damping:
+            raise InputError(
+                f"operator.coupling_damping: got {self.coupling_damping!r} without a spring beside it; give "
+                "operator.coupling_stiffness as well, or add the damping to the device"
+            )
 
     @property
     def rigid(self) -> bool:

@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 
 from zwidth.arrays.xp import is_jax
+from zwidth.parts.coupling import Coupling
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
 from zwidth.parts.timing import Timing
@@ -42,18 +43,24 @@ class Parts(Protocol):
 AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")
-_NAMED = ("velocity", "operator")
+# The parts that a scene need not have, in the order in which it is described; those of the device are fields of it.
+PARTS = {"operator": Operator, "coupling": Coupling}
+_OF_DEVICE = ("coupling",)
+_NAMED = ("velocity", *(name for name in PARTS if name not in _OF_DEVICE))
+
+
+def find_parts(scene: Parts) -> dict[str, Any]:
+    """The velocity estimate and the parts that a scene has, by name."""
+    found = {name: getattr(scene, name) for name in _NAMED} | {name: getattr(scene.device, name) for name in _OF_DEVICE}
+    return {name: part for name, part in found.items() if part is not None}
 
 
 def _parts(scene: Parts) -> Iterator[tuple[str, str, Any]]:
     """Every part there is: what its paths begin with, its field of the scene, and itself."""
     for name in _BARE:
         yield "", name, getattr(scene, name)
-    for name in _NAMED:
-        if getattr(scene, name) is not None:
-            yield f"{name}.", name, getattr(scene, name)
-    if scene.device.coupling is not None:
-        yield "coupling.", "coupling", scene.device.coupling
+    for name, part in find_parts(scene).items():
+        yield f"{name}.", name, part
 
 
 def list_parameters(scene: Parts) -> dict[str, Any]:

@@ -7,37 +7,28 @@ by the wrong time and the cut-off lies elsewhere: that is what the loop then doe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from zwidth.arrays.xp import is_jax, namespace
-from zwidth.parts.checks import check_number, check_whole
+from zwidth.parts.checks import check_fields, check_whole
 from zwidth.parts.estimate import Estimate
 from zwidth.words.errors import InputError
-
-_LONGEST_WINDOW, _HIGHEST_ORDER, _LONGEST_ADAPTIVE = 1000, 8, 64
-
-# What a configuration calls the estimates that the linear loop knows.
-VELOCITY_KINDS = {
-    "BackwardDifference": "backward_difference",
-    "WindowedDifference": "windowed_difference",
-    "LowPass": "low_pass",
-    "Butterworth": "butterworth",
-    "VelocityFilter": "filter",
-}
+from zwidth.words.quantities import Range
 
 
-def _check_period(owner: Any) -> None:
-    if owner.coded_period is not None:
-        value = check_number("velocity.coded_period", owner.coded_period, "s", low_open=True)
-        object.__setattr__(owner, "coded_period", value)
+class _Checked:
+    """Base of the estimates that are given by their numbers."""
+
+    def __post_init__(self) -> None:
+        check_fields(self, "velocity")
 
 
 @dataclass(frozen=True)
-class BackwardDifference:
+class BackwardDifference(_Checked):
     """``v = (x_k - x_(k-1))/T``, the default and the paper's.
 
     Args:
@@ -49,16 +40,13 @@ class BackwardDifference:
 
     coded_period: Any = None
 
-    def __post_init__(self) -> None:
-        _check_period(self)
-
     def estimate(self, period: Any) -> Estimate:
         """The estimate for a loop of this period, normalized."""
         return Estimate(window=1, gain=_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True)
-class WindowedDifference:
+class WindowedDifference(_Checked):
     """``v = (x_k - x_(k-n))/(n T)``, the mean velocity of the last n periods.
 
     Args:
@@ -72,17 +60,13 @@ class WindowedDifference:
     samples: int
     coded_period: Any = None
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "samples", check_whole("velocity.samples", self.samples, 1, _LONGEST_WINDOW))
-        _check_period(self)
-
     def estimate(self, period: Any) -> Estimate:
         """The estimate for a loop of this period, normalized."""
         return Estimate(window=self.samples, gain=_ratio(period, self.coded_period))
 
 
 @dataclass(frozen=True)
-class LowPass:
+class LowPass(_Checked):
     """The backward difference behind one or two equal first-order low-passes: ``v <- p v + (1 - p) input`` each.
 
     ``p = exp(-T/tau)``, ``tau = 1/(2 pi cutoff)``; ``F = (1 - 1/z)/T ((1 - p) z/(z - p))^order``.
@@ -108,11 +92,8 @@ class LowPass:
             raise InputError(
                 "velocity: give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
             )
-        name, unit = ("cutoff", "Hz") if self.time_constant is None else ("time_constant", "s")
-        value = check_number(f"velocity.{name}", getattr(self, name), unit, low_open=True)
-        object.__setattr__(self, name, value)
-        object.__setattr__(self, "order", check_whole("velocity.order", self.order, 1, 2))
-        _check_period(self)
+        check_whole("velocity.order", self.order, 1, 2)
+        super().__post_init__()
 
     def estimate(self, period: Any) -> Estimate:
         """The estimate for a loop of this period, normalized."""
@@ -130,7 +111,7 @@ class LowPass:
 
 
 @dataclass(frozen=True)
-class Butterworth:
+class Butterworth(_Checked):
     """The backward difference behind a Butterworth low-pass, as `scipy.signal.butter` designs it.
 
     Args:
@@ -145,11 +126,6 @@ class Butterworth:
     cutoff: Any
     order: int = 2
     coded_period: Any = None
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "cutoff", check_number("velocity.cutoff", self.cutoff, "Hz", low_open=True))
-        object.__setattr__(self, "order", check_whole("velocity.order", self.order, 1, _HIGHEST_ORDER))
-        _check_period(self)
 
     def estimate(self, period: Any) -> Estimate:
         """The estimate for a loop of this period, normalized."""
@@ -222,7 +198,7 @@ class VelocityFilter:
 
 
 @dataclass(frozen=True)
-class FOAW:
+class FOAW(_Checked):
     """First-order adaptive windowing, for simulations: it has no linear form and no answer to questions of stability.
 
     The slope over the longest window, up to ``samples`` periods, whose straight line from its oldest to its newest
@@ -237,11 +213,7 @@ class FOAW:
     """
 
     noise: Any
-    samples: int = 15
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "noise", check_number("velocity.noise", self.noise, "m", low_open=True))
-        object.__setattr__(self, "samples", check_whole("velocity.samples", self.samples, 1, _LONGEST_ADAPTIVE))
+    samples: int = field(default=15, metadata={"allowed": Range(1, 64)})
 
     def estimate(self, period: Any) -> Estimate:
         """Refused: what it answers hangs on the motion."""
@@ -252,6 +224,20 @@ class FOAW:
 
 
 Velocity: TypeAlias = BackwardDifference | WindowedDifference | LowPass | Butterworth | VelocityFilter | FOAW
+# By what configurations and the command line call them.
+ESTIMATES = {
+    "backward_difference": BackwardDifference,
+    "windowed_difference": WindowedDifference,
+    "low_pass": LowPass,
+    "butterworth": Butterworth,
+    "filter": VelocityFilter,
+    "foaw": FOAW,
+}
+
+
+def name_estimate(velocity: Velocity) -> str:
+    """What configurations call the kind of an estimate."""
+    return next(kind for kind, part in ESTIMATES.items() if type(velocity) is part)
 
 
 def check_cutoff(cutoff: Any, period: Any) -> None:

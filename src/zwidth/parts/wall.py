@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from zwidth.parts.checks import check_number
+from zwidth.parts.checks import check_fields
 from zwidth.words.errors import InputError
 
 
@@ -23,8 +22,7 @@ class VirtualWall:
     virtual_damping: Any = 0.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("stiffness", "N/m"), ("virtual_damping", "N s/m")):
-            object.__setattr__(self, name, check_number(name, getattr(self, name), unit, low=-math.inf))
+        check_fields(self)
 
 
 @dataclass(frozen=True)

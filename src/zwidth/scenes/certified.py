@@ -8,6 +8,7 @@ python-flint. With P of degree n and ``P*(z) = z^n P(1/z)``, all zeros of P lie 
 
 from __future__ import annotations
 
+from dataclasses import fields, is_dataclass
 from fractions import Fraction
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -71,7 +72,7 @@ def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, BallP
 
 def _is_free(scene: Any) -> bool:
     """Whether no spring ties the device to the ground."""
-    return scene.operator is None or scene.operator.stiffness == 0
+    return not any(body.stiffness for body in scene.chain.bodies)
 
 
 def all_inside(p: flint.arb_poly) -> bool | None:
@@ -125,23 +126,20 @@ def _exact(scene: Any, period: flint.arb) -> Any:
     """The scene's numbers as exact balls, for `chain_of`; in the estimate's place the mass in kg."""
     import flint
 
-    def part(of: Any, *fields: str, **others: Any) -> SimpleNamespace:
-        return SimpleNamespace(**{name: flint.arb(float(getattr(of, name))) for name in fields}, **others)
+    def exact(part: Any) -> Any:
+        """The same with balls for numbers, past the checks of these."""
+        if isinstance(part, float) or not is_dataclass(part):
+            return flint.arb(part) if isinstance(part, float) else part
+        # Without what the part has computed from its numbers.
+        made = object.__new__(type(part))
+        for item in fields(part):
+            object.__setattr__(made, item.name, exact(getattr(part, item.name)))
+        return made
 
-    coupling, hand = scene.device.coupling, scene.operator
-    if coupling is not None:
-        coupling = part(coupling, "mass", "stiffness", "damping", sensor=coupling.sensor)
-    if hand is not None:
-        tie = () if hand.rigid else ("coupling_stiffness", "coupling_damping")
-        hand = part(hand, "mass", "damping", "stiffness", *tie, rigid=hand.rigid)
-    device = part(scene.device, "mass", "damping", coupling=coupling)
-    mass = device.mass + (hand.mass if hand is not None and hand.rigid and coupling is None else 0)
-    return SimpleNamespace(
-        device=device,
-        timing=SimpleNamespace(period=period),
-        operator=hand,
-        velocity=SimpleNamespace(estimate=lambda period: mass),
-    )
+    made = exact(scene)
+    own = {item.name: getattr(made, item.name) for item in fields(made)}
+    own |= {"timing": SimpleNamespace(period=period), "velocity": SimpleNamespace(estimate=lambda period: made.mass)}
+    return SimpleNamespace(**own)
 
 
 def _device(chain: Chain) -> tuple[flint.arb_poly, flint.arb_poly]:

@@ -11,11 +11,11 @@ import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
 from zwidth import figures
-from zwidth.config.axes import read_entries
+from zwidth.config.axes import Axis, read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import Fraction
 from zwidth.config.numbers import number, whole_number
-from zwidth.config.parameters import StiffnessAxis
+from zwidth.config.parameters import parameter_axis
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.units import make_entry_reader
 from zwidth.figures.table import SI_COLUMNS
@@ -79,7 +79,7 @@ class DesignStudy(ComputedStudy):
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
 
-    stiffness: StiffnessAxis
+    stiffness: Annotated[Axis, *parameter_axis("stiffness")]
     """Wanted stiffness K in N/m or with a unit, one or several; the scene's where left out."""
 
     reserve: Reserve = 1.0

@@ -10,23 +10,20 @@ import numpy as np
 from pydantic import BeforeValidator
 
 from zwidth import figures
+from zwidth.config.axes import Axis
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import unit_schema
-from zwidth.config.parameters import CutoffAxis, DampingAxis, WindowAxis
-from zwidth.config.parts import Order, locate_refusal
+from zwidth.config.fields import Quantity
+from zwidth.config.numbers import whole_number
+from zwidth.config.parameters import parameter_axis
+from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
-from zwidth.config.units import quantity
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, stack
 from zwidth.studies.stable_set import name_kind
 from zwidth.words.errors import InputError
-from zwidth.words.quantities import POSITIVE
-from zwidth.words.units import LENGTH, SPEED
-
-Length = Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)]
-Speed = Annotated[float, BeforeValidator(quantity(SPEED, POSITIVE)), unit_schema(SPEED)]
+from zwidth.words.quantities import PARAMETERS, POSITIVE
 
 
 class FiltersStudy(ComputedStudy):
@@ -41,22 +38,22 @@ class FiltersStudy(ComputedStudy):
     device: PhysicalDevice
     """Device in SI units; the scene's where left out. Its velocity estimate is replaced."""
 
-    damping: DampingAxis | None = None
+    damping: Annotated[Axis, *parameter_axis("damping")] | None = None
     """Physical damping of the device, in N s/m or with a unit; the device's own where left out."""
 
-    cutoff: CutoffAxis | None = None
+    cutoff: Annotated[Axis, *parameter_axis("velocity.cutoff")] | None = None
     """Cut-offs of a low-pass, in Hz or with a unit."""
 
-    order: Order = 1
+    order: Annotated[int, BeforeValidator(whole_number(PARAMETERS["velocity.order"].allowed))] = 1
     """Order of the low-pass, 1 or 2."""
 
-    samples: WindowAxis | None = None
+    samples: Annotated[Axis, *parameter_axis("velocity.samples")] | None = None
     """Lengths of a window, in periods."""
 
-    resolution: Length | None = None
+    resolution: Annotated[float, Quantity("m", POSITIVE)] | None = None
     """One count of the position, in m or with a unit: the noise that it makes of the velocity is computed as well."""
 
-    noise_limit: Speed | None = None
+    noise_limit: Annotated[float, Quantity("m/s", POSITIVE)] | None = None
     """Standard deviation that the noise of the velocity may have, in m/s or with a unit: the best filter is marked."""
 
     @classmethod

@@ -9,25 +9,26 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WrapValidator
+from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WithJsonSchema, WrapValidator
 from pydantic_core import CoreSchema
 
 from zwidth import figures
 from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Fraction, Strict, VirtualDamping, members, unit_schema
-from zwidth.config.parts import Frequency, Spring, Time, VelocityField, build_velocity, locate_refusal
+from zwidth.config.fields import Fraction, Quantity, Strict, describe_entry, members, quantity_of
+from zwidth.config.parts import VelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene
 from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, plain, with_unit
+from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
-from zwidth.words.units import LENGTH
 
 # Times of a log and the period may differ so much, as a share.
 _SAME_PERIOD = 1e-3
@@ -43,7 +44,7 @@ def _read_resolution(raw: Any) -> Any:
     return raw
 
 
-Step = Annotated[float | str, BeforeValidator(_read_resolution), unit_schema(LENGTH, "rad", "deg")]
+Step = Annotated[float | str, BeforeValidator(_read_resolution), WithJsonSchema(describe_entry("m", "rad", "deg"))]
 
 
 class LogSection(Strict):
@@ -123,13 +124,13 @@ class BuzzSection(Strict):
 
     what: ClassVar[str] = "a wall that buzzed"
 
-    stiffness: Spring
+    stiffness: Annotated[float, Quantity("N/m", POSITIVE)]
     """K in N/m or with a unit, raised at this damping until the wall buzzed."""
 
-    virtual_damping: VirtualDamping = 0.0
+    virtual_damping: Annotated[float, quantity_of("virtual_damping")] = 0.0
     """B in N s/m or with a unit."""
 
-    frequency: Frequency
+    frequency: Annotated[float, Quantity("Hz", POSITIVE)]
     """Of the buzz, in Hz or with a unit."""
 
 
@@ -157,13 +158,13 @@ class FitStudy(ComputedStudy):
     buzz: Annotated[tuple[BuzzSection, ...], WrapValidator(members("walls"))] | None = None
     """Walls at the onset of buzzing, two at least, of different dampings."""
 
-    period: Time | None = None
+    period: Annotated[float, Quantity("s", POSITIVE)] | None = None
     """Sampling period T in s or with a unit; of buzzing walls alone, or of logs in place of their times."""
 
     noise: Fraction | None = None
     """Relative noise of stiffness and frequency of buzzing walls; estimated where left out."""
 
-    max_delay: Time | None = None
+    max_delay: Annotated[float, Quantity("s", POSITIVE)] | None = None
     """The longest delay looked for in logs, in s or with a unit; 20 periods where left out."""
 
     resample: bool = False
@@ -275,7 +276,7 @@ class FitStudy(ComputedStudy):
         )
 
     def _fit(self) -> list[_Fitted]:
-        velocity, fits = build_velocity(self.velocity), []
+        velocity, fits = BackwardDifference() if self.velocity is None else self.velocity.to_part(), []
         period = self.period
         if self.log:
             options = {"max_delay": self.max_delay, "resample": self.resample}

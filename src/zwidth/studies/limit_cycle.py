@@ -8,16 +8,15 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 import numpy as np
-from pydantic import BeforeValidator, Field, PlainValidator, WithJsonSchema, WrapValidator, create_model
+from pydantic import Field, WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.axes import SPELLED, Axis, axis_schema, make_axis_reader
+from zwidth.config.axes import Axis
 from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict, members, unit_schema
-from zwidth.config.parameters import StiffnessAxis, VirtualDampingAxis
+from zwidth.config.fields import Quantity, Strict, members
+from zwidth.config.parameters import parameter_axis, quantity_axis
 from zwidth.config.scenes import AnyScene
-from zwidth.config.units import quantity
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
@@ -27,7 +26,6 @@ from zwidth.studies.simulate import SimulatedStudy, check_circumstances, name_co
 from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 from zwidth.words.status import Status
-from zwidth.words.units import FORCE, LENGTH, Dimension
 
 # The axes that there may be, with their columns.
 _COLUMNS = {
@@ -40,19 +38,6 @@ _OUTPUTS = ("amplitude", "frequency", "energy_given", "outcome", "status")
 # So many values of a list are curves, and more are a plane.
 _MOST_CURVES = 6
 
-
-def _reader(dimension: Dimension) -> Any:
-    return PlainValidator(make_axis_reader(quantity(dimension, NOT_NEGATIVE), quantity(dimension, POSITIVE)))
-
-
-def _schema(dimension: Dimension) -> WithJsonSchema:
-    entry = unit_schema(dimension).json_schema
-    assert entry is not None, "a schema for validation is given"
-    return axis_schema(entry, entry)
-
-
-LengthAxis = Annotated[Axis, _reader(LENGTH), SPELLED, _schema(LENGTH)]
-FrictionAxis = Annotated[Axis, _reader(FORCE), SPELLED, _schema(FORCE)]
 
 # All that the study sets for every condition may be set for one; what is not is None.
 _OWN: Any = {
@@ -77,16 +62,16 @@ class CycleAxes(Strict):
 
     what: ClassVar[str] = "the axes of a limit_cycle study"
 
-    stiffness: StiffnessAxis
+    stiffness: Annotated[Axis, *parameter_axis("stiffness")]
     """Stiffness K of the wall, in N/m or with a unit."""
 
-    virtual_damping: VirtualDampingAxis
+    virtual_damping: Annotated[Axis, *parameter_axis("virtual_damping")]
     """Damping B of the wall, in N s/m or with a unit."""
 
-    resolution: LengthAxis | None = None
+    resolution: Annotated[Axis, *quantity_axis("m", NOT_NEGATIVE)] | None = None
     """One count of the encoder, in m or with a unit."""
 
-    coulomb: FrictionAxis | None = None
+    coulomb: Annotated[Axis, *quantity_axis("N", NOT_NEGATIVE)] | None = None
     """Dry friction, in N or with a unit."""
 
     def limits(self) -> Iterable[LocatedProblem]:
@@ -123,10 +108,10 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     conditions: Annotated[tuple[CycleCondition, ...], WrapValidator(members("conditions"))]
     """What each panel has of its own, beside what the study sets for all; one panel where left out."""
 
-    silence: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)] = 1e-6
+    silence: Annotated[float, Quantity("m", POSITIVE)] = 1e-6
     """Amplitude below which a motion counts as silent, in m or with a unit."""
 
-    widest: Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)] = 1e-3
+    widest: Annotated[float, Quantity("m", POSITIVE)] = 1e-3
     """Amplitude beyond which it counts as no buzz any more, in m or with a unit."""
 
     @classmethod

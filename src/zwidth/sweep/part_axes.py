@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING
 
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.parts import build_velocity, locate_refusal
+from zwidth.config.parts import build_parts, locate_refusal
 from zwidth.parts.device import Device
-from zwidth.parts.operator import Operator
+from zwidth.parts.paths import PARTS
 from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import WALL
@@ -32,12 +34,13 @@ def make_scene(study: SweepStudy, values: dict[str, float]) -> Scene:
     given = dict(values)
     period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
     delay = given.pop("delay", 0.0) * (period if study.axes.delay_in_periods else 1.0)
-    coupling = None if study.coupling is None else study.coupling.to_part()
-    needs_hand = any(name.startswith("operator.") for name in given)
-    operator = study.operator.to_part() if study.operator else (Operator() if needs_hand else None)
-    device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0), coupling=coupling)
-    timing = Timing(period=period, delay=delay)
-    return Scene(device, timing, velocity=build_velocity(study.velocity), operator=operator).replace(**given)
+    parts = build_parts(study)
+    for name in given:
+        part = name.partition(".")[0]
+        if part in PARTS and part not in parts:
+            parts[part] = PARTS[part]()
+    device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0))
+    return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
 
 def find_faults(study: SweepStudy) -> Iterator[LocatedProblem]:
@@ -59,10 +62,10 @@ def _has_parameter(study: SweepStudy, name: str) -> bool:
     """Whether the part that an axis belongs to is there, and has such a key."""
     part, _, key = name.partition(".")
     section = getattr(study, part)
-    if section is None:
-        # Without a section there is nobody's hand, and the difference of two samples.
-        return part == "operator" or name == "velocity.coded_period"
-    return key in type(section).model_fields
+    kind = section.part if section is not None else PARTS.get(part, BackwardDifference)
+    # A part that has no section is there where it needs no numbers.
+    needed = section is None and any(item.default is MISSING for item in fields(kind))
+    return not needed and key in kind.__dataclass_fields__
 
 
 def _place_axis(axes: Axes, name: str) -> tuple[str, ...]:

@@ -9,22 +9,13 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import AnyAxis, Axis, DelayAxis, DeltaAxis
+from zwidth.config.axes import Axis
 from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
-from zwidth.config.fields import Strict, members
+from zwidth.config.fields import Generated, describe_parameter, members
 from zwidth.config.numbers import number
-from zwidth.config.parameters import (
-    PART_AXES,
-    DampingAxis,
-    MassAxis,
-    PeriodAxis,
-    RateAxis,
-    StiffnessAxis,
-    TimeAxis,
-    VirtualDampingAxis,
-)
-from zwidth.config.parts import CouplingSection, OperatorSection, VelocityField, list_parts
+from zwidth.config.parameters import parameter_axis
+from zwidth.config.parts import list_parts, make_parts_base
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study
 from zwidth.sweep.part_axes import find_faults
@@ -56,54 +47,26 @@ OutputName = Annotated[str, BeforeValidator(_check_output), WithJsonSchema({"typ
 _ACCURACY = Range(1e-12, 0.1)
 
 
-# Field names with dots, which a class body cannot have.
-_PART_FIELDS: Any = {
-    name: (form | None, Field(default=None, description=f"{PARAMETERS[name].long_name}; the scene's where left out."))
-    for name, form in PART_AXES.items()
-}
-_PartAxes: Any = create_model("_PartAxes", __base__=Strict, **_PART_FIELDS)
+def _axis_field(name: str) -> tuple[Any, Any]:
+    if name == "devices":
+        rows = "Parameters that move together, one row a device: lists of equal length, or a CSV file."
+        return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
+    axis: Any = Annotated[Axis, *parameter_axis(name)]
+    words = describe_parameter(PARAMETERS[name]) + ("." if name in WALL else "; the scene's where left out.")
+    return axis | None, Field(default=None, description=words)
 
 
-class Axes(_PartAxes):
+# In the order in which a store keeps what was asked of it.
+_OF_WALL, _OF_DEVICE = ("stiffness", "virtual_damping"), ("mass", "damping", "period", "rate", "delay")
+_FIELDS: Any = {name: _axis_field(name) for name in (*OF_PARTS, "devices", *NORMALIZED, *_OF_WALL, *_OF_DEVICE)}
+# Some of the names have dots, which a class body cannot have.
+_Axes: Any = create_model("_Axes", __base__=Generated, **_FIELDS)
+
+
+class Axes(_Axes):
     """The parameters of a sweep and the values that each of them takes."""
 
     what: ClassVar[str] = "the axes of a sweep"
-
-    devices: TableField | None = None
-    """Parameters that move together, one row a device: lists of equal length, or a CSV file."""
-
-    alpha: AnyAxis | None = None
-    """Normalized stiffness K T^2/m of the wall."""
-
-    beta: AnyAxis | None = None
-    """Normalized damping B T/m of the wall; 0 where left out."""
-
-    delta: DeltaAxis | None = None
-    """Normalized damping b T/m of the device; the scene's where left out."""
-
-    d: DelayAxis | None = None
-    """Delay in periods; the scene's where left out."""
-
-    stiffness: StiffnessAxis | None = None
-    """Stiffness K of the wall, in N/m or with a unit."""
-
-    virtual_damping: VirtualDampingAxis | None = None
-    """Damping B of the wall, in N s/m or with a unit; 0 where left out."""
-
-    mass: MassAxis | None = None
-    """Moving mass m of the device, in kg or with a unit; the scene's where left out."""
-
-    damping: DampingAxis | None = None
-    """Physical damping b of the device, in N s/m or with a unit; the scene's, or 0, where left out."""
-
-    period: PeriodAxis | None = None
-    """Sampling period T, in s or with a unit; give it or the rate, or leave it to the scene."""
-
-    rate: RateAxis | None = None
-    """Sampling rate 1/T, in Hz or with a unit."""
-
-    delay: TimeAxis | None = None
-    """Delay t_d, in s, with a unit of time, or in periods; the scene's, or 0, where left out."""
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
@@ -178,26 +141,24 @@ def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
         yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
 
 
-class SweepStudy(Study):
-    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
-
-    what: ClassVar[str] = "a sweep study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
-    takes_parts: ClassVar[bool] = True
+class _Swept(Study):
+    """What is swept."""
 
     kind: Literal["sweep"]
 
     axes: Axes
     """The parameters and their values; every combination is computed."""
 
-    velocity: VelocityField | None = None
-    """How the velocity is estimated; the scene's where left out. Its keys may be axes, as ``velocity.cutoff``."""
 
-    operator: OperatorSection | None = None
-    """The hand that holds the device; the scene's where left out. Its keys may be axes, as ``operator.mass``."""
+_Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
 
-    coupling: CouplingSection | None = None
-    """The mass beyond a spring and damper; the scene's where left out. Its keys may be axes as well."""
+
+class SweepStudy(_Parts, _Swept):
+    """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
+
+    what: ClassVar[str] = "a sweep study"
+    from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
+    takes_parts: ClassVar[bool] = True
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""

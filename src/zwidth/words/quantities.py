@@ -54,21 +54,26 @@ class Parameter:
     """One quantity of the loop.
 
     Attributes:
-        name: in files and stores.
-        long_name: what it is, for the readers of a store.
-        words, symbol: what a figure calls it; the symbol in mathtext, without dollar signs.
+        name: in files and stores; of a part beside device and timing, with the part's name and a dot.
+        long_name: what it is, for the readers of a store, of a schema and of the command line's help.
+        symbol: in mathtext, without dollar signs.
         allowed: its admissible values, in its unit.
         unit: SI base unit; "1" for a normalized quantity.
+        slider: the range in which the explorer moves it, in its unit; None where it is no slider.
+        note: more for the readers of a schema and of the command line's help.
+        short_name: what a figure and the explorer call it, where that is another.
         definition: of a normalized quantity, in mathtext.
         whole: whether only whole numbers are admissible.
     """
 
     name: str
     long_name: str
-    words: str
     symbol: str
     allowed: Range
     unit: str = "1"
+    slider: tuple[float, float] | None = None
+    note: str = ""
+    short_name: str = ""
     definition: str = ""
     whole: bool = False
 
@@ -77,82 +82,95 @@ class Parameter:
         """Its name in a store: CF has no dots in names."""
         return self.name.replace(".", "_")
 
+    @property
+    def words(self) -> str:
+        """What a figure and the explorer call it."""
+        return self.short_name or self.long_name
+
+    @property
+    def sentence(self) -> str:
+        """What it is, with a capital letter."""
+        return self.long_name[0].upper() + self.long_name[1:]
+
 
 # In the order of a store's dimensions: a plane of walls lies together, at the end.
 _PARAMETERS = (
-    Parameter("period", "sampling period T", "sampling period", "T", PERIODS, "s"),
-    Parameter("rate", "sampling rate 1/T", "sampling rate", "1/T", RATES, "Hz"),
-    Parameter("delay", "delay t_d from a sample to the moment its force acts", "delay", "t_d", NOT_NEGATIVE, "s"),
-    Parameter("mass", "mass m of the device", "mass", "m", POSITIVE, "kg"),
-    Parameter("damping", "physical damping b of the device", "physical damping", "b", NOT_NEGATIVE, "N s/m"),
+    Parameter("period", "sampling period T", "T", PERIODS, "s", (5e-5, 0.02), short_name="sampling period"),
+    Parameter("rate", "sampling rate 1/T", "1/T", RATES, "Hz", None, "in place of the period", "sampling rate"),
     Parameter(
-        "d",
-        "delay in sampling periods, t_d/T",
-        "delay in periods",
-        "d",
-        Range(0.0, MAX_DELAY_PERIODS),
-        definition="t_d/T",
+        "delay", "delay t_d from a sample to the moment its force acts", "t_d", NOT_NEGATIVE, "s", (0.0, 0.02),
+        "or in periods", "delay",
+    ),
+    Parameter("mass", "mass m of the device", "m", POSITIVE, "kg", (1e-3, 10.0), short_name="mass"),
+    Parameter(
+        "damping", "physical damping b of the device", "b", NOT_NEGATIVE, "N s/m", (0.0, 100.0),
+        short_name="physical damping",
     ),
     Parameter(
-        "delta",
-        "normalized damping of the device, b T/m",
-        "normalized physical damping",
-        r"\delta",
-        NOT_NEGATIVE,
-        definition="b\\,T/m",
-    ),
-    Parameter("velocity.cutoff", "cut-off of the velocity filter", "cut-off", "f_c", POSITIVE, "Hz"),
-    Parameter(
-        "velocity.time_constant", "time constant of the velocity filter", "time constant", r"\tau", POSITIVE, "s"
-    ),
-    Parameter("velocity.samples", "window of the velocity estimate", "window", "n", Range(1, 1000), whole=True),
-    Parameter("velocity.order", "order of the velocity filter", "filter order", "n_f", Range(1, 8), whole=True),
-    Parameter(
-        "velocity.coded_period", "period written into the velocity estimate", "coded period", "T_c", PERIODS, "s"
-    ),
-    Parameter("operator.mass", "mass of the hand", "mass of the hand", "m_h", NOT_NEGATIVE, "kg"),
-    Parameter("operator.damping", "damping of the hand to ground", "damping of the hand", "b_h", NOT_NEGATIVE, "N s/m"),
-    Parameter(
-        "operator.stiffness", "stiffness of the hand to ground", "stiffness of the hand", "k_h", NOT_NEGATIVE, "N/m"
+        "d", "delay in sampling periods, t_d/T", "d", Range(0.0, MAX_DELAY_PERIODS), slider=(0.0, 10.0),
+        short_name="delay in periods", definition="t_d/T",
     ),
     Parameter(
-        "operator.coupling_stiffness",
-        "stiffness of the spring between hand and device",
-        "stiffness of the grasp",
-        "k_g",
-        POSITIVE,
-        "N/m",
+        "delta", "normalized damping of the device, b T/m", r"\delta", NOT_NEGATIVE, slider=(0.0, 5.0),
+        short_name="normalized physical damping", definition="b\\,T/m",
     ),
     Parameter(
-        "operator.coupling_damping",
-        "damping of the damper between hand and device",
-        "damping of the grasp",
-        "c_g",
-        NOT_NEGATIVE,
-        "N s/m",
+        "velocity.cutoff", "cut-off of the velocity filter", "f_c", POSITIVE, "Hz", (1.0, 5e3),
+        "below half the sampling rate", "cut-off",
     ),
-    Parameter("coupling.mass", "mass beyond the coupling of the device", "mass of the tip", "m_2", POSITIVE, "kg"),
-    Parameter("coupling.stiffness", "stiffness of the coupling", "stiffness of the coupling", "k", POSITIVE, "N/m"),
-    Parameter("coupling.damping", "damping of the coupling", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m"),
-    Parameter("stiffness", "stiffness K of the virtual wall", "stiffness", "K", ANY, "N/m"),
     Parameter(
-        "alpha",
-        "normalized stiffness of the virtual wall, K T^2/m",
-        "normalized stiffness",
-        r"\alpha",
-        ANY,
-        definition=r"K\,T^2\!/m",
+        "velocity.time_constant", "time constant of the velocity filter", r"\tau", POSITIVE, "s", (2e-5, 0.2),
+        "in place of the cut-off", "time constant",
     ),
-    Parameter("virtual_damping", "damping B of the virtual wall", "virtual damping", "B", ANY, "N s/m"),
     Parameter(
-        "beta",
-        "normalized damping of the virtual wall, B T/m",
-        "normalized virtual damping",
-        r"\beta",
-        ANY,
-        definition="B\\,T/m",
+        "velocity.samples", "window of the velocity estimate", "n", Range(1, 1000), slider=(1.0, 50.0),
+        note="in sampling periods", short_name="window", whole=True,
     ),
-)
+    Parameter(
+        "velocity.order", "order of the velocity filter", "n_f", Range(1, 8), slider=(1.0, 8.0),
+        note="of a low-pass 1 or 2", short_name="filter order", whole=True,
+    ),
+    Parameter(
+        "velocity.coded_period", "period written into the velocity estimate", "T_c", POSITIVE, "s",
+        note="the loop's where left out", short_name="coded period",
+    ),
+    Parameter("operator.mass", "mass of the hand", "m_h", NOT_NEGATIVE, "kg", (0.0, 2.0), "> 0 behind a spring"),
+    Parameter(
+        "operator.damping", "damping of the hand to ground", "b_h", NOT_NEGATIVE, "N s/m", (0.0, 50.0),
+        short_name="damping of the hand",
+    ),
+    Parameter(
+        "operator.stiffness", "stiffness of the hand to ground", "k_h", NOT_NEGATIVE, "N/m", (0.0, 1e3),
+        short_name="stiffness of the hand",
+    ),
+    Parameter(
+        "operator.coupling_stiffness", "stiffness of the spring between hand and device", "k_g", POSITIVE, "N/m",
+        (10.0, 100e3), "a rigid grasp where left out", "stiffness of the grasp",
+    ),
+    Parameter(
+        "operator.coupling_damping", "damping of the damper between hand and device", "c_g", NOT_NEGATIVE, "N s/m",
+        (0.0, 50.0), "beside that spring", "damping of the grasp",
+    ),
+    Parameter(
+        "coupling.mass", "mass beyond the coupling of the device", "m_2", POSITIVE, "kg", (1e-3, 1.0),
+        short_name="mass of the tip",
+    ),
+    Parameter("coupling.stiffness", "stiffness of the coupling", "k", POSITIVE, "N/m", (100.0, 1e6)),
+    Parameter("coupling.damping", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m", (0.0, 50.0)),
+    Parameter("stiffness", "stiffness K of the virtual wall", "K", ANY, "N/m", (0.0, 50e3), short_name="stiffness"),
+    Parameter(
+        "alpha", "normalized stiffness of the virtual wall, K T^2/m", r"\alpha", ANY, slider=(0.0, 1.0),
+        short_name="normalized stiffness", definition=r"K\,T^2\!/m",
+    ),
+    Parameter(
+        "virtual_damping", "damping B of the virtual wall", "B", ANY, "N s/m", (-20.0, 100.0),
+        short_name="virtual damping",
+    ),
+    Parameter(
+        "beta", "normalized damping of the virtual wall, B T/m", r"\beta", ANY, slider=(-0.5, 1.5),
+        short_name="normalized virtual damping", definition="B\\,T/m",
+    ),
+)  # fmt: skip
 PARAMETERS = {parameter.name: parameter for parameter in _PARAMETERS}
 NORMALIZED = ("alpha", "beta", "delta", "d")
 PHYSICAL = tuple(name for name in PARAMETERS if name not in NORMALIZED)
@@ -160,7 +178,24 @@ OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
 """Parameters of the parts beside device and timing, by the path that leads to them in a scene."""
 VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
 """The same by their names in a store."""
+_NOISE = Parameter("velocity.noise", "largest error of a measured position", "", POSITIVE, "m", note="one count")
+FIELDS = {**PARAMETERS, _NOISE.name: _NOISE}
+"""Every number that a part may have; the noise belongs to an estimate that has no stable walls, and is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
+
+
+class Choice(NamedTuple):
+    """What a part has that is no number: one of a few names."""
+
+    names: tuple[str, ...]
+    sentence: str
+
+
+_KINDS = ("backward_difference", "windowed_difference", "low_pass", "butterworth")
+CHOICES = {
+    "velocity.kind": Choice(_KINDS, "Velocity estimate; told by the options below where it can be"),
+    "coupling.sensor": Choice(("motor", "tip"), "Where the position is measured; at the motor by default"),
+}
 
 Family: TypeAlias = Literal["wall", "device"]
 """Whether an output belongs to each wall, or to each device and delay whatever its wall."""

@@ -68,7 +68,8 @@ ANGULAR_STIFFNESS = Dimension(
 ANGULAR_DAMPING = Dimension({"N m s/rad": 0, "mN m s/rad": -3}, "2 mN m s/rad")
 SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
 FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
-_OF_UNIT = {dimension.base: dimension for dimension in (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, LENGTH, SPEED)}
+_SCALES = (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED)
+_OF_UNIT = {dimension.base: dimension for dimension in _SCALES}
 
 PERIOD_WORDS = ("periods", "period")
 

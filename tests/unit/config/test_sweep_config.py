@@ -83,6 +83,12 @@ def test_devices_from_a_csv_file_beside_the_configuration(load, tmp_path, monkey
     assert Config.model_validate(dump).model_dump(mode="json", exclude_none=True) == dump
 
 
+def test_devices_of_a_spreadsheet_with_decimal_commas(load, tmp_path):
+    (tmp_path / "d.csv").write_text("sep=;\nlabel;mass (g);damping\narm, left;0,5;1,5\n", encoding="utf-8")
+    table = load(SCENE + sweep("devices: {csv: d.csv}, stiffness: 10")).studies[0].axes.devices
+    assert (table.labels, table.columns) == (("arm, left",), {"mass": (0.0005,), "damping": (1.5,)})
+
+
 def test_columns_of_a_csv_file_can_be_named(load, tmp_path):
     (tmp_path / "d.csv").write_text("Moving mass [g],b\n100,2\n", encoding="utf-8")
     text = 'devices: {csv: d.csv, columns: {mass: "Moving mass [g]", damping: b}}, rate: 1, stiffness: 1'

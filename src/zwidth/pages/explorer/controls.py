@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from zwidth.parts.coupling import Coupling
 from zwidth.parts.device import Device
-from zwidth.parts.operator import Operator
+from zwidth.parts.paths import PARTS, find_parts
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
 from zwidth.parts.wall import VirtualWall
@@ -19,6 +18,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import choose_damping
 from zwidth.studies.document import load_config
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
 
 # Beyond so many, the poles cannot follow a drag.
 _MOST_POLES = 80
@@ -37,31 +37,18 @@ class Slider(NamedTuple):
     whole: bool = False
 
 
+def _make_slider(parameter: Parameter) -> Slider:
+    unit, per_si = _SHOWN.get(parameter.unit, (parameter.unit.removeprefix("1"), 1.0))
+    low, high = parameter.slider or (0.0, 0.0)
+    label = f"{parameter.words} {parameter.symbol.lstrip(chr(92))}"
+    return Slider(label, unit, per_si, low * per_si, high * per_si, parameter.whole)
+
+
+# The units of the page, and how many of them are one SI unit.
+_SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
+_DEVICE, _WALL = ("mass", "damping", "period", "delay", "delta", "d"), ("stiffness", "virtual_damping", "alpha", "beta")
 # By the path in a scene. A range that begins at 0 is cubic on the page, one above logarithmic.
-SLIDERS = {
-    "mass": Slider("mass m", "g", 1e3, 1.0, 10e3),
-    "damping": Slider("physical damping b", "N s/m", 1.0, 0.0, 100.0),
-    "period": Slider("period T", "ms", 1e3, 0.05, 20.0),
-    "delay": Slider("delay t_d", "ms", 1e3, 0.0, 20.0),
-    "delta": Slider("normalized damping delta", "", 1.0, 0.0, 5.0),
-    "d": Slider("delay d", "periods", 1.0, 0.0, 10.0),
-    "stiffness": Slider("wall stiffness K", "N/m", 1.0, 0.0, 50e3),
-    "virtual_damping": Slider("wall damping B", "N s/m", 1.0, -20.0, 100.0),
-    "alpha": Slider("wall stiffness alpha", "", 1.0, 0.0, 1.0),
-    "beta": Slider("wall damping beta", "", 1.0, -0.5, 1.5),
-    "velocity.samples": Slider("window n", "periods", 1.0, 1.0, 50.0, True),
-    "velocity.cutoff": Slider("cut-off", "Hz", 1.0, 1.0, 5e3),
-    "velocity.time_constant": Slider("time constant", "ms", 1e3, 0.02, 200.0),
-    "velocity.order": Slider("order", "", 1.0, 1.0, 8.0, True),
-    "operator.mass": Slider("hand: mass", "g", 1e3, 0.0, 2e3),
-    "operator.damping": Slider("hand: damping", "N s/m", 1.0, 0.0, 50.0),
-    "operator.stiffness": Slider("hand: stiffness", "N/m", 1.0, 0.0, 1e3),
-    "operator.coupling_stiffness": Slider("grasp: stiffness", "N/m", 1.0, 10.0, 100e3),
-    "operator.coupling_damping": Slider("grasp: damping", "N s/m", 1.0, 0.0, 50.0),
-    "coupling.mass": Slider("tip: mass", "g", 1e3, 1.0, 1e3),
-    "coupling.stiffness": Slider("tip: spring", "N/m", 1.0, 100.0, 1e6),
-    "coupling.damping": Slider("tip: damper", "N s/m", 1.0, 0.0, 50.0),
-}
+SLIDERS = {name: _make_slider(PARAMETERS[name]) for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider}
 # With m = 1 and T = 1 these are the scene's own numbers.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
 CHOICES = {
@@ -73,9 +60,9 @@ CHOICES = {
         "Butterworth": "Butterworth",
         "VelocityFilter": "coefficients, as given",
     },
-    "operator": {"none": "none", "rigid": "rigid", "grasp": "grasp"},
-    "coupling": {"none": "none", "motor": "tip, sensor at the motor", "tip": "tip, sensor at the tip"},
+    **{name: {form: form for form in ("none", *part.usual)} for name, part in PARTS.items()},
 }
+CHOICES["coupling"] |= {"motor": "tip, sensor at the motor", "tip": "tip, sensor at the tip"}
 
 
 def _small_device() -> Scene:
@@ -100,13 +87,14 @@ class Controls:
         scene, values = self.scene, self.scene.parameters()
         if self.normalized:
             return {"mode": "normalized"} | {name: values[path] for name, path in _NORMALIZED.items()}
-        hand, tip = scene.operator, scene.device.coupling
-        if hand is not None and hand.rigid:
-            values.pop("operator.coupling_damping", None)
+        forms = {name: _find_form(part) for name, part in find_parts(scene).items() if name in PARTS}
         found = {name: value * SLIDERS[name].per_si for name, value in values.items() if name in SLIDERS}
-        grasp = "none" if hand is None else "rigid" if hand.rigid else "grasp"
-        choices = {"operator": grasp, "coupling": "none" if tip is None else tip.sensor}
-        return found | {"mode": "physical", "velocity": type(scene.velocity).__name__} | choices
+        for part, form in forms.items():
+            # A form has the numbers that it names: without a spring, the damper beside it does nothing.
+            idle = {f"{part}.{item.name}" for item in fields(PARTS[part]) if item.name not in PARTS[part].usual[form]}
+            found = {name: value for name, value in found.items() if name not in idle}
+        choices = {"mode": "physical", "velocity": type(scene.velocity).__name__}
+        return found | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
         """New controls with some values as the page shows them.
@@ -149,21 +137,17 @@ class Controls:
         """The scene with another part of a usual kind."""
         scene = self.scene
         cutoff = min(100.0, 0.1 / scene.timing.period)
-        hand, tip = (0.554, 6.45, 135.0), (0.05, 20e3, 2.0)
-        parts = {
+        estimates = {
             "BackwardDifference": lambda: BackwardDifference(),
             "WindowedDifference": lambda: WindowedDifference(5),
             "LowPass": lambda: LowPass(cutoff=cutoff),
             "Butterworth": lambda: Butterworth(cutoff),
-            "none": lambda: None,
-            "rigid": lambda: Operator(*hand),
-            "grasp": lambda: Operator(*hand, 1e3, 5.0),
-            "motor": lambda: Coupling(*tip),
-            "tip": lambda: Coupling(*tip, sensor="tip"),
         }
-        if kind not in parts:
+        if name in PARTS:
+            return scene.replace(**{name: None if kind == "none" else PARTS[name](**PARTS[name].usual[kind])})
+        if kind not in estimates:
             raise InputError(f"{name}: coefficients come with a configuration alone; choose another")
-        return scene.replace(**{name: parts[kind]()})
+        return scene.replace(velocity=estimates[kind]())
 
     def _convert(self) -> Controls:
         """The device and wall in the other units; normalized it is rigid, its parts are left out."""
@@ -173,6 +157,16 @@ class Controls:
         rate, (stiffness, damping) = mass / period, self.wall
         wall = VirtualWall(stiffness * rate / period, damping * rate)
         return Controls(Scene(Device(mass, scene.damping * rate), Timing(period, float(scene.d) * period), wall))
+
+
+def _find_form(part: Any) -> str:
+    """Which of its usual forms a part has: the one with the same words, and with the same numbers left out."""
+
+    def shape(part: Any) -> dict[str, Any]:
+        values = {item.name: getattr(part, item.name) for item in fields(part)}
+        return {name: value for name, value in values.items() if not isinstance(value, float)}
+
+    return next(form for form, given in part.usual.items() if shape(type(part)(**given)) == shape(part))
 
 
 def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Controls:

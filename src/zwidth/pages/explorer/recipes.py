@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import MISSING, fields
 from typing import Any
 
 from zwidth.pages.explorer.controls import Controls
-from zwidth.parts.velocity import VELOCITY_KINDS, BackwardDifference
-from zwidth.scenes.scene import Scene
+from zwidth.parts.spelling import spell_part, spell_scene
 
 _SCRIPT = """\
 import matplotlib.pyplot as plt
@@ -45,24 +43,12 @@ def _section(controls: Controls) -> dict[str, Any]:
     """The scene as a configuration spells it."""
     if controls.normalized:
         return {name: value for name, value in controls.shown().items() if name != "mode"}
-    scene: Scene = controls.scene
-    found = _given(scene.timing) | _given(scene.wall)
-    if scene.velocity != BackwardDifference():
-        found["velocity"] = {"kind": VELOCITY_KINDS[type(scene.velocity).__name__], **_given(scene.velocity)}
-    parts = {"operator": scene.operator, "coupling": scene.device.coupling}
-    found |= {name: _given(part) for name, part in parts.items() if part is not None}
-    return {"mass": scene.device.mass, "damping": scene.device.damping} | found
-
-
-def _given(part: Any) -> dict[str, Any]:
-    """The fields of a part that differ from their defaults."""
-    values = {field.name: (getattr(part, field.name), field.default) for field in fields(part)}
-    return {name: value for name, (value, default) in values.items() if default is MISSING or value != default}
+    return spell_scene(controls.scene)
 
 
 def to_python(controls: Controls) -> str:
     """A script that builds the scene, judges its wall and draws the stable set."""
-    parts = _given(controls.scene)
+    parts = spell_part(controls.scene)
     text = "zwidth.Scene(\n" + "".join(f"    {name}={_spell(part)},\n" for name, part in parts.items()) + ")"
     normalized = {"notes": "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "unit": "(alpha)"}
     normalized |= {"x": "normalized stiffness alpha", "y": "normalized damping beta"}
@@ -74,5 +60,5 @@ def _spell(part: Any) -> str:
     """A part as Python writes it."""
     if not hasattr(part, "__dataclass_fields__"):
         return repr(part)
-    given = ", ".join(f"{name}={_spell(value)}" for name, value in _given(part).items())
+    given = ", ".join(f"{name}={_spell(value)}" for name, value in spell_part(part).items())
     return f"zwidth.{type(part).__name__}({given})"

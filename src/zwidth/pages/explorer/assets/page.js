@@ -3,7 +3,7 @@
 const start = JSON.parse(document.getElementById("start").textContent);
 const by = id => document.getElementById(id);
 const STEPS = 1000;
-const LABELS = { mode: "numbers", velocity: "velocity estimate", operator: "operator", coupling: "compliance" };
+const LABELS = { mode: "numbers", velocity: "velocity estimate", coupling: "compliance" };
 const fields = {};
 let inputs = null, serial = 0, answered = 0, waiting = {}, rests = false, scheduled = false;
 
@@ -49,7 +49,7 @@ function addChoice(form, name) {
   const select = element("select", { id: name });
   for (const [value, text] of Object.entries(start.choices[name])) select.append(element("option", { value, textContent: text }));
   select.addEventListener("change", () => send({ [name]: select.value }, true));
-  fields[name] = { select, row: addRow(form, name, LABELS[name], select) };
+  fields[name] = { select, row: addRow(form, name, LABELS[name] ?? name, select) };
 }
 function build() {
   const form = by("controls"), names = Object.keys(start.sliders);
@@ -64,7 +64,7 @@ function build() {
       fields.rate = { rate, row };
     }
   }
-  for (const part of ["velocity", "operator", "coupling"]) {
+  for (const part of Object.keys(start.choices).filter(name => name !== "mode")) {
     addChoice(form, part);
     for (const name of names.filter(name => name.startsWith(`${part}.`))) addSlider(form, name);
   }

@@ -1,0 +1,204 @@
+"""A part of a scene is added as CONTRIBUTING.md says: in the files that it names, and everything else knows it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+MOUNT = '''"""A spring and a damper between the motor's side of the device and the ground."""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from zwidth.parts.checks import check_fields
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A spring and a damper between device and ground."""
+
+    usual: ClassVar[dict[str, dict[str, float]]] = {"soft": {"stiffness": 100.0, "damping": 1.0}}
+
+    stiffness: Any
+    damping: Any = 0.0
+
+    def __post_init__(self) -> None:
+        check_fields(self, "mount")
+'''
+IMPORT = "from zwidth.parts.mount import Mount\n"
+# By file: texts, and what stands there in the copy.
+EDITS = {
+    "quantities.py": {
+        '    Parameter("stiffness", "stiffness K': (
+            '    Parameter("mount.stiffness", "stiffness of the mount", "k_0", POSITIVE, "N/m", (1.0, 1e3)),\n'
+            '    Parameter("mount.damping", "damping of the mount", "b_0", NOT_NEGATIVE, "N s/m", (0.0, 10.0)),\n'
+            '    Parameter("stiffness", "stiffness K'
+        )
+    },
+    "parts/paths.py": {
+        '"coupling": Coupling}': '"coupling": Coupling, "mount": Mount}',
+        "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
+    },
+    "scene.py": {
+        "    operator: Operator | None = None\n": (
+            "    operator: Operator | None = None\n    mount: Mount | None = None\n"
+        ),
+        '"zwidth.Operator(mass=0.5)",': '"zwidth.Operator(mass=0.5)",\n    "mount": "zwidth.Mount(stiffness=100)",',
+        '"operator": Operator | None}': '"operator": Operator | None, "mount": Mount | None}',
+        "self.device.coupling is None\n\n": "self.device.coupling is None and self.mount is None\n\n",
+        "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
+    },
+    "linear/chain.py": {
+        "    links = []\n": (
+            "    links = []\n"
+            "    if (mount := scene.mount) is not None:\n"
+            "        masses = [(device.mass, device.damping + mount.damping, mount.stiffness)]\n"
+        )
+    },
+    "__init__.pyi": {
+        "from .parts.operator": "from .parts.mount import Mount as Mount\nfrom .parts.operator",
+    },
+}
+
+CONFIGURATION = """
+version: 1
+name: mounted
+scene: {mass: 100 g, damping: 10, period: 1 ms, mount: {stiffness: 0.135 N/mm, damping: 6}}
+studies:
+  - {kind: sweep, name: springs, axes: {mount.stiffness: [10, 1 kN/m], stiffness: [1e3, 50e3], virtual_damping: 5}}
+"""
+
+PROGRAM = """
+import json, zwidth
+from click.testing import CliRunner
+from zwidth.cli import cli
+from zwidth.pages.explorer.controls import CHOICES, SLIDERS, Controls
+from zwidth.pages.explorer.recipes import to_python, to_yaml
+from zwidth.studies.document import config_json_schema
+
+def say(*arguments):
+    return CliRunner().invoke(cli, list(arguments)).output
+
+def answer(scene):
+    radius = [float(scene.spectral_radius(stiffness, 5.0)) for stiffness in (1e3, 50e3)]
+    certified = [bool(scene.is_stable(stiffness, 5.0, method="certified")) for stiffness in (1e3, 50e3)]
+    return [*radius, *certified, float(scene.max_stiffness().stiffness), scene.sensitivities().per["damping"]]
+
+def refuse(function):
+    try:
+        function()
+    except zwidth.ZwidthError as error:
+        return str(error)
+
+CHECK = ("check", "--mass", "0.1", "--damping", "10", "--period", "1e-3", "--stiffness", "1e3")
+config = zwidth.load_config("mounted.yaml")
+scene = config.scene.to_scene()
+bare = scene.replace(mount=None)
+assert zwidth.run("mounted.yaml", out="out").ok
+store = zwidth.open_dataset("out/springs.zarr")
+controls = Controls().change({"mount": "soft"}).change({"mount.stiffness": 50})
+schema = config_json_schema()["$defs"]
+print(json.dumps({
+    "parameters": scene.parameters(),
+    "answers": [answer(scene), answer(bare.replace(operator=zwidth.Operator(damping=6, stiffness=135)))],
+    "slopes": sorted(scene.sensitivities().per),
+    "help": say("check", "--help"),
+    "checked": say(*CHECK, "--mount-stiffness", "135", "--mount-damping", "6"),
+    "doubted": say(*CHECK, "--mount-stiffness", "1e12"),
+    "needed": say(*CHECK, "--mount-damping", "1"),
+    "refused": [refuse(lambda: zwidth.Mount(stiffness=0)), refuse(lambda: scene.replace(mount=None).replace(mount=5))],
+    "faults": refuse(lambda: zwidth.load_config("wrong.yaml")),
+    "store": [list(store.stable.dims), store.mount_stiffness.attrs],
+    "page": [SLIDERS["mount.stiffness"], CHOICES["mount"], controls.shown(), to_yaml(controls), to_python(controls)],
+    "schema": [schema["MountSection"], "mount" in schema["PhysicalScene"]["properties"]],
+}, default=float))
+"""
+
+
+@pytest.fixture(scope="module")
+def copied(tmp_path_factory):
+    """What a program says that runs with a copy of the package, to which the part was added."""
+    folder = tmp_path_factory.mktemp("copy")
+    package = folder / "zwidth"
+    shutil.copytree(ROOT / "src" / "zwidth", package, ignore=shutil.ignore_patterns("__pycache__"))
+    (package / "parts" / "mount.py").write_text(MOUNT, encoding="utf-8")
+    for file, edits in EDITS.items():
+        text = (package / file).read_text(encoding="utf-8")
+        for old, new in edits.items():
+            assert text.count(old) == 1, (file, old)
+            text = text.replace(old, new)
+        (package / file).write_text(text, encoding="utf-8")
+    (folder / "mounted.yaml").write_text(CONFIGURATION, encoding="utf-8")
+    wrong = CONFIGURATION.replace("stiffness: 0.135 N/mm, damping: 6", "stiffness: 0, dampin: 6")
+    (folder / "wrong.yaml").write_text(wrong, encoding="utf-8")
+    environment = {**os.environ, "PYTHONPATH": str(folder)}
+    found = subprocess.run(
+        [sys.executable, "-c", PROGRAM], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert found.returncode == 0, found.stderr[-3000:]
+    return json.loads(found.stdout)
+
+
+def test_the_files_are_those_that_the_guide_names():
+    guide = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = guide[guide.index("**A part of a scene**") : guide.index("## Style")]
+    named = set(re.findall(r"`([\w/]+\.pyi?)`", section)) - {"tests/unit/test_adding_a_part.py"}
+    assert named == set(EDITS)
+    # With its own file they are six.
+    assert len(EDITS) == 5
+
+
+def test_a_scene_knows_its_numbers(copied):
+    assert {name: value for name, value in copied["parameters"].items() if "." in name} == {
+        "mount.stiffness": 135.0,
+        "mount.damping": 6.0,
+    }
+    assert {"mount.stiffness", "mount.damping"} <= set(copied["slopes"])
+    assert (
+        copied["refused"][0]
+        == "mount.stiffness: got 0 N/m; it must be greater than 0 N/m; write a number in this range"
+    )
+    assert copied["refused"][1].startswith("mount: got 5")
+
+
+def test_every_answer_is_that_of_a_massless_hand_with_the_same_numbers(copied):
+    mounted, held = copied["answers"]
+    assert mounted == pytest.approx(held, rel=1e-9)
+    assert mounted[2:4] == [True, False]
+
+
+def test_the_command_line_takes_judges_and_doubts_it(copied):
+    assert "Stiffness of the mount, in N/m." in copied["help"]
+    assert re.search(r"^mount +stiffness 135\.0 N/m, damping 6\.000 N s/m", copied["checked"], re.MULTILINE)
+    assert "--mount-stiffness is 1e+12 N/m, far from any device" in copied["doubted"]
+    assert "a mount has a stiffness; give --mount-stiffness" in copied["needed"]
+
+
+def test_configurations_have_its_section_and_stores_its_axis(copied):
+    assert "scene.mount.stiffness: got 0 N/m; it must be greater than 0 N/m" in copied["faults"]
+    assert "a mount has the keys 'stiffness', 'damping'; did you mean 'damping'?" in copied["faults"]
+    dims, attributes = copied["store"]
+    assert "mount_stiffness" in dims
+    assert attributes == {"long_name": "stiffness of the mount", "units": "N/m"}
+    section, known = copied["schema"]
+    assert known
+    assert section["required"] == ["stiffness"]
+    assert section["properties"]["damping"]["description"].startswith("Damping of the mount, in N s/m or with a unit")
+
+
+def test_the_explorer_has_its_sliders_and_writes_it_down(copied):
+    slider, choices, shown, yaml, python = copied["page"]
+    assert slider == ["stiffness of the mount k_0", "N/m", 1.0, 1.0, 1000.0, False]
+    assert choices == {"none": "none", "soft": "soft"}
+    assert (shown["mount"], shown["mount.stiffness"]) == ("soft", 50.0)
+    assert 'mount: {"stiffness": 50.0, "damping": 1.0}' in yaml
+    assert "mount=zwidth.Mount(stiffness=50.0, damping=1.0)" in python
