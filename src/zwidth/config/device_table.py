@@ -17,7 +17,7 @@ from zwidth.config.axes import SPELLED, Entry, read_entries
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.parameters import make_delay_readers
 from zwidth.config.units import make_entry_reader
-from zwidth.sweep.files.cells import read_rows, split_title
+from zwidth.words.cells import read_rows, split_title
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
 from zwidth.words.quantities import PARAMETERS

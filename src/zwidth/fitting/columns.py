@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.log import fit_log
-from zwidth.sweep.files.cells import read_rows, split_title
+from zwidth.words.cells import read_rows, split_title
 from zwidth.words.errors import InputError, UnusableValueError
 from zwidth.words.formatting import describe, suggestion, with_unit
 from zwidth.words.quantities import POSITIVE
