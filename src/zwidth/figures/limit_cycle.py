@@ -27,7 +27,6 @@ _DIVERGED = 4
 _CYCLES = ("amplitude_m", "frequency_Hz", "outcome", "linearly_stable")
 _BEYOND: dict[str, Any] = {"facecolor": "#D9D9D9", "edgecolor": "#A8A8A8", "hatch": "////", "linewidth": 0.0}
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
-_STYLES = (style.SOLID, style.DASHED, style.DASH_DOTTED, style.DOTTED)
 
 
 @style.house_style()
@@ -148,14 +147,14 @@ def draw_limit_cycle_curves(
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:
     """The look of every curve, and its label: which value it belongs to, and where no wall of it is linearly stable."""
     if not family:
-        return [{"color": style.DISTINCT[0], "linestyle": style.SOLID, "label": "buzz"}]
+        return [{**style.look(0), "label": "buzz"}]
     values, (_, symbol, unit) = arrays[family], _AXES[family]
     times, unit = style.si_unit(float(np.abs(values).max()), unit)
     colors = style.ordered_colors(values.size)
     unstable = [not np.any(stable[:, k]) for k in range(values.size)]
     texts = [f"${symbol} = {value * times:.4g}$ {unit}" for value in values]
     return [
-        {"color": color, "linestyle": _STYLES[k % len(_STYLES)], "label": text + (", unstable" if lost else "")}
+        {**style.look(k), "color": color, "label": text + (", unstable" if lost else "")}
         for k, (color, text, lost) in enumerate(zip(colors, texts, unstable, strict=True))
     ]
 

@@ -11,8 +11,6 @@ from matplotlib.axes import Axes
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves
 
-# In gray these differ in lightness from one to the next.
-_STYLES = (style.SOLID, style.DASHED, style.DASH_DOTTED, style.DOTTED)
 # A motion this much wider than the smallest is cut, so that the smallest is still seen.
 _CUT = 8.0
 _MOST_PANELS = 6
@@ -119,7 +117,7 @@ def _read_motions(table: Table) -> list[Any]:
     motions = curves({**columns, "number": np.cumsum(columns["time_s"] == 0.0)}, "number")
     for k, each in enumerate(motions):
         each.label = style.literal(each.label[0])
-        each.look = {"color": style.DISTINCT[k % len(style.DISTINCT)], "linestyle": _STYLES[k % len(_STYLES)]}
+        each.look = style.look(k)
     return motions
 
 

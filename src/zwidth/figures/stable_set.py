@@ -52,7 +52,7 @@ def draw_stable_set(
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
     tables = [table for table in (walls, outlines) if "label" in table]
     labels = list(dict.fromkeys(label for table in tables for label in np.asarray(table["label"]).tolist()))
-    colors = {label: style.DISTINCT[k % len(style.DISTINCT)] for k, label in enumerate(labels)}
+    colors = {label: style.look(k)["color"] for k, label in enumerate(labels)}
     names = ("alpha", "beta") if normalized else SI_COLUMNS
     largest = max(float(np.nanmax(np.abs(table[names[0]]), initial=0.0)) for table in tables)
     factor, unit = (1.0, "") if normalized else style.si_unit(largest, "N/m")

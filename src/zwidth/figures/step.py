@@ -11,8 +11,6 @@ from matplotlib.lines import Line2D
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves
 
-# In gray these differ in lightness from one to the next.
-_STYLES = (style.SOLID, style.DASHED, style.DASH_DOTTED, style.DOTTED)
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
 
@@ -55,15 +53,15 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
         largest = max(float(np.nanmax(np.abs(each.position))) for each in responses)
         factor, length = style.si_unit(max(finals, default=largest), "m")
-    for each, color, dash in _assign_colors(responses):
+    for each in responses:
         text = rf"{style.literal(each.label)}  ($\alpha = {each.alpha:.3g}$, $\beta = {each.beta:.3g}$)"
         text += ", not settled" if each.settled is False else ""
-        ax.plot(each.time * clock, each.position * factor, color=color, linestyle=dash, label=text, zorder=3)
+        ax.plot(each.time * clock, each.position * factor, label=text, zorder=3, **each.look)
         if np.isfinite(each.final_position):
-            ax.axhline(each.final_position * factor, color=color, linewidth=0.5, zorder=2)
+            ax.axhline(each.final_position * factor, color=each.look["color"], linewidth=0.5, zorder=2)
         if each.settled:
             at = np.interp(each.settling_time, each.time, each.position)
-            ax.plot(each.settling_time * clock, at * factor, color=color, zorder=4, **_DOT)
+            ax.plot(each.settling_time * clock, at * factor, color=each.look["color"], zorder=4, **_DOT)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
     ax.set_ylabel(f"position  $x$  in {length} for 1 N" if physical else r"position  $x$  in $F\,T^2\!/m$")
     return clock, unit
@@ -77,24 +75,18 @@ def _read_responses(table: Table) -> list[Any]:
     # Each begins at time 0: two of them may be alike in all but that.
     columns["number"] = np.cumsum(columns["time"] == 0.0)
     responses = curves(columns, "number")
-    for each in responses:
+    for k, each in enumerate(responses):
+        each.look = style.look(k)
         for name in {"label", "alpha", "beta", "final_position", "settling_time"} & set(columns):
             setattr(each, name, getattr(each, name)[0])
         each.settled = bool(each.settling_time <= each.time[-1]) if "settling_time" in columns else None
     return responses
 
 
-def _assign_colors(responses: list[Any]) -> list[tuple[Any, Any, Any]]:
-    """Each with a color and a line style."""
-    return [
-        (each, style.DISTINCT[k % len(style.DISTINCT)], _STYLES[k % len(_STYLES)]) for k, each in enumerate(responses)
-    ]
-
-
 def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
     """The force of the wall over time."""
-    for each, color, _ in _assign_colors(responses):
-        label = f"wall_force, {style.literal(each.label)}"
+    for each in responses:
         # Steps are too short for dashes: lightness has to do.
-        ax.plot(each.time * clock, each.wall_force, color=color, linewidth=1.1, label=label, zorder=3)
+        look = {"color": each.look["color"], "linewidth": 1.1, "label": f"wall_force, {style.literal(each.label)}"}
+        ax.plot(each.time * clock, each.wall_force, zorder=3, **look)
     ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)

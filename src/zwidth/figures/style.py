@@ -34,6 +34,7 @@ SOLID = "-"
 DASHED = (0, (5.0, 2.2))
 DASH_DOTTED = (0, (6.0, 1.8, 1.2, 1.8))
 DOTTED = (0, (1.2, 1.6))
+STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED)
 
 ALPHA_LABEL = r"normalized stiffness  $\alpha = K\,T^2\!/m$"
 BETA_LABEL = r"normalized virtual damping  $\beta = B\,T/m$"
@@ -237,6 +238,11 @@ def color_by_value(values: Sequence[float]) -> dict[float, Any]:
     """A color for every value that occurs, `ordered_colors` in ascending order."""
     distinct = sorted(set(values))
     return dict(zip(distinct, ordered_colors(len(distinct)), strict=True))
+
+
+def look(k: int) -> dict[str, Any]:
+    """Color and line style of one of several curves; in gray they differ in lightness from one to the next."""
+    return {"color": DISTINCT[k % len(DISTINCT)], "linestyle": STYLES[k % len(STYLES)]}
 
 
 def pick_evenly(count: int, most: int) -> list[int]:
