@@ -16,10 +16,11 @@ from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
+from zwidth.figures.table import stack
 from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.loops.rigid.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device, stack
+from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
 from zwidth.words.types import DelayModel

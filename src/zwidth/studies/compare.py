@@ -14,8 +14,8 @@ from zwidth.config.fields import members
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
-from zwidth.figures.table import SI_COLUMNS
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, stack
+from zwidth.figures.table import SI_COLUMNS, stack
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.studies.stable_set import name_kind
 
 # An outline has some hundreds of points, of which an estimate of the size may rest on.

@@ -18,12 +18,12 @@ from zwidth.config.numbers import number, whole_number
 from zwidth.config.parameters import parameter_axis
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.units import make_entry_reader
-from zwidth.figures.table import SI_COLUMNS
+from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.required import RequiredValue
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, short, suggestion
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, Range

@@ -17,10 +17,10 @@ from zwidth.config.numbers import whole_number
 from zwidth.config.parameters import parameter_axis
 from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
-from zwidth.figures.table import SI_COLUMNS
+from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table, stack
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table
 from zwidth.studies.stable_set import name_kind
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, POSITIVE

@@ -18,13 +18,14 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Fraction, Quantity, Strict, describe_entry, members, quantity_of
 from zwidth.config.parts import VelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene
+from zwidth.figures.table import stack
 from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
 from zwidth.parts.velocity import BackwardDifference
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, stack
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, plain, with_unit
 from zwidth.words.quantities import POSITIVE

@@ -17,11 +17,11 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Quantity, Strict, members
 from zwidth.config.parameters import parameter_axis, quantity_axis
 from zwidth.config.scenes import AnyScene
-from zwidth.figures.table import SI_COLUMNS
+from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
-from zwidth.studies.outcome import Outcome, csv_text, stack
+from zwidth.studies.outcome import Outcome, csv_text
 from zwidth.studies.simulate import SimulatedStudy, check_circumstances, name_column
 from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE

@@ -16,7 +16,6 @@ from zwidth.config.axes import Axis
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import Study
 from zwidth.figures.table import SI_COLUMNS
-from zwidth.figures.table import stack as stack
 from zwidth.words.formatting import to_cell
 
 Table: TypeAlias = dict[str, np.ndarray]

@@ -13,11 +13,12 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
+from zwidth.figures.table import stack
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.assessment import Assessment, assess
 from zwidth.studies.boundary import outline
-from zwidth.studies.outcome import Outcome, add_si_columns, si_scales, stack
+from zwidth.studies.outcome import Outcome, add_si_columns, si_scales
 from zwidth.studies.passivity import passive_outlines
 from zwidth.studies.recommend_with_parts import recommend_with_parts, spell_answer
 from zwidth.studies.step import ResponseStudy

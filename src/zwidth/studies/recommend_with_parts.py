@@ -11,11 +11,12 @@ import numpy as np
 
 from zwidth import figures
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
+from zwidth.figures.table import stack
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.scenes.limits import describe_islands
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall, choose_damping
-from zwidth.studies.outcome import Outcome, stack
+from zwidth.studies.outcome import Outcome
 from zwidth.studies.stable_set import name_kind
 from zwidth.words.formatting import plain, tell_apart, with_unit
 from zwidth.words.status import Status

@@ -11,10 +11,11 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels
+from zwidth.figures.table import stack
 from zwidth.loops.rigid.ridge import RidgeKind, RidgePoint, alpha_max
 from zwidth.loops.rigid.slope import stiffness_slope
 from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, Table, stack
+from zwidth.studies.outcome import Outcome, Table
 from zwidth.words.status import Status
 from zwidth.words.types import DelayModel
 

@@ -26,11 +26,11 @@ from zwidth.config.scenes import (
     WallField,
 )
 from zwidth.config.study import HeldOnly
-from zwidth.figures.table import SI_COLUMNS
+from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, si_scales, stack
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, si_scales
 from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import with_unit

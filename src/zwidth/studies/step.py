@@ -29,10 +29,11 @@ from zwidth.config.scenes import (
     normalized_wall,
 )
 from zwidth.config.study import HeldOnly, refuse_parts
+from zwidth.figures.table import stack
 from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.span import Span
-from zwidth.studies.outcome import ComputedStudy, Outcome, stack
+from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import Range
