@@ -3,7 +3,6 @@
 from . import devices as devices
 from . import plot as plot
 from .assessment import Assessment as Assessment
-from .assessment import SceneAssessment as SceneAssessment
 from .assessment import assess as assess
 from .assessment import assess_many as assess_many
 from .design.area import stable_area as stable_area

@@ -43,7 +43,6 @@ def test_margins_and_passivity_are_those_of_the_scene(parts):
 def test_with_the_sensor_at_the_tip_passivity_is_not_known():
     coupling = zwidth.Coupling(0.05, 20e3, 1, sensor="tip")
     verdict = zwidth.assess(zwidth.Scene(zwidth.Device(0.1, 10, coupling), TIMING, WALL))
-    assert isinstance(verdict, zwidth.SceneAssessment)
     assert verdict.passive is None
     assert math.isnan(verdict.passivity_margin)
     assert verdict.as_dict()["passivity_margin"] is None
@@ -86,7 +85,6 @@ def test_a_wall_that_takes_all_damping_away_is_not(name, damping):
 def test_an_undamped_device_has_no_stable_spring(delay):
     scene = dataclasses.replace(free_scene("filter", 0.0, 0.0), timing=zwidth.Timing(1e-3, delay))
     verdict = zwidth.assess(scene)
-    assert isinstance(verdict, zwidth.SceneAssessment)
     assert verdict.stable_stiffness == ()
     assert verdict.stable_damping == ()
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.assessment import Assessment, SceneAssessment
+from zwidth.assessment import Assessment
 from zwidth.formatting import plain
 from zwidth.linear.crossing_lines import end_lines
 from zwidth.linear.passivity import has_condition
@@ -126,14 +126,14 @@ def nyquist_curve(scene: Scene) -> np.ndarray:
     )
 
 
-def crossover(scene: Scene, verdict: Assessment | SceneAssessment) -> complex:
+def crossover(scene: Scene, verdict: Assessment) -> complex:
     """The open loop where its magnitude is 1, the frequency of which the verdict has; NaN without one."""
     hertz = verdict.gain_crossover
     wall = scene.wall.stiffness, scene.wall.virtual_damping
     return complex(scene.frequency_response(*wall, hertz)) if isfinite(hertz) else complex("nan+nanj")
 
 
-def length_of(scene: Scene, verdict: Assessment | SceneAssessment) -> int:
+def length_of(scene: Scene, verdict: Assessment) -> int:
     """How many periods show the wall's slowest motion: six of its time constants, if that is neither few nor many."""
     periods = 6.0 * abs(verdict.time_constant) / scene.timing.period
     return int(min(max(periods, _SHORTEST), _LONGEST)) if isfinite(periods) else 10 * _SHORTEST
@@ -230,6 +230,6 @@ def normalized_lines(verdict: Assessment) -> list[str]:
     return [f"{label:<20}  {text}" for label, text in rows.items()]
 
 
-def word_of(verdict: Assessment | SceneAssessment) -> str:
+def word_of(verdict: Assessment) -> str:
     """The verdict in a word."""
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"

@@ -78,8 +78,8 @@ def test_a_coupling_and_the_ends_of_its_row_and_column():
 def test_the_words_of_a_scene_with_parts():
     out = run("check", *WALL, *DEVICE, *RATE, *PARTS["filter"][0]).stdout.splitlines()
     labels = [line[:22].strip() for line in out]
-    assert labels[:5] == ["device", "timing", "velocity", "wall", ""]
-    assert labels[5:12] == [
+    assert labels[:6] == ["device", "timing", "velocity", "wall", "normalized", ""]
+    assert labels[6:13] == [
         "verdict",
         "to the boundary in K",
         "to the boundary in B",
@@ -89,8 +89,8 @@ def test_the_words_of_a_scene_with_parts():
         "margins",
     ]
     assert "cutoff 100.0 Hz" in out[2]
-    assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[9]
-    assert out[12].startswith("what limits it        no delay: K_max")
+    assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[10]
+    assert out[13].startswith("what limits it        no delay: K_max")
 
 
 def test_a_rigid_scene_says_what_limits_it_too():
