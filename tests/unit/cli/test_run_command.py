@@ -6,7 +6,7 @@ from click.testing import CliRunner
 import zwidth
 from zwidth.cli.commands import cli
 from zwidth.formatting import plain, with_unit
-from zwidth.studies.recommend_with_parts import spell_answer
+from zwidth.studies.recommend import spell_answer
 
 HEAD = "version: 1\nname: small\n"
 STUDY = "studies: [{kind: recommend, name: best, stiffness_fraction: %s}]\n"
