@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from typing import Any
@@ -19,7 +18,7 @@ from zwidth.cli.fit import fit
 from zwidth.cli.init import init
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.report import report
-from zwidth.formatting import plain, to_json, with_unit
+from zwidth.formatting import plain, with_unit
 
 
 @click.group(
@@ -55,16 +54,12 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
         result["islands"] = [island._asdict() for island in scene.islands()]
         if rule is not None:
             result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
-        _print_json(result)
+        words.print_json(result)
         return
     lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
     lines += words.friction_lines(rule) if rule is not None else []
     for line in [*lines, *(words.row("note", note) for note in notes)]:
         click.echo(line)
-
-
-def _print_json(result: dict[str, Any]) -> None:
-    click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
 
 
 @cli.command()
@@ -126,7 +121,7 @@ def ridge(
             "notes": notes,
         }
     if as_json:
-        _print_json(result)
+        words.print_json(result)
         return
     for line in [] if normalized else words.scene_lines(scene):
         click.echo(line)
@@ -146,7 +141,7 @@ def schema() -> None:
     """Print the JSON Schema of configuration files, for editors."""
     from zwidth.studies.document import config_json_schema
 
-    click.echo(json.dumps(config_json_schema(), indent=2))
+    words.print_json(config_json_schema())
 
 
 for command in (init, *runs.COMMANDS, report, design, devices, explore, fit, bench):

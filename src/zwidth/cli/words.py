@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import math
 from math import isfinite, isinf, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from zwidth.formatting import plain, short, tell_apart, with_unit
+from zwidth.formatting import plain, short, tell_apart, to_json, with_unit
 
 if TYPE_CHECKING:
     from zwidth.assessment import Assessment, Intervals
@@ -23,6 +24,11 @@ _UNITS = {"mass": "kg", "damping": "N s/m", "stiffness": "N/m", "cutoff": "Hz", 
 
 def row(label: str, text: str) -> str:
     return f"{label:<20}  {text}"
+
+
+def print_json(result: Any) -> None:
+    """Print what a machine reads; null stands for what is not known or not finite."""
+    click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
 
 
 def scene_lines(scene: Scene) -> list[str]:
@@ -215,8 +221,8 @@ class Slope(NamedTuple):
         return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines; null stands for an infinite slope, which JSON cannot write."""
-        return {"value": self.value if isfinite(self.value) else None, "unit": self.unit}
+        """For machines."""
+        return {"value": self.value, "unit": self.unit}
 
 
 def list_slopes(scene: Scene) -> list[Slope]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.formatting import with_unit
+from zwidth.formatting import to_json, with_unit
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
@@ -236,7 +236,7 @@ class DeviceFit:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
-        return _without_nan(self._numbers())
+        return to_json(self._numbers())
 
     def _numbers(self) -> dict[str, Any]:
         return {
@@ -257,14 +257,6 @@ class DeviceFit:
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),
         }
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _without_nan(part) for name, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return None if value != value else value
 
 
 def scene_of(values: Iterable[float], period: float, velocity: Velocity) -> Scene:
