@@ -23,6 +23,7 @@ from matplotlib.patches import Circle, PathPatch
 
 from zwidth._types import ArrayLike
 from zwidth.batching import as_float64
+from zwidth.design.passive import passive_edge
 from zwidth.errors import InputError
 from zwidth.figures import style
 from zwidth.figures.grid import logarithmic
@@ -95,7 +96,7 @@ def region(
             at = top.stiffness / x_unit, top.virtual_damping / y_unit
             ax.plot(*at, "o", color=color, markersize=4.5, zorder=5, clip_on=False, label="stiffest stable wall")
         if passive:
-            walls = _passive_edge(each)
+            walls = passive_edge(each, _ANGLES)
             ax.plot(walls[0] / x_unit, walls[1] / y_unit, color=color, linestyle=style.DASH_DOTTED, zorder=3)
         handles.append(style.line(label or "stable", color=color))
     handles += [style.line("passive", style.DASH_DOTTED)] if passive else []
@@ -106,16 +107,6 @@ def region(
     ax.margins(0.04)
     ax.legend(handles=handles, loc="best")
     return ax
-
-
-def _passive_edge(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The edge of the passive walls with stiffness > 0: the damping that a wall needs grows as the wall does."""
-    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, _ANGLES)[1:-1]
-    units = scene.units
-    stiffness, damping = units.stiffness * np.cos(angle), units.virtual_damping * np.sin(angle)
-    own = float(scene.passivity_margin(0.0, 0.0))
-    reach = own / (own - scene.passivity_margin(stiffness, damping))
-    return reach * stiffness, reach * damping
 
 
 @style.house_style()

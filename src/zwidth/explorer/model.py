@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.assessment import Assessment
+from zwidth.design.passive import passive_edge
 from zwidth.formatting import plain
 from zwidth.linear.crossing_lines import end_lines
 from zwidth.linear.passivity import has_condition
@@ -154,14 +155,7 @@ def passive_set(scene: Scene) -> Curve | None:
     """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
     if not has_condition(scene.device):
         return None
-    damping, units = float(scene.device.damping), scene.units
-    if damping == 0:
-        return np.empty(0), np.empty(0)
-    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS if scene.is_rigid else _FEW_DIRECTIONS)
-    # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
-    along = np.maximum(np.cos(turn), 0.0) * units.stiffness, np.sin(turn) * units.virtual_damping
-    share = damping / (damping - np.asarray(scene.passivity_margin(*along)))
-    return along[0] * share, along[1] * share
+    return passive_edge(scene, _DIRECTIONS if scene.is_rigid else _FEW_DIRECTIONS)
 
 
 def radius_map(scene: Scene, across: Range, up: Range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

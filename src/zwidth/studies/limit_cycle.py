@@ -27,6 +27,7 @@ from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.status import Status
 from zwidth.studies.outcome import Outcome, csv_text, stack
 from zwidth.studies.simulate import SimulatedStudy, check_circumstances, name_column
+from zwidth.studies.stable_set import trace_outlines
 from zwidth.units import FORCE, LENGTH, Dimension
 
 # The axes that there may be, with their columns.
@@ -229,10 +230,8 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
     if not walls:
         return []
     lines = []
-    for outline in scene.stable_region():
-        # Closed: the first point comes again at the end.
-        stiffness, damping = (np.append(part, part[0]) for part in outline[:2])
-        ends: dict[str, np.ndarray] = {"stiffness": stiffness, "virtual_damping": damping}
+    for outline in trace_outlines(scene):
+        ends: dict[str, np.ndarray] = {name: outline[_COLUMNS[name]] for name in ("stiffness", "virtual_damping")}
         if len(walls) == 2:
             lines.append(ends)
             continue

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,16 +10,14 @@ import numpy as np
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
-from zwidth.stability.passivity import passivity_margin
 from zwidth.stability.region import stable_region
 from zwidth.stability.ridge import RidgeKind
 from zwidth.status import Status
 from zwidth.studies.outcome import Table
+from zwidth.studies.passivity import unit_outline
 
 if TYPE_CHECKING:
     from zwidth.figures.region import Outlines
-
-_ANGLES = 721
 
 
 def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
@@ -60,15 +57,5 @@ def find_edges(delta: float, d: float) -> dict[str, Outlines]:
         return {}
     edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
     if delta > 0:
-        edges["passive"] = [(_find_passive(delta, d), False)]
+        edges["passive"] = [(delta * np.stack(unit_outline(d), -1), False)]
     return edges
-
-
-def _find_passive(delta: float, d: float) -> np.ndarray:
-    """The edge of the passive walls: the damping that a wall needs grows as the wall does."""
-    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, _ANGLES)
-    walls = np.stack([np.cos(angle), np.sin(angle)], -1)
-    needed = -np.asarray(passivity_margin(walls[:, 0], walls[:, 1], 0.0, d))
-    # The smallest cosines are rounded zeros.
-    walls[[0, -1], 0] = 0.0
-    return delta * walls / needed[:, None]
