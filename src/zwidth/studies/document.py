@@ -27,7 +27,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, validation_er
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
-from zwidth.config.study import Study
+from zwidth.config.study import KINDS, Study
 from zwidth.formatting import describe, suggestion
 from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.compare import CompareStudy
@@ -45,9 +45,6 @@ from zwidth.sweep.study import SweepStudy
 from zwidth.units import looks_like_number
 
 FORMAT_VERSION = 1
-
-KINDS: dict[str, type[Study]] = {}
-"""The models of the studies by the name of their kind."""
 
 
 def register(model: type[Study]) -> type[Study]:

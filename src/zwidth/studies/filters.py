@@ -59,16 +59,6 @@ class FiltersStudy(ComputedStudy):
     noise_limit: Speed | None = None
     """Standard deviation that the noise of the velocity may have, in m/s or with a unit: the best filter is marked."""
 
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        return {"device": scene.device, **raw} if isinstance(scene.device, PhysicalDevice) else raw
-
-    @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        if name == "device":
-            return "a stiffness in N/m needs a device in SI units", "give the scene mass and period"
-        return super().missing(name)
-
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
         if self.cutoff is None and self.samples is None:

@@ -61,19 +61,6 @@ class RecommendStudy(ResponseStudy):
     stiffness_fraction: Fraction = RECOMMENDED_SHARE
     """Stiffness of the recommended wall as a share of the maximum."""
 
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        filled = {"delay_model": scene.delay_model, **raw}
-        if isinstance(scene.device, PhysicalDevice):
-            filled.setdefault("device", scene.device)
-        return filled
-
-    @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        if name == "device":
-            return "a recommendation in N/m needs a device in SI units", "give the scene mass and period"
-        return super().missing(name)
-
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         return ((self.device, None),)
 

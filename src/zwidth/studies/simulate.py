@@ -20,7 +20,6 @@ from zwidth.config.scenes import (
     AnyScene,
     AnyWall,
     PhysicalDevice,
-    PhysicalScene,
     PhysicalWall,
     SimulatedDevice,
     WallField,
@@ -62,19 +61,6 @@ class SimulatedStudy(ComputedStudy):
 
     delay_model: HeldOnly = "held"
     """How a delay that is not whole is modeled; a motion exists in the model 'held' only."""
-
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        filled = {"delay_model": scene.delay_model, **raw}
-        if isinstance(scene, PhysicalScene):
-            filled.setdefault("device", scene.simulated_device)
-        return filled
-
-    @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        if name == "device":
-            return "a motion in m and N needs a device in SI units", "give the scene mass and period"
-        return super().missing(name)
 
 
 def check_circumstances(given: Circumstances, scene: Scene) -> Iterable[LocatedProblem]:
