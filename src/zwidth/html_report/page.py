@@ -26,7 +26,7 @@ _METHODS = {
     "map": "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors.",
     "passivity": "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms.",
     "step": "Exact solution between the instants at which a force changes; rounding alone.",
-    "slope": "The limit polynomial of eq. (22), to some rounding errors.",
+    "published": "The paper's numbers, from closed forms.",
     "recommend": "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings.",
     "compare": "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge.",
     "filters": "The highest point of all edges of the stable set, one filter after the other, to about 1e-13.",
@@ -142,7 +142,7 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
                 f'<figure><img alt="{escape(text)}" src="data:image/svg+xml;base64,{data}">'
                 f"<figcaption>{escape(Path(file).stem)}</figcaption></figure>"
             )
-        elif file == "published.json" and path.is_file():
+        elif entry.get("kind") == "published" and file.endswith(".json") and path.is_file():
             yield _published(json.loads(path.read_text(encoding="utf-8")))
     store = where / f"{entry['name']}{SUFFIX}"
     if store.is_dir() and not store.is_symlink():

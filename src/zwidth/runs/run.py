@@ -34,7 +34,7 @@ AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class Computation:
-    """What a run computes as a whole: a study that is no sweep, or the comparison with the paper's numbers."""
+    """What a run computes as a whole: a study that is no sweep."""
 
     name: str
     kind: str
@@ -58,9 +58,9 @@ def run(
     """Run the studies of a configuration and write their results into one folder.
 
     A sweep is computed chunk by chunk into a store ``<name>.zarr``. Any other study writes a table ``<name>.csv`` (a
-    map: ``<name>.npz``) and a figure as PNG and SVG; ``recommend`` adds a recommendation, and a configuration that
-    repeats figures of the paper adds ``published.md`` and ``published.json``. Files that the configuration reads are
-    copied to ``inputs``, and ``config.yaml``, the configuration with the names of the copies, computes the same again.
+    map: ``<name>.npz``) and a figure as PNG and SVG; ``recommend`` adds a recommendation. Files that the configuration
+    reads are copied to ``inputs``, and ``config.yaml``, the configuration with the names of the copies, computes the
+    same again.
     ``run.json`` tells what ran, in which versions, how long it took, what failed, and which files are the run's own.
 
     Args:
@@ -276,7 +276,7 @@ def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
 
 
 def _list_computations(config: Config, names: dict[str, str]) -> list[Computation]:
-    """The studies that are computed as a whole; where figures of the paper are repeated, its numbers as well.
+    """The studies that are computed as a whole.
 
     Their inputs name the copies of files that the run keeps, so that it may go on from its own folder.
     """
@@ -290,10 +290,6 @@ def _list_computations(config: Config, names: dict[str, str]) -> list[Computatio
             pieces.append(
                 Computation(study.name, study.kind_name(), inputs, partial(study.compute, config.scene, alone))
             )
-    if any((getattr(study, "figure", None) or "").startswith("fig") for study in config.studies):
-        from zwidth.studies.published import compare_published
-
-        pieces.append(Computation("published", "report", {}, compare_published))
     return pieces
 
 

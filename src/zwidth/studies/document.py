@@ -37,6 +37,7 @@ from zwidth.studies.fit import FitStudy
 from zwidth.studies.limit_cycle import LimitCycleStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
+from zwidth.studies.published import PublishedStudy
 from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy
 from zwidth.studies.simulate import SimulateStudy
@@ -73,6 +74,7 @@ for _model in (
     SimulateStudy,
     LimitCycleStudy,
     FitStudy,
+    PublishedStudy,
     SweepStudy,
 ):
     register(_model)

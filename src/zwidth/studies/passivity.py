@@ -32,9 +32,6 @@ class PassivityStudy(CurvesStudy):
     delay_model: HeldOnly = "held"
     """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
 
-    figure: Literal["passivity_cost"] | None = None
-    """Layout of the figure; a generic one where left out."""
-
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The stiffest passive and the stiffest stable wall over delta, as a table and a figure."""
         ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
