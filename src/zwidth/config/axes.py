@@ -1,7 +1,6 @@
 """Axes of a study: the values that one quantity takes.
 
 An axis is written as one number, a list, ``{linear: {start, stop, num}}`` or ``{log: {start, stop, num}}``.
-A new spelling is one more class here and one more entry in `_spellings`.
 """
 
 from __future__ import annotations

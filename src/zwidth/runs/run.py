@@ -23,7 +23,6 @@ from zwidth.runs.result import ProgressCallback, RunResult, StudyEvent, StudyRes
 from zwidth.studies.document import Config, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, check_stores, compute_sweeps
-from zwidth.sweep.jobs import Perform
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.resume import remove, store_path
 from zwidth.sweep.store import Store, check_installed
@@ -53,7 +52,6 @@ def run(
     shard: tuple[int, int] | None = None,
     memory: int = MEMORY,
     progress: ProgressCallback | None = None,
-    perform: Perform | None = None,
 ) -> RunResult:
     """Run the studies of a configuration and write their results into one folder.
 
@@ -78,7 +76,6 @@ def run(
             the other studies are the first one's. A shard goes on with what is there.
         memory: bytes that a chunk of a sweep may take while it is computed.
         progress: called with a `StudyEvent` when a study starts and when it ends, and after every chunk.
-        perform: what computes one chunk; for tests.
 
     Returns:
         RunResult: ``folder``; ``studies``, how each of them went; ``seconds``. A study that fails is recorded with its
@@ -140,7 +137,7 @@ def run(
         about = {"name": config.name, "description": config.description, "config": _spell(config)}
         if planned and not job.over:
             options = {"shard": shard, "workers": workers, "scheduler": scheduler}
-            job.sweep(planned, about, perform=perform, **options)
+            job.sweep(planned, about, **options)
     seconds = time.perf_counter() - clock
     ends = job.hopeless, job.interrupted, job.lost
     return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), *ends)
