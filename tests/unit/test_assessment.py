@@ -49,6 +49,22 @@ def test_with_the_sensor_at_the_tip_passivity_is_not_known():
     assert verdict.gain_margin > 0
 
 
+@pytest.mark.parametrize("parts", [{}, {"velocity": SLOW}, {"operator": HAND}], ids=["rigid", "filter", "hand"])
+@pytest.mark.parametrize("wall", [(3e3, 5.0), (60e3, 5.0), (3e3, 900.0)])
+def test_every_scene_has_its_intervals_and_the_ends_of_the_nearest(parts, wall):
+    scene = zwidth.Scene(DEVICE, TIMING, zwidth.VirtualWall(*wall), **parts)
+    verdict = zwidth.assess(scene)
+    found = verdict.stable_stiffness, verdict.stable_damping
+    for told, expected in zip(found, (scene.stable_stiffness(), scene.stable_damping()), strict=True):
+        np.testing.assert_allclose(np.reshape(told, (-1, 2)), expected, rtol=1e-9, atol=1e-9)
+    ends = (verdict.stiffness_limit,), (verdict.virtual_damping_lower, verdict.virtual_damping_upper)
+    for value, intervals, told in zip(wall, found, ends, strict=True):
+        assert np.all(np.isnan(told)) == (not intervals)
+        if intervals:
+            assert any(told == ends[-len(told) :] for ends in intervals)
+        assert verdict.stable == any(low < value < high for low, high in intervals)
+
+
 @pytest.mark.parametrize("name", FREE)
 def test_a_damper_alone_is_marginal(name):
     scene = free_scene(name, 0.0, 5.0)
