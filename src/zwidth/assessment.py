@@ -13,6 +13,7 @@ from zwidth.errors import InputError
 from zwidth.formatting import to_json
 from zwidth.linear.passivity import has_condition
 from zwidth.linear.poles import is_marginal
+from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.decay import decay_rate
@@ -110,11 +111,16 @@ def assess(scene: Scene) -> Assessment:
         beta_at_max=float(top[1]),
         stiffness_max=float(best.stiffness),
         virtual_damping_at_max=float(best.virtual_damping),
-        ridge_kind=RidgeKind(int(best.kind)).name.lower() if best.status == Status.OK else "none",
+        ridge_kind=name_kind(best),
         ridge_frequency=float(best.frequency),
         **{name: float(getattr(stands, name)) for name in _MARGINS},
         **found,
     )
+
+
+def name_kind(wall: StiffestWall) -> str:
+    """The kind of a stiffest wall in words, "none" where there is no such wall."""
+    return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
 
 
 def nearest_interval(intervals: Intervals, value: float) -> tuple[float, float]:

@@ -86,10 +86,10 @@ def ridge(
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
     would change is printed as well.
     """
+    from zwidth.assessment import name_kind
     from zwidth.parts.device import Device
     from zwidth.parts.timing import Timing
     from zwidth.scene import Scene
-    from zwidth.stability.ridge import RidgeKind
     from zwidth.status import Status
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
@@ -100,7 +100,7 @@ def ridge(
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         raise click.UsageError(f"no wall with K > 0 is stable on this device: {Status(int(wall.status)).message}")
-    top, kind = scene.normalize_walls(wall.stiffness, wall.virtual_damping), RidgeKind(int(wall.kind)).name.lower()
+    top, kind = scene.normalize_walls(wall.stiffness, wall.virtual_damping), name_kind(wall)
     result: dict[str, Any] = {
         "delta": float(scene.delta),
         "d": float(scene.d),

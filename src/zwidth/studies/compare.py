@@ -13,9 +13,8 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
-from zwidth.figures.table import SI_COLUMNS
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, stack
-from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
+from zwidth.studies.stable_set import summarize_stiffest, tabulate_walls, trace_outlines
 
 # An outline has some hundreds of points, of which an estimate of the size may rest on.
 _POINTS_PER_OUTLINE = 1000
@@ -67,16 +66,7 @@ class CompareStudy(ComputedStudy):
             top = loop.max_stiffness()
             pieces = list(trace_outlines(loop, label=label))
             islands = sum(piece["piece"] == "island" for piece in pieces)
-            wall = dict(zip(SI_COLUMNS, map(float, top[:2]), strict=True))
-            rows.append(
-                {
-                    "label": label,
-                    **wall,
-                    "frequency_Hz": float(top.frequency),
-                    "kind": name_kind(top),
-                    "islands": islands,
-                }
-            )
+            rows.append({"label": label, **summarize_stiffest(top), "islands": islands})
             outlines += pieces
             walls.append(tabulate_walls(label, {"stiffest": top}))
         bare = [row["label"] for row in rows if row["kind"] == "none"]

@@ -22,7 +22,7 @@ from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
 from zwidth.quantities import POSITIVE
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, stack
-from zwidth.studies.stable_set import name_kind
+from zwidth.studies.stable_set import summarize_stiffest
 from zwidth.units import LENGTH, SPEED
 
 Length = Annotated[float, BeforeValidator(quantity(LENGTH, POSITIVE)), unit_schema(LENGTH)]
@@ -109,14 +109,7 @@ class FiltersStudy(ComputedStudy):
         for damping in self.dampings.tolist():
             for named, velocity in self.estimates():
                 top = bare.replace(damping=damping, velocity=velocity).max_stiffness()
-                wall = dict(zip(SI_COLUMNS, map(float, top[:2]), strict=True))
-                row = {
-                    "damping_N_s_per_m": damping,
-                    **named,
-                    **wall,
-                    "frequency_Hz": float(top.frequency),
-                    "kind": name_kind(top),
-                }
+                row = {"damping_N_s_per_m": damping, **named, **summarize_stiffest(top)}
                 if self.resolution is not None:
                     noise = find_velocity_noise(velocity, self.device.period, self.resolution)
                     row |= {"velocity_noise_m_per_s": noise, "force_noise_N": noise * abs(float(top.virtual_damping))}

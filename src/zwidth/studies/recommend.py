@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.assessment import Assessment, assess
+from zwidth.assessment import Assessment, assess, name_kind
 from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.design.limits import describe_islands
@@ -24,7 +24,7 @@ from zwidth.status import Status
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, Table, add_si_columns, stack
 from zwidth.studies.passivity import passive_outlines
-from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
+from zwidth.studies.stable_set import tabulate_walls, trace_outlines
 from zwidth.studies.step import ResponseStudy
 
 _UNITS = {

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from zwidth.assessment import name_kind
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.linear.stiffest import StiffestWall
 from zwidth.scene import Scene
 from zwidth.stability.region import stable_region
-from zwidth.stability.ridge import RidgeKind
-from zwidth.status import Status
 from zwidth.studies.outcome import Table
 from zwidth.studies.passivity import unit_outline
 
@@ -37,9 +36,10 @@ def trace_outlines(scene: Scene, **columns: Any) -> Iterator[dict[str, Any]]:
         }
 
 
-def name_kind(wall: StiffestWall) -> str:
-    """The kind of a stiffest wall in words, "none" where there is no such wall."""
-    return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
+def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
+    """A stiffest wall as columns of a table."""
+    found = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
+    return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
 
 def tabulate_walls(label: str, walls: Mapping[str, StiffestWall]) -> Table:
