@@ -55,7 +55,6 @@ from .parts.wall import VirtualWall as VirtualWall
 from .runs import run as run
 from .scenes.answers import to_control as to_control
 from .scenes.assessment import Assessment as Assessment
-from .scenes.assessment import SceneAssessment as SceneAssessment
 from .scenes.assessment import assess as assess
 from .scenes.assessment import assess_many as assess_many
 from .scenes.damping import DampingChoice as DampingChoice

@@ -105,8 +105,8 @@ def verdicts(wall: Wall, found: Any) -> dict[str, bool | None]:
         "assess.stable": found.stable,
         "assess.spectral_radius": None if np.isnan(found.spectral_radius) else found.spectral_radius < 1,
         "assess.decay_rate": None if np.isnan(found.decay_rate) else found.decay_rate > 0,
-        "assess, stable K": any(low < K < high for low, high in _intervals(found, "stiffness")),
-        "assess, stable B": any(low < B < high for low, high in _intervals(found, "damping")),
+        "assess, stable K": any(low < K < high for low, high in found.stable_stiffness),
+        "assess, stable B": any(low < B < high for low, high in found.stable_damping),
     }
     if scene.is_rigid:
         alpha, beta = (float(part) for part in scene.normalize_walls(K, B))
@@ -117,15 +117,6 @@ def verdicts(wall: Wall, found: Any) -> dict[str, bool | None]:
 
 def _known(told: Any) -> bool | None:
     return bool(told.stable) if int(told.status) in (Status.OK, Status.ON_BOUNDARY) else None
-
-
-def _intervals(found: Any, what: str) -> list[tuple[float, float]]:
-    """The stable intervals of an assessment in one form."""
-    if hasattr(found, f"stable_{what}"):
-        return list(getattr(found, f"stable_{what}"))
-    if what == "stiffness":
-        return [(0.0, found.stiffness_limit)]
-    return [(found.virtual_damping_lower, found.virtual_damping_upper)]
 
 
 def near_the_edge(wall: Wall) -> bool:

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import patch
@@ -75,9 +76,10 @@ def sweep_of(described) -> SweepStudy:
     return sweep
 
 
-def run_sweeps(config, out, **options):
-    """Run a configuration; returns what became of the chunks of all its sweeps together."""
-    result = run(config, out=out, **options)
+def run_sweeps(config, out, *, perform=None, **options):
+    """Run a configuration, its chunks computed by ``perform``; returns what became of those of all its sweeps."""
+    with patch("zwidth.sweep.chunks.perform", perform) if perform else nullcontext():
+        result = run(config, out=out, **options)
     sweeps = result.sweeps.values()
     counts = {name: sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")}
     failed = {chunk: error for sweep in sweeps for chunk, error in sweep.failed.items()}

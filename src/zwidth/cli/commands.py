@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import json
+import math
+from dataclasses import replace
 from typing import Any
 
 import click
 
 from zwidth import __version__
-from zwidth.cli import runs
+from zwidth.cli import runs, words
 from zwidth.cli.bench import bench
 from zwidth.cli.design import design
 from zwidth.cli.devices import devices
@@ -17,7 +18,6 @@ from zwidth.cli.fit import fit
 from zwidth.cli.init import init
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
 from zwidth.cli.report import report
-from zwidth.cli.words import Slope, find_slopes, row, verdict_lines
 from zwidth.words.formatting import plain, with_unit
 
 
@@ -40,37 +40,31 @@ def cli() -> None:
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""
-    from zwidth.cli import scene_words
-    from zwidth.scenes.assessment import Assessment, assess
+    from zwidth.scenes.assessment import assess
     from zwidth.scenes.friction import friction_rule
     from zwidth.scenes.limits import limits_of
 
-    verdict, limits, notes = assess(scene), limits_of(scene), scene_words.scene_notes(scene)
+    verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
     rule = None
     if friction is not None or resolution is not None:
         device = {"damping": scene.damping, "period": scene.timing.period}
         rule = friction_rule(**device, friction=friction, resolution=resolution)
     if as_json:
-        result = verdict.as_dict() | {"limits": [_without_nan(limit._asdict()) for limit in limits], "notes": notes}
+        result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
         result["islands"] = [island._asdict() for island in scene.islands()]
         if rule is not None:
             result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
-        click.echo(json.dumps(result, indent=2, allow_nan=False))
+        words.print_json(result)
         return
-    rigid = isinstance(verdict, Assessment)
-    lines = verdict_lines(scene, verdict) if rigid else scene_words.scene_verdict_lines(scene, verdict)
-    lines += scene_words.limit_lines(limits) + (scene_words.friction_lines(rule) if rule is not None else [])
-    for line in [*lines, *(row("note", note) for note in notes)]:
+    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
+    lines += words.friction_lines(rule) if rule is not None else []
+    for line in [*lines, *(words.row("note", note) for note in notes)]:
         click.echo(line)
 
 
-def _without_nan(entries: dict[str, Any]) -> dict[str, Any]:
-    return {name: None if value != value else value for name, value in entries.items()}
-
-
 @cli.command()
-@click.option("--delta", type=float, help="Normalized physical damping b T/m.")
-@click.option("--d", type=float, help="Delay in periods.")
+@click.option("--delta", type=click.FloatRange(min=0.0), help="Normalized physical damping b T/m.")
+@click.option("--d", type=click.FloatRange(min=0.0), help="Delay in periods.")
 @scene_options(wall=False, required=False)
 @click.option(
     "--delay-model",
@@ -89,80 +83,56 @@ def ridge(
 ) -> None:
     """Print the stiffest stable wall of a device.
 
-    The device is given by --delta and --d, or by its physical data; then what a little more damping, mass, rate or
-    delay would change is printed as well.
+    The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
+    would change is printed as well.
     """
-    import numpy as np
-
-    from zwidth.loops.rigid.ridge import RidgeKind, alpha_max
+    from zwidth.parts.device import Device
+    from zwidth.parts.timing import Timing
+    from zwidth.scenes.assessment import name_kind
+    from zwidth.scenes.scene import Scene
     from zwidth.words.status import Status
 
     if (scene is None) == (delta is None) or (delta is None) != (d is None):
         raise click.UsageError("give either --delta and --d, or --mass and --period (with --damping and --delay)")
-    if scene is not None and (not scene.is_rigid or scene.operator is not None):
-        if delay_model != "held":
-            raise click.UsageError("--delay-model fractional_power is for a rigid device without parts")
-        _print_part_ridge(scene, as_json)
-        return
-    at_delta, at_d = (scene.delta, scene.d) if scene is not None else (delta, d)
-    point = alpha_max(at_delta, at_d, delay=delay_model)  # pyright: ignore[reportArgumentType]  (click checked it)
-    if int(point.status) != Status.OK:
-        raise click.UsageError(f"--delta {at_delta}, --d {at_d}: {Status(int(point.status)).message}")
-    slopes: list[Slope] = []
-    result: dict[str, Any] = {
-        "delta": float(np.asarray(at_delta)),
-        "d": float(np.asarray(at_d)),
-        "alpha_max": float(point.alpha),
-        "beta": float(point.beta),
-        "omega": float(point.omega),
-        "kind": RidgeKind(int(point.kind)).name.lower(),
-    }
-    if scene is not None:
-        wall = scene.to_si(alpha=point.alpha, beta=point.beta)
-        result |= {"stiffness_max": float(wall.stiffness), "virtual_damping": float(wall.virtual_damping)}
-        slopes = find_slopes(scene, delay_model)
-        result["sensitivities"] = {slope.name: slope.as_dict() for slope in slopes}
-    if as_json:
-        click.echo(json.dumps(result, indent=2, allow_nan=False))
-        return
-    click.echo(row("device", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"))
-    click.echo(row("alpha_max", f"{result['alpha_max']:.12g} ({result['kind']} optimum)"))
-    click.echo(row("beta", f"{result['beta']:.12g}"))
-    if scene is not None:
-        click.echo(row("K_max", with_unit(result["stiffness_max"], "N/m")))
-        click.echo(row("B", with_unit(result["virtual_damping"], "N s/m")))
-    for slope in slopes:
-        click.echo(slope.line())
-
-
-def _print_part_ridge(scene: Any, as_json: bool) -> None:
-    """The stiffest wall of a scene with parts."""
-    from zwidth.cli import scene_words
-    from zwidth.loops.rigid.ridge import RidgeKind
-    from zwidth.words.status import Status
-
+    normalized = scene is None
+    scene = Scene(Device(1.0, delta), Timing(1.0, d)) if scene is None else scene
+    scene = replace(scene, timing=replace(scene.timing, delay_model=delay_model))
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
         raise click.UsageError(f"no wall with K > 0 is stable on this device: {Status(int(wall.status)).message}")
-    slopes, kind = scene_words.part_slopes(scene), RidgeKind(int(wall.kind)).name.lower()
-    if as_json:
-        result = {
+    top, kind = scene.normalize_walls(wall.stiffness, wall.virtual_damping), name_kind(wall)
+    result: dict[str, Any] = {
+        "delta": float(scene.delta),
+        "d": float(scene.d),
+        "alpha_max": float(top[0]),
+        "beta": float(top[1]),
+        "omega": float(wall.frequency * (2.0 * math.pi * scene.timing.period)),
+        "kind": kind,
+    }
+    slopes, notes = [], []
+    if not normalized:
+        slopes, notes = words.list_slopes(scene), words.scene_notes(scene)
+        result |= {
             "stiffness_max": float(wall.stiffness),
             "virtual_damping": float(wall.virtual_damping),
             "frequency": float(wall.frequency),
-            "kind": kind,
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
             "islands": [island._asdict() for island in scene.islands()],
-            "notes": scene_words.scene_notes(scene),
+            "notes": notes,
         }
-        click.echo(json.dumps(result, indent=2, allow_nan=False))
+    if as_json:
+        words.print_json(result)
         return
-    for line in scene_words.scene_lines(scene):
+    for line in [] if normalized else words.scene_lines(scene):
         click.echo(line)
-    click.echo(row("K_max", f"{with_unit(float(wall.stiffness), 'N/m')} ({kind.replace('_', ' ')} optimum)"))
-    click.echo(row("B", with_unit(float(wall.virtual_damping), "N s/m")))
-    click.echo(row("frequency", with_unit(float(wall.frequency), "Hz")))
-    for line in [*(slope.line() for slope in slopes), *(row("note", n) for n in scene_words.scene_notes(scene))]:
+    click.echo(words.row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"))
+    click.echo(words.row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"))
+    click.echo(words.row("beta", f"{result['beta']:.12g}"))
+    if not normalized:
+        click.echo(words.row("K_max", with_unit(result["stiffness_max"], "N/m")))
+        click.echo(words.row("B", with_unit(result["virtual_damping"], "N s/m")))
+        click.echo(words.row("frequency", with_unit(result["frequency"], "Hz")))
+    for line in [*(slope.line() for slope in slopes), *(words.row("note", note) for note in notes)]:
         click.echo(line)
 
 
@@ -171,7 +141,7 @@ def schema() -> None:
     """Print the JSON Schema of configuration files, for editors."""
     from zwidth.studies.document import config_json_schema
 
-    click.echo(json.dumps(config_json_schema(), indent=2))
+    words.print_json(config_json_schema())
 
 
 for command in (init, *runs.COMMANDS, report, design, devices, explore, fit, bench):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict
 from typing import Any
 
 import click
 
 from zwidth.cli.options import flag_of, json_option, scene_options
-from zwidth.cli.words import row
+from zwidth.cli.words import print_json, row
 from zwidth.words.formatting import plain, with_unit
 
 _FINDS = {
@@ -86,7 +85,7 @@ def design(
             found["every_device"], words = _prove(scene, dict(tolerances))
             lines += words
     if as_json:
-        click.echo(json.dumps(found, indent=2, allow_nan=False))
+        print_json(found)
         return
     for line in lines:
         click.echo(line)
@@ -106,14 +105,14 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         within = present / 30.0, min(30.0 * present, 0.499 / (scene.velocity.coded_period or scene.timing.period))
     wanted = float(scene.wall.stiffness)
     needed = scene.required(path, wanted, within=within)
-    result = {"parameter": path, "value": _plain(needed.value), "unit": unit, "enough": needed.enough}
+    result = {"parameter": path, "value": needed.value, "unit": unit, "enough": needed.enough}
     result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
-    text = _amount(needed.value, unit)
+    text = with_unit(needed.value, unit)
     if path == "period":
-        result["rate"] = None if result["value"] is None else 1.0 / needed.value
+        result["rate"] = 1.0 / needed.value
         text += f" (a rate of {with_unit(1.0 / needed.value, 'Hz')}; the same delay in seconds)"
     if needed.enough in ("nowhere", "everywhere"):
-        low, high = (_amount(end, unit) for end in needed.range)
+        low, high = (with_unit(end, unit) for end in needed.range)
         reached = "reached nowhere" if needed.enough == "nowhere" else "reached everywhere"
         text = f"K_max = {with_unit(wanted, 'N/m')} is {reached} from {low} to {high}"
     else:
@@ -132,7 +131,7 @@ def _tolerate(
     count = samples if samples is not None else 10_000 if scene.is_rigid else 200
     named = {name: Tolerance(share, distribution) for name, share in shares.items()}
     found = simulate_tolerances(scene, named, samples=count, seed=seed)
-    result = {name: _plain(value) for name, value in asdict(found).items() if name not in ("drawn", "labels")}
+    result = {name: value for name, value in asdict(found).items() if name not in ("drawn", "labels")}
     result |= {"seed": seed, "distribution": distribution, "shares": shares}
     percent = f"{100 * found.reliability:g} %"
     share = f"{plain(100 * found.stable)} % of {found.samples} devices drawn"
@@ -143,7 +142,7 @@ def _tolerate(
         row("stable", f"{share} ({known})"),
         row(f"borne by {percent}", f"K up to {with_unit(found.stiffness, 'N/m')} at this B"),
     ]
-    if result["stiffness_max"] is not None:
+    if found.stiffness_max == found.stiffness_max:
         lines.append(row("", f"K up to {with_unit(found.stiffness_max, 'N/m')}, each device with a B of its own"))
     return result, lines
 
@@ -162,9 +161,9 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
             box[name] = Interval(value - reach, value + reach)
     wall, best = robust_wall(**box), robust_max_stiffness(**box)
     result = {
-        "stiffness": _plain(float(wall.stiffness)),
-        "virtual_damping": _plain(float(wall.virtual_damping)),
-        "stiffness_max": _plain(float(best.stiffness)),
+        "stiffness": float(wall.stiffness),
+        "virtual_damping": float(wall.virtual_damping),
+        "stiffness_max": float(best.stiffness),
     }
     lines = [
         row(
@@ -174,11 +173,3 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
         )
     ]
     return result, lines
-
-
-def _plain(value: Any) -> Any:
-    return None if isinstance(value, float) and value != value else value
-
-
-def _amount(value: float, unit: str) -> str:
-    return with_unit(value * 1e3, "g") if unit == "kg" else with_unit(value, unit)

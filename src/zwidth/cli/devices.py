@@ -48,8 +48,6 @@ def devices(name: str | None, as_json: bool) -> None:
 def _amount(number: tuple[float, str, str, str]) -> str:
     """A number with its unit; inertias and counts without a prefix."""
     value, unit = number[:2]
-    if unit == "kg":
-        return with_unit(value * 1e3, "g", 3)
     if unit == "counts":
         return f"{value:g} counts"
     # A prefix on "kg m^2" would be a second one.

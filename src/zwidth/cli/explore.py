@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from zwidth.cli import words
+
 
 @click.command()
 @click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(exists=True, path_type=Path))
@@ -43,18 +45,10 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
 
 def check_lines(scene: Any, verdict: Any, limits: list[Any]) -> list[str]:
     """What `zwidth check` says of a scene's wall, without color."""
-    from zwidth.cli import scene_words
-    from zwidth.cli.words import row, verdict_lines
-    from zwidth.scenes.assessment import Assessment
-
-    rigid = isinstance(verdict, Assessment)
-    lines = verdict_lines(scene, verdict) if rigid else scene_words.scene_verdict_lines(scene, verdict)
-    lines += scene_words.limit_lines(limits)
-    return [click.unstyle(line) for line in [*lines, *(row("note", n) for n in scene_words.scene_notes(scene))]]
+    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
+    return [click.unstyle(line) for line in [*lines, *(words.row("note", n) for n in words.scene_notes(scene))]]
 
 
 def slope_lines(scene: Any) -> list[str]:
     """What `zwidth ridge` says of a little more of every parameter."""
-    from zwidth.cli.scene_words import part_slopes
-
-    return [slope.line() for slope in part_slopes(scene)]
+    return [slope.line() for slope in words.list_slopes(scene)]

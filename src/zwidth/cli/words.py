@@ -1,18 +1,23 @@
-"""What the commands say, in plain words."""
+"""What `zwidth check` and `zwidth ridge` say of a scene, its wall and what limits it, in plain words."""
 
 from __future__ import annotations
 
+import json
+import math
 from math import isfinite, isinf, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from zwidth.words.formatting import plain, with_unit
+from zwidth.parts.paths import find_parts
+from zwidth.words.formatting import plain, short, tell_apart, to_json, with_unit
+from zwidth.words.quantities import PARAMETERS
 
 if TYPE_CHECKING:
-    from zwidth.scenes.assessment import Assessment, SceneAssessment
+    from zwidth.scenes.assessment import Assessment, Intervals
+    from zwidth.scenes.friction import FrictionRule
+    from zwidth.scenes.limits import Limit
     from zwidth.scenes.scene import Scene
-
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.
 _ROUNDED = 1e-12
@@ -22,35 +27,43 @@ def row(label: str, text: str) -> str:
     return f"{label:<20}  {text}"
 
 
-class Slope(NamedTuple):
-    """The derivative of K_max by one property of a device, and what a small step of it comes to in words."""
-
-    name: str
-    symbol: str
-    value: float
-    unit: str
-    words: str
-
-    def line(self) -> str:
-        """For people."""
-        return row(f"dK_max/d{self.symbol}", f"{with_unit(self.value, self.unit)}: {self.words}")
-
-    def as_dict(self) -> dict[str, Any]:
-        """For machines; null stands for an infinite slope, which JSON cannot write."""
-        return {"value": self.value if isfinite(self.value) else None, "unit": self.unit}
+def print_json(result: Any) -> None:
+    """Print what a machine reads; null stands for what is not known or not finite."""
+    click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
 
 
-def find_slopes(scene: Scene, delay_model: Any) -> list[Slope]:
-    """What damping, mass, period and delay change of the stiffest wall of a device."""
-    from zwidth.scenes.stiffness import sensitivities, sensitivity_lines
+def scene_lines(scene: Scene) -> list[str]:
+    """Device, timing and parts."""
+    device, timing = scene.device, scene.timing
+    lines = [
+        row("device", f"m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}"),
+        row(
+            "timing",
+            f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(scene.d)})",
+        ),
+    ]
+    velocity = type(scene.velocity).__name__
+    parts, values = find_parts(scene), scene.parameters()
+    # From the motor outwards.
+    for name in (name for name in dict.fromkeys(("velocity", "coupling", *parts)) if name in parts):
+        own = {path: value for path, value in values.items() if path.startswith(f"{name}.")}
+        if name == "velocity" and velocity == "BackwardDifference" and not own:
+            continue
+        words = [f"{path.partition('.')[2].replace('_', ' ')} {_spell(path, own[path])}" for path in own if own[path]]
+        if name == "coupling":
+            words.append(f"sensor at the {parts[name].sensor}")
+        lines.append(row(name, ", ".join([*([velocity] if name == "velocity" else []), *words])))
+    return lines
 
-    numbers = (scene.device.damping, scene.device.mass, scene.timing.period, scene.timing.delay)
-    device: dict[str, Any] = dict(zip(("damping", "mass", "period", "delay"), numbers, strict=True))
-    gain = sensitivities(**device, delay_model=delay_model)
-    words = sensitivity_lines(**device, delay_model=delay_model)
-    units = (f"N/m per {unit}" for unit in ("N s/m", "kg", "s", "s"))
-    values = (float(getattr(gain, f"per_{name}")) for name in device)
-    return [Slope(*parts) for parts in zip(device, ("b", "m", "T", "t_d"), values, units, words, strict=True)]
+
+def unit_of(path: str) -> str:
+    """The SI unit of a parameter by its path; nothing for whole numbers."""
+    return PARAMETERS[path].unit.removeprefix("1") if path in PARAMETERS else ""
+
+
+def _spell(path: str, value: Any) -> str:
+    unit = unit_of(path)
+    return with_unit(value, unit) if unit else short(value)
 
 
 def stability_word(stable: bool, marginal: bool = False) -> str:
@@ -62,60 +75,54 @@ def stability_word(stable: bool, marginal: bool = False) -> str:
 
 
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
-    wall, device, timing = scene.wall, scene.device, scene.timing
-    stable = stability_word(verdict.stable, verdict.marginal)
-    lines = [
-        row("device", f"m = {with_unit(device.mass * 1e3, 'g')}, b = {with_unit(device.damping, 'N s/m')}"),
-        row(
-            "timing",
-            f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(verdict.d)})",
-        ),
+    """The verdict on a scene's wall."""
+    wall = scene.wall
+    word = stability_word(verdict.stable, verdict.marginal)
+    best = "none: no stiffness is stable at any damping"
+    if isfinite(verdict.stiffness_max):
+        best = (
+            f"K_max = {with_unit(verdict.stiffness_max, 'N/m')} at B = "
+            f"{with_unit(verdict.virtual_damping_at_max, 'N s/m')} ({verdict.ridge_kind.replace('_', ' ')} optimum, "
+            f"{with_unit(verdict.ridge_frequency, 'Hz')}; alpha_max = {plain(verdict.alpha_max)}, "
+            f"beta = {plain(verdict.beta_at_max)})"
+        )
+    return [
+        *scene_lines(scene),
         row("wall", f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
         row(
             "normalized",
             f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}",
         ),
         "",
-        row("verdict", f"{stable}, spectral radius {verdict.spectral_radius:.6f}"),
-        *_distance_lines(wall.stiffness, wall.virtual_damping, verdict),
+        row("verdict", f"{word}, spectral radius {verdict.spectral_radius:.6f}"),
+        row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B")),
+        row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K")),
         row("passive", passivity_words(scene, verdict)),
-        row(
-            "stiffest stable wall",
-            f"K_max = {with_unit(verdict.stiffness_max, 'N/m')} "
-            f"at B = {with_unit(verdict.virtual_damping_at_max, 'N s/m')} "
-            f"(alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)})",
-        ),
+        row("stiffest stable wall", best),
         row("slowest pole", pole_words(verdict.time_constant, verdict.frequency)),
         *margin_lines(wall.stiffness, verdict),
     ]
-    return lines
 
 
-def _distance_lines(stiffness: float, virtual_damping: float, verdict: Assessment) -> list[str]:
-    limit, lower, upper = verdict.stiffness_limit, verdict.virtual_damping_lower, verdict.virtual_damping_upper
-    if limit != limit:
-        in_k = "no stiffness is stable at this B"
-    elif verdict.stable:
-        in_k = f"K may rise by {with_unit(limit - stiffness, 'N/m')}, to {with_unit(limit, 'N/m')} (at this B)"
-    elif stiffness <= 0:
-        in_k = f"K must be greater than 0, up to {with_unit(limit, 'N/m')} (at this B)"
+def _distance(value: float, intervals: Intervals, unit: str, name: str, other: str) -> str:
+    """How far a value may move inside its stable interval, or must to reach the nearest; all intervals if several."""
+    from zwidth.scenes.assessment import nearest_interval
+
+    if not intervals:
+        return f"no {name} is stable at this {other}"
+    ranges = " and ".join(" to ".join(tell_apart(*ends, unit)) for ends in intervals)
+    low, high = nearest_interval(intervals, value)
+    if low < value < high:
+        moves = [f"fall by {with_unit(value - low, unit)}"] if isfinite(low) else []
+        moves += [f"rise by {with_unit(high - value, unit)}"] if isfinite(high) else []
+        moved = f"{name} may {' or '.join(moves)}"
     else:
-        in_k = f"K must fall by {with_unit(stiffness - limit, 'N/m')}, below {with_unit(limit, 'N/m')} (at this B)"
-    if lower != lower or upper != upper:
-        in_b = "no damping makes this K stable"
-    else:
-        span = f"between {with_unit(lower, 'N s/m')} and {with_unit(upper, 'N s/m')} (at this K)"
-        if verdict.stable:
-            in_b = (
-                f"B may fall by {with_unit(virtual_damping - lower, 'N s/m')} or rise by "
-                f"{with_unit(upper - virtual_damping, 'N s/m')}: {span}"
-            )
-        else:
-            in_b = f"B must lie {span}"
-    return [row("to the boundary in K", in_k), row("to the boundary in B", in_b)]
+        verb, step = ("rise", low - value) if value <= low else ("fall", value - high)
+        moved = f"{name} must {verb}{f' by {with_unit(step, unit)}' if step else ''}"
+    return f"{moved}: stable from {ranges} (at this {other})"
 
 
-def margin_lines(stiffness: float, verdict: Assessment | SceneAssessment) -> list[str]:
+def margin_lines(stiffness: float, verdict: Assessment) -> list[str]:
     """The margins of control engineering, where the wall has a stiffness or stands without one."""
     if stiffness <= 0 and not verdict.stable:
         return []
@@ -128,8 +135,8 @@ def margin_lines(stiffness: float, verdict: Assessment | SceneAssessment) -> lis
     return [row("margins", ", ".join(parts))]
 
 
-def passivity_words(scene: Scene, verdict: Assessment | SceneAssessment, *, sufficient: bool = False) -> str:
-    """Whether a wall is passive; where the condition is only sufficient, a wall that misses it may still be."""
+def passivity_words(scene: Scene, verdict: Assessment) -> str:
+    """Whether a wall is passive; with a coupling a wall that misses the condition may still be."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
         return "not known: the sensor is not where the force acts"
@@ -140,7 +147,7 @@ def passivity_words(scene: Scene, verdict: Assessment | SceneAssessment, *, suff
         return "only just, without any physical damping to spare"
     if verdict.passive:
         return f"yes, with {with_unit(margin, 'N s/m')} of physical damping to spare"
-    verb = "not proved" if sufficient else "no"
+    verb = "no" if scene.device.coupling is None else "not proved"
     return f"{verb}, for want of {with_unit(-margin, 'N s/m')} of physical damping"
 
 
@@ -151,3 +158,99 @@ def pole_words(constant: float, frequency: float) -> str:
         return f"neither decays nor grows{swing}"
     verb = "decays" if constant >= 0 else "grows"
     return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"
+
+
+def limit_lines(limits: list[Limit]) -> list[str]:
+    """What limits the stiffest wall, the largest gain first."""
+    lines = []
+    for limit in limits:
+        if isfinite(limit.stiffness):
+            less = " (it helps as it is)" if limit.gain < 1 else ""
+            words = f"{limit.words}: K_max {with_unit(limit.stiffness, 'N/m')}, {plain(limit.gain, 3)} times{less}"
+            lines.append(row("" if lines else "what limits it", words))
+    return lines
+
+
+def friction_lines(rule: FrictionRule) -> list[str]:
+    """The rule of friction and resolution."""
+    parts = []
+    if rule.by_damping is not None:
+        parts.append(f"2 b/T = {with_unit(rule.by_damping, 'N/m')}")
+    if rule.by_friction is not None:
+        parts.append(f"2 f_c/Q = {with_unit(rule.by_friction, 'N/m')}")
+    if rule.stiffness is None:
+        parts.append("both are needed for the rule")
+    else:
+        known = with_unit(rule.stiffness, "N/m")
+        parts.append(f"a spring alone is passive up to {known} (rigid, without delay; Abbott and Okamura 2005)")
+    return [row("friction, resolution", ", ".join(parts))]
+
+
+def coded_period_notes(scene: Scene) -> list[str]:
+    """A line where the estimate was written for another period than the loop's."""
+    coded, period = getattr(scene.velocity, "coded_period", None), scene.timing.period
+    if coded is None or abs(coded / period - 1) < 1e-9:
+        return []
+    text = (
+        f"the velocity estimate is written for a period of {with_unit(coded, 's')}, the loop's is "
+        f"{with_unit(period, 's')}: velocities come out {plain(period / coded, 3)} times as large"
+    )
+    cutoff = getattr(scene.velocity, "cutoff", None)
+    if cutoff is not None:
+        real = with_unit(cutoff * coded / period, "Hz")
+        text += f", and the cut-off lies at {real} in place of {with_unit(cutoff, 'Hz')}"
+    return [text]
+
+
+def scene_notes(scene: Scene) -> list[str]:
+    """What is remarkable of a scene beside its verdict."""
+    from zwidth.scenes.limits import describe_islands
+
+    return [*coded_period_notes(scene), *describe_islands(scene)]
+
+
+class Slope(NamedTuple):
+    """The derivative of K_max in one parameter of a scene, and what a small step of it comes to in words."""
+
+    name: str
+    value: float
+    unit: str
+    words: str
+
+    def line(self) -> str:
+        """For people."""
+        return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For machines."""
+        return {"value": self.value, "unit": self.unit}
+
+
+def list_slopes(scene: Scene) -> list[Slope]:
+    """What a little more of every parameter of a scene changes of its stiffest wall."""
+    per, values = scene.sensitivities().per, scene.parameters()
+    found = []
+    for path, slope in per.items():
+        unit, value = unit_of(path), float(slope)
+        # A delay is counted in periods, a damping one by one.
+        size = scene.timing.period if path == "delay" else values[path]
+        step = 1.0 if unit == "N s/m" or not size else one_percent(float(size))
+        words = f"{with_unit(step, unit, 1)} more {describe_effect(value * step)}"
+        words += " (same delay in seconds)" if path == "period" else ""
+        found.append(Slope(path, value, f"N/m per {unit}", words))
+    return found
+
+
+def one_percent(value: float) -> float:
+    """A power of ten near one percent of ``value``, as a step people can picture."""
+    return 10.0 ** (math.floor(math.log10(value) + 0.5) - 2)
+
+
+def describe_effect(change: float) -> str:
+    """ "buys 0.5 kN/m", "costs 3 N/m"."""
+    if change == 0:
+        return "changes nothing"
+    verb = "buys" if change > 0 else "costs"
+    if not isfinite(change):
+        return f"{verb} stiffness at an infinite rate at first"
+    return f"{verb} {with_unit(abs(change), 'N/m', 3)}"

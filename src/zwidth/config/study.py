@@ -11,15 +11,15 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
-from zwidth.config.scenes import AnyScene, is_adaptive, is_with_parts
+from zwidth.config.scenes import AnyScene, PhysicalScene, is_adaptive, is_with_parts
 from zwidth.words.formatting import describe
 from zwidth.words.types import DELAY_MODELS, DelayModel
 
 MAX_POINTS = 150_000_000
 MAX_BYTES = 2**30
 
-KINDS_WITH_PARTS = ("boundary", "recommend", "compare", "filters", "design", "simulate", "limit_cycle", "sweep")
-"""The kinds that answer for devices with parts, for messages."""
+KINDS: dict[str, type[Study]] = {}
+"""The models of the studies by the name of their kind."""
 
 
 def _only_held(value: Any) -> str:
@@ -39,7 +39,7 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
     """The problem of a device with parts in a study that would forget them."""
     what = f"got a device with {' and '.join(parts)}"
     allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
-    kinds = f"use one of the kinds {listing(KINDS_WITH_PARTS)}"
+    kinds = f"use one of the kinds {listing(name for name, model in KINDS.items() if model.takes_parts)}"
     return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
 
 
@@ -81,13 +81,15 @@ class Study(Strict):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         """Add what the study leaves out and the scene knows."""
-        supplied = {
+        supplied: dict[str, Any] = {
             "delta": scene.delta,
             "d": scene.d,
             "delay_model": scene.delay_model,
             "delay_models": [scene.delay_model],
         }
-        return {**{name: supplied[name] for name in cls.from_scene}, **raw}
+        if "device" in cls.from_scene and isinstance(scene, PhysicalScene):
+            supplied["device"] = scene.simulated_device if cls.simulates else scene.device
+        return {**{name: supplied[name] for name in cls.from_scene if name in supplied}, **raw}
 
     @classmethod
     def _list_taken(cls, raw: dict[str, Any]) -> list[str]:
@@ -109,6 +111,8 @@ class Study(Strict):
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
+        if name == "device":
+            return f"{cls.what} needs a device in SI units", "give the scene mass and period"
         if name in cls.from_scene:
             return "a study needs it where the file has no scene to take it from", f"add {name!r}, or a scene"
         return super().missing(name)

@@ -28,6 +28,7 @@ from zwidth.figures.motion import draw_motion
 from zwidth.figures.stable_set import draw_stable_set, tabulate_walls, trace_outlines
 from zwidth.figures.step import draw_step
 from zwidth.figures.table import stack
+from zwidth.loops.rigid.passive_area import passive_edge
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
@@ -74,20 +75,10 @@ def region(
     for label, each in (scene if isinstance(scene, Mapping) else {"": scene}).items():
         outlines += trace_outlines(each, label=label)
         if passive:
-            edge = tabulate_walls(each, *_find_passive(each))
+            edge = tabulate_walls(each, *passive_edge(each, _ANGLES))
             outlines.append({"label": label, "number": len(outlines) + 1, "piece": "passive", **edge})
         walls.append({"label": label, "wall": "stiffest", **tabulate_walls(each, *each.max_stiffness()[:2])})
     return draw_stable_set(stack(outlines), stack(walls), _axes(ax), normalized=normalized)[0]
-
-
-def _find_passive(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
-    """The edge of the passive walls with stiffness > 0: the damping that a wall needs grows as the wall does."""
-    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, _ANGLES)[1:-1]
-    units = scene.units
-    stiffness, damping = units.stiffness * np.cos(angle), units.virtual_damping * np.sin(angle)
-    own = float(scene.passivity_margin(0.0, 0.0))
-    reach = own / (own - scene.passivity_margin(stiffness, damping))
-    return reach * stiffness, reach * damping
 
 
 @style.house_style()

@@ -202,7 +202,7 @@ def _choose(
 def _describe(device: RivalDevice) -> str:
     cutoff = "" if device.cutoff is None else f", cut-off {with_unit(device.cutoff, 'Hz')}"
     return (
-        f"m = {with_unit(device.mass * 1e3, 'g')}, b = {with_unit(device.damping, 'N s/m')}, "
+        f"m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, "
         f"t_d = {with_unit(device.delay, 's')}{cutoff}"
     )
 

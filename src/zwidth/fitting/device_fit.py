@@ -13,7 +13,7 @@ import numpy as np
 from zwidth.fitting.scenes import scene_of
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
-from zwidth.words.formatting import with_unit
+from zwidth.words.formatting import to_json, with_unit
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -235,7 +235,7 @@ class DeviceFit:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
-        return _without_nan(self._numbers())
+        return to_json(self._numbers())
 
     def _numbers(self) -> dict[str, Any]:
         return {
@@ -256,14 +256,6 @@ class DeviceFit:
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),
         }
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _without_nan(part) for name, part in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(part) for part in value]
-    return None if value != value else value
 
 
 @dataclass(frozen=True)

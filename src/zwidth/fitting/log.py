@@ -191,7 +191,7 @@ def _refuse_unmoved(best: FittedModel, period: float) -> None:
         )
     if theta[0] <= 0:
         raise InputError(
-            f"force: the device runs away from it, as if its mass were {with_unit(1e3 * period**2 / theta[0], 'g')}; "
+            f"force: the device runs away from it, as if its mass were {with_unit(period**2 / theta[0], 'kg')}; "
             "turn the sign of the force, or of the position"
         )
     left = squares / float(rest @ rest)
@@ -209,7 +209,7 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
     if not rotary and not _LIGHTEST <= mass <= _HEAVIEST:
         light = "the position may be in mm, or the force in kN"
         slip = light if mass < _LIGHTEST else "the force may be in mN, or the time in ms"
-        doubts.append(f"a mass of {with_unit(1e3 * mass, 'g')} is far from any device; {slip}: m, N and s are meant")
+        doubts.append(f"a mass of {with_unit(mass, 'kg')} is far from any device; {slip}: m, N and s are meant")
     way, push = max(float(np.ptp(log.position)) for log in logs), find_largest(best.model)
     if not rotary and way > _FARTHEST:
         doubts.append(f"a way of {with_unit(way, 'm')} is far from any device; the position may be in mm: m is meant")

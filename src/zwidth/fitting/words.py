@@ -48,7 +48,7 @@ class AxisUnits(NamedTuple):
         if name == "mass":
             # What data sheets of rotors have.
             turns = self is ROTARY
-            return f"{plain(1e7 * value, digits)} g cm^2" if turns else with_unit(1e3 * value, "g", digits)
+            return f"{plain(1e7 * value, digits)} g cm^2" if turns else with_unit(value, "kg", digits)
         units = {
             **self._asdict(),
             "delay": "s",

@@ -228,7 +228,7 @@ class Record:
     def files(self) -> set[str]:
         """All files that the run has written, by the record."""
         found = {RUN_FILE}
-        if self.content.get("config_file") or self.content.get("format") == 1:
+        if self.content.get("config_file"):
             found.add(CONFIG_FILE)
         for entry in self.content.get("studies", ()):
             found |= {str(file) for file in entry.get("files", ())}
@@ -274,7 +274,7 @@ def _find_fault(content: Any) -> str:
         return "no record of a run"
     names = list(content.get("inputs", ()))
     for entry in content["studies"]:
-        if not isinstance(entry, dict) or not isinstance(entry.get("files", {}), dict | list):
+        if not isinstance(entry, dict) or not isinstance(entry.get("files", {}), dict):
             return "a damaged record of a run"
         names += [entry.get("name"), *entry.get("files", ())]
     # All that a run removes or replaces is named there.

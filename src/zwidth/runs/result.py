@@ -18,8 +18,8 @@ class StudyResult:
     to do, by another shard or because the run was stopped.
     """
 
-    name: str  # "published" for the comparison with the paper's numbers
-    kind: str  # "report" for that comparison
+    name: str
+    kind: str
     state: Literal["done", "kept", "failed", "open"]
     seconds: float = 0.0  # the sweeps of a run are computed together
     files: tuple[str, ...] = ()  # written in the run's folder; a sweep's is its store

@@ -22,7 +22,6 @@ from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, check_stores, compute_sweeps
 from zwidth.sweep.files.lock import holding
 from zwidth.sweep.files.whole import hopeless
-from zwidth.sweep.jobs import Perform
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.resume import remove, store_path
 from zwidth.sweep.store import Store, check_installed
@@ -34,7 +33,7 @@ AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
 @dataclass(frozen=True)
 class Computation:
-    """What a run computes as a whole: a study that is no sweep, or the comparison with the paper's numbers."""
+    """What a run computes as a whole: a study that is no sweep."""
 
     name: str
     kind: str
@@ -53,14 +52,13 @@ def run(
     shard: tuple[int, int] | None = None,
     memory: int = MEMORY,
     progress: ProgressCallback | None = None,
-    perform: Perform | None = None,
 ) -> RunResult:
     """Run the studies of a configuration and write their results into one folder.
 
     A sweep is computed chunk by chunk into a store ``<name>.zarr``. Any other study writes a table ``<name>.csv`` (a
-    map: ``<name>.npz``) and a figure as PNG and SVG; ``recommend`` adds a recommendation, and a configuration that
-    repeats figures of the paper adds ``published.md`` and ``published.json``. Files that the configuration reads are
-    copied to ``inputs``, and ``config.yaml``, the configuration with the names of the copies, computes the same again.
+    map: ``<name>.npz``) and a figure as PNG and SVG; ``recommend`` adds a recommendation. Files that the configuration
+    reads are copied to ``inputs``, and ``config.yaml``, the configuration with the names of the copies, computes the
+    same again.
     ``run.json`` tells what ran, in which versions, how long it took, what failed, and which files are the run's own.
 
     Args:
@@ -78,7 +76,6 @@ def run(
             the other studies are the first one's. A shard goes on with what is there.
         memory: bytes that a chunk of a sweep may take while it is computed.
         progress: called with a `StudyEvent` when a study starts and when it ends, and after every chunk.
-        perform: what computes one chunk; for tests.
 
     Returns:
         RunResult: ``folder``; ``studies``, how each of them went; ``seconds``. A study that fails is recorded with its
@@ -140,7 +137,7 @@ def run(
         about = {"name": config.name, "description": config.description, "config": _spell(config)}
         if planned and not job.over:
             options = {"shard": shard, "workers": workers, "scheduler": scheduler}
-            job.sweep(planned, about, perform=perform, **options)
+            job.sweep(planned, about, **options)
     seconds = time.perf_counter() - clock
     ends = job.hopeless, job.interrupted, job.lost
     return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), *ends)
@@ -276,7 +273,7 @@ def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
 
 
 def _list_computations(config: Config, names: dict[str, str]) -> list[Computation]:
-    """The studies that are computed as a whole; where figures of the paper are repeated, its numbers as well.
+    """The studies that are computed as a whole.
 
     Their inputs name the copies of files that the run keeps, so that it may go on from its own folder.
     """
@@ -290,10 +287,6 @@ def _list_computations(config: Config, names: dict[str, str]) -> list[Computatio
             pieces.append(
                 Computation(study.name, study.kind_name(), inputs, partial(study.compute, config.scene, alone))
             )
-    if any((getattr(study, "figure", None) or "").startswith("fig") for study in config.studies):
-        from zwidth.studies.published import compare_published
-
-        pieces.append(Computation("published", "report", {}, compare_published))
     return pieces
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +15,6 @@ from zwidth.loops.rigid.polynomial import check_delay_model
 from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel
 from zwidth.parts.span import accept_units
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import with_unit
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
@@ -148,52 +146,3 @@ def _sensitivities_kernel(
         by_d * mass * rate**3,
         status,
     )
-
-
-def one_percent(value: float) -> float:
-    """A power of ten near one percent of ``value``, as a step people can picture."""
-    return 10.0 ** (math.floor(math.log10(value) + 0.5) - 2)
-
-
-def sensitivity_lines(
-    *, mass: float, damping: float = 0.0, period: float, delay: float = 0.0, delay_model: DelayModel = "held"
-) -> list[str]:
-    """Say in words what a little more of each property of one device buys or costs.
-
-    Each line is a derivative times a step: one N s/m, and about one percent of the mass and of the period.
-
-    Args:
-        mass, damping, period, delay: single numbers as for `sensitivities`.
-        delay_model: "held" or "fractional_power".
-
-    Returns:
-        Four lines: damping, mass, sampling period (at the same delay in seconds), delay.
-
-    Example:
-        >>> from zwidth.scenes.stiffness import sensitivity_lines
-        >>> print(sensitivity_lines(mass=0.1, damping=10, period=1e-3, delay=1e-3)[0])
-        one more N s/m of damping buys 572 N/m
-    """
-    for name, value in (("mass", mass), ("damping", damping), ("period", period), ("delay", delay)):
-        if np.ndim(value) != 0:
-            raise InputError(f"{name}: got an array of shape {np.shape(value)}; a single number is needed")
-    gain = sensitivities(mass=mass, damping=damping, period=period, delay=delay, delay_model=delay_model)
-    if gain.status != Status.OK:
-        raise InputError(f"mass, damping, period, delay: {Status(int(gain.status)).message}")
-    step_m, step_t = one_percent(float(mass)), one_percent(float(period))
-    grams, seconds = with_unit(step_m * 1e3, "g", 1), with_unit(step_t, "s", 1)
-    return [
-        f"one more N s/m of damping {describe_effect(gain.per_damping)}",
-        f"{grams} more mass {describe_effect(gain.per_mass * step_m)}",
-        f"a sampling period {seconds} shorter {describe_effect(-gain.per_period * step_t)} (same delay in seconds)",
-        f"{seconds} more delay {describe_effect(gain.per_delay * step_t)}",
-    ]
-
-
-def describe_effect(change: float) -> str:
-    """ "buys 0.5 kN/m", "costs 3 N/m"."""
-    if change == 0:
-        return "changes nothing"
-    if not math.isfinite(change):
-        return f"{'buys' if change > 0 else 'costs'} stiffness at an infinite rate at first"
-    return f"{'buys' if change > 0 else 'costs'} {with_unit(abs(float(change)), 'N/m', 3)}"

@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth import figures
 from zwidth.arrays.batching import map_flat
-from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels
@@ -59,9 +59,6 @@ class BoundaryStudy(CurvesStudy):
     passivity: bool = False
     """Draw the passivity condition as well."""
 
-    figure: Literal["fig5", "fig6", "fig7", "fig8", "fig9"] | None = None
-    """Layout of the figure; a generic one where left out."""
-
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         if "device" in raw or (is_with_parts(scene) and not {"delta", "d"} & set(raw)):
@@ -88,18 +85,9 @@ class BoundaryStudy(CurvesStudy):
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        plane = raw.get("plane", "alpha_beta")
-        plane = plane if isinstance(plane, str) else ""
-        if plane == "delta_beta" and raw.get("ridge_path") is True:
+        if raw.get("plane") == "delta_beta" and raw.get("ridge_path") is True:
             allowed = "the path of maximum stiffness lies in the plane alpha_beta; at alpha -> 0 there is none"
             yield ("ridge_path",), problem("got true with plane delta_beta", allowed, "remove ridge_path")
-        figure = raw.get("figure")
-        layouts = {"alpha_beta": ("fig5", "fig7", "fig8"), "delta_beta": ("fig6", "fig9")}
-        for other, names in layouts.items():
-            if figure in names and plane in layouts and plane != other:
-                allowed = f"the layouts for this plane are {listing(layouts[plane])}"
-                remedy = "choose one of these, or change the plane"
-                yield ("figure",), problem(f"got {figure!r} with plane {plane}", allowed, remedy)
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -115,7 +103,7 @@ class BoundaryStudy(CurvesStudy):
         if self.device.is_rigid:
             return
         asked = {"plane": "alpha_beta", "delay_models": ("held",), "ridge_path": False, "passivity": False}
-        for name in [name for name, known in {**asked, "figure": None}.items() if getattr(self, name) != known]:
+        for name in [name for name, known in asked.items() if getattr(self, name) != known]:
             parts = " and ".join(list_parts(self.device))
             allowed = f"it is known for a rigid mass with the difference of two samples, not for one with {parts}"
             yield (name,), problem(f"got {name!r}", allowed, "remove it", on_key=True)

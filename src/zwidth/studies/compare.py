@@ -14,9 +14,9 @@ from zwidth.config.fields import members
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
-from zwidth.figures.table import SI_COLUMNS, stack
+from zwidth.figures.table import stack
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
-from zwidth.studies.stable_set import name_kind
+from zwidth.studies.stable_set import summarize_stiffest
 
 # An outline has some hundreds of points, of which an estimate of the size may rest on.
 _POINTS_PER_OUTLINE = 1000
@@ -68,16 +68,7 @@ class CompareStudy(ComputedStudy):
             top = loop.max_stiffness()
             pieces = list(trace_outlines(loop, label=label))
             islands = sum(piece["piece"] == "island" for piece in pieces)
-            wall = dict(zip(SI_COLUMNS, map(float, top[:2]), strict=True))
-            rows.append(
-                {
-                    "label": label,
-                    **wall,
-                    "frequency_Hz": float(top.frequency),
-                    "kind": name_kind(top),
-                    "islands": islands,
-                }
-            )
+            rows.append({"label": label, **summarize_stiffest(top), "islands": islands})
             outlines += pieces
             walls.append({"label": label, "wall": "stiffest", **tabulate_walls(loop, *top[:2])})
         bare = [row["label"] for row in rows if row["kind"] == "none"]

@@ -109,8 +109,6 @@ class DesignStudy(ComputedStudy):
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
-        if name == "device":
-            return "a stiffness in N/m needs a device in SI units", "give the scene mass and period"
         if name == "stiffness":
             return "a design begins with the stiffness that is wanted", "add 'stiffness: [20 kN/m, 40 kN/m]'"
         return super().missing(name)

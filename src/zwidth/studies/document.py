@@ -27,7 +27,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, validation_er
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
-from zwidth.config.study import Study
+from zwidth.config.study import KINDS, Study
 from zwidth.studies.boundary import BoundaryStudy
 from zwidth.studies.compare import CompareStudy
 from zwidth.studies.design import DesignStudy
@@ -36,6 +36,7 @@ from zwidth.studies.fit import FitStudy
 from zwidth.studies.limit_cycle import LimitCycleStudy
 from zwidth.studies.map import MapStudy
 from zwidth.studies.passivity import PassivityStudy
+from zwidth.studies.published import PublishedStudy
 from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy
 from zwidth.studies.simulate import SimulateStudy
@@ -45,9 +46,6 @@ from zwidth.words.formatting import describe, suggestion
 from zwidth.words.units import looks_like_number
 
 FORMAT_VERSION = 1
-
-KINDS: dict[str, type[Study]] = {}
-"""The models of the studies by the name of their kind."""
 
 
 def register(model: type[Study]) -> type[Study]:
@@ -76,6 +74,7 @@ for _model in (
     SimulateStudy,
     LimitCycleStudy,
     FitStudy,
+    PublishedStudy,
     SweepStudy,
 ):
     register(_model)

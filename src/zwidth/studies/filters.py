@@ -21,7 +21,7 @@ from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table
-from zwidth.studies.stable_set import name_kind
+from zwidth.studies.stable_set import summarize_stiffest
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, POSITIVE
 
@@ -55,16 +55,6 @@ class FiltersStudy(ComputedStudy):
 
     noise_limit: Annotated[float, Quantity("m/s", POSITIVE)] | None = None
     """Standard deviation that the noise of the velocity may have, in m/s or with a unit: the best filter is marked."""
-
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        return {"device": scene.device, **raw} if isinstance(scene.device, PhysicalDevice) else raw
-
-    @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        if name == "device":
-            return "a stiffness in N/m needs a device in SI units", "give the scene mass and period"
-        return super().missing(name)
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -116,14 +106,7 @@ class FiltersStudy(ComputedStudy):
         for damping in self.dampings.tolist():
             for named, velocity in self.estimates():
                 top = bare.replace(damping=damping, velocity=velocity).max_stiffness()
-                wall = dict(zip(SI_COLUMNS, map(float, top[:2]), strict=True))
-                row = {
-                    "damping_N_s_per_m": damping,
-                    **named,
-                    **wall,
-                    "frequency_Hz": float(top.frequency),
-                    "kind": name_kind(top),
-                }
+                row = {"damping_N_s_per_m": damping, **named, **summarize_stiffest(top)}
                 if self.resolution is not None:
                     noise = find_velocity_noise(velocity, self.device.period, self.resolution)
                     row |= {"velocity_noise_m_per_s": noise, "force_noise_N": noise * abs(float(top.virtual_damping))}

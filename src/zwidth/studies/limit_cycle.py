@@ -17,6 +17,7 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Quantity, Strict, members
 from zwidth.config.parameters import parameter_axis, quantity_axis
 from zwidth.config.scenes import AnyScene
+from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
@@ -214,10 +215,8 @@ def trace_edges(scene: Scene, label: str, varied: dict[str, Axis], axes: dict[st
     if not walls:
         return []
     lines = []
-    for outline in scene.stable_region():
-        # Closed: the first point comes again at the end.
-        stiffness, damping = (np.append(part, part[0]) for part in outline[:2])
-        ends: dict[str, np.ndarray] = {"stiffness": stiffness, "virtual_damping": damping}
+    for outline in trace_outlines(scene):
+        ends: dict[str, np.ndarray] = {name: outline[_COLUMNS[name]] for name in ("stiffness", "virtual_damping")}
         if len(walls) == 2:
             lines.append(ends)
             continue

@@ -1,8 +1,4 @@
-"""The passive set of walls, and the study of what passivity costs.
-
-The passivity condition is homogeneous: a wall (alpha, beta) needs damping in proportion to its distance from the
-origin. The damping that a unit circle of walls needs therefore gives the whole set, for every delta.
-"""
+"""The passive set of walls, which grows with delta as a whole, and the study of what passivity costs."""
 
 from __future__ import annotations
 
@@ -15,12 +11,14 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly
-from zwidth.loops.rigid.passivity import passive_stiffness_slope, passivity_margin
+from zwidth.loops.rigid.passive_area import passive_edge
+from zwidth.loops.rigid.passivity import passive_stiffness_slope
+from zwidth.parts.device import Device
+from zwidth.parts.timing import Timing
+from zwidth.scenes.scene import Scene
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome
 from zwidth.studies.ridge import ridge_table
-
-_DIRECTIONS = 721
 
 
 class PassivityStudy(CurvesStudy):
@@ -34,9 +32,6 @@ class PassivityStudy(CurvesStudy):
     delay_model: HeldOnly = "held"
     """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
 
-    figure: Literal["passivity_cost"] | None = None
-    """Layout of the figure; a generic one where left out."""
-
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The stiffest passive and the stiffest stable wall over delta, as a table and a figure."""
         ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
@@ -47,16 +42,9 @@ class PassivityStudy(CurvesStudy):
         return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
 
 
-def passive_edge(angles: np.ndarray, d: float) -> tuple[np.ndarray, np.ndarray]:
-    """alpha and beta, both over delta, of the passive set's edge in given directions of the plane."""
-    alpha, beta = np.maximum(np.cos(angles), 0.0), np.sin(angles)
-    needed = 1.0 - np.asarray(passivity_margin(alpha, beta, 1.0, d))
-    return alpha / needed, beta / needed
-
-
 def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
-    """The edge of the passive set for delta = 1, from the smallest beta to the largest."""
-    return passive_edge(np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS), d)
+    """alpha and beta of the passive set's edge for delta = 1, from the smallest beta to the largest."""
+    return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
 
 
 def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:

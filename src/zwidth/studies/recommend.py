@@ -13,17 +13,37 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
+from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.assessment import Assessment, assess
+from zwidth.scenes.assessment import Assessment, assess, name_kind
+from zwidth.scenes.limits import describe_islands
+from zwidth.scenes.scene import Scene
+from zwidth.scenes.stiffest import StiffestWall, choose_damping
 from zwidth.studies.boundary import outline
-from zwidth.studies.outcome import Outcome, add_si_columns, si_scales
+from zwidth.studies.outcome import Outcome, Table, add_si_columns
 from zwidth.studies.passivity import passive_outlines
-from zwidth.studies.recommend_with_parts import recommend_with_parts, spell_answer
 from zwidth.studies.step import ResponseStudy
-from zwidth.words.formatting import plain, with_unit
+from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
+from zwidth.words.status import Status
+
+_UNITS = {
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "virtual_damping": "N s/m",
+    "mass": "kg",
+    "time": "s",
+    "frequency": "Hz",
+}
+_WALL = ("stiffness", "virtual_damping")
+_BARE = ("mass", "damping", "period", "delay", "delta", "d")
+_JUDGED = (
+    *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
+    *("passivity_margin", "time_constant", "frequency"),
+)
+_PASSIVE = {True: "yes", False: "no", None: "not known, the sensor is not where the force acts"}
+_OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
 
 
 class RecommendStudy(ResponseStudy):
@@ -42,147 +62,157 @@ class RecommendStudy(ResponseStudy):
     stiffness_fraction: Fraction = RECOMMENDED_SHARE
     """Stiffness of the recommended wall as a share of the maximum."""
 
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        filled = {"delay_model": scene.delay_model, **raw}
-        if isinstance(scene.device, PhysicalDevice):
-            filled.setdefault("device", scene.device)
-        return filled
-
-    @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        if name == "device":
-            return "a recommendation in N/m needs a device in SI units", "give the scene mass and period"
-        return super().missing(name)
-
     def pairs(self) -> tuple[tuple[AnyDevice, AnyWall | None], ...]:
         return ((self.device, None),)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """Recommend a wall, judge it, and write both down as text and JSON, with a table and a figure."""
-        stem = "recommendation" if alone else f"{self.name}_recommendation"
-        device = self.device
-        bare = device.to_scene()
-        if not device.is_rigid:
-            return recommend_with_parts(bare, device.label or self.name, self.stiffness_fraction, stem)
-        ridge = alpha_max(device.delta, device.d)
-        alpha, beta = self.stiffness_fraction * float(ridge.alpha), float(ridge.beta)
-        stiffness, damping = si_scales(device)
-        wall = VirtualWall(stiffness=alpha * stiffness, virtual_damping=beta * damping)
-        verdict = assess(replace(bare, wall=wall))
-        assert isinstance(verdict, Assessment), "scenes with parts are recommended for elsewhere"
-        # The wall as it was judged: from SI units and back, a last digit may be another.
-        columns, note = self.respond(
-            device, verdict.alpha, verdict.beta, label=device.label or self.name, physical=True
-        )
-        response = stack([columns])
-        found = _summary(device, wall, verdict, self.stiffness_fraction, float(columns["settling_time_s"]))
-        edge, verified = outline(device.delta, device.d, "held")
-        passive = passive_outlines(np.array([device.delta]), np.array([device.d]), device.own_share)
-        region = add_si_columns(stack([edge, *passive]), device)
-        notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
+        stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
+        bare, share = self.device.to_scene(), self.stiffness_fraction
+        top, verdict, notes = bare.max_stiffness(), None, describe_islands(bare)
+        wall = top._replace(stiffness=share * top.stiffness)
+        if top.status == Status.OK:
+            wall = wall._replace(virtual_damping=np.float64(choose_damping(bare, top, float(wall.stiffness))))
+            verdict = assess(replace(bare, wall=VirtualWall(float(wall.stiffness), float(wall.virtual_damping))))
+        if verdict is None or not verdict.stable:
+            notes.append(f"no stable wall was found at {share:g} of the largest stiffness; choose another share")
+        elif wall.virtual_damping != top.virtual_damping:
+            notes.append(_OTHER_DAMPING)
+        found = _summarize(bare, top, wall, verdict, share)
+        if bare.is_rigid and verdict is not None:
+            # The wall as it was judged: from SI units and back, a last digit may be another.
+            columns, note = self.respond(self.device, verdict.alpha, verdict.beta, label=label, physical=True)
+            found["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
+            table, notes = stack([columns]), [*notes, note] if note else notes
+            region, remarks = _outline_rigid(self.device)
+            notes += remarks
+            draw = partial(figures.draw_recommendation, found, region, table)
+        else:
+            table = stack(trace_outlines(bare, label=label))
+            marked = {"stiffest": top, **({"recommended": wall} if verdict is not None and verdict.stable else {})}
+            walls = stack(
+                {"label": label, "wall": kind, **tabulate_walls(bare, *one[:2])} for kind, one in marked.items()
+            )
+            draw = partial(figures.draw_stable_set, table, walls)
         return Outcome(
-            table=response,
-            figures={"": partial(figures.draw_recommendation, found, region, response)},
+            table=table,
+            figures={"": draw} if table else {},
             documents={
                 f"{stem}.json": json.dumps(found, indent=2, allow_nan=False) + "\n",
-                f"{stem}.md": _markdown(device, wall, verdict, found),
+                f"{stem}.md": _describe(bare, found),
             },
             answer=spell_answer(found, verdict),
-            notes=(*notes, *([note] if note else [])),
+            notes=tuple(notes),
         )
 
 
-def _finite(value: float) -> float | None:
-    """A number as JSON has it: none that is infinite or missing."""
-    return value if math.isfinite(value) else None
+def _outline_rigid(device: PhysicalDevice) -> tuple[Table, list[str]]:
+    """The stable and the passive walls of a rigid device, and what to say of them."""
+    edge, verified = outline(device.delta, device.d, "held")
+    passive = passive_outlines(np.array([device.delta]), np.array([device.d]), device.own_share)
+    unsure = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
+    return add_si_columns(stack([edge, *passive]), device), unsure
 
 
-def _summary(
-    device: PhysicalDevice, wall: VirtualWall, verdict: Assessment, stiffness_fraction: float, settling_time: float
+def _summarize(
+    scene: Scene, top: StiffestWall, wall: StiffestWall, verdict: Assessment | None, share: float
 ) -> dict[str, Any]:
-    """All numbers of the recommendation in SI units, with the normalized ones beside them."""
-    return {
-        "units": {
-            "stiffness": "N/m",
-            "damping": "N s/m",
-            "virtual_damping": "N s/m",
-            "mass": "kg",
-            "time": "s",
-            "frequency": "Hz",
-        },
-        "device": {
-            "mass": device.mass,
-            "damping": device.damping,
-            "period": device.period,
-            "delay": device.delay.seconds(device.period),
-            "delta": verdict.delta,
-            "d": verdict.d,
-        },
+    """All numbers of the recommendation in SI units, with the normalized ones beside them; None where not known."""
+    judged = {} if verdict is None else verdict.as_dict()
+    device = {name: value for name, value in scene.parameters().items() if name not in _WALL}
+    numbers = {name: judged.get(name) for name in _JUDGED}
+    constant = math.nan if verdict is None or not verdict.stable else verdict.time_constant
+    found = {
+        "units": _UNITS,
+        "device": {**device, "velocity": type(scene.velocity).__name__, "delta": float(scene.delta), "d": scene.d},
         "maximum": {
-            "stiffness": verdict.stiffness_max,
-            "virtual_damping": verdict.virtual_damping_at_max,
-            "alpha": verdict.alpha_max,
-            "beta": verdict.beta_at_max,
-            "kind": verdict.ridge_kind,
+            "stiffness": float(top.stiffness),
+            "virtual_damping": float(top.virtual_damping),
+            "alpha": judged.get("alpha_max"),
+            "beta": judged.get("beta_at_max"),
+            "frequency": float(top.frequency),
+            "kind": name_kind(top),
         },
         "recommended": {
-            "stiffness_fraction": stiffness_fraction,
-            "stiffness": wall.stiffness,
-            "virtual_damping": wall.virtual_damping,
-            "alpha": verdict.alpha,
-            "beta": verdict.beta,
-            "virtual_damping_lower": _finite(verdict.virtual_damping_lower),
-            "virtual_damping_upper": _finite(verdict.virtual_damping_upper),
-            "stable": verdict.stable,
-            "spectral_radius": verdict.spectral_radius,
-            "passive": verdict.passive,
-            "passivity_margin": _finite(verdict.passivity_margin),
-            "settling_time": _finite(settling_time),
-            "time_constant": _finite(verdict.time_constant),
-            "frequency": _finite(verdict.frequency),
+            "stiffness_fraction": share,
+            "stiffness": float(wall.stiffness),
+            "virtual_damping": float(wall.virtual_damping),
+            **numbers,
+            "stable": verdict is not None and verdict.stable,
+            # Two percent of the slowest motion.
+            "settling_time": math.log(50.0) * constant,
         },
     }
+    return to_json(found)
 
 
-def _markdown(device: PhysicalDevice, wall: VirtualWall, verdict: Assessment, found: dict[str, Any]) -> str:
-    """The recommendation for a reader."""
-    stiffness, stiffness_max = (with_unit(value, "N/m") for value in (wall.stiffness, verdict.stiffness_max))
-    dampings = (
-        wall.virtual_damping,
-        verdict.virtual_damping_at_max,
-        verdict.virtual_damping_lower,
-        verdict.virtual_damping_upper,
-        device.damping,
-        -verdict.passivity_margin,
+def spell_answer(found: dict[str, Any], margins: Any) -> tuple[str, ...]:
+    """A recommended wall in two lines, what to set and how far that is from trouble; nothing where there is none."""
+    best, most = found["recommended"], found["maximum"]
+    if best["stiffness"] is None:
+        return ()
+    stiffness, largest = (with_unit(row["stiffness"], "N/m") for row in (best, most))
+    share = f"{100 * best['stiffness_fraction']:g} % of the stiffest stable wall, {largest}"
+    wall = f"K = {stiffness}, B = {with_unit(best['virtual_damping'], 'N s/m')}: {share}"
+    if not best["stable"]:
+        return wall, "NOT stable; choose another stiffness_fraction"
+    lower, upper = tell_apart(*_find_ends(best))
+    delay = float(margins.delay_margin)
+    apart = (
+        f"gain {plain(float(margins.gain_margin))}",
+        f"phase {plain(float(margins.phase_margin))} degrees",
+        f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
     )
-    recommended, at_max, lower, upper, physical, missing = (with_unit(value, "N s/m") for value in dampings)
-    period, delay = (with_unit(value, "s") for value in (device.period, device.delay.seconds(device.period)))
-    best = found["recommended"]
-    settled = best["settling_time"]
-    settling = "not known" if settled is None else f"{with_unit(settled, 's', 3)} after a step of force"
-    passive = "yes" if verdict.passive else f"no, that would take {missing} more physical damping"
+    passive = _PASSIVE[best["passive"]]
+    return wall, f"stable for B from {lower} to {upper} N s/m; margins: {', '.join(apart)}; passive: {passive}"
+
+
+def _find_ends(best: dict[str, Any]) -> tuple[float, float]:
+    """The ends of the stable dampings; NaN where JSON has null."""
+    lower, upper = (best[f"virtual_damping_{side}"] for side in ("lower", "upper"))
+    return math.nan if lower is None else lower, math.nan if upper is None else upper
+
+
+def _describe(scene: Scene, found: dict[str, Any]) -> str:
+    """The recommendation for a reader."""
+    best, most, device = found["recommended"], found["maximum"], scene.device
+
+    def spell(value: float | None, unit: str = "") -> str:
+        return "not known" if value is None else with_unit(value, unit) if unit else plain(value)
+
+    radius = "not known" if best["spectral_radius"] is None else f"{best['spectral_radius']:.6f}"
+
+    def cells(row: dict[str, Any], mark: str = "") -> str:
+        units = {"stiffness": "N/m", "virtual_damping": "N s/m"}
+        spelled = [f"{mark}{spell(row[name], unit)}{mark}" for name, unit in units.items()]
+        return " | ".join([*spelled, spell(row["alpha"]), spell(row["beta"])])
+
+    lower, upper = tell_apart(*_find_ends(best), "N s/m")
+    passive, missing = _PASSIVE[best["passive"]], best["passivity_margin"]
+    if best["passive"] is False:
+        passive += f", that would take {with_unit(-missing, 'N s/m')} more physical damping"
+    parts = [f"{name} = {value}" for name, value in found["device"].items() if name not in _BARE]
     lines = [
         "# Recommended virtual wall",
         "",
-        f"Device: m = {with_unit(1e3 * device.mass, 'g')}, b = {physical}, sampled every {period}, force delayed by",
-        f"{delay} (normalized: delta = {plain(verdict.delta)}, d = {plain(verdict.d)}).",
+        f"Device: m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, sampled every "
+        f"{with_unit(scene.timing.period, 's')}, force delayed by",
+        f"{with_unit(scene.timing.delay, 's')} (normalized: delta = {plain(scene.delta)}, d = {plain(scene.d)}).",
+        *([] if scene.is_rigid and scene.operator is None else [f"Its parts, in SI units: {', '.join(parts)}."]),
         "",
         "| | stiffness K | virtual damping B | alpha | beta |",
         "|---|---|---|---|---|",
-        f"| stiffest stable wall | {stiffness_max} | {at_max} "
-        f"| {plain(verdict.alpha_max)} | {plain(verdict.beta_at_max)} |",
-        f"| **recommended, {100 * best['stiffness_fraction']:g} % of it** | **{stiffness}** | **{recommended}** "
-        f"| {plain(verdict.alpha)} | {plain(verdict.beta)} |",
+        f"| stiffest stable wall | {cells(most)} |",
+        f"| **recommended, {100 * best['stiffness_fraction']:g} % of it** | {cells(best, '**')} |",
         "",
         "The recommended wall",
         "",
-        f"- is {'stable' if verdict.stable else 'NOT stable'}: spectral radius {verdict.spectral_radius:.6f};",
+        f"- is {'stable' if best['stable'] else 'NOT stable'}: spectral radius {radius};",
         f"- stays stable at this K for B between {lower} and {upper};",
-        f"- settles to 2 % {settling};",
+        f"- settles to 2 % of a step of force in about {spell(best['settling_time'], 's')};",
         f"- is passive: {passive}.",
         "",
-        "No virtual damping makes a stiffness above the maximum stable.",
-        "",
     ]
+    if scene.is_rigid:
+        lines += ["No virtual damping makes a stiffness above the maximum stable.", ""]
     return "\n".join(lines)

@@ -38,8 +38,8 @@ class RidgeStudy(CurvesStudy):
     delay_models: DelayModels = ("held",)
     """Models of a delay that is not whole."""
 
-    figure: Literal["fig10"] | None = None
-    """Layout of the figure; a generic one where left out."""
+    two_scalings: bool = False
+    """Show the small deltas in a panel of their own, as fig. 10 of the paper does."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The maximum stiffness over delta, as a table and a figure."""
@@ -49,7 +49,7 @@ class RidgeStudy(CurvesStudy):
             parts.append(part)
             notes += remarks
         table = stack(parts)
-        drawn: dict[str, Any] = {"": partial(figures.draw_ridge, table, two_scalings=self.figure == "fig10")}
+        drawn: dict[str, Any] = {"": partial(figures.draw_ridge, table, two_scalings=self.two_scalings)}
         if table["delta"].max() >= _STRONG_DAMPING:
             drawn["_slope"] = partial(figures.draw_slope, table, slope_table(table))
         return Outcome(table=table, figures=drawn, notes=tuple(notes))

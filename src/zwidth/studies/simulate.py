@@ -16,15 +16,7 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members
 from zwidth.config.numbers import whole_number
 from zwidth.config.parts import NO_LINEAR_FORM, locate_refusal
-from zwidth.config.scenes import (
-    AnyScene,
-    AnyWall,
-    PhysicalDevice,
-    PhysicalScene,
-    PhysicalWall,
-    SimulatedDevice,
-    WallField,
-)
+from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice, WallField
 from zwidth.config.study import HeldOnly
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
@@ -62,19 +54,6 @@ class SimulatedStudy(ComputedStudy):
 
     delay_model: HeldOnly = "held"
     """How a delay that is not whole is modeled; a motion exists in the model 'held' only."""
-
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        filled = {"delay_model": scene.delay_model, **raw}
-        if isinstance(scene, PhysicalScene):
-            filled.setdefault("device", scene.simulated_device)
-        return filled
-
-    @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        if name == "device":
-            return "a motion in m and N needs a device in SI units", "give the scene mass and period"
-        return super().missing(name)
 
 
 def check_circumstances(given: Circumstances, scene: Scene) -> Iterable[LocatedProblem]:

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import math
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.loops.rigid.passivity import passivity_margin
+from zwidth.figures.table import SI_COLUMNS
 from zwidth.loops.rigid.region import stable_region
-from zwidth.loops.rigid.ridge import RidgeKind
+from zwidth.scenes.assessment import name_kind
 from zwidth.scenes.stiffest import StiffestWall
-from zwidth.words.status import Status
+from zwidth.studies.passivity import unit_outline
 
 if TYPE_CHECKING:
     from zwidth.figures.region import Outlines
 
-_ANGLES = 721
 
-
-def name_kind(wall: StiffestWall) -> str:
-    """The kind of a stiffest wall in words, "none" where there is no such wall."""
-    return RidgeKind(int(wall.kind)).name.lower() if wall.status == Status.OK else "none"
+def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
+    """A stiffest wall as columns of a table."""
+    found = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
+    return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
 
 def find_edges(delta: float, d: float) -> dict[str, Outlines]:
@@ -31,15 +29,5 @@ def find_edges(delta: float, d: float) -> dict[str, Outlines]:
         return {}
     edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
     if delta > 0:
-        edges["passive"] = [(_find_passive(delta, d), False)]
+        edges["passive"] = [(delta * np.stack(unit_outline(d), -1), False)]
     return edges
-
-
-def _find_passive(delta: float, d: float) -> np.ndarray:
-    """The edge of the passive walls: the damping that a wall needs grows as the wall does."""
-    angle = np.linspace(-0.5 * math.pi, 0.5 * math.pi, _ANGLES)
-    walls = np.stack([np.cos(angle), np.sin(angle)], -1)
-    needed = -np.asarray(passivity_margin(walls[:, 0], walls[:, 1], 0.0, d))
-    # The smallest cosines are rounded zeros.
-    walls[[0, -1], 0] = 0.0
-    return delta * walls / needed[:, None]

@@ -130,9 +130,6 @@ class StepStudy(ResponseStudy):
     walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
     """Walls, one for all devices or one for each; a single device takes any number of them."""
 
-    figure: Literal["fig11"] | None = None
-    """Layout of the figure; a generic one where left out."""
-
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         filled = {"delay_model": scene.delay_model, **raw}

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, Perform, in_this_process
+from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.resume import check_same, new_store, remove_partials, repair, store_path
 from zwidth.sweep.store import Store
@@ -67,7 +67,6 @@ def compute_sweeps(
     shard: tuple[int, int] | None,
     workers: int | None,
     scheduler: str | None,
-    perform: Perform | None,
     progress: Callable[[Progress], None],
 ) -> Sweeps:
     """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there (`check_stores`).
@@ -77,13 +76,12 @@ def compute_sweeps(
         folder: held by the caller.
         about: ``name``, ``description`` and ``config`` of the configuration, for the stores' attributes.
         shard, workers, scheduler, progress: as in `zwidth.run`.
-        perform: what computes a chunk instead of `zwidth.sweep.chunks.perform`; for tests.
 
     Raises:
         InputError: the scheduler does not answer, or its workers do not see the folder.
     """
-    if perform is None:
-        from zwidth.sweep.chunks import perform
+    from zwidth.sweep.chunks import perform
+
     with ExitStack() as stack:
         client = None
         if scheduler is not None:

@@ -25,7 +25,9 @@ def plain(value: float, digits: int = 4) -> str:
 
 
 def with_unit(value: float, unit: str, digits: int = 4) -> str:
-    """A quantity with an SI prefix on its unit: ``19.87 kN/m``."""
+    """A quantity with an SI prefix on its unit: ``19.87 kN/m``, ``100.0 g`` of kilograms."""
+    if unit == "kg":
+        value, unit = 1e3 * value, "g"
     if not math.isfinite(value) or value == 0:
         return f"{plain(value)} {unit}" if value == 0 else plain(value)
     power = min(9, max(-9, 3 * math.floor(math.log10(abs(value)) / 3)))
@@ -48,6 +50,15 @@ def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
 def header(name: str, unit: str) -> str:
     """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
     return name if unit in ("", "1", "sampling periods") else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
+
+
+def to_json(value: Any) -> Any:
+    """A value as JSON has it: None in place of NaN and infinities, lists in place of tuples."""
+    if isinstance(value, Mapping):
+        return {name: to_json(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [to_json(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def to_cell(value: Any) -> Any:

@@ -78,8 +78,8 @@ def test_a_coupling_and_the_ends_of_its_row_and_column():
 def test_the_words_of_a_scene_with_parts():
     out = run("check", *WALL, *DEVICE, *RATE, *PARTS["filter"][0]).stdout.splitlines()
     labels = [line[:22].strip() for line in out]
-    assert labels[:5] == ["device", "timing", "velocity", "wall", ""]
-    assert labels[5:12] == [
+    assert labels[:6] == ["device", "timing", "velocity", "wall", "normalized", ""]
+    assert labels[6:13] == [
         "verdict",
         "to the boundary in K",
         "to the boundary in B",
@@ -89,8 +89,31 @@ def test_the_words_of_a_scene_with_parts():
         "margins",
     ]
     assert "cutoff 100.0 Hz" in out[2]
-    assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[9]
-    assert out[12].startswith("what limits it        no delay: K_max")
+    assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[10]
+    assert out[13].startswith("what limits it        no delay: K_max")
+
+
+def test_every_scene_has_the_same_keys():
+    for command, *wall in (["check", *WALL], ["ridge"]):
+        arguments = [command, *wall, *DEVICE, *RATE, "--json"]
+        rigid, *others = (json.loads(run(*arguments, *PARTS[name][0] if name else ()).stdout) for name in ("", *PARTS))
+        assert all(list(other) == list(rigid) for other in others)
+
+
+@pytest.mark.parametrize(
+    ("wall", "words"),
+    [
+        (("3 kN/m", "5"), "K may fall by 3.000 kN/m or rise by "),
+        (("60 kN/m", "5"), "K must fall by "),
+        (("-5 N/m", "5"), "K must rise by 5.000 N/m: stable from 0 N/m to "),
+        (("0 N/m", "5"), "K must rise: stable from 0 N/m to "),
+        (("3 kN/m", "500"), "B must fall by "),
+    ],
+)
+@pytest.mark.parametrize("name", ["", "filter"])
+def test_how_far_it_is_to_the_boundary(wall, words, name):
+    arguments = ["--stiffness", wall[0], "--virtual-damping", wall[1], *(PARTS[name][0] if name else ())]
+    assert words in run("check", *arguments, *DEVICE, *RATE).stdout
 
 
 def test_a_rigid_scene_says_what_limits_it_too():

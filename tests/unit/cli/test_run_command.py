@@ -5,7 +5,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.studies.recommend_with_parts import spell_answer
+from zwidth.studies.recommend import spell_answer
 from zwidth.words.formatting import plain, with_unit
 
 HEAD = "version: 1\nname: small\n"

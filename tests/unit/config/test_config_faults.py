@@ -54,8 +54,6 @@ FAULTS = {
     "duration_unit": [("8:15: studies[0].duration: got '100 samples'", "write a number and a unit, as in '1 ms'")],
     "empty": [("1:1: the file is empty", "start with 'version: 1'")],
     "escape_beyond_unicode": [("3:17: an escape or a number that does not exist", "correct or remove it")],
-    "figure_of_other_plane": [("8:13: studies[0].figure: got 'fig6' with plane alpha_beta", "choose one of these")],
-    "figure_unknown": [("8:13: studies[0].figure: got 'fig5'", "did you mean 'fig10'?")],
     "fraction_75": [("7:25: studies[0].stiffness_fraction: got 75", "write 75 % as 0.75")],
     "fraction_and_walls": [("8:5: studies[0].walls: stiffness_fraction and walls are both", "remove one")],
     "fraction_missing": [("4:5: studies[0]: stiffness_fraction or walls is missing", "add 'stiffness_fraction")],

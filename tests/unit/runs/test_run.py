@@ -12,8 +12,7 @@ from run_folders import BOTH, SMALL, contents, record_of, states
 
 import zwidth
 from zwidth.runs import run
-from zwidth.runs.run import _list_computations
-from zwidth.studies import Config, Outcome, load_config
+from zwidth.studies import Outcome, load_config
 from zwidth.studies.map import MapStudy
 from zwidth.sweep.verify import verify
 from zwidth.words.errors import ConfigError, InputError, StoreError, StoreExistsError
@@ -140,15 +139,6 @@ def test_data_stay_when_the_drawing_fails(config, tmp_path, monkeypatch):
     result = run(config, out=tmp_path / "out")
     assert result.failed[0].files == ("one.csv",)
     assert (result.folder / "one.csv").is_file()
-
-
-def test_repeated_figures_of_the_paper_bring_its_numbers():
-    study = {"kind": "ridge", "name": "r", "delta": [0, 1], "d": 0, "figure": "fig10"}
-    config = Config.model_validate({"version": 1, "name": "p", "studies": [study]})
-    assert [piece.name for piece in _list_computations(config, {})] == ["r", "published"]
-    del study["figure"]
-    plain = Config.model_validate({"version": 1, "name": "p", "studies": [study]})
-    assert [piece.name for piece in _list_computations(plain, {})] == ["r"]
 
 
 def test_every_kind_of_study_is_in_the_record_and_the_result(finished):

@@ -43,11 +43,26 @@ def test_margins_and_passivity_are_those_of_the_scene(parts):
 def test_with_the_sensor_at_the_tip_passivity_is_not_known():
     coupling = zwidth.Coupling(0.05, 20e3, 1, sensor="tip")
     verdict = zwidth.assess(zwidth.Scene(zwidth.Device(0.1, 10, coupling), TIMING, WALL))
-    assert isinstance(verdict, zwidth.SceneAssessment)
     assert verdict.passive is None
     assert math.isnan(verdict.passivity_margin)
     assert verdict.as_dict()["passivity_margin"] is None
     assert verdict.gain_margin > 0
+
+
+@pytest.mark.parametrize("parts", [{}, {"velocity": SLOW}, {"operator": HAND}], ids=["rigid", "filter", "hand"])
+@pytest.mark.parametrize("wall", [(3e3, 5.0), (60e3, 5.0), (3e3, 900.0)])
+def test_every_scene_has_its_intervals_and_the_ends_of_the_nearest(parts, wall):
+    scene = zwidth.Scene(DEVICE, TIMING, zwidth.VirtualWall(*wall), **parts)
+    verdict = zwidth.assess(scene)
+    found = verdict.stable_stiffness, verdict.stable_damping
+    for told, expected in zip(found, (scene.stable_stiffness(), scene.stable_damping()), strict=True):
+        np.testing.assert_allclose(np.reshape(told, (-1, 2)), expected, rtol=1e-9, atol=1e-9)
+    ends = (verdict.stiffness_limit,), (verdict.virtual_damping_lower, verdict.virtual_damping_upper)
+    for value, intervals, told in zip(wall, found, ends, strict=True):
+        assert np.all(np.isnan(told)) == (not intervals)
+        if intervals:
+            assert any(told == ends[-len(told) :] for ends in intervals)
+        assert verdict.stable == any(low < value < high for low, high in intervals)
 
 
 @pytest.mark.parametrize("name", FREE)
@@ -86,7 +101,6 @@ def test_a_wall_that_takes_all_damping_away_is_not(name, damping):
 def test_an_undamped_device_has_no_stable_spring(delay):
     scene = dataclasses.replace(free_scene("filter", 0.0, 0.0), timing=zwidth.Timing(1e-3, delay))
     verdict = zwidth.assess(scene)
-    assert isinstance(verdict, zwidth.SceneAssessment)
     assert verdict.stable_stiffness == ()
     assert verdict.stable_damping == ()
 

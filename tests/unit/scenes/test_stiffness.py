@@ -7,7 +7,6 @@ import pytest
 
 import zwidth
 from zwidth import max_stiffness, sensitivities
-from zwidth.scenes.stiffness import sensitivity_lines
 
 NAMES = ("mass", "damping", "period", "delay")
 # Device by device: light, damped, slow; whole, fractional and no delay; the last two corners.
@@ -72,21 +71,9 @@ def test_one_bad_device_spoils_no_other():
     assert np.all(np.isfinite([leaf[0] for leaf in gain[:5]]))
 
 
-def test_words():
-    lines = sensitivity_lines(mass=0.1, damping=10.0, period=1e-3, delay=1e-3)
-    assert lines == [
-        "one more N s/m of damping buys 572 N/m",
-        "1 g more mass buys 141 N/m",
-        "a sampling period 10 µs shorter buys 153 N/m (same delay in seconds)",
-        "10 µs more delay costs 187 N/m",
-    ]
-
-
 @pytest.mark.parametrize("bad, message", [({"mass": 0.0}, "mass: got 0.0"), ({"delay": -1.0}, "delay: got -1.0")])
 def test_wrong_input_is_named(bad, message):
     good = {"mass": 0.1, "damping": 1.0, "period": 1e-3, "delay": 0.0}
-    for function in (max_stiffness, sensitivities, sensitivity_lines):
+    for function in (max_stiffness, sensitivities):
         with pytest.raises(zwidth.InputError, match=message):
             function(**(good | bad))
-    with pytest.raises(zwidth.InputError, match="mass: got an array"):
-        sensitivity_lines(mass=np.ones(2), period=1e-3)  # pyright: ignore[reportArgumentType]

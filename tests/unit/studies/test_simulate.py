@@ -156,7 +156,7 @@ def test_a_normalized_scene_has_no_motion(tmp_path):
         "version: 1\nname: a\nscene: {delta: 0.1, d: 1}\nstudies: [{kind: simulate, name: s, walls: [{alpha: 0.1}]}]\n",
         encoding="utf-8",
     )
-    with pytest.raises(zwidth.ConfigError, match=r"studies\[0\]\.device: missing; a motion in m and N needs a device"):
+    with pytest.raises(zwidth.ConfigError, match=r"studies\[0\]\.device: missing; a simulate study needs a device"):
         zwidth.load_config(file)
 
 

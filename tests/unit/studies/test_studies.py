@@ -12,7 +12,7 @@ from zwidth.loops.rigid.poles import unstable_poles
 from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
 from zwidth.studies.map import MapStudy
 from zwidth.studies.outcome import csv_text, stack
-from zwidth.studies.passivity import PassivityStudy, passive_edge, unit_outline
+from zwidth.studies.passivity import PassivityStudy, unit_outline
 from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy, needed_models, ridge_table, slope_table
 from zwidth.studies.step import StepStudy
@@ -56,8 +56,7 @@ def test_the_fractional_power_ends_at_its_lobe():
 
 @pytest.mark.parametrize("d", [0.0, 0.5, 1.0, 2.0])
 def test_the_passive_edge_separates_passive_from_not(d):
-    angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 61)
-    alpha, beta = passive_edge(angles, d)
+    alpha, beta = unit_outline(d)
     for delta in (0.1, 3.0):
         inside = zwidth.is_passive(delta * alpha * (1 - 1e-9), delta * beta * (1 - 1e-9), delta, d)
         beyond = zwidth.is_passive(delta * alpha * (1 + 1e-9), delta * beta * (1 + 1e-9), delta, d)

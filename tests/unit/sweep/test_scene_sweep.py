@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from independent_scenes import closed_loop_matrix
-from sweeping import config_of, study
+from sweeping import config_of, run_sweeps, study
 
 import zwidth
 from zwidth.config.faults import ConfigFileError
@@ -124,7 +124,7 @@ def test_a_run_goes_on_and_is_verified(folder, tmp_path):
         perform(path, family, index)
         done.append(family)
 
-    zwidth.run(config, out=tmp_path, perform=stop_after_one)
+    run_sweeps(config, tmp_path, perform=stop_after_one)
     assert zwidth.run(config, out=tmp_path, resume=True).ok
     assert all(each.ok for each in verify(tmp_path))
     one, other = (open_dataset(place / "walls.zarr").load() for place in (folder, tmp_path))

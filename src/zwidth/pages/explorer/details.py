@@ -47,7 +47,7 @@ def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
     if wish.outline and not rigid:
         yield show_outlines(model.outlines(scene))
     verdict = assess(scene)
-    own = model.normalized_lines(verdict) if wish.normalized and isinstance(verdict, Assessment) else None
+    own = model.normalized_lines(verdict) if wish.normalized else None
     lines = own or words.check(scene, verdict, [])
     yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(wish, verdict)}
     if wish.outline:
@@ -81,7 +81,7 @@ def _length(wish: Wish) -> float:
     return 1.0 if wish.normalized else 1e3
 
 
-def _wall_curves(wish: Wish, verdict: Any) -> Update:
+def _wall_curves(wish: Wish, verdict: Assessment) -> Update:
     """The Nyquist curve, its crossover, the step response, and the stiffest wall."""
     scene = wish.scene
     curve, cross = model.nyquist_curve(scene), model.crossover(scene, verdict)

@@ -13,10 +13,11 @@ import numpy as np
 from zwidth.loops.linear.crossing_lines import end_lines
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.rigid.passive_area import passive_edge
 from zwidth.loops.rigid.poles import companion
 from zwidth.loops.rigid.region import stable_region
 from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.scenes.assessment import Assessment, SceneAssessment
+from zwidth.scenes.assessment import Assessment
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain
@@ -126,14 +127,14 @@ def nyquist_curve(scene: Scene) -> np.ndarray:
     )
 
 
-def crossover(scene: Scene, verdict: Assessment | SceneAssessment) -> complex:
+def crossover(scene: Scene, verdict: Assessment) -> complex:
     """The open loop where its magnitude is 1, the frequency of which the verdict has; NaN without one."""
     hertz = verdict.gain_crossover
     wall = scene.wall.stiffness, scene.wall.virtual_damping
     return complex(scene.frequency_response(*wall, hertz)) if isfinite(hertz) else complex("nan+nanj")
 
 
-def length_of(scene: Scene, verdict: Assessment | SceneAssessment) -> int:
+def length_of(scene: Scene, verdict: Assessment) -> int:
     """How many periods show the wall's slowest motion: six of its time constants, if that is neither few nor many."""
     periods = 6.0 * abs(verdict.time_constant) / scene.timing.period
     return int(min(max(periods, _SHORTEST), _LONGEST)) if isfinite(periods) else 10 * _SHORTEST
@@ -154,14 +155,7 @@ def passive_set(scene: Scene) -> Curve | None:
     """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
     if not has_condition(scene.device):
         return None
-    damping, units = float(scene.device.damping), scene.units
-    if damping == 0:
-        return np.empty(0), np.empty(0)
-    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, _DIRECTIONS if scene.is_rigid else _FEW_DIRECTIONS)
-    # The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
-    along = np.maximum(np.cos(turn), 0.0) * units.stiffness, np.sin(turn) * units.virtual_damping
-    share = damping / (damping - np.asarray(scene.passivity_margin(*along)))
-    return along[0] * share, along[1] * share
+    return passive_edge(scene, _DIRECTIONS if scene.is_rigid else _FEW_DIRECTIONS)
 
 
 def radius_map(scene: Scene, across: Range, up: Range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -230,6 +224,6 @@ def normalized_lines(verdict: Assessment) -> list[str]:
     return [f"{label:<20}  {text}" for label, text in rows.items()]
 
 
-def word_of(verdict: Assessment | SceneAssessment) -> str:
+def word_of(verdict: Assessment) -> str:
     """The verdict in a word."""
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"

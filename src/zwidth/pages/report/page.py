@@ -26,7 +26,7 @@ _METHODS = {
     "map": "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors.",
     "passivity": "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms.",
     "step": "Exact solution between the instants at which a force changes; rounding alone.",
-    "slope": "The limit polynomial of eq. (22), to some rounding errors.",
+    "published": "The paper's numbers, from closed forms.",
     "recommend": "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings.",
     "compare": "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge.",
     "filters": "The highest point of all edges of the stable set, one filter after the other, to about 1e-13.",
@@ -139,7 +139,7 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
                 f'<figure><img alt="{escape(text)}" src="data:image/svg+xml;base64,{data}">'
                 f"<figcaption>{escape(path.stem)}</figcaption></figure>"
             )
-        elif file == "published.json":
+        elif entry.get("kind") == "published" and file.endswith(".json"):
             yield _published(json.loads(path.read_text(encoding="utf-8")))
         elif file.endswith(SUFFIX) and path.is_symlink():
             # Stores are not read through links: what one leads to may be anybody's.
