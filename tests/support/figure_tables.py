@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from zwidth.studies.outcome import stack
+from zwidth.figures.table import stack
 
 
 def outline(delta, d=0.0, delay_model="held", line=False):

@@ -34,7 +34,8 @@ from matplotlib.text import Annotation, Text
 
 from zwidth import figures
 from zwidth.figures import style, table
-from zwidth.studies.outcome import csv_text, stack
+from zwidth.figures.table import stack
+from zwidth.studies.outcome import csv_text
 from zwidth.words.errors import InputError
 
 
@@ -201,7 +202,7 @@ def test_boundaries_show_the_given_curves_in_one_panel_for_each_delay():
             given = outline(delta, d)
             assert_drawn(ax, f"boundary, delta = {delta:g}, d = {d:g}", given["alpha"], given["beta"])
         assert_drawn(ax, f"path of alpha_max, d = {d:g}", path(d)["alpha"], path(d)["beta"])
-        shaded = [patch.get_path().vertices for patch in ax.patches if isinstance(patch, PathPatch)]
+        shaded = [np.asarray(patch.get_path().vertices) for patch in ax.patches if isinstance(patch, PathPatch)]
         assert any(np.array_equal(xy[:21], np.c_[outline(1.0, d)["alpha"], outline(1.0, d)["beta"]]) for xy in shaded)
 
 

@@ -7,11 +7,12 @@ import pytest
 
 import zwidth
 from zwidth.config.scenes import PhysicalScene
+from zwidth.figures.table import stack
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.poles import unstable_poles
 from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
 from zwidth.studies.map import MapStudy
-from zwidth.studies.outcome import csv_text, stack
+from zwidth.studies.outcome import csv_text
 from zwidth.studies.passivity import PassivityStudy, unit_outline
 from zwidth.studies.recommend import RecommendStudy
 from zwidth.studies.ridge import RidgeStudy, needed_models, ridge_table, slope_table
