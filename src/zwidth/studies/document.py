@@ -217,7 +217,7 @@ def _scene_or_stand_in(raw: Any) -> AnyScene:
         pass
     if isinstance(raw, dict) and is_normalized(raw):
         return NormalizedScene(delta=0.0, alpha=0.0)
-    return PhysicalScene(mass=1.0, period=1.0, stiffness=0.0)
+    return PhysicalScene.model_validate({"mass": 1.0, "period": 1.0, "stiffness": 0.0})
 
 
 def _fill_study(study: Any, scene: AnyScene) -> Any:
