@@ -261,14 +261,14 @@ def compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...] = ()) -> 
     return jax.jit(strips, compiler_options=WIDE)
 
 
-def map_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int, threads: int | None = None) -> Any:
+def map_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int) -> Any:
     """Apply a compiled elementwise function to equally long columns, block by block on every processor.
 
     One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py):
     what the function holds meanwhile leaves the cache.
     Columns of one value are handed over as they are.
     """
-    return _map_pieces(function, columns, _padded_size(_length(columns), block, _LEAST), threads)
+    return _map_pieces(function, columns, _padded_size(_length(columns), block, _LEAST))
 
 
 @cache
@@ -301,19 +301,15 @@ def map_flat(
     columns: list[np.ndarray],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    least: int = 1,
-    threads: int | None = None,
 ) -> Any:
     """Apply a one-point kernel to every row of equally long columns, in float64; NumPy leaves come back.
 
-    Pieces hold ``chunk`` points and run on ``threads`` threads, by default as many as there are processors. A piece is
-    never shorter than ``least``: the compiler treats very short ones differently, to the last place.
+    Pieces hold ``chunk`` points and run on as many threads as there are processors.
     """
-    size = _padded_size(columns[0].size, chunk, least)
-    return _map_pieces(_compile_pointwise(kernel, static), columns, size, threads)
+    return _map_pieces(_compile_pointwise(kernel, static), columns, _padded_size(columns[0].size, chunk, 1))
 
 
-def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None) -> Any:
+def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int) -> Any:
     count = _length(columns)
     flagged = [(column, column.size == 1 < count) for column in columns]
 
@@ -333,7 +329,7 @@ def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: i
     store(0, first)
     if count > size:
         # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
-        with ThreadPoolExecutor(threads or processors()) as pool:
+        with ThreadPoolExecutor(processors()) as pool:
             list(pool.map(lambda start: store(start, run(start)), range(size, count, size)))
     return whole
 
@@ -351,14 +347,13 @@ def pointwise(
     values: tuple[ArrayLike, ...],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    least: int = 1,
 ) -> Any:
     """Broadcast ``values``, apply the one-point JAX ``kernel`` to each point, and restore the common shape."""
     if is_traced(*values):
         return _map_traced(kernel, values, static)
     arrays = broadcast(names, values)
     shape = arrays[0].shape
-    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, least)
+    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 

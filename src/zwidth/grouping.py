@@ -55,9 +55,6 @@ def map_by_degree(
     names: tuple[str, ...] = NAMES,
     static: tuple[Any, ...] = (),
     lead: bool = False,
-    chunk: Callable[[Degree], int] = lambda degree: batching.CHUNK,
-    least: int = 1,
-    threads: int | None = None,
     few: Callable[[Degree], int] | None = None,
 ) -> Any:
     """Apply ``kernel(alpha, beta, delta, d, degree, *static)`` to points whose delays may differ.
@@ -65,7 +62,7 @@ def map_by_degree(
     Other arguments may take the place of these if ``names`` says so; the last one is the delay. Results that are
     vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN
     behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any shape, and takes up to
-    so many points of a degree without JAX. ``least`` and ``threads`` as for `zwidth.batching.map_flat`.
+    so many points of a degree without JAX.
     """
     if is_traced(*values):
         return _map_traced(kernel, names, values, static, lead)
@@ -78,7 +75,7 @@ def map_by_degree(
             with np.errstate(all="ignore"):
                 parts.append(kernel(*picked, degree, *static))
         else:
-            parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), least, threads))
+            parts.append(batching.map_flat(kernel, picked, (degree, *static)))
         places.append(index)
     if not parts:
         parts, places = [_of_nothing(kernel, columns, static, few)], [np.arange(0)]

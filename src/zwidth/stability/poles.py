@@ -200,11 +200,6 @@ def _block(most: int) -> int:
     return 1 << max(1, most).bit_length() - 1
 
 
-def companion_chunk(degree: Degree) -> int:
-    """How many companion matrices fit into about 32 MiB."""
-    return _block((1 << 22) // degree.poles**2)
-
-
 def poles(
     alpha: ArrayLike,
     beta: ArrayLike,
