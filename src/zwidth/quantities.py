@@ -293,8 +293,8 @@ _OUTPUTS = (
         "time in which the slowest pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall",
         units="sampling periods",
         physical_units="s",
-        words="settling time to 2 %",
-        symbol="t_s",
+        words="decay time to 2 %",
+        symbol=r"t_{2\%}",
         look="steep",
     ),
     Output(

@@ -1,11 +1,4 @@
-"""Time response of the rigid device in contact with the wall, exact at the samples and between them.
-
-Between two instants at which a force changes, the damped mass has the exact solution
-
-    x(t) = x + t phi1(delta t) v + t^2 phi2(delta t) F        v(t) = e^(-delta t) v + t phi1(delta t) F
-
-(T = 1, m = 1). In each period the wall's force changes once, at the fraction f of a delay d = n + f.
-"""
+"""Step response of the rigid device in contact with the wall: a simulation, and when it has settled."""
 
 from __future__ import annotations
 
@@ -14,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth._types import Array, Samples
+from zwidth._types import Samples
 from zwidth.batching import as_float64
 from zwidth.errors import InputError
-from zwidth.grouping import find_degree
-from zwidth.numerics import phi
-from zwidth.settling import advance, settling_time
+from zwidth.parts.device import Device
+from zwidth.parts.timing import Timing
+from zwidth.scene import Scene
+from zwidth.settling import settling_time
 
 
 class StepResponse(NamedTuple):
@@ -31,54 +25,6 @@ class StepResponse(NamedTuple):
     wall_force: Samples
     final_position: float
     settling_time: float
-
-
-class _Samples(NamedTuple):
-    """State at the start of every period, and the wall's force before and behind the instant at which it changes."""
-
-    x: np.ndarray
-    v: np.ndarray
-    older: np.ndarray
-    newer: np.ndarray
-
-
-def _run(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> _Samples:
-    """Run the loop from rest, sample by sample.
-
-    In plain floats: a period takes a microsecond or two, less than importing a compiler for most runs.
-    """
-    lag = find_degree(d).whole
-    f = d - lag
-    # x and v after each part of a period are linear in x, v and the force: three numbers a part.
-    parts = []
-    for t in (f, 1.0 - f):
-        at = phi.phi_functions(np.float64(delta * t))
-        parts.append((float(t * at.phi1), float(t * t * at.phi2), math.exp(-delta * t)))
-    (xv0, xf0, c0), (xv1, xf1, c1) = parts
-    # The velocity gains t phi1 F, the factor that the velocity has in the position.
-    x = v = previous = 0.0
-    forces = [0.0] * (periods + lag + 2)
-    rows = []
-    for k in range(periods):
-        forces[k + lag + 1] = -(alpha * x + beta * (x - previous))
-        older, newer = forces[k], forces[k + 1]
-        rows.append((x, v, older, newer))
-        previous = x
-        first, second = applied + older, applied + newer
-        x, v = x + xv0 * v + xf0 * first, c0 * v + xv0 * first
-        x, v = x + xv1 * v + xf1 * second, c1 * v + xv1 * second
-    return _Samples(*np.array(rows).T)
-
-
-def _interpolate(samples: _Samples, fractions: np.ndarray, delta: float, f: float, applied: float) -> tuple[Array, ...]:
-    """Position, velocity and force at the instants ``fractions`` of every period; rows are periods."""
-    x, v, older, newer = (column[:, None] for column in samples)
-    x_bend, v_bend = advance(x, v, applied + older, np.float64(f), delta)
-    before = fractions < f
-    span = np.where(before, fractions, fractions - f)
-    force = np.where(before, older, newer)
-    x, v = advance(np.where(before, x, x_bend), np.where(before, v, v_bend), applied + force, span, delta)
-    return x, v, force
 
 
 def step_response(
@@ -105,8 +51,8 @@ def step_response(
         from the poles, see `zwidth.settling`. NaN where the wall is not stable, and beyond d = 500.
 
     Numerics:
-        Exact between force changes up to rounding; float64, by NumPy. An unstable response that outgrows it ends as
-        inf or NaN.
+        That of `zwidth.simulate`: exact between force changes up to rounding. An unstable response that outgrows
+        float64 ends as inf or NaN.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VIII, Fig. 11, eqs. (2), (6).
@@ -128,12 +74,8 @@ def step_response(
         if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
             raise InputError(f"{name}: got {count!r}; a whole number of at least 1 is needed")
     alpha, beta, delta, d, force = (float(number) for number in numbers.values())
-    fractions = np.arange(substeps) / substeps
-    with np.errstate(all="ignore"):
-        samples = _run(alpha, beta, delta, d, force, int(periods))
-        history = _interpolate(samples, fractions, delta, d - math.floor(d), force)
-    position, velocity, wall_force = (np.broadcast_to(part, (periods, substeps)).ravel() for part in history)
-    time = (np.arange(periods)[:, None] + fractions).ravel()
+    scene = Scene(Device(mass=1.0, damping=delta), Timing(period=1.0, delay=d))
+    motion = scene.simulate(alpha, beta, push=force, periods=periods, substeps=substeps)
     final = force / alpha if alpha != 0 else math.nan
     settled = settling_time(alpha, beta, delta, d) if force != 0 else 0.0
-    return StepResponse(time, position, velocity, wall_force, final, settled)
+    return StepResponse(motion.time, motion.position, motion.velocity, motion.wall_force, final, settled)

@@ -121,6 +121,15 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
     return _last_outside(found, instants, last, allowed)
 
 
+def decay_time(rate: Array) -> Array:
+    """In what time a slowest pole that decays at a rate has decayed to 2 %; infinite where it does not decay.
+
+    An estimate of the settling time by one pole, ``ln 50/rate``: the others and their residues may delay or hasten it.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(rate > 0, -math.log(SETTLING_BAND) / rate, np.where(np.isnan(rate), np.nan, np.inf))
+
+
 def _envelope_end(bound: np.ndarray, rate: np.ndarray, allowed: float) -> int:
     """The first period from which on the sum of the modes' sizes stays within the band."""
     longest = np.max(np.log(np.maximum(bound * bound.size / allowed, 1.0)) / rate)

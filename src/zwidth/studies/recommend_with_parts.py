@@ -15,11 +15,11 @@ from zwidth.formatting import plain, tell_apart, with_unit
 from zwidth.linear.passivity import has_condition
 from zwidth.linear.stiffest import StiffestWall, choose_damping
 from zwidth.scene import Scene
+from zwidth.settling import decay_time
 from zwidth.status import Status
 from zwidth.studies.outcome import Outcome, stack
 from zwidth.studies.stable_set import name_kind, tabulate_walls, trace_outlines
 
-_DECAY = math.log(50.0)
 _SIDES = ("lower", "upper")
 _PASSIVE = {True: "yes", False: "no", None: "not known, the sensor is not where the force acts"}
 
@@ -104,7 +104,7 @@ def _summarize(
             "virtual_damping_upper": _known(ends[1]),
             "stable": stable,
             "spectral_radius": _known(radius),
-            "settling_time": _known(-_DECAY * scene.timing.period / math.log(radius) if 0 < radius < 1 else math.nan),
+            "decay_time": _known(float(decay_time(-np.log(radius))) * scene.timing.period),
             "passive": passive,
         },
     }
@@ -142,8 +142,8 @@ def _describe(found: dict[str, Any]) -> str:
         "",
         f"- is {'stable' if best['stable'] else 'NOT stable'};",
         f"- stays stable at this K for B between {lower} and {upper};",
-        f"- has the spectral radius {spell(best['spectral_radius'], '')} and settles to 2 % in about "
-        f"{spell(best['settling_time'], 's')};",
+        f"- has the spectral radius {spell(best['spectral_radius'], '')}, which decays to 2 % in "
+        f"{spell(best['decay_time'], 's')};",
         f"- is passive: {_PASSIVE[best['passive']]}.",
         "",
     ]

@@ -7,7 +7,6 @@ batches of two sizes, may round differently.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product
@@ -16,6 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from zwidth.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
+from zwidth.settling import decay_time
 from zwidth.stability.boundary_map import row_limits
 from zwidth.stability.decay import rates
 from zwidth.stability.margins import margins_kernel
@@ -35,7 +35,6 @@ _WALL_PIECE = 1 << 12
 _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
 _MANY_ROWS = 256
-_DECAY = math.log(50.0)
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
@@ -86,7 +85,8 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
         found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
         found["margin"] = -np.expm1(-rate)
-        found["settling_time"] = _settling_time(rate, block)
+        periods = decay_time(rate)
+        found["settling_time"] = periods * block.period[:, None, None] if block.period.size else periods
     if MARGIN_OUTPUTS & set(outputs):
         compute = partial(_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
         found |= dict(zip(_MARGINS, _by_device(compute, block, shape, _all_devices, leaves=4), strict=True))
@@ -119,13 +119,6 @@ def _status(
     if not (device.all() and alpha.all() and beta.all()):
         status[~(device[:, None, None] & alpha[:, :, None] & beta[:, None, :])] = Status.INVALID_INPUT
     return status
-
-
-def _settling_time(rate: np.ndarray, block: Block) -> np.ndarray:
-    """The time in which the slowest pole decays to 2 %, in seconds where there is a period."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        periods = np.where(rate > 0, _DECAY / rate, np.where(np.isnan(rate), np.nan, np.inf))
-    return periods * block.period[:, None, None] if block.period.size else periods
 
 
 def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
