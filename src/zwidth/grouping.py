@@ -52,21 +52,19 @@ def map_by_degree(
     kernel: Callable[..., Any],
     values: tuple[ArrayLike, ...],
     *,
-    names: tuple[str, ...] = NAMES,
     static: tuple[Any, ...] = (),
     lead: bool = False,
     few: Callable[[Degree], int] | None = None,
 ) -> Any:
     """Apply ``kernel(alpha, beta, delta, d, degree, *static)`` to points whose delays may differ.
 
-    Other arguments may take the place of these if ``names`` says so; the last one is the delay. Results that are
-    vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN
-    behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any shape, and takes up to
-    so many points of a degree without JAX.
+    Results that are vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for
+    coefficients) or NaN behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any
+    shape, and takes up to so many points of a degree without JAX.
     """
     if is_traced(*values):
-        return _map_traced(kernel, names, values, static, lead)
-    arrays = batching.broadcast(names, values)
+        return _map_traced(kernel, values, static, lead)
+    arrays = batching.broadcast(NAMES, values)
     columns = [array.ravel() for array in arrays]
     parts, places = [], []
     for degree, index in groups(columns[-1]):
@@ -118,7 +116,7 @@ def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
     return filled
 
 
-def _map_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static: tuple, lead: bool) -> Any:
+def _map_traced(kernel: Callable[..., Any], values: tuple, static: tuple, lead: bool) -> Any:
     import jax
     import jax.numpy as jnp
 
@@ -133,7 +131,7 @@ def _map_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static:
         parts.append(jax.vmap(lambda *point, degree=degree: kernel(*point, degree, *static))(*picked))
         places.append(index)
     if not parts:
-        raise InputError(f"{', '.join(names)}: got no point at all inside a JAX transformation")
+        raise InputError(f"{', '.join(NAMES)}: got no point at all inside a JAX transformation")
     order = np.argsort(np.concatenate(places), kind="stable")
 
     def gather(*leaves: jax.Array) -> jax.Array:
