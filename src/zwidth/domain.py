@@ -12,16 +12,9 @@ import numpy as np
 
 from zwidth._types import Array
 from zwidth.errors import InputError
+from zwidth.quantities import LARGEST_DAMPING, LONGEST_DELAY, SIZES, WALL_RANGE
 from zwidth.status import Status
 from zwidth.xp import namespace
-
-# Every SI quantity is 0 or of a magnitude in this range.
-SI_RANGE = (1e-30, 1e30)
-# alpha and beta are 0 or of a magnitude in this range.
-WALL_RANGE = (1e-60, 1e60)
-# The largest physical damping (delta) and the longest delay (d).
-LARGEST_DAMPING = 1e12
-LONGEST_DELAY = 1e5
 
 
 def within(value: Array, limits: tuple[float, float]) -> Array:
@@ -83,19 +76,14 @@ def poison(ok: Array, *inputs: Array) -> Array:
     return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
 
 
-# Every other name is one of a wall's numbers.
-_LARGEST = {"delta": LARGEST_DAMPING, "d": LONGEST_DELAY}
-
-
 def check_scalars(**values: Any) -> None:
     """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
     for name, value in values.items():
         if not isinstance(value, int | float | np.floating | np.integer) or not np.isfinite(value):
             continue
-        if name in _LARGEST:
-            inside, allowed = value <= _LARGEST[name], f"0 to {_LARGEST[name]:g}"
-        else:
-            inside = bool(within(np.float64(value), WALL_RANGE))
-            allowed = f"0 or {WALL_RANGE[0]:g} to {WALL_RANGE[1]:g} in magnitude"
+        # Every other name is one of a wall's numbers.
+        least, most = SIZES.get(name, WALL_RANGE)
+        inside = within(np.float64(value), (least, most)) if least else value <= most
+        allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"0 to {most:g}"
         if not inside:
             raise InputError(f"{name}: got {value!r}; it must be {allowed}")

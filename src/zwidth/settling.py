@@ -21,6 +21,7 @@ from zwidth.grouping import find_degree
 from zwidth.loop import coefficients
 from zwidth.numerics import phi
 from zwidth.numerics.roots import bisect
+from zwidth.quantities import LONGEST_SETTLING
 from zwidth.stability.crossover import stable_kernel
 from zwidth.stability.poles import poles
 
@@ -28,8 +29,6 @@ from zwidth.stability.poles import poles
 SETTLING_BAND = 0.02
 # Instants a period at which the motion is looked at, beside the one at which the force changes.
 _INSTANTS = 40
-# All poles are needed: their cost grows with the cube of the delay.
-_LONGEST = 500
 # How far the modes, summed up at the first samples, may be from the motion that they stand for.
 _MISFIT = 1e-6
 # Instants laid out at one time.
@@ -104,7 +103,7 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
     """
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
-    if not stable or d > _LONGEST:
+    if not stable or d > LONGEST_SETTLING:
         return math.nan
     with np.errstate(all="ignore"):
         found = modes(alpha, beta, delta, d)

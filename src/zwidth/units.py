@@ -13,10 +13,9 @@ from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 import numpy as np
 
 from zwidth._types import Array
-from zwidth.domain import SI_RANGE
 from zwidth.errors import InputError, UnusableValueError
 from zwidth.formatting import describe, short, suggestion
-from zwidth.quantities import ANY, NOT_NEGATIVE, PARAMETERS, Range
+from zwidth.quantities import ANY, NOT_NEGATIVE, PARAMETERS, SI_RANGE, Range
 from zwidth.xp import frozen, namespace
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.

@@ -19,10 +19,11 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import elementwise
 from zwidth.design.stiffness import check_stiffness, max_stiffness_kernel
-from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE, check_scalars, device_status, poison, within
+from zwidth.domain import LARGEST_DAMPING, LONGEST_DELAY, check_scalars, device_status, poison, within
 from zwidth.errors import InputError, check_choice
 from zwidth.normalization import denormalize, normalize, quantity_status
 from zwidth.numerics.roots import last_cell, newton
+from zwidth.quantities import SI_RANGE
 from zwidth.stability.devices import ANY, classify_delays
 from zwidth.stability.ridge import slopes_kernel, stiffness_slopes
 from zwidth.status import Status
@@ -133,9 +134,10 @@ class _Given(NamedTuple):
 def _kernel(*arguments: Any) -> Requirement:
     """The requirement of `_Given`; the last two arguments are the parameter and the delays that occur."""
     *inputs, parameter, kind = arguments
-    names = ("wanted_stiffness", "mass", "damping", "period", "delay", "d")
-    usable = quantity_status(**dict(zip(names, inputs, strict=True)))
+    names = ("stiffness", "mass", "damping", "period", "delay", "d")
     xp = namespace(*inputs)
+    usable = quantity_status(**dict(zip(names, inputs, strict=True)))
+    usable = xp.where(inputs[0] > 0, usable, int(Status.INVALID_INPUT))
     # A harmless number in place of a bad one.
     given, rises = _Given(*(xp.where(usable == Status.OK, value, 1.0) for value in inputs)), parameter in _RISES
     still = frozen(given, xp)

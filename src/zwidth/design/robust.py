@@ -15,10 +15,11 @@ import numpy as np
 from zwidth._types import Array, ArrayLike
 from zwidth.batching import as_float64
 from zwidth.design.stiffness import max_stiffness
-from zwidth.domain import SI_RANGE, within
+from zwidth.domain import within
 from zwidth.errors import InputError
 from zwidth.normalization import normalize
 from zwidth.numerics.roots import bisect
+from zwidth.quantities import SI_RANGE
 from zwidth.stability.affine import quantities, stable_everywhere
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.labels import is_stable

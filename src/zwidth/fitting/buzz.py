@@ -98,7 +98,7 @@ def fit_buzz(
         >>> print(f"{fit.mass * 1e3:.0f} g")
         100 g
     """
-    period = check_number("period", period, "s", low_open=True)
+    period = check_number("period", period)
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")

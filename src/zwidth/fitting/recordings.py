@@ -12,6 +12,7 @@ from zwidth.errors import InputError
 from zwidth.fitting.moving import Recording
 from zwidth.formatting import plain, with_unit
 from zwidth.parts.checks import check_number
+from zwidth.quantities import POSITIVE
 
 # How far a sample's time may lie from an even one, as a share of the period, unasked and where a wavering clock is
 # asked for, less than what a missing sample looks like; how far periods of logs may differ beyond their errors.
@@ -77,7 +78,7 @@ def _read(time: Any, position: Any, force: Any, resample: bool) -> tuple[Log, fl
         if bad.size:
             raise InputError(f"{name}: {bad.size} samples are no numbers, the first is sample {bad[0]}; leave them out")
     if clock is None:
-        period, error = check_number("time", time, "s", low_open=True), 0.0
+        period, error = check_number("time", time, "s", POSITIVE), 0.0
     else:
         period, error = _period(clock, resample)
     if np.ptp(f) == 0:

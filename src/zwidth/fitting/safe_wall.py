@@ -18,13 +18,14 @@ import numpy as np
 from zwidth._types import Array
 from zwidth.batching import FEW
 from zwidth.design.tolerances import borne_by
-from zwidth.domain import SI_RANGE, device_status
+from zwidth.domain import device_status
 from zwidth.errors import InputError
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.device_fit import scene_of
 from zwidth.linear.polynomial import affine_polynomial
 from zwidth.linear_loop import circle
 from zwidth.parts.checks import check_whole
+from zwidth.quantities import SI_RANGE
 from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.labels import is_stable

@@ -17,7 +17,8 @@ from zwidth._types import Array
 from zwidth.errors import InputError
 from zwidth.linear.polynomial import affine_polynomial
 from zwidth.linear_loop import Estimate, LinearLoop
-from zwidth.stability.poles import MOST_POLES, companion
+from zwidth.quantities import MOST_POLES
+from zwidth.stability.poles import companion
 
 # Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
 _STEPS, _ARRIVED = 60, 4e-16

@@ -10,19 +10,20 @@ import numpy as np
 
 from zwidth.errors import InputError, UnusableValueError
 from zwidth.formatting import describe
-from zwidth.quantities import NOT_NEGATIVE, Range
+from zwidth.quantities import NOT_NEGATIVE, PARAMETERS, Range
 from zwidth.units import Span, find_dimension, read_quantity, read_span, to_float
 from zwidth.xp import is_jax
 
 
-def check_number(field: str, value: Any, unit: str, *, low: float = 0.0, low_open: bool = False) -> Any:
+def check_number(field: str, value: Any, unit: str = "", allowed: Range | None = None) -> Any:
     """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`.
 
-    A text is a number with a unit, as in configuration files: "70 g".
+    A text is a number with a unit, as in configuration files: "70 g". Unit and range are those that `zwidth.quantities`
+    has for the field where they are left out.
     """
     if is_jax(value):
         return value
-    allowed = Range(low, low_open=low_open)
+    unit, allowed = unit or PARAMETERS[field].unit, allowed or PARAMETERS[field].sign
     return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed)[0])
 
 

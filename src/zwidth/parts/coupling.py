@@ -36,7 +36,6 @@ class Coupling:
     sensor: Literal["motor", "tip"] = "motor"
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mass", check_number("coupling.mass", self.mass, "kg", low_open=True))
-        object.__setattr__(self, "stiffness", check_number("coupling.stiffness", self.stiffness, "N/m", low_open=True))
-        object.__setattr__(self, "damping", check_number("coupling.damping", self.damping, "N s/m"))
+        for name in ("mass", "stiffness", "damping"):
+            object.__setattr__(self, name, check_number(f"coupling.{name}", getattr(self, name)))
         check_choice("coupling.sensor", self.sensor, ("motor", "tip"))

@@ -25,7 +25,7 @@ class Device:
     coupling: Coupling | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mass", check_number("mass", self.mass, "kg", low_open=True))
-        object.__setattr__(self, "damping", check_number("damping", self.damping, "N s/m"))
+        object.__setattr__(self, "mass", check_number("mass", self.mass))
+        object.__setattr__(self, "damping", check_number("damping", self.damping))
         if self.coupling is not None and not isinstance(self.coupling, Coupling):
             raise InputError(f"coupling: got {self.coupling!r}; a zwidth.Coupling is needed, or None")

@@ -11,6 +11,7 @@ from typing import Any
 
 from zwidth.errors import InputError
 from zwidth.parts.checks import check_number
+from zwidth.quantities import POSITIVE
 
 
 @dataclass(frozen=True)
@@ -40,9 +41,9 @@ class Operator:
     coupling_damping: Any = 0.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("mass", "kg"), ("damping", "N s/m"), ("stiffness", "N/m"), ("coupling_damping", "N s/m")):
-            least_open = name == "mass" and not self.rigid
-            value = check_number(f"operator.{name}", getattr(self, name), unit, low_open=least_open)
+        for name in ("mass", "damping", "stiffness", "coupling_damping"):
+            allowed = POSITIVE if name == "mass" and not self.rigid else None
+            value = check_number(f"operator.{name}", getattr(self, name), allowed=allowed)
             object.__setattr__(self, name, value)
         if self.rigid:
             damped = self.coupling_damping
@@ -52,7 +53,7 @@ class Operator:
                     "operator.coupling_stiffness as well, or add the damping to the device"
                 )
             return
-        value = check_number("operator.coupling_stiffness", self.coupling_stiffness, "N/m", low_open=True)
+        value = check_number("operator.coupling_stiffness", self.coupling_stiffness)
         object.__setattr__(self, "coupling_stiffness", value)
 
     @property

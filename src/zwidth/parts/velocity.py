@@ -16,6 +16,7 @@ import numpy as np
 from zwidth.errors import InputError
 from zwidth.linear_loop import Estimate
 from zwidth.parts.checks import check_number, check_whole
+from zwidth.quantities import POSITIVE
 from zwidth.xp import is_jax, namespace
 
 _LONGEST_WINDOW, _HIGHEST_ORDER, _LONGEST_ADAPTIVE = 1000, 8, 64
@@ -32,7 +33,7 @@ VELOCITY_KINDS = {
 
 def _check_period(owner: Any) -> None:
     if owner.coded_period is not None:
-        value = check_number("velocity.coded_period", owner.coded_period, "s", low_open=True)
+        value = check_number("velocity.coded_period", owner.coded_period)
         object.__setattr__(owner, "coded_period", value)
 
 
@@ -108,9 +109,8 @@ class LowPass:
             raise InputError(
                 "velocity: give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
             )
-        name, unit = ("cutoff", "Hz") if self.time_constant is None else ("time_constant", "s")
-        value = check_number(f"velocity.{name}", getattr(self, name), unit, low_open=True)
-        object.__setattr__(self, name, value)
+        name = "cutoff" if self.time_constant is None else "time_constant"
+        object.__setattr__(self, name, check_number(f"velocity.{name}", getattr(self, name)))
         object.__setattr__(self, "order", check_whole("velocity.order", self.order, 1, 2))
         _check_period(self)
 
@@ -147,7 +147,7 @@ class Butterworth:
     coded_period: Any = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "cutoff", check_number("velocity.cutoff", self.cutoff, "Hz", low_open=True))
+        object.__setattr__(self, "cutoff", check_number("velocity.cutoff", self.cutoff))
         object.__setattr__(self, "order", check_whole("velocity.order", self.order, 1, _HIGHEST_ORDER))
         _check_period(self)
 
@@ -240,7 +240,7 @@ class FOAW:
     samples: int = 15
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "noise", check_number("velocity.noise", self.noise, "m", low_open=True))
+        object.__setattr__(self, "noise", check_number("velocity.noise", self.noise, "m", POSITIVE))
         object.__setattr__(self, "samples", check_whole("velocity.samples", self.samples, 1, _LONGEST_ADAPTIVE))
 
     def estimate(self, period: Any) -> Estimate:

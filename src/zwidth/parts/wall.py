@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -23,8 +22,8 @@ class VirtualWall:
     virtual_damping: Any = 0.0
 
     def __post_init__(self) -> None:
-        for name, unit in (("stiffness", "N/m"), ("virtual_damping", "N s/m")):
-            object.__setattr__(self, name, check_number(name, getattr(self, name), unit, low=-math.inf))
+        for name in ("stiffness", "virtual_damping"):
+            object.__setattr__(self, name, check_number(name, getattr(self, name)))
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from zwidth.domain import LONGEST_DELAY, check_scalars, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.grouping import NAMES, Degree, few_poles, find_degree, map_by_degree
 from zwidth.loop import check_has_poles, coefficients
+from zwidth.quantities import MOST_POLES
 from zwidth.stability.aberth import (
     aberth_kernel,
     discs,
@@ -33,9 +34,6 @@ PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
 # The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
 _POLISHING_STEPS = 3
-
-# All poles take degree^3 operations and degree^2 numbers: 4,000 take minutes and 0.3 GB.
-MOST_POLES = 4000
 
 # Beyond, steps and the time to compile them grow, and the product of all distances between poles loses its digits.
 _MOST_AT_ONE_TIME = 24

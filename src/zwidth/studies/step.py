@@ -30,7 +30,7 @@ from zwidth.config.scenes import (
 )
 from zwidth.config.study import HeldOnly, refuse_parts
 from zwidth.formatting import plain, with_unit
-from zwidth.quantities import Range
+from zwidth.quantities import LONGEST_SETTLING, Range
 from zwidth.response import step_response
 from zwidth.stability.ridge import alpha_max
 from zwidth.studies.outcome import ComputedStudy, Outcome, stack
@@ -90,7 +90,8 @@ class ResponseStudy(ComputedStudy):
             f"settling_time{second}": settling_time,
         }
         if np.isnan(settling_time):
-            unknown = "the wall is not stable, its poles nearly coincide, or the delay exceeds 500 periods"
+            longest = f"the delay exceeds {LONGEST_SETTLING} periods"
+            unknown = f"the wall is not stable, its poles nearly coincide, or {longest}"
             return columns, f"no settling time: {unknown}"
         after = with_unit(settling_time, "s", 3) if physical else f"{plain(settling_time)} periods"
         late = settling_time > time[-1]
