@@ -261,14 +261,14 @@ def compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...] = ()) -> 
     return jax.jit(strips, compiler_options=WIDE)
 
 
-def map_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int) -> Any:
+def map_blocks(function: Callable[..., Any], columns: list[np.ndarray], block: int, threads: int | None = None) -> Any:
     """Apply a compiled elementwise function to equally long columns, block by block on every processor.
 
     One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py):
     what the function holds meanwhile leaves the cache.
     Columns of one value are handed over as they are.
     """
-    return _map_pieces(function, columns, _padded_size(_length(columns), block, _LEAST))
+    return _map_pieces(function, columns, _padded_size(_length(columns), block, _LEAST), threads)
 
 
 @cache
@@ -309,7 +309,7 @@ def map_flat(
     return _map_pieces(_compile_pointwise(kernel, static), columns, _padded_size(columns[0].size, chunk, 1))
 
 
-def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int) -> Any:
+def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None = None) -> Any:
     count = _length(columns)
     flagged = [(column, column.size == 1 < count) for column in columns]
 
@@ -329,7 +329,7 @@ def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: i
     store(0, first)
     if count > size:
         # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
-        with ThreadPoolExecutor(processors()) as pool:
+        with ThreadPoolExecutor(threads or processors()) as pool:
             list(pool.map(lambda start: store(start, run(start)), range(size, count, size)))
     return whole
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from zwidth.status import Status
@@ -24,6 +25,8 @@ class Range(NamedTuple):
     def holds(self, value: Any) -> Any:
         """Whether finite values are admissible, elementwise."""
         above = value > self.low if self.low_open else value >= self.low
+        if self.high == math.inf:
+            return above
         return above & (value < self.high if self.high_open else value <= self.high)
 
     def __str__(self) -> str:
@@ -80,7 +83,7 @@ class Parameter:
     definition: str = ""
     whole: bool = False
 
-    @property
+    @cached_property
     def sign(self) -> Range:
         """The values that the model takes: files and axes have ends of their own beside it."""
         if self.allowed.low < 0:

@@ -121,7 +121,9 @@ def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) ->
     return RidgeSlopes(_point(ridge, status), by_delta, by_d)
 
 
-def stiffness_slopes(found: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array) -> tuple[Array, ...]:
+def stiffness_slopes(
+    found: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array
+) -> tuple[Array, Array, Array, Array, Array]:
     """K_max and what it gains per unit of mass, damping, period and delay, each with the other three held fixed.
 
     ``dK/dm = (a - delta a_delta)/T^2``, ``dK/db = a_delta/T``, ``dK/dT = (delta a_delta - d a_d - 2 a) m/T^3``,
