@@ -118,7 +118,7 @@ def required(
     return elementwise(_kernel, ("stiffness", *named), values, (parameter, kind), few=_FEW, block=_BLOCK)
 
 
-class _Given(NamedTuple):
+class _Request(NamedTuple):
     wanted: Array  # stiffness
     mass: Array
     damping: Array
@@ -132,23 +132,23 @@ class _Given(NamedTuple):
 
 
 def _kernel(*arguments: Any) -> Requirement:
-    """The requirement of `_Given`; the last two arguments are the parameter and the delays that occur."""
+    """The requirement of `_Request`; the last two arguments are the parameter and the delays that occur."""
     *inputs, parameter, kind = arguments
     names = ("stiffness", "mass", "damping", "period", "delay", "d")
     xp = namespace(*inputs)
     usable = quantity_status(**dict(zip(names, inputs, strict=True)))
     usable = xp.where(inputs[0] > 0, usable, int(Status.INVALID_INPUT))
     # A harmless number in place of a bad one.
-    given, rises = _Given(*(xp.where(usable == Status.OK, value, 1.0) for value in inputs)), parameter in _RISES
+    given, rises = _Request(*(xp.where(usable == Status.OK, value, 1.0) for value in inputs)), parameter in _RISES
     still = frozen(given, xp)
 
-    def misfit(x: Array, given: _Given = still) -> Array:
+    def misfit(x: Array, given: _Request = still) -> Array:
         """``K_max/K - 1``, or ``K/K_max - 1`` where K_max falls: positive at large x, and there all but a power."""
         given = given._replace(**{parameter: x})
         reached = max_stiffness_kernel(given.mass, given.period, *given.normalized(), kind)
         return (reached / given.wanted if rises else given.wanted / reached) - 1.0
 
-    def with_slope(x: Array, given: _Given = still) -> tuple[Array, Array]:
+    def with_slope(x: Array, given: _Request = still) -> tuple[Array, Array]:
         given = given._replace(**{parameter: x})
         at = given.normalized()
         reached, *slopes = stiffness_slopes(slopes_kernel(*at, "held", kind), given.mass, given.period, *at)
@@ -160,7 +160,7 @@ def _kernel(*arguments: Any) -> Requirement:
         return ratio - 1.0, (1.0 if rises else -1.0) * ratio * slope / reached
 
     def at_samples(x: Array) -> Array:
-        return misfit(x, _Given(*(part[..., None] for part in still)))
+        return misfit(x, _Request(*(part[..., None] for part in still)))
 
     inner, outer, offset = _bracket(parameter, still)
     # Cut off by the domain, the bracket may end short of any zero.
@@ -188,7 +188,7 @@ def _kernel(*arguments: Any) -> Requirement:
     return Requirement(value + poison(status == Status.OK, *inputs), status.astype(np.int32))
 
 
-def _bracket(parameter: Property, given: _Given) -> tuple[Array, Array, Array]:
+def _bracket(parameter: Property, given: _Request) -> tuple[Array, Array, Array]:
     """Ends between which the last zero lies within the domain, and what to add to samples of equal ratios."""
     wanted, m, b, T, t, turns = given
     xp = namespace(wanted, m)
