@@ -108,13 +108,10 @@ def functions() -> Answers:
     wanted = 10.0 ** random.uniform(2, 5, 30)
     yield from ask("max_stiffness", zwidth.max_stiffness, **device, delay=1e-3 * d[:30])
     yield from ask("sensitivities", zwidth.sensitivities, **device, delay=1e-3 * d[:30])
-    for name, left_out in (("damping", "damping"), ("period", "period"), ("mass", "mass")):
-        given = {key: part for key, part in device.items() if key != left_out}
-        yield from ask(f"required_{name}", getattr(zwidth, f"required_{name}"), wanted, **given, delay=1e-3)
-    yield from ask("allowed_delay", zwidth.allowed_delay, wanted, **device)
-    for name in ("fastest_damping", "most_robust_damping"):
-        yield from ask(name, getattr(zwidth, name), alpha[:6], delta[:6], d[:6])
-    yield from ask("fastest_wall", zwidth.fastest_wall, delta[:3], d[:3])
+    for name in ("damping", "period", "mass"):
+        given = {key: part for key, part in device.items() if key != name}
+        yield from ask(f"required_{name}", zwidth.required, name, wanted, **given, delay=1e-3)
+    yield from ask("allowed_delay", zwidth.required, "delay", wanted, **device)
     with jax.enable_x64(True):
         slopes = jax.vmap(jax.grad(lambda delta, d: zwidth.alpha_max(delta, d).alpha), (0, None))
         yield from ask("grad alpha_max", slopes, delta[:20] + 0.01, 1.0)
@@ -149,6 +146,7 @@ def scenes() -> Answers:
             yield from ask(f"{name}.stable_region", scene.stable_region)
             yield from ask(f"{name}.sensitivities", scene.sensitivities)
             yield from ask(f"{name}.required", scene.required, "damping", 0.8 * K)
+            yield from ask(f"{name}.best_damping", scene.best_damping, 0.5 * K)
             yield from ask(f"{name}.limits_of", zwidth.limits_of, scene)
             wall = scene.replace(wall=zwidth.VirtualWall(float(stiffness[0]), float(damping[0])))
             yield from ask(f"{name}.assess", zwidth.assess, wall)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -97,11 +98,17 @@ def only(names, values: dict[str, Value]) -> dict[str, Value]:
 
 
 def of_quantities(call, names, name=None, **options):
-    names = set(names) | ({"stiffness"} if call.__name__ not in ("max_stiffness", "sensitivities") else set())
     columns = {**WANTED, **SI_DEVICE}
     bad, beyond = {"stiffness": -1.0, **BAD_SI}, {"stiffness": 1e31, **BEYOND_SI}
     good, bad, beyond = (only(names, columns), only(names, bad), only(names, beyond))
     return Case(name or call.__name__, call, good, bad, beyond, domain=QUANTITIES, strict=True, **options)
+
+
+def of_requirement(parameter):
+    others = set(SI_DEVICE) - {parameter}
+    gradient_in = "" if parameter == "damping" else REQUIREMENTS
+    call = partial(zwidth.required, parameter=parameter)
+    return of_quantities(call, {*others, "stiffness"}, f"required {parameter}", gradient_in=gradient_in)
 
 
 def ray_point(alpha0, beta0, dalpha, dbeta, delta, d):
@@ -161,10 +168,7 @@ CASES = [
     ),
     of_quantities(zwidth.max_stiffness, SI_DEVICE),
     of_quantities(zwidth.sensitivities, SI_DEVICE, derivatives=1),
-    of_quantities(zwidth.required_damping, ("mass", "period", "delay")),
-    of_quantities(zwidth.required_mass, ("damping", "period", "delay"), gradient_in=REQUIREMENTS),
-    of_quantities(zwidth.required_period, ("mass", "damping", "delay"), gradient_in=REQUIREMENTS),
-    of_quantities(zwidth.allowed_delay, ("mass", "damping", "period"), gradient_in=REQUIREMENTS),
+    *(of_requirement(name) for name in ("damping", "mass", "period", "delay")),
     Case(
         "count_poles",
         lambda gain, lag, radius: zwidth.count_poles([0.8], [1.0, 0.9], gain, lag, radius),
@@ -182,13 +186,10 @@ CASES = [
 OTHERS = {
     "assess": "one scene: tests/unit/studies/test_paper_values.py, tests/properties/test_consistency.py",
     "assess_many": "scenes by name: tests/unit/scenes/test_assessment.py",
-    "fastest_damping": "a search, compiled even for one point: tests/unit/scenes/test_traced_choices.py",
-    "fastest_wall": "a search, compiled even for one point: tests/unit/scenes/test_traced_choices.py",
     "fit_buzz": "one device: tests/unit/fitting/test_buzz.py",
     "fit_log": "one device: tests/unit/fitting/test_log.py",
     "limits_of": "one scene: tests/unit/scenes/test_limits.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
-    "most_robust_damping": "a search, compiled even for one point: tests/unit/scenes/test_traced_choices.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
     "robust_max_stiffness": "boxes of devices: tests/unit/scenes/test_robust.py",
     "robust_wall": "boxes of devices: tests/unit/scenes/test_robust.py",

@@ -17,7 +17,7 @@ from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import Status
 
 ALL = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
-OPTIONAL = {("boundary_point", "alpha"), ("boundary_point", "beta"), ("required_period", "delay")}
+OPTIONAL = {("boundary_point", "alpha"), ("boundary_point", "beta"), ("required", "damping"), ("required", "delay")}
 KINDS = {"b": np.bool_, "f": np.float64, "c": np.complex128}
 
 
@@ -192,7 +192,7 @@ import zwidth
 zwidth.count_poles([0.8], [1.0, 0.9], 0.01, 3.0)
 for name, line in (("beta", 0.3), ("alpha", 0.1), ("ray", (0.1, 0.3, 1.0, 0.5))):
     zwidth.boundary_point(0.1, 1.0, **{{name: line}})
-calls = {[(case.function, {k: v[1] for k, v in case.good.items()}) for case in CASES if called_by_name(case)]!r}
+calls = {[(case.function, numbers_of(case)) for case in CASES if called_by_name(case)]!r}
 for name, numbers in calls:
     getattr(zwidth, name)(**numbers)
 del sys.modules["jax"]
@@ -202,6 +202,10 @@ print(len(calls))
     result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert result.returncode == 0, result.stderr
     assert int(result.stdout) == len(CASES) - 4
+
+
+def numbers_of(case):
+    return {**getattr(case.call, "keywords", {}), **{name: values[1] for name, values in case.good.items()}}
 
 
 def called_by_name(case):

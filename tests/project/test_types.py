@@ -15,7 +15,7 @@ import zwidth
 from zwidth.loops.rigid.aberth import aberth_kernel, discs, product_form
 from zwidth.loops.rigid.degrees import find_degree
 from zwidth.loops.rigid.poles import companion, enclose_poles, pole_kernel, radius_kernel, unstable_poles
-from zwidth.loops.rigid.polynomial import affine, closed_loop_transfer, coefficients, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.region import lobe
 from zwidth.loops.rigid.response import step_response
 from zwidth.words import types as _types
@@ -41,10 +41,6 @@ CALLS = [
     (
         zwidth.count_poles,
         {"zeros": np.ones((3, 1)), "poles": np.ones((2, 1, 2)), "gain": np.float64(0.1), "lag": np.array([1, 2, 3])},
-    ),
-    (
-        closed_loop_transfer,
-        {name: np.full(3, 0.1) for name in ("mass", "damping", "period", "stiffness", "virtual_damping")} | {"d": 2},
     ),
     (zwidth.stable_region, {"delta": 0.1, "d": 1.0, "points": 20}),
     (lobe, {"delta": 0.1, "d": 1.0, "points": 20}),

@@ -325,19 +325,15 @@ def map_flat(
     columns: list[np.ndarray],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    least: int = 1,
-    threads: int | None = None,
 ) -> Any:
     """Apply a one-point kernel to every row of equally long columns, in float64; NumPy leaves come back.
 
-    Pieces hold ``chunk`` points and run on ``threads`` threads, by default as many as there are processors. A piece is
-    never shorter than ``least``: the compiler treats very short ones differently, to the last place.
+    Pieces hold ``chunk`` points and run on as many threads as there are processors.
     """
-    size = _padded_size(columns[0].size, chunk, least)
-    return _map_pieces(_compile_pointwise(kernel, static), columns, size, threads)
+    return _map_pieces(_compile_pointwise(kernel, static), columns, _padded_size(columns[0].size, chunk, 1))
 
 
-def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None) -> Any:
+def _map_pieces(function: Callable[..., Any], columns: list[np.ndarray], size: int, threads: int | None = None) -> Any:
     count = _length(columns)
     flagged = [(column, column.size == 1 < count) for column in columns]
 
@@ -375,14 +371,13 @@ def pointwise(
     values: tuple[ArrayLike, ...],
     static: tuple[Any, ...] = (),
     chunk: int = CHUNK,
-    least: int = 1,
 ) -> Any:
     """Broadcast ``values``, apply the one-point JAX ``kernel`` to each point, and restore the common shape."""
     if is_traced(*values):
         return _map_traced(kernel, values, static)
     arrays = broadcast(names, values)
     shape = arrays[0].shape
-    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk, least)
+    flat = map_flat(kernel, [array.ravel() for array in arrays], static, chunk)
     return to_caller(tree_map(lambda leaf: leaf.reshape(shape + leaf.shape[1:]), flat), values)
 
 

@@ -273,7 +273,7 @@ class FigureSize(click.ParamType):
 def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_json: bool, **drawing: Any) -> None:
     """Draw the sweeps in DIR, as PNG and SVG.
 
-    Stable and passive walls with their boundaries, contours of margins and settling times, surfaces of the stiffest
+    Stable and passive walls with their boundaries, contours of margins and decay times, surfaces of the stiffest
     wall. --at chooses slices by the nearest value that the sweep has, in the units of the store; without it up to
     three values of a parameter have a panel each.
     """

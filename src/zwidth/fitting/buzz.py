@@ -29,7 +29,6 @@ from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velo
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.quantities import POSITIVE
 from zwidth.words.status import Status
 
 # Beyond this condition number some direction is not seen at all.
@@ -99,7 +98,7 @@ def fit_buzz(
         >>> print(f"{fit.mass * 1e3:.0f} g")
         100 g
     """
-    period = check_number("period", period, "s", POSITIVE)
+    period = check_number("period", period)
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
         raise InputError(f"velocity: got {velocity!r}; give an estimate, as zwidth.LowPass(cutoff=100)")

@@ -24,6 +24,7 @@ from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import NOT_NEGATIVE
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -111,7 +112,7 @@ def fit_log(
     """
     velocity = BackwardDifference() if velocity is None else velocity
     logs, period, wavers = read_logs(time, position, force, resample)
-    longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s") / period
+    longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
     recordings = tuple(log.recording(skip, k) for k, log in enumerate(logs))
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
@@ -169,7 +170,7 @@ def _find_step(resolution: Any, logs: tuple[Log, ...]) -> tuple[float, list[str]
     if resolution is None:
         steps = [find_resolution(log.position) for log in logs]
         return (min(steps) if min(steps) and max(steps) < 1.5 * min(steps) else 0.0), []
-    step = check_number("resolution", resolution, "m")
+    step = check_number("resolution", resolution, "m", NOT_NEGATIVE)
     if step and not all(fits_steps(log.position, step) for log in logs):
         text = with_unit(step, "m")
         return 0.0, [f"the positions are no whole steps of {text}, so its errors are taken for noise: check resolution"]

@@ -13,14 +13,9 @@ import numpy as np
 
 from zwidth.arrays.xp import namespace
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, SIZES, WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
-
-# alpha and beta are 0 or of a magnitude in this range.
-WALL_RANGE = (1e-60, 1e60)
-# The largest physical damping (delta) and the longest delay (d).
-LARGEST_DAMPING = 1e12
-LONGEST_DELAY = 1e5
 
 
 def within(value: Array, limits: tuple[float, float]) -> Array:
@@ -83,9 +78,7 @@ def poison(ok: Array, *inputs: Array) -> Array:
     return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
 
 
-# Every other name is one of a wall's numbers.
 _NUMBERS = (int, float, np.floating, np.integer)
-_LARGEST = {"delta": LARGEST_DAMPING, "d": LONGEST_DELAY}
 
 
 def check_scalars(**values: Any) -> None:
@@ -93,10 +86,9 @@ def check_scalars(**values: Any) -> None:
     for name, value in values.items():
         if not isinstance(value, _NUMBERS):
             continue
-        size = abs(value)
-        if name in _LARGEST:
-            if _LARGEST[name] < value < math.inf:
-                raise InputError(f"{name}: got {value!r}; it must be 0 to {_LARGEST[name]:g}")
-        elif 0 < size < WALL_RANGE[0] or WALL_RANGE[1] < size < math.inf:
-            least, most = WALL_RANGE
-            raise InputError(f"{name}: got {value!r}; it must be 0 or {least:g} to {most:g} in magnitude")
+        # Every other name is one of a wall's numbers. What is infinite gets a status, as what is negative.
+        least, most = SIZES.get(name, WALL_RANGE)
+        size = abs(value) if least else value
+        if 0 < size < least or most < size < math.inf:
+            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"0 to {most:g}"
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}")

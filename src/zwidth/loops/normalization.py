@@ -6,7 +6,6 @@ The normalization is the paper's eqs. (14) and (16): ``alpha = K T^2/m``, ``beta
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,10 +13,10 @@ import numpy as np
 
 from zwidth.arrays.batching import join_shapes, refuse_masked
 from zwidth.arrays.xp import is_jax, is_traced, namespace
-from zwidth.loops.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE, void, within
+from zwidth.loops.domain import void, within
 from zwidth.parts.span import accept_units, in_periods
 from zwidth.words.errors import InputError
-from zwidth.words.quantities import SI_RANGE
+from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 
@@ -42,20 +41,9 @@ class Physical(NamedTuple):
     virtual_damping: Array
 
 
-# field -> (unit, lowest value, whether the lowest value itself is excluded, magnitudes allowed beside 0)
-_RANGES: dict[str, tuple[str, float, bool, tuple[float, float]]] = {
-    "mass": ("kg", 0.0, True, SI_RANGE),
-    "damping": ("N s/m", 0.0, False, SI_RANGE),
-    "period": ("s", 0.0, True, SI_RANGE),
-    "delay": ("s", 0.0, False, SI_RANGE),
-    "stiffness": ("N/m", -math.inf, False, SI_RANGE),
-    "virtual_damping": ("N s/m", -math.inf, False, SI_RANGE),
-    "wanted_stiffness": ("N/m", 0.0, True, SI_RANGE),
-    "delta": ("", 0.0, False, (0.0, LARGEST_DAMPING)),
-    "d": ("", 0.0, False, (0.0, LONGEST_DELAY)),
-    "alpha": ("", -math.inf, False, WALL_RANGE),
-    "beta": ("", -math.inf, False, WALL_RANGE),
-}
+def _magnitudes(name: str) -> tuple[float, float]:
+    """The magnitudes that are allowed beside 0."""
+    return SIZES.get(name, SI_RANGE)
 
 
 def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
@@ -71,23 +59,19 @@ def _check_quantity(name: str, value: ArrayLike) -> ArrayLike:
         raise InputError(f"{name}: got {value!r}, a real number or an array of them is needed")
     number = number.astype(np.float64, copy=False)
     if number.ndim == 0:
-        unit, lowest, excluded, (least, most) = _RANGES[name]
+        parameter, (least, most) = PARAMETERS[name], _magnitudes(name)
+        unit = f" (in {parameter.unit})" if parameter.unit != "1" else ""
         if not _valid(name, number):
-            bound = "" if lowest == -math.inf else f" and {'greater than' if excluded else 'at least'} {lowest:g}"
-            raise InputError(f"{name}: got {value!r}; it must be finite{bound}{f' (in {unit})' if unit else ''}")
+            bound = str(parameter.sign)
+            raise InputError(f"{name}: got {value!r}; it must be finite{f' and {bound}' if bound else ''}{unit}")
         if not within(number, (least, most)):
             allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"at most {most:g}"
-            raise InputError(f"{name}: got {value!r}; it must be {allowed}{f' (in {unit})' if unit else ''}")
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}{unit}")
     return number
 
 
 def _valid(name: str, value: Array) -> Array:
-    _, lowest, excluded, _ = _RANGES[name]
-    return namespace(value).isfinite(value) & ((value > lowest) if excluded else (value >= lowest))
-
-
-def _in_range(name: str, value: Array) -> Array:
-    return _valid(name, value) & within(value, _RANGES[name][3])
+    return namespace(value).isfinite(value) & PARAMETERS[name].sign.holds(value)
 
 
 def quantity_status(**values: Array) -> Array:
@@ -95,7 +79,7 @@ def quantity_status(**values: Array) -> Array:
     xp = namespace(*values.values())
     valid = inside = True
     for name, value in values.items():
-        valid, inside = valid & _valid(name, value), inside & within(value, _RANGES[name][3])
+        valid, inside = valid & _valid(name, value), inside & within(value, _magnitudes(name))
     return xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
 
 
@@ -115,7 +99,8 @@ def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: Arr
 def _formula_at(*arguments: Any) -> tuple[Array, ...]:
     """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
     *values, formula, names = arguments
-    return formula(*(void(_in_range(name, value), value)[0] for name, value in zip(names, values, strict=True)))
+    good = (_valid(name, value) & within(value, _magnitudes(name)) for name, value in zip(names, values, strict=True))
+    return formula(*(void(ok, value)[0] for ok, value in zip(good, values, strict=True)))
 
 
 def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:

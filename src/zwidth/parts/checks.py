@@ -13,7 +13,7 @@ from zwidth.arrays.xp import is_jax
 from zwidth.parts.span import Span, read_span
 from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe
-from zwidth.words.quantities import CHOICES, FIELDS, NOT_NEGATIVE, Range
+from zwidth.words.quantities import CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, Range
 from zwidth.words.units import find_dimension, read_quantity, to_float
 
 
@@ -40,13 +40,18 @@ def find_range(item: Field[Any], path: str) -> Range:
     return item.metadata.get("allowed", FIELDS[path].allowed)
 
 
-def check_number(field: str, value: Any, unit: str, allowed: Range = NOT_NEGATIVE) -> Any:
+def check_number(field: str, value: Any, unit: str = "", allowed: Range | None = None) -> Any:
     """Return one quantity in its SI unit, a float unless JAX traces or holds it; else raise `InputError`.
 
-    A text is a number with a unit, as in configuration files: "70 g".
+    A text is a number with a unit, as in configuration files: "70 g". Unit and range are those that `words.quantities`
+    has for the field where they are left out.
     """
     if is_jax(value):
         return value
+    if not unit:
+        unit = PARAMETERS[field].unit
+    if allowed is None:
+        allowed = PARAMETERS[field].sign if field in PARAMETERS else NOT_NEGATIVE
     return _read(field, value, lambda known: read_quantity(known, find_dimension(unit), allowed)[0])
 
 

@@ -51,7 +51,7 @@ class Operator:
 
     def __post_init__(self) -> None:
         if not self.rigid:
-            check_number("operator.mass", self.mass, "kg", POSITIVE)
+            check_number("operator.mass", self.mass, allowed=POSITIVE)
         check_fields(self, "operator")
         if self.rigid and isinstance(self.coupling_damping, float) and self.coupling_damping:
             raise InputError(

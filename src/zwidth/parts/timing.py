@@ -11,7 +11,6 @@ from zwidth.arrays.xp import is_jax
 from zwidth.parts.checks import check_number, check_span
 from zwidth.parts.span import Span, in_periods
 from zwidth.words.errors import InputError, check_choice
-from zwidth.words.quantities import POSITIVE
 from zwidth.words.types import DELAY_MODELS, DelayModel
 
 
@@ -44,9 +43,9 @@ class Timing:
         if (self.period is None) == (self.rate is None):
             raise InputError("timing: give either the period (s) or the rate (Hz), and only one of them")
         if self.rate is not None:
-            object.__setattr__(self, "period", 1.0 / check_number("rate", self.rate, "Hz", POSITIVE))
+            object.__setattr__(self, "period", 1.0 / check_number("rate", self.rate))
             object.__setattr__(self, "rate", None)
-        object.__setattr__(self, "period", check_number("period", self.period, "s", POSITIVE))
+        object.__setattr__(self, "period", check_number("period", self.period))
         delay = check_span("delay", self.delay)
         if isinstance(delay, Span):
             object.__setattr__(self, "_periods", delay.value if delay.unit == "periods" else None)

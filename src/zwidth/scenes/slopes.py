@@ -14,7 +14,7 @@ from zwidth.arrays.xp import is_jax
 from zwidth.loops.linear.chain import chain_of, flow, rates
 from zwidth.loops.linear.ridge import BoundRidge, Condition
 from zwidth.loops.rigid.delay_classes import classify_delays
-from zwidth.loops.rigid.ridge import slopes_kernel
+from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
 from zwidth.scenes.stiffest import allows_negative, refuse_fractional_power, search
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -69,23 +69,16 @@ def _by_closed_form(scene: Any, negative: bool) -> SceneSensitivities | None:
     """Those of a rigid device; None where its ridge lies at a damping that does not count."""
     device, model = scene.normalized, scene.timing.delay_model
     values = device.delta, device.d
-    point, by_delta, by_d = elementwise(slopes_kernel, ("delta", "d"), values, (model, classify_delays(device.d)))
-    if not negative and point.beta < 0:
+    found = elementwise(slopes_kernel, ("delta", "d"), values, (model, classify_delays(device.d)))
+    if not negative and found.point.beta < 0:
         return None
-    mass, rate = scene.mass, 1.0 / scene.timing.period
-    alpha, change = point.alpha, device.delta * by_delta
-    delayed = device.d * by_d if device.d > 0 else 0.0
-    per = {
-        "mass": (alpha - change) * rate * rate,
-        "damping": by_delta * rate,
-        "period": (change - delayed - 2.0 * alpha) * mass * rate**3,
-        "delay": by_d * mass * rate**3,
-    }
+    stiffness, *slopes = stiffness_slopes(found, scene.mass, scene.timing.period, *values)
+    per = dict(zip(("mass", "damping", "period", "delay"), slopes, strict=True))
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
         per["operator.stiffness"] = _by_spring(scene, negative)
-    stiffness = np.float64(alpha * mass * rate * rate)
-    return SceneSensitivities(stiffness, {path: float(slope) for path, slope in per.items()}, point.status)
+    per = {path: float(slope) for path, slope in per.items()}
+    return SceneSensitivities(np.float64(stiffness), per, found.point.status)
 
 
 def _by_spring(scene: Any, negative: bool) -> float:

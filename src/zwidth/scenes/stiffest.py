@@ -74,12 +74,20 @@ def choose_damping(scene: Any, top: StiffestWall, stiffness: float) -> float:
     row = scene.stable_stiffness(damping)
     if scene.is_rigid or np.any((row[:, 0] < stiffness) & (row[:, 1] > (1.0 - _ROUNDED) * top.stiffness)):
         return damping
-    units, pieces = scene.units, scene.border.pieces
-    alpha, least = stiffness / units.stiffness, -math.inf if allows_negative(scene, None) else 0.0
+    column = soft_dampings(scene, stiffness, allows_negative(scene, None))
+    low, high = max(column, key=lambda ends: ends[1] - ends[0], default=(math.nan, math.nan))
+    return 0.5 * (low + high) * scene.units.virtual_damping if column else damping
+
+
+def soft_dampings(scene: Any, stiffness: float, negative: bool) -> list[tuple[float, float]]:
+    """The intervals of beta with which walls of a stiffness are stable in a piece with soft walls."""
+    alpha, least = stiffness / scene.units.stiffness, -math.inf if negative else 0.0
     column = np.maximum(stable_dampings(scene.traced_boundary, alpha), least)
-    found = [(high - low, 0.5 * (low + high)) for low, high in column.tolist() if low < high]
-    found = [(width, middle) for width, middle in found if pieces.holds_softly(alpha, middle)]
-    return max(found)[1] * units.virtual_damping if found else damping
+    return [
+        (low, high)
+        for low, high in column.tolist()
+        if low < high and (scene.is_rigid or scene.border.pieces.holds_softly(alpha, 0.5 * (low + high)))
+    ]
 
 
 def list_islands(scene: Any, negative_damping: bool | None = None) -> list[Island]:

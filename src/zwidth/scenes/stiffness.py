@@ -12,7 +12,7 @@ from zwidth.loops.domain import check_scalars
 from zwidth.loops.normalization import Normalized, normalize, quantity_status
 from zwidth.loops.rigid.delay_classes import Kind, classify_delays
 from zwidth.loops.rigid.polynomial import check_delay_model
-from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel
+from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.parts.span import accept_units
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -66,10 +66,10 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
     """
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
     values = (mass, period, device.delta, device.d)
-    return elementwise(_max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (classify_delays(device.d),))
+    return elementwise(max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (classify_delays(device.d),))
 
 
-def _max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: Kind) -> Array:
+def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: Kind) -> Array:
     return ridge_kernel(delta, d, "held", kind).alpha * (mass / period) / period
 
 
@@ -132,17 +132,8 @@ def _sensitivities_kernel(
     mass: Array, damping: Array, period: Array, delay: Array, delta: Array, d: Array, delay_model: str, kind: Kind
 ) -> Sensitivities:
     xp = namespace(mass, delta, d)
-    point, by_delta, by_d = slopes_kernel(delta, d, delay_model, kind)
+    found = slopes_kernel(delta, d, delay_model, kind)
     # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.
     given = quantity_status(mass=mass, damping=damping, period=period, delay=delay)
-    status = xp.where(given == Status.OK, point.status, given).astype(np.int32)
-    alpha, rate = point.alpha, 1.0 / period
-    return Sensitivities(
-        alpha * mass * rate * rate,
-        (alpha - delta * by_delta) * rate * rate,
-        by_delta * rate,
-        # No delay needs no product, which an infinite slope would make NaN.
-        (delta * by_delta - xp.where(d > 0.0, d * by_d, 0.0) - 2.0 * alpha) * mass * rate**3,
-        by_d * mass * rate**3,
-        status,
-    )
+    status = xp.where(given == Status.OK, found.point.status, given).astype(np.int32)
+    return Sensitivities(*stiffness_slopes(found, mass, period, delta, d), status)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from zwidth.simulation.batch import TOGETHER, Numbers, run_batch, structure
 from zwidth.simulation.lanes import Course
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.words.errors import InputError, ResourceError, check_choice
+from zwidth.words.quantities import ANY, NOT_NEGATIVE
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -27,26 +28,22 @@ CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")
 _RECORDED, _JITTERED, _DRAWN, _MOST_BYTES = 2 * 14 * 8, 20 * 8, 4 * 8, 4 << 30
 
 
-class _Argument(NamedTuple):
-    unit: str
-    low: float
-    infinite: bool = False
-
-
 _ARGUMENTS = {
-    "stiffness": _Argument("N/m", -np.inf),
-    "virtual_damping": _Argument("N s/m", -np.inf),
-    "start_position": _Argument("m", -np.inf),
-    "start_velocity": _Argument("m/s", -np.inf),
-    "push": _Argument("N", -np.inf),
-    "resolution": _Argument("m", 0.0),
-    "noise": _Argument("m", 0.0),
-    "coulomb": _Argument("N", 0.0),
-    "static": _Argument("N", 0.0),
-    "max_force": _Argument("N", 0.0, infinite=True),
-    "max_rate": _Argument("N/s", 0.0, infinite=True),
-    "jitter": _Argument("s", 0.0),
+    "stiffness": ("N/m", ANY),
+    "virtual_damping": ("N s/m", ANY),
+    "start_position": ("m", ANY),
+    "start_velocity": ("m/s", ANY),
+    "push": ("N", ANY),
+    "resolution": ("m", NOT_NEGATIVE),
+    "noise": ("m", NOT_NEGATIVE),
+    "coulomb": ("N", NOT_NEGATIVE),
+    "static": ("N", NOT_NEGATIVE),
+    "max_force": ("N", NOT_NEGATIVE),
+    "max_rate": ("N/s", NOT_NEGATIVE),
+    "jitter": ("s", NOT_NEGATIVE),
 }
+# Infinite where there is no limit.
+_LIMITS = ("max_force", "max_rate")
 
 
 def simulate(
@@ -259,7 +256,7 @@ def _read(
     for name, array in arrays.items():
         usable, allowed = _check(name, array, arrays, clock[which] if array.ndim else clock.min())
         if array.ndim == 0 and not np.all(usable):
-            raise InputError(f"{name}: got {float(array):g} {_ARGUMENTS[name].unit}; {allowed}")
+            raise InputError(f"{name}: got {float(array):g} {_ARGUMENTS[name][0]}; {allowed}")
         good &= usable
     flat = {name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()}
     steady = None
@@ -275,11 +272,9 @@ def _read(
 
 def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: Any) -> tuple[Any, str]:
     """Which values of an argument are usable, and what is allowed."""
-    rule = _ARGUMENTS[name]
-    usable = (array >= rule.low) & (np.isfinite(array) | (rule.infinite & (array > 0)))
-    allowed = (
-        "it must be finite" if rule.low < 0 else "it must be at least 0" + ("" if rule.infinite else " and finite")
-    )
+    _, rule = _ARGUMENTS[name]
+    usable = rule.holds(array) & (np.isfinite(array) | ((name in _LIMITS) & (array > 0)))
+    allowed = "it must be finite" if rule == ANY else f"it must be {rule}" + ("" if name in _LIMITS else " and finite")
     if name == "static":
         return usable & (array >= arrays["coulomb"]), "it must be at least coulomb, the friction while slipping"
     if name == "jitter":

@@ -15,6 +15,7 @@ from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
+from zwidth.loops.rigid.settling import decay_time
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.assessment import Assessment, assess, name_kind
 from zwidth.scenes.limits import describe_islands
@@ -139,8 +140,9 @@ def _summarize(
             "virtual_damping": float(wall.virtual_damping),
             **numbers,
             "stable": verdict is not None and verdict.stable,
-            # Two percent of the slowest motion.
-            "settling_time": math.log(50.0) * constant,
+            "decay_time": float(decay_time(1.0 / np.float64(constant))),
+            # Of the response to a step, where one is drawn.
+            "settling_time": None,
         },
     }
     return to_json(found)
@@ -192,6 +194,9 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
     if best["passive"] is False:
         passive += f", that would take {with_unit(-missing, 'N s/m')} more physical damping"
     parts = [f"{name} = {value}" for name, value in found["device"].items() if name not in _BARE]
+    settles = f"settles to 2 % of a step of force in about {spell(best['settling_time'], 's')}"
+    if best["settling_time"] is None:
+        settles = f"has a slowest motion that decays to 2 % in {spell(best['decay_time'], 's')}"
     lines = [
         "# Recommended virtual wall",
         "",
@@ -209,7 +214,7 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
         "",
         f"- is {'stable' if best['stable'] else 'NOT stable'}: spectral radius {radius};",
         f"- stays stable at this K for B between {lower} and {upper};",
-        f"- settles to 2 % of a step of force in about {spell(best['settling_time'], 's')};",
+        f"- {settles};",
         f"- is passive: {passive}.",
         "",
     ]

@@ -36,7 +36,7 @@ from zwidth.parts.span import Span
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.quantities import Range
+from zwidth.words.quantities import LONGEST_SETTLING, Range
 
 
 class ResponseStudy(ComputedStudy):
@@ -91,7 +91,8 @@ class ResponseStudy(ComputedStudy):
             f"settling_time{second}": settling_time,
         }
         if np.isnan(settling_time):
-            unknown = "the wall is not stable, its poles nearly coincide, or the delay exceeds 500 periods"
+            longest = f"the delay exceeds {LONGEST_SETTLING} periods"
+            unknown = f"the wall is not stable, its poles nearly coincide, or {longest}"
             return columns, f"no settling time: {unknown}"
         after = with_unit(settling_time, "s", 3) if physical else f"{plain(settling_time)} periods"
         late = settling_time > time[-1]

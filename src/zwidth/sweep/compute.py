@@ -7,7 +7,6 @@ batches of two sizes, may round differently.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import product
@@ -21,6 +20,7 @@ from zwidth.loops.rigid.margins import margins_kernel
 from zwidth.loops.rigid.outermost_poles import outermost_poles, radius_at, usable
 from zwidth.loops.rigid.passivity import margin_at_one_delay
 from zwidth.loops.rigid.ridge import alpha_max
+from zwidth.loops.rigid.settling import decay_time
 from zwidth.sweep.grid import Block
 from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status
@@ -35,7 +35,6 @@ _WALL_PIECE = 1 << 12
 _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
 _MANY_ROWS = 256
-_DECAY = math.log(50.0)
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
@@ -86,7 +85,8 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
         found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
         found["margin"] = -np.expm1(-rate)
-        found["settling_time"] = _settling_time(rate, block)
+        periods = decay_time(rate)
+        found["settling_time"] = periods * block.period[:, None, None] if block.period.size else periods
     if MARGIN_OUTPUTS & set(outputs):
         compute = partial(_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
         found |= dict(zip(_MARGINS, _by_device(compute, block, shape, _all_devices, leaves=4), strict=True))
@@ -119,13 +119,6 @@ def _status(
     if not (device.all() and alpha.all() and beta.all()):
         status[~(device[:, None, None] & alpha[:, :, None] & beta[:, None, :])] = Status.INVALID_INPUT
     return status
-
-
-def _settling_time(rate: np.ndarray, block: Block) -> np.ndarray:
-    """The time in which the slowest pole decays to 2 %, in seconds where there is a period."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        periods = np.where(rate > 0, _DECAY / rate, np.where(np.isnan(rate), np.nan, np.inf))
-    return periods * block.period[:, None, None] if block.period.size else periods
 
 
 def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from zwidth.words.status import Status
@@ -21,10 +22,12 @@ class Range(NamedTuple):
     low_open: bool = False
     high_open: bool = False
 
-    def holds(self, value: float) -> bool:
-        """Whether a finite value is admissible."""
+    def holds(self, value: Any) -> Any:
+        """Whether finite values are admissible, elementwise."""
         above = value > self.low if self.low_open else value >= self.low
-        return above and (value < self.high if self.high_open else value <= self.high)
+        if self.high == math.inf:
+            return above
+        return above & (value < self.high if self.high_open else value <= self.high)
 
     def __str__(self) -> str:
         ends = []
@@ -42,9 +45,17 @@ FRACTION = Range(0.0, 1.0, low_open=True, high_open=True)
 # Wide enough for any sampled loop, narrow enough that T^2 and 1/T^2 stay within float64.
 PERIODS = Range(1e-12, 1e9)
 RATES = Range(1e-9, 1e12)
-# Every SI quantity is 0 or of a magnitude in this range.
+# Where the model is computed: SI quantities, alpha and beta are 0 or of these magnitudes, delta and d at most so large.
 SI_RANGE = (1e-30, 1e30)
+WALL_RANGE = (1e-60, 1e60)
+LARGEST_DAMPING = 1e12
+LONGEST_DELAY = 1e5
+SIZES = {"alpha": WALL_RANGE, "beta": WALL_RANGE, "delta": (0.0, LARGEST_DAMPING), "d": (0.0, LONGEST_DELAY)}
+# Shorter limits of the delay: in files, where more is a slip of a unit; of all poles, which take degree^3 operations
+# and degree^2 numbers (4,000 take minutes and 0.3 GB); and of settling times, which take them at once.
 MAX_DELAY_PERIODS = 10_000.0
+MOST_POLES = 4000
+LONGEST_SETTLING = 500
 # Stiffness of a recommended wall over that of the stiffest stable one.
 RECOMMENDED_SHARE = 0.75
 
@@ -76,6 +87,13 @@ class Parameter:
     short_name: str = ""
     definition: str = ""
     whole: bool = False
+
+    @cached_property
+    def sign(self) -> Range:
+        """The values that the model takes: files and axes have ends of their own beside it."""
+        if self.allowed.low < 0:
+            return ANY
+        return POSITIVE if self.allowed.low > 0 or self.allowed.low_open else NOT_NEGATIVE
 
     @property
     def variable(self) -> str:
@@ -330,8 +348,8 @@ _OUTPUTS = (
         "time in which the slowest pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall",
         units="sampling periods",
         physical_units="s",
-        words="settling time to 2 %",
-        symbol="t_s",
+        words="decay time to 2 %",
+        symbol=r"t_{2\%}",
         look="steep",
     ),
     Output(

@@ -29,15 +29,17 @@ def test_what_is_needed_agrees_with_the_closed_form_of_a_rigid_device():
         return {key: value for key, value in plain.items() if key != name}
 
     assert needed(*find, "damping")["value"] == pytest.approx(
-        zwidth.required_damping(40e3, **known("damping")).value, rel=1e-9
+        zwidth.required("damping", 40e3, **known("damping")).value, rel=1e-9
     )
-    assert needed(*find, "mass")["value"] == pytest.approx(zwidth.required_mass(40e3, **known("mass")).value, rel=1e-9)
-    longest = zwidth.required_period(40e3, **known("period")).value
+    assert needed(*find, "mass")["value"] == pytest.approx(
+        zwidth.required("mass", 40e3, **known("mass")).value, rel=1e-9
+    )
+    longest = zwidth.required("period", 40e3, **known("period")).value
     rate = needed(*find, "rate")
     assert rate["value"] == pytest.approx(longest, rel=1e-9)
     assert rate["rate"] == 1 / rate["value"]
     assert needed(*find, "delay")["value"] == pytest.approx(
-        zwidth.allowed_delay(40e3, **known("delay")).value, rel=1e-9
+        zwidth.required("delay", 40e3, **known("delay")).value, rel=1e-9
     )
 
 
@@ -57,7 +59,7 @@ def test_a_cutoff_is_enough_and_a_lower_one_is_not():
 def test_from_no_damping_and_no_delay_a_range_is_searched():
     bare = ["--mass", "0.1", "--rate", "1000", "--stiffness", "100 kN/m"]
     assert needed(*bare, "--find", "damping")["value"] == pytest.approx(
-        zwidth.required_damping(100e3, mass=0.1, period=1e-3).value, rel=1e-9
+        zwidth.required("damping", 100e3, mass=0.1, period=1e-3).value, rel=1e-9
     )
     assert "reached nowhere" in design(*bare, "--find", "delay")
 

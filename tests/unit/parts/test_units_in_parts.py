@@ -60,7 +60,7 @@ def test_functions_read_texts_with_units():
     assert zwidth.normalize(**texts, stiffness="5 kN/m") == zwidth.normalize(**numbers, stiffness=5e3)
     known = {name: value for name, value in texts.items() if name != "damping"}
     plain = {name: value for name, value in numbers.items() if name != "damping"}
-    assert zwidth.required_damping("5 kN/m", **known) == zwidth.required_damping(5e3, **plain)
+    assert zwidth.required("damping", "5 kN/m", **known) == zwidth.required("damping", 5e3, **plain)
     worst = zwidth.robust_max_stiffness(mass=zwidth.Interval("60 g", "80 g"), period="1 ms", delay="1 periods")
     assert worst == zwidth.robust_max_stiffness(mass=zwidth.Interval(0.06, 0.08), period=1e-3, delay=1e-3)
     arrays = zwidth.max_stiffness(mass=np.array([0.07, 0.1]), period="1 ms")
@@ -80,7 +80,10 @@ def test_functions_read_texts_with_units():
         (lambda: zwidth.Timing("1 ms", "-1 periods"), "delay: got -1 periods; it must be at least 0 periods"),
         (lambda: zwidth.max_stiffness(mass="70 m", period="1 ms"), "mass: got '70 m'; the units allowed are"),
         (lambda: zwidth.max_stiffness(mass="-70 g", period="1 ms"), "mass: got -0.07; it must be finite and greater"),
-        (lambda: zwidth.required_mass("5 kN/m", period=zwidth.Interval(1, 2), delay="1 periods"), "delay: got '1 per"),
+        (
+            lambda: zwidth.required("mass", "5 kN/m", period=zwidth.Interval(1, 2), delay="1 periods"),
+            "delay: got '1 per",
+        ),
     ],
 )
 def test_what_is_refused(make, message):

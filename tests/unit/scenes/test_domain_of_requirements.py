@@ -2,21 +2,22 @@
 
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 
 import zwidth
-from zwidth import allowed_delay, max_stiffness, required_damping, required_mass, required_period, sensitivities
+from zwidth import max_stiffness, required, sensitivities
 from zwidth.words.status import Status
 
 BEYOND = [
-    (required_damping, {"stiffness": 1e3, "mass": 1e-162, "period": 1e-3}, "mass"),
-    (required_mass, {"stiffness": 1e3, "damping": 1e-300, "period": 1e-3, "delay": 1e-3}, "damping"),
-    (allowed_delay, {"stiffness": 1e-300, "mass": 1.0, "damping": 1.0, "period": 1e-3}, "stiffness"),
-    (required_period, {"stiffness": 1e3, "mass": 1e31, "delay": 1e-3}, "mass"),
-    (required_period, {"stiffness": 1e3, "mass": 1.0, "delay_periods": 2e5}, "d"),
-    (required_damping, {"stiffness": 1e3, "mass": 1.0, "period": 1e-3, "delay": 1e3}, "d"),
+    (partial(required, "damping"), {"stiffness": 1e3, "mass": 1e-162, "period": 1e-3}, "mass"),
+    (partial(required, "mass"), {"stiffness": 1e3, "damping": 1e-300, "period": 1e-3, "delay": 1e-3}, "damping"),
+    (partial(required, "delay"), {"stiffness": 1e-300, "mass": 1.0, "damping": 1.0, "period": 1e-3}, "stiffness"),
+    (partial(required, "period"), {"stiffness": 1e3, "mass": 1e31, "delay": 1e-3}, "mass"),
+    (partial(required, "period"), {"stiffness": 1e3, "mass": 1.0, "delay_periods": 2e5}, "d"),
+    (partial(required, "damping"), {"stiffness": 1e3, "mass": 1.0, "period": 1e-3, "delay": 1e3}, "d"),
     (max_stiffness, {"mass": 1e-162, "period": 1e-3}, "mass"),
     (max_stiffness, {"mass": 1e-10, "damping": 1e10, "period": 1e-3}, "delta"),
     (sensitivities, {"mass": 1.0, "period": 1e-31}, "period"),
@@ -60,10 +61,10 @@ def test_devices_up_to_the_corners_of_the_range_are_put_back(seed):
     device = {"mass": mass, "damping": delta * mass / period, "period": period, "delay": d * period}
     wanted = max_stiffness(**device) * 10 ** random.uniform(-2, 2, count)
     answers = {
-        "damping": required_damping(wanted, mass=mass, period=period, delay=device["delay"]),
-        "delay": allowed_delay(wanted, mass=mass, damping=device["damping"], period=period),
-        "mass": required_mass(wanted, damping=device["damping"], period=period, delay=device["delay"]),
-        "period": required_period(wanted, mass=mass, damping=device["damping"], delay=device["delay"]),
+        "damping": required("damping", wanted, mass=mass, period=period, delay=device["delay"]),
+        "delay": required("delay", wanted, mass=mass, damping=device["damping"], period=period),
+        "mass": required("mass", wanted, damping=device["damping"], period=period, delay=device["delay"]),
+        "period": required("period", wanted, mass=mass, damping=device["damping"], delay=device["delay"]),
     }
     for name, answer in answers.items():
         assert np.all(np.isnan(answer.value) == (answer.status != Status.OK))
@@ -78,7 +79,7 @@ def test_single_devices_need_no_jax():
         "import sys, zwidth\n"
         "zwidth.max_stiffness(mass=0.1, damping=10.0, period=1e-3, delay=1e-3)\n"
         "zwidth.sensitivities(mass=0.1, damping=10.0, period=1e-3, delay=1e-3)\n"
-        "zwidth.required_damping(2e4, mass=0.1, period=1e-3, delay=1e-3)\n"
+        "zwidth.required('damping', 2e4, mass=0.1, period=1e-3, delay=1e-3)\n"
         "zwidth.alpha_max(0.1, 1), zwidth.stiffness_slope(2.5), zwidth.alpha_max(0.1, 1.5, delay='fractional_power')\n"
         "assert 'jax' not in sys.modules\n"
     )

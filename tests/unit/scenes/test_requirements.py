@@ -6,7 +6,7 @@ import pytest
 from compiling import SOON
 
 import zwidth
-from zwidth import allowed_delay, max_stiffness, required_damping, required_mass, required_period, sensitivities
+from zwidth import max_stiffness, required, sensitivities
 from zwidth.words.status import Status
 
 # The search takes a logarithm of K_max/K within 1e-14 for 0; the forward model adds a few rounding errors.
@@ -26,21 +26,19 @@ def devices():
     return {"mass": mass, "damping": damping, "period": period, "delay": d * period}
 
 
-ASKED = {
-    "damping": lambda k, o: required_damping(k, mass=o["mass"], period=o["period"], delay=o["delay"]),
-    "period": lambda k, o: required_period(k, mass=o["mass"], damping=o["damping"], delay=o["delay"]),
-    "delay": lambda k, o: allowed_delay(k, mass=o["mass"], damping=o["damping"], period=o["period"]),
-    "mass": lambda k, o: required_mass(k, damping=o["damping"], period=o["period"], delay=o["delay"]),
-}
+def ask(name, wanted, device):
+    return required(name, wanted, **{key: value for key, value in device.items() if key != name})
+
+
 # How a little more of the quantity moves K_max past the answer.
 IMPROVES = {"damping": 1.0, "period": -1.0, "delay": -1.0, "mass": 1.0}
 
 
-@pytest.mark.parametrize("name", ASKED)
+@pytest.mark.parametrize("name", IMPROVES)
 @pytest.mark.parametrize("factor", [0.5, 1.0, 2.0])
 def test_the_forward_model_returns_the_wanted_stiffness(name, factor, devices):
     wanted = factor * max_stiffness(**devices)
-    answer = ASKED[name](wanted, devices)
+    answer = ask(name, wanted, devices)
     found = (answer.status == Status.OK) & (answer.value > 0)
     assert np.sum(found) > COUNT // 4
     reached = max_stiffness(**(devices | {name: np.where(found, answer.value, devices[name])}))
@@ -69,22 +67,22 @@ def _stable_just_below_and_not_above(wanted, device, found):
 
 def test_a_period_for_a_delay_in_periods():
     mass, damping, d = 0.1, np.array([0.0, 1.0, 10.0, 100.0]), np.array([0.0, 0.3, 1.0, 4.0])
-    answer = required_period(20e3, mass=mass, damping=damping, delay_periods=d)
+    answer = required("period", 20e3, mass=mass, damping=damping, delay_periods=d)
     reached = max_stiffness(mass=mass, damping=damping, period=answer.value, delay=d * answer.value)
     np.testing.assert_allclose(reached, 20e3, rtol=RTOL)
 
 
 def test_no_rate_makes_up_for_a_delay_in_seconds():
     # In continuous time this device reaches 1.80e5 N/m.
-    answer = required_period(np.array([1.5e5, 1.9e5]), mass=1e-3, damping=100.0, delay=1e-3)
+    answer = required("period", np.array([1.5e5, 1.9e5]), mass=1e-3, damping=100.0, delay=1e-3)
     assert answer.status.tolist() == [Status.OK, Status.UNREACHABLE]
     assert np.isnan(answer.value[1])
 
 
 def test_nothing_is_required_where_the_rest_is_enough():
-    assert required_damping(np.array([1e3]), mass=0.1, period=1e-3, delay=1e-3).value == 0
-    assert required_mass(np.array([1.0]), damping=100.0, period=1e-3, delay=1e-3).value == 0
-    assert allowed_delay(np.array([1e9]), mass=0.1, damping=0.0, period=1e-3).status == Status.UNREACHABLE
+    assert required("damping", np.array([1e3]), mass=0.1, period=1e-3, delay=1e-3).value == 0
+    assert required("mass", np.array([1.0]), damping=100.0, period=1e-3, delay=1e-3).value == 0
+    assert required("delay", np.array([1e9]), mass=0.1, damping=0.0, period=1e-3).status == Status.UNREACHABLE
 
 
 def test_the_longest_delay_is_found_beyond_the_best_one():
@@ -93,7 +91,7 @@ def test_the_longest_delay_is_found_beyond_the_best_one():
     best = np.max(max_stiffness(**device, delay=np.linspace(0, 0.3, 301)))
     none = max_stiffness(**device, delay=0.0)
     wanted = np.array([0.5 * (best + none)])
-    answer = allowed_delay(wanted, **device)
+    answer = required("delay", wanted, **device)
     assert best > 1.01 * none
     np.testing.assert_allclose(max_stiffness(**device, delay=answer.value), wanted, rtol=RTOL)
 
@@ -104,7 +102,7 @@ def test_derivatives_are_those_of_the_inverse_function(x64):
     gain = sensitivities(damping=damping, mass=0.1, period=1e-3, delay=1e-3)
 
     def needed(stiffness, mass):
-        return required_damping(stiffness, mass=mass, period=1e-3, delay=1e-3).value
+        return required("damping", stiffness, mass=mass, period=1e-3, delay=1e-3).value
 
     slopes = jax.jit(jax.grad(needed, (0, 1)), compiler_options=SOON)
     by_stiffness, by_mass = slopes(float(wanted[0]), 0.1)
@@ -113,15 +111,21 @@ def test_derivatives_are_those_of_the_inverse_function(x64):
 
 
 def test_bad_entries_spoil_no_other():
-    answer = required_damping(np.array([20e3, -1.0, np.nan]), mass=0.1, period=1e-3, delay=1e-3)
+    answer = required("damping", np.array([20e3, -1.0, np.nan]), mass=0.1, period=1e-3, delay=1e-3)
     assert answer.status.tolist() == [Status.OK, Status.INVALID_INPUT, Status.INVALID_INPUT]
     assert np.isnan(answer.value).tolist() == [False, True, True]
 
 
 def test_wrong_input_is_named():
     with pytest.raises(zwidth.InputError, match=r"stiffness: got -1; it must be finite and greater than 0"):
-        required_damping(-1, mass=0.1, period=1e-3)
-    with pytest.raises(zwidth.InputError, match="give exactly one of the two"):
-        required_period(1e3, mass=0.1)
+        required("damping", -1, mass=0.1, period=1e-3)
+    with pytest.raises(zwidth.InputError, match="delay_periods: got 1, and a delay in seconds; give one of the two"):
+        required("period", 1e3, mass=0.1, delay=1e-3, delay_periods=1)
+    with pytest.raises(zwidth.InputError, match=r"mass: got 0\.1, but it is what is sought; leave it out"):
+        required("mass", 1e3, mass=0.1, period=1e-3)
+    with pytest.raises(zwidth.InputError, match="mass: got None, a real number"):
+        required("period", 1e3)
+    with pytest.raises(zwidth.InputError, match="parameter: got 'rate'"):
+        required("rate", 1e3, mass=0.1)  # pyright: ignore[reportArgumentType]
     with pytest.raises(zwidth.InputError, match="period: got 0"):
-        allowed_delay(1e3, mass=0.1, period=0)
+        required("delay", 1e3, mass=0.1, period=0)

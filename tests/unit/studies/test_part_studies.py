@@ -81,7 +81,7 @@ def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
     wall = stiffness, best["virtual_damping"]
     assert best["passive"] == bool(scene.is_passive(*wall))
     assert best["spectral_radius"] == pytest.approx(np.abs(scene.poles(*wall)).max(), rel=1e-9)
-    assert best["settling_time"] == pytest.approx(-1e-3 * np.log(50) / np.log(best["spectral_radius"]))
+    assert best["decay_time"] == pytest.approx(-1e-3 * np.log(50) / np.log(best["spectral_radius"]))
     assert outcome.notes == ()
     assert len(outcome.figures[""]()) == 1
 

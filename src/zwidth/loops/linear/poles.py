@@ -15,9 +15,10 @@ import numpy as np
 
 from zwidth.loops.linear.loop import LinearLoop
 from zwidth.loops.linear.polynomial import affine_polynomial
-from zwidth.loops.rigid.poles import MOST_POLES, companion
+from zwidth.loops.rigid.poles import companion
 from zwidth.parts.estimate import Estimate
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import MOST_POLES
 from zwidth.words.types import Array
 
 # Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.

@@ -295,22 +295,3 @@ def _long_end_of_column(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> Arr
         return xp.minimum(x / (1.0 + xp.where(at.d_alpha > 0, step, 0.0)), top.x)
 
     return repeat(_COLUMN_STEPS, inwards, x, xp)
-
-
-class Column(NamedTuple):
-    """The lowest and the highest stable damping of a stiffness, and whether there is any."""
-
-    lower: Array
-    upper: Array
-    exists: Array
-
-
-def column(alpha: Array, lobe: Lobe, top: Peak) -> Column:
-    """The stable dampings at one stiffness, held delay; of no meaning where none exist."""
-    xp = namespace(alpha, lobe.d)
-    exists = (alpha > 0) & (alpha < top.alpha)
-    goal = xp.where(exists, alpha, 0.5 * top.alpha)
-    lower, _ = column_end(goal, top, lobe, upper=False)
-    upper, cut = column_end(goal, top, lobe, upper=True)
-    upper = xp.where(cut, 0.5 * (on_line(lobe) - goal), wall(upper, lobe).b - lobe.here.delta)
-    return Column(wall(lower, lobe).b - lobe.here.delta, upper, exists)

@@ -52,24 +52,19 @@ def map_by_degree(
     kernel: Callable[..., Any],
     values: tuple[ArrayLike, ...],
     *,
-    names: tuple[str, ...] = NAMES,
     static: tuple[Any, ...] = (),
     lead: bool = False,
-    chunk: Callable[[Degree], int] = lambda degree: batching.CHUNK,
-    least: int = 1,
-    threads: int | None = None,
     few: Callable[[Degree], int] | None = None,
 ) -> Any:
     """Apply ``kernel(alpha, beta, delta, d, degree, *static)`` to points whose delays may differ.
 
-    Other arguments may take the place of these if ``names`` says so; the last one is the delay. Results that are
-    vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for coefficients) or NaN
-    behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any shape, and takes up to
-    so many points of a degree without JAX. ``least`` and ``threads`` as for `arrays.batching.map_flat`.
+    Results that are vectors come back in one array; shorter ones are filled with zeros in front (``lead``, for
+    coefficients) or NaN behind (for poles). With ``few`` the kernel's text serves NumPy too, along first axes of any
+    shape, and takes up to so many points of a degree without JAX.
     """
     if is_traced(*values):
-        return _map_traced(kernel, names, values, static, lead)
-    arrays = batching.broadcast(names, values)
+        return _map_traced(kernel, values, static, lead)
+    arrays = batching.broadcast(NAMES, values)
     columns = [array.ravel() for array in arrays]
     parts, places = [], []
     for degree, index in groups(columns[-1]):
@@ -78,7 +73,7 @@ def map_by_degree(
             with np.errstate(all="ignore"):
                 parts.append(kernel(*picked, degree, *static))
         else:
-            parts.append(batching.map_flat(kernel, picked, (degree, *static), chunk(degree), least, threads))
+            parts.append(batching.map_flat(kernel, picked, (degree, *static)))
         places.append(index)
     if not parts:
         parts, places = [_of_nothing(kernel, columns, static, few)], [np.arange(0)]
@@ -121,7 +116,7 @@ def _same_length(leaves: list[Any], lead: bool, numpy: Any) -> list[Any]:
     return filled
 
 
-def _map_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static: tuple, lead: bool) -> Any:
+def _map_traced(kernel: Callable[..., Any], values: tuple, static: tuple, lead: bool) -> Any:
     import jax
     import jax.numpy as jnp
 
@@ -136,7 +131,7 @@ def _map_traced(kernel: Callable[..., Any], names: tuple, values: tuple, static:
         parts.append(jax.vmap(lambda *point, degree=degree: kernel(*point, degree, *static))(*picked))
         places.append(index)
     if not parts:
-        raise InputError(f"{', '.join(names)}: got no point at all inside a JAX transformation")
+        raise InputError(f"{', '.join(NAMES)}: got no point at all inside a JAX transformation")
     order = np.argsort(np.concatenate(places), kind="stable")
 
     def gather(*leaves: jax.Array) -> jax.Array:

@@ -20,10 +20,8 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 from zwidth.arrays import phi
-from zwidth.arrays.batching import pointwise
 from zwidth.arrays.xp import namespace
-from zwidth.loops.normalization import normalize
-from zwidth.words.types import Array, ArrayLike, Coefficients
+from zwidth.words.types import Array
 
 # x -> `arrays.phi.PhiFunctions`, in any arithmetic
 Functions = Callable[[Any], Any]
@@ -75,98 +73,3 @@ def split_delay(d: Array) -> tuple[Array, Array]:
     """``d = n + f``; the difference is exact in floating point. Derivatives are those from the right."""
     whole = namespace(d).floor(d)
     return whole, d - whole
-
-
-class Transfer(NamedTuple):
-    """A discrete transfer function, coefficients highest power first along the last axis."""
-
-    numerator: Array
-    denominator: Coefficients
-
-
-def velocity_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) -> Transfer:
-    """Return H_v(z), from held force (N) to sampled velocity (m/s).
-
-    ``H_v = (T/m) phi1(delta) / (z - c)`` with ``delta = b T/m``, the paper's ``(1 - c)/(b (z - c))`` and, for
-    b = 0, its limit ``T/(m (z - 1))``.
-
-    Args:
-        mass: m in kg, > 0.
-        damping: b in N s/m, >= 0.
-        period: T in s, > 0. All three broadcast.
-
-    Returns:
-        Transfer: ``numerator`` (..., 1), ``denominator`` (..., 2). A point out of range is NaN.
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
-    Numerics:
-        No cancellation for any b. Float64 when called directly; the ambient precision inside `jit`.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, eqs. (5), (12).
-
-    Example:
-        >>> from zwidth.loops.rigid.plant import velocity_transfer
-        >>> velocity_transfer(0.5, 0.0, 1e-3).denominator
-        array([ 1., -1.])
-    """
-    delta = normalize(mass=mass, damping=damping, period=period).delta
-    return pointwise(_velocity_kernel, ("mass", "period", "delta"), (mass, period, delta))
-
-
-def _velocity_kernel(mass: Array, period: Array, delta: Array) -> Transfer:
-    xp = namespace(delta)
-    return Transfer(
-        xp.stack([period / mass * phi.phi1(delta)]),
-        xp.stack([_one_at(delta), -phi.decay(delta)]),
-    )
-
-
-def _one_at(delta: Array) -> Array:
-    """The leading coefficient: 1, or NaN where the damping is."""
-    xp = namespace(delta)
-    return xp.where(xp.isnan(delta), delta, 1.0)
-
-
-def position_transfer(mass: ArrayLike, damping: ArrayLike, period: ArrayLike) -> Transfer:
-    """Return H_x(z), from held force (N) to sampled position (m).
-
-    ``H_x = (T^2/m) (phi2 z + psi) / ((z - 1)(z - c))``, the paper's eq. (9) and, for b = 0, its limit
-    ``T^2 (z + 1) / (2 m (z - 1)^2)``.
-
-    Args:
-        mass: m in kg, > 0.
-        damping: b in N s/m, >= 0.
-        period: T in s, > 0. All three broadcast.
-
-    Returns:
-        Transfer: ``numerator`` (..., 2), ``denominator`` (..., 3). A point out of range is NaN.
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-
-    Numerics:
-        No cancellation for any b. Float64 when called directly; the ambient precision inside `jit`.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, eqs. (9), (13).
-
-    Example:
-        >>> from zwidth.loops.rigid.plant import position_transfer
-        >>> position_transfer(0.5, 0.0, 1.0).numerator
-        array([1., 1.])
-    """
-    delta = normalize(mass=mass, damping=damping, period=period).delta
-    return pointwise(_position_kernel, ("mass", "period", "delta"), (mass, period, delta))
-
-
-def _position_kernel(mass: Array, period: Array, delta: Array) -> Transfer:
-    xp = namespace(delta)
-    c = phi.decay(delta)
-    gain = period * period / mass
-    return Transfer(
-        xp.stack([gain * phi.phi2(delta), gain * phi.psi(delta)]),
-        xp.stack([_one_at(delta), -(1.0 + c), c]),
-    )

@@ -26,6 +26,7 @@ from zwidth.loops.rigid.aberth import (
 from zwidth.loops.rigid.degrees import NAMES, Degree, few_poles, find_degree, map_by_degree
 from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
+from zwidth.words.quantities import MOST_POLES
 from zwidth.words.status import Method, Status
 from zwidth.words.types import Array, ArrayLike, Coefficients, Counts, Matrices, Radii, Reals, Roots, RootsFirst
 
@@ -33,9 +34,6 @@ PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
 # The eigenvalues start with errors near eps^(1/k) for a k-fold pole; two steps finish a simple one.
 _POLISHING_STEPS = 3
-
-# All poles take degree^3 operations and degree^2 numbers: 4,000 take minutes and 0.3 GB.
-MOST_POLES = 4000
 
 # Beyond, steps and the time to compile them grow, and the product of all distances between poles loses its digits.
 _MOST_AT_ONE_TIME = 24
@@ -198,11 +196,6 @@ def _compile_by_degree(kernel: Callable[..., Any], degree: Degree, spring: bool)
 def _block(most: int) -> int:
     """The largest power of two that is not above."""
     return 1 << max(1, most).bit_length() - 1
-
-
-def companion_chunk(degree: Degree) -> int:
-    """How many companion matrices fit into about 32 MiB."""
-    return _block((1 << 22) // degree.poles**2)
 
 
 def poles(

@@ -15,12 +15,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import concrete_delay
 from zwidth.arrays.xp import horner, namespace
 from zwidth.loops.domain import check_scalars, poison, valid_wall
-from zwidth.loops.normalization import normalize
 from zwidth.loops.rigid.degrees import Degree, few_poles, map_by_degree
-from zwidth.loops.rigid.plant import Plant, Transfer, held_plant, split_delay, undelayed_plant
+from zwidth.loops.rigid.plant import Plant, held_plant, split_delay, undelayed_plant
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
 
@@ -241,117 +239,3 @@ def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree:
     xp = namespace(alpha, beta, delta, d)
     alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     return coefficients(alpha, beta, delta, xp.where(ok, d, float(degree.whole)), degree) + spoiled
-
-
-def char_poly_si(
-    mass: ArrayLike,
-    damping: ArrayLike,
-    period: ArrayLike,
-    stiffness: ArrayLike,
-    virtual_damping: ArrayLike,
-    delay: ArrayLike = 0.0,
-) -> Coefficients:
-    """Return the monic characteristic polynomial of a loop in SI units, highest power first.
-
-    Eq. (11) over its leading coefficient ``-T b^2``, which leaves its zeros alone and, unlike (11) itself, has the
-    limit of the undamped device for b = 0. With ``delta = b T/m`` and ``c = e^-delta``, for whole ``d = t_d/T``,
-    ``p(z)/(-T b^2) = z^(1+d) (z - 1)(z - c) + (T^2/m) (phi2 z + psi) (K z + (B/T) (z - 1))``.
-
-    Args:
-        mass: m in kg, > 0.
-        damping: b in N s/m, >= 0.
-        period: T in s, > 0.
-        stiffness: K in N/m.
-        virtual_damping: B in N s/m.
-        delay: t_d in s, >= 0, whole periods or not (held); concrete also inside `jit`. All six broadcast.
-
-    Returns:
-        As `char_poly`, dimensionless. A point out of range is NaN.
-
-    Raises:
-        InputError: a scalar is out of range, an argument is no real number, or shapes do not broadcast.
-        TracedDelayError: the delay or the period is traced.
-
-    Numerics:
-        No cancellation for any b: see `char_poly`.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, eqs. (11), (13).
-
-    Example:
-        >>> import numpy as np
-        >>> from zwidth.loops.rigid.polynomial import char_poly_si
-        >>> print(np.array2string(char_poly_si(0.1, 0.0, 1e-3, 50e3, 50.0), precision=2))
-        [ 1.   -1.5   1.25 -0.25]
-    """
-    wall = normalize(
-        mass=mass,
-        damping=damping,
-        period=period,
-        delay=delay,
-        stiffness=stiffness,
-        virtual_damping=virtual_damping,
-    )
-    return char_poly(*wall)
-
-
-def closed_loop_transfer(
-    mass: ArrayLike,
-    damping: ArrayLike,
-    period: ArrayLike,
-    stiffness: ArrayLike,
-    virtual_damping: ArrayLike,
-    d: int,
-) -> Transfer:
-    """Return G_x(z), from a held force on the device (N) to its sampled position (m), in contact with the wall.
-
-    ``G_x = H_x/(1 + H_x z^-d (K + (B/T) (z - 1)/z))`` with `plant.position_transfer`: eq. (10) with numerator
-    and denominator over ``-T b^2``, so that the denominator is monic and b = 0 is the limit of the undamped device.
-
-    Args:
-        mass: m in kg, > 0.
-        damping: b in N s/m, >= 0.
-        period: T in s, > 0.
-        stiffness: K in N/m.
-        virtual_damping: B in N s/m. All five broadcast.
-        d: delay of the wall's force in periods, one whole number >= 0.
-
-    Returns:
-        Transfer: ``numerator`` (..., 3 + d), ``(T^2/m) (phi2 z + psi) z^(1+d)``; ``denominator`` (..., 4 + d), see
-        `char_poly_si`. A point out of range is NaN.
-
-    Raises:
-        InputError: d is no whole number, a scalar is out of range, an argument is no real number, or shapes do not
-            broadcast.
-        TracedDelayError: d is traced.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, eqs. (10), (11), (13).
-
-    Example:
-        >>> from zwidth.loops.rigid.polynomial import closed_loop_transfer
-        >>> loop = closed_loop_transfer(0.1, 0.0, 1e-3, 50e3, 50.0, 1)
-        >>> loop.numerator.size, loop.denominator.size
-        (4, 5)
-    """
-    delay = concrete_delay(d)
-    if delay.ndim or not (np.isfinite(delay) and delay >= 0 and delay == np.floor(delay)):
-        raise InputError(f"d: got {d!r}; one whole number of at least 0 is needed, a fraction has no eq. (10)")
-    alpha, beta, delta, _ = normalize(
-        mass=mass, damping=damping, period=period, stiffness=stiffness, virtual_damping=virtual_damping
-    )
-    names = ("mass", "period", "alpha", "beta", "delta", "d")
-    values = (mass, period, alpha, beta, delta, float(delay))
-    return map_by_degree(_closed_loop_kernel, values, names=names, few=few_poles)
-
-
-def _closed_loop_kernel(
-    mass: Reals, period: Reals, alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree
-) -> Transfer:
-    xp = namespace(delta)
-    plant = undelayed_plant(delta)
-    gain = period * period / mass
-    numerator = xp.stack([gain * plant.a2, gain * plant.a1] + [0.0 * gain] * (degree.whole + 1), axis=-1)
-    # Bad masses and periods have become bad alphas.
-    spoiled = poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta)[..., None]
-    return Transfer(numerator + spoiled, _char_poly_kernel(alpha, beta, delta, d, degree))

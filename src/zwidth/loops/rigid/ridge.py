@@ -92,7 +92,7 @@ def alpha_max(
         # The general route iterates over long formulas; its solvers take a second to import.
         from zwidth.loops.rigid.ridge_kkt import kkt_kernel
 
-        return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
+        return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK)
     return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)
 
 
@@ -119,6 +119,26 @@ def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) ->
     by_delta = alpha_change(ridge.s, plant, lag, by_delta, undelayed)
     by_delta, by_d = void(converged(ridge), by_delta, by_d)
     return RidgeSlopes(_point(ridge, status), by_delta, by_d)
+
+
+def stiffness_slopes(
+    found: RidgeSlopes, mass: Array, period: Array, delta: Array, d: Array
+) -> tuple[Array, Array, Array, Array, Array]:
+    """K_max and what it gains per unit of mass, damping, period and delay, each with the other three held fixed.
+
+    ``dK/dm = (a - delta a_delta)/T^2``, ``dK/db = a_delta/T``, ``dK/dT = (delta a_delta - d a_d - 2 a) m/T^3``,
+    ``dK/dt_d = a_d m/T^3`` with ``a = alpha_max(delta, d)``.
+    """
+    alpha, rate, change = found.point.alpha, 1.0 / period, delta * found.by_delta
+    # No delay needs no product, which an infinite slope would make NaN.
+    delayed = namespace(alpha).where(d > 0.0, d * found.by_d, 0.0)
+    return (
+        alpha * mass * rate * rate,
+        (alpha - change) * rate * rate,
+        found.by_delta * rate,
+        (change - delayed - 2.0 * alpha) * mass * rate**3,
+        found.by_d * mass * rate**3,
+    )
 
 
 def _solve_ridge(

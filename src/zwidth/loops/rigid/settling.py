@@ -22,14 +22,13 @@ from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.degrees import find_degree
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.polynomial import coefficients
+from zwidth.words.quantities import LONGEST_SETTLING
 from zwidth.words.types import Array
 
 # The band round the final value that counts as settled, as in control textbooks.
 SETTLING_BAND = 0.02
 # Instants a period at which the motion is looked at, beside the one at which the force changes.
 _INSTANTS = 40
-# All poles are needed: their cost grows with the cube of the delay.
-_LONGEST = 500
 # How far the modes, summed up at the first samples, may be from the motion that they stand for.
 _MISFIT = 1e-6
 # Instants laid out at one time.
@@ -104,7 +103,7 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
     """
     with np.errstate(all="ignore"):
         stable = stable_kernel(np.float64(alpha), np.float64(beta), np.float64(delta), np.float64(d))
-    if not stable or d > _LONGEST:
+    if not stable or d > LONGEST_SETTLING:
         return math.nan
     with np.errstate(all="ignore"):
         found = modes(alpha, beta, delta, d)
@@ -119,6 +118,15 @@ def settling_time(alpha: float, beta: float, delta: float, d: float, band: float
         return math.nan
     last = _envelope_end(bound, rate, allowed)
     return _last_outside(found, instants, last, allowed)
+
+
+def decay_time(rate: Array) -> Array:
+    """In what time a slowest pole that decays at a rate has decayed to 2 %; infinite where it does not decay.
+
+    An estimate of the settling time by one pole, ``ln 50/rate``: the others and their residues may delay or hasten it.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(rate > 0, -math.log(SETTLING_BAND) / rate, np.where(np.isnan(rate), np.nan, np.inf))
 
 
 def _envelope_end(bound: np.ndarray, rate: np.ndarray, allowed: float) -> int:

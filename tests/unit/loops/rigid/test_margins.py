@@ -240,3 +240,16 @@ def test_traced(x64):
         # The frequency of a minimum is known to half of the digits.
         np.testing.assert_allclose(slopes[:6], expected[:6], rtol=1e-6, atol=1e-7)
         np.testing.assert_allclose(slopes[6], expected[6], rtol=1e-2, atol=1e-2)
+
+
+def test_the_margin_is_the_distance_of_p_over_its_open_loop():
+    omega = np.linspace(0, np.pi, 40_001)[1:]
+    z = np.exp(1j * omega)
+    for alpha, beta, delta, d in ((0.1, 0.2, 0.1, 0.0), (0.05, 0.1, 0.1, 1.5), (1e-3, 0.05, 0.5, 3.0)):
+        ratio = np.polyval(zwidth.char_poly(alpha, beta, delta, d), z) / np.polyval(zwidth.char_poly(0, 0, delta, d), z)
+        assert modulus_margin(np.array([alpha]), beta, delta, d)[0] == pytest.approx(np.abs(ratio).min(), rel=1e-6)
+
+
+def test_the_margin_vanishes_on_the_boundary():
+    edge = zwidth.boundary(0.5, 0.3, 1.0)
+    assert modulus_margin(np.array([edge.alpha]), edge.beta, 0.3, 1.0)[0] < 1e-8

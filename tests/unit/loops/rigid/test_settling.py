@@ -71,7 +71,7 @@ def test_a_double_pole_settles_too():
     for _ in range(10):
         delta = random.uniform(0.05, 1.0)
         alpha = 0.3 * float(zwidth.alpha_max(delta, 1.0).alpha)
-        choice = zwidth.fastest_damping(alpha, delta, 1.0)
-        wall = (alpha, float(choice.beta), delta, 1.0)
+        scene = zwidth.Scene(zwidth.Device(1.0, delta), zwidth.Timing(1.0, 1.0))
+        wall = (alpha, scene.best_damping(alpha).virtual_damping, delta, 1.0)
         found = settling_time(*wall)
         assert abs(found - last_outside(wall, 400, 200)) < 0.006 or np.isnan(found), wall
