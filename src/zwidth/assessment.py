@@ -16,6 +16,7 @@ from zwidth.scene import Scene
 from zwidth.stability.boundary import boundary_point
 from zwidth.stability.decay import decay_rate
 from zwidth.stability.proved import outermost_poles
+from zwidth.stability.radii import spectral_radius
 from zwidth.stability.ridge import RidgeKind, alpha_max
 from zwidth.status import Status
 
@@ -196,7 +197,7 @@ def _judge_rigid(scene: Scene) -> dict[str, Any]:
         "d": d,
         # The row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
         "marginal": alpha == 0 and float(row.alpha) > 0,
-        "spectral_radius": math.exp(-rate),
+        "spectral_radius": float(spectral_radius(alpha, beta, delta, d)),
         "decay_rate": rate / period,
         "stiffness_limit": float(row.alpha) * units.stiffness,
         "virtual_damping_lower": lower * units.virtual_damping,

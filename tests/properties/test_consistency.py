@@ -312,7 +312,7 @@ def test_an_assessment_says_what_the_functions_say():
             "passive": zwidth.is_passive(*wall),
             "passivity_margin": zwidth.passivity_margin(*wall),
             "decay_rate": rate,
-            "spectral_radius": np.exp(-rate),
+            "spectral_radius": zwidth.spectral_radius(*wall),
             "stiffness_limit": zwidth.boundary_point(delta, found.d, beta=beta).alpha,
             "stiffness_max": zwidth.alpha_max(delta, found.d).alpha,
             "gain_margin": stands.gain_margin,

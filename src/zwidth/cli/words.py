@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isfinite, isinf, isnan
+from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
@@ -147,7 +147,7 @@ def passivity_words(scene: Scene, verdict: Assessment | SceneAssessment, *, suff
 def pole_words(constant: float, frequency: float) -> str:
     """How the slowest pole moves: its time constant in s, negative for a growing one, and its frequency in Hz."""
     swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
-    if isinf(constant):
+    if not isfinite(constant):
         return f"neither decays nor grows{swing}"
     verb = "decays" if constant >= 0 else "grows"
     return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"
