@@ -43,7 +43,7 @@ _MESSAGES = {
         "and >= 0."
     ),
     Status.NOT_CONVERGED: "The solver stopped before its tolerance; ask for a nearby point or another method.",
-    Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha, beta or ray.",
+    Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha or beta.",
     Status.UNDECIDED: (
         "The chosen precision cannot tell stable from unstable; use method='certified' "
         "with the extra 'certified' installed."

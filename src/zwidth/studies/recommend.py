@@ -76,10 +76,9 @@ class RecommendStudy(ResponseStudy):
         )
         response = stack([columns])
         found = _summary(device, wall, verdict, self.stiffness_fraction, float(columns["settling_time_s"]))
-        edge, verified = outline(device.delta, device.d, "held")
+        edge = outline(device.delta, device.d, "held")
         passive = passive_outlines(np.array([device.delta]), np.array([device.d]), device.own_share)
         region = add_si_columns(stack([edge, *passive]), device)
-        notes = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
         return Outcome(
             table=response,
             figures={"": partial(figures.draw_recommendation, found, region, response)},
@@ -88,7 +87,7 @@ class RecommendStudy(ResponseStudy):
                 f"{stem}.md": _markdown(device, wall, verdict, found),
             },
             answer=spell_answer(found, verdict),
-            notes=(*notes, *([note] if note else [])),
+            notes=(note,) if note else (),
         )
 
 

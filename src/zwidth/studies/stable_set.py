@@ -54,10 +54,8 @@ def tabulate_walls(label: str, walls: Mapping[str, StiffestWall]) -> Table:
 
 
 def find_edges(delta: float, d: float) -> dict[str, Outlines]:
-    """Where the stable and the passive walls of a rigid device end, normalized; none where that is not verified."""
+    """Where the stable and the passive walls of a rigid device end, normalized."""
     found = stable_region(delta, d)
-    if not found.verified:
-        return {}
     edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
     if delta > 0:
         edges["passive"] = [(_find_passive(delta, d), False)]
