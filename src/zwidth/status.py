@@ -27,13 +27,11 @@ class Status(IntEnum):
 
 
 class Method(IntEnum):
-    """What decided a point, in `zwidth.decide_stability`, `bound_radius` and `enclose_poles`."""
+    """What decided a point, in `zwidth.decide_stability`."""
 
     COMPANION = 0
     CROSSOVER = 1
     CERTIFIED = 2
-    NEWTON = 3
-    ABERTH = 4
 
 
 _MESSAGES = {

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 import zwidth
+from bounds import bound_radius
 from zwidth.domain import wall_status
 from zwidth.settling import settling_time
-from zwidth.stability.radii import bound_radius
 from zwidth.status import Status
 
 # Walls that are judged at one time: few enough for NumPy, so that nothing is compiled.

@@ -18,7 +18,7 @@ from zwidth.grouping import find_degree
 from zwidth.loop import affine, closed_loop_transfer, coefficients, frequency_boundary, frequency_loop
 from zwidth.response import step_response
 from zwidth.stability.aberth import aberth_kernel, discs, product_form
-from zwidth.stability.poles import companion, enclose_poles, pole_kernel, radius_kernel, unstable_poles
+from zwidth.stability.poles import companion, pole_kernel, radius_kernel, unstable_poles
 from zwidth.stability.region import lobe
 
 with patch.object(typing, "TYPE_CHECKING", True):
@@ -36,7 +36,6 @@ ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
 CALLS = [
     (zwidth.char_poly, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
     (zwidth.poles, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
-    (enclose_poles, {**WALL, "d": np.float64(1.5)}),
     (unstable_poles, {**WALL, "d": np.float64(1.5)}),
     (
         zwidth.count_poles,

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 import zwidth
+from bounds import bound_radius
 from zwidth.stability.layout import Points, fold
 from zwidth.stability.proved import outermost_poles
-from zwidth.stability.radii import bound_radius
 from zwidth.stability.radius_map import SMALLEST_MAP, as_map, followed_poles, lay_nodes
 from zwidth.status import Status
 
