@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 
 from zwidth._types import Array
 from zwidth.batching import traced_columns
@@ -29,11 +28,11 @@ from zwidth.linear_loop import circle
 from zwidth.normalization import in_periods
 from zwidth.parts.paths import replace_parameters
 from zwidth.parts.wall import VirtualWall
+from zwidth.stability.exact_points import polish
 from zwidth.stability.ridge import RidgeKind
 from zwidth.status import Status
 from zwidth.xp import is_traced, namespace
 
-_MAX_STEPS = 16
 # A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
 
@@ -155,26 +154,10 @@ def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Arra
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
     args = _prepare(chain, start, codes)
     begin = start / args.scales
-    tolerance = _tolerance(start.dtype)
-    solution = optimistix.root_find(
-        partial(_residual, chain),
-        optimistix.Newton(rtol=tolerance, atol=tolerance),
-        begin,
-        args=args,
-        max_steps=_MAX_STEPS,
-        throw=False,
-    )
-    close = jnp.all(jnp.abs(solution.value - begin) <= _reach(start.dtype))
-    return *(solution.value * args.scales), close
-
-
-def _tolerance(dtype: Any) -> float:
-    return 16 * float(jnp.finfo(dtype).eps)
-
-
-def _reach(dtype: Any) -> float:
-    """How far Newton may go: it must stay where the search put it; a double root is met to half of the digits."""
-    return 64 * _tolerance(dtype) ** 0.5
+    found = polish(partial(_residual, chain), begin, args)
+    # Newton must stay where the search put it; a double root is met to half of the digits.
+    close = jnp.all(jnp.abs(found - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
+    return *(found * args.scales), close
 
 
 def _prepare(chain: Chain, start: Array, codes: Array) -> _Arguments:

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth._types import Array, ArrayLike, DelayModel
-from zwidth.batching import elementwise
+from zwidth.batching import elementwise, pointwise
 from zwidth.domain import check_scalars, poison, valid_device, wall_status
 from zwidth.errors import InputError, check_choice
 from zwidth.loop import Wall, check_delay_model, frequency_boundary, frequency_loop
@@ -139,9 +139,9 @@ def boundary_point(
     names, values = ("delta", "d", name), (delta, d, value)
     if method == "optimistix":
         # Its solvers take a second to import.
-        from zwidth.stability.boundary_solve import solved_point
+        from zwidth.stability.exact_points import point_kernel
 
-        return solved_point(names, values, line, delay)
+        return pointwise(point_kernel, names, values, (line, delay))
     return elementwise(_point_kernel, names, values, (line, delay, classify_delays(d)))
 
 

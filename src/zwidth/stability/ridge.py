@@ -90,7 +90,7 @@ def alpha_max(
     check_scalars(delta=delta, d=d)
     if method == "kkt":
         # The general route iterates over long formulas; its solvers take a second to import.
-        from zwidth.stability.ridge_kkt import kkt_kernel
+        from zwidth.stability.exact_points import kkt_kernel
 
         return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK, False)
     return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)

@@ -184,7 +184,7 @@ def _upper_kernel(delta, d, delay: str):
     """The largest stable beta as alpha -> 0: the lobe's end, or the line P(-1) = 0 where it comes first."""
     import jax.numpy as jnp
 
-    from zwidth.stability.bracketing import lobe_end
+    from zwidth.stability.exact_points import lobe_end
 
     loop = frequency_loop(delta, d, delay)
     omega = lobe_end(loop, d, delay)
