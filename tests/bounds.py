@@ -19,7 +19,7 @@ class Radius(NamedTuple):
     status: np.ndarray
 
 
-def bound_radius(alpha, beta, delta, d, accuracy=1e-9) -> Radius:
+def bound_radius(alpha, beta, delta, d, *, accuracy=1e-9) -> Radius:
     """What `zwidth.spectral_radius` knows of each point."""
     arrays = broadcast(NAMES, (alpha, beta, delta, d))
     radius, proved, status = prove_radii(arrays, accuracy)

@@ -23,7 +23,9 @@ def edge_is_right(alpha, beta, delta, d, away=1e-6):
     low, high, off = beta[0], beta[-1], away * (beta[-1] - beta[0])
     column = zwidth.is_stable(away**2 * alpha.max(), [low - off, low + off, high - off, high + off], delta, d)
     inside, outside = (
-        zwidth.is_stable(*(m + size * (x[rim] - m) for m, x in zip(middle, (alpha, beta), strict=True)), delta, d)
+        zwidth.is_stable(
+            middle[0] + size * (alpha[rim] - middle[0]), middle[1] + size * (beta[rim] - middle[1]), delta, d
+        )
         for size in (1.0 - away, 1.0 + away)
     )
     return column.tolist() == [False, True, True, False] and inside.all() and not outside.any()
