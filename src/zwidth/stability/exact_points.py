@@ -100,15 +100,15 @@ def frequency_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyL
     return jnp.stack([re, im])
 
 
-class _Arguments(NamedTuple):
-    """The parameters of the equations; ``number`` is the alpha or beta of the line."""
+class _Line(NamedTuple):
+    """What the equations depend on beside the unknowns; ``number`` is the alpha or beta of the line."""
 
     loop: FrequencyLoop
     number: Array
     scales: Array
 
 
-def _residual(line: str, unknowns: Array, args: _Arguments) -> Array:
+def _residual(line: str, unknowns: Array, args: _Line) -> Array:
     """The three equations, of order one; ``unknowns`` are alpha, beta and omega over their scales."""
     alpha, beta, omega = unknowns * args.scales
 
@@ -132,7 +132,7 @@ def _solve(line: str, start: Array, number: Array, loop: FrequencyLoop, delay_mo
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
-    omega = polish(lambda *at: _residual(line, *at), unknowns, _Arguments(loop, number, scales))[2]
+    omega = polish(lambda *at: _residual(line, *at), unknowns, _Line(loop, number, scales))[2]
     omega = store_once(omega, start)
     return omega, frequency_boundary(omega, loop, delay_model)
 
