@@ -24,9 +24,9 @@ from zwidth.loops.rigid import (
     certified_filter,
     circle,
     crossover,
+    exact_points,
     pole_step,
     ridge,
-    ridge_kkt,
     ridge_newton,
 )
 from zwidth.loops.rigid import (
@@ -71,7 +71,7 @@ def compiled(kernel: Callable[..., Any], options: dict[str, Any] | None = None, 
 @contextmanager
 def replaced(names: dict[str, Any]) -> Iterator[None]:
     """Other functions in place of those of a module, while something is traced."""
-    modules = {"crossover": crossover, "kkt": ridge_kkt, "newton": ridge_newton, "filter": certified_filter}
+    modules = {"crossover": crossover, "kkt": exact_points, "newton": ridge_newton, "filter": certified_filter}
     modules |= {"circle": circle, "radius": radius, "step": pole_step}
     patches = [patch.object(modules[name.split("__")[0]], name.split("__")[1], value) for name, value in names.items()]
     for each in patches:
@@ -110,7 +110,7 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
         return radius.quick_kernel(*walls, 1e-9, True)  # pyright: ignore
 
     def point(a: Any, b: Any) -> Any:
-        return jax.vmap(lambda x, y: ridge_kkt.kkt_kernel(x, y, "held"))(a, b)
+        return jax.vmap(lambda x, y: exact_points.kkt_kernel(x, y, "held"))(a, b)
 
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, "held", ANY)

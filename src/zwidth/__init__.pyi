@@ -31,7 +31,6 @@ from .loops.rigid.region import StableRegion as StableRegion
 from .loops.rigid.region import stable_region as stable_region
 from .loops.rigid.response import StepResponse as StepResponse
 from .loops.rigid.response import step_response as step_response
-from .loops.rigid.ridge import RidgeKind as RidgeKind
 from .loops.rigid.ridge import RidgePoint as RidgePoint
 from .loops.rigid.ridge import alpha_max as alpha_max
 from .loops.rigid.slope import stiffness_slope as stiffness_slope
@@ -86,6 +85,7 @@ from .words.errors import PrecisionWarning as PrecisionWarning
 from .words.errors import StoreExistsError as StoreExistsError
 from .words.errors import TracedDelayError as TracedDelayError
 from .words.errors import ZwidthError as ZwidthError
+from .words.status import RidgeKind as RidgeKind
 from .words.status import Status as Status
 
 __all__: list[str]

@@ -111,10 +111,6 @@ def of_requirement(parameter):
     return of_quantities(call, {*others, "stiffness"}, f"required {parameter}", gradient_in=gradient_in)
 
 
-def ray_point(alpha0, beta0, dalpha, dbeta, delta, d):
-    return zwidth.boundary_point(delta, d, ray=(alpha0, beta0, dalpha, dbeta))
-
-
 CASES = [
     Case(
         "normalize",
@@ -154,11 +150,6 @@ CASES = [
         "boundary_point of a column",
         lambda alpha, delta, d: zwidth.boundary_point(delta, d, alpha=alpha),
         {"alpha": [0.3, 0.1, 0.05]},
-    ),
-    of_devices(
-        "boundary_point on a ray",
-        ray_point,
-        {"alpha0": [0.1, 0.05, 0.05], "beta0": [0.3, 0.2, 0.1], "dalpha": [1.0, 0.5, 1.0], "dbeta": [0.5, 0.1, -0.2]},
     ),
     of_devices("alpha_max", zwidth.alpha_max),
     of_devices("stable_area", zwidth.stable_area, derivatives=1),

@@ -14,7 +14,7 @@ from jaxtyping import AbstractArray, jaxtyped
 import zwidth
 from zwidth.loops.rigid.aberth import aberth_kernel, discs, product_form
 from zwidth.loops.rigid.degrees import find_degree
-from zwidth.loops.rigid.poles import companion, enclose_poles, pole_kernel, radius_kernel, unstable_poles
+from zwidth.loops.rigid.poles import companion, pole_kernel, radius_kernel, unstable_poles
 from zwidth.loops.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.region import lobe
 from zwidth.loops.rigid.response import step_response
@@ -36,7 +36,6 @@ ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
 CALLS = [
     (zwidth.char_poly, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
     (zwidth.poles, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
-    (enclose_poles, {**WALL, "d": np.float64(1.5)}),
     (unstable_poles, {**WALL, "d": np.float64(1.5)}),
     (
         zwidth.count_poles,

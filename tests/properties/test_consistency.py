@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from bounds import bound_radius
 
 import zwidth
 from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.settling import settling_time
-from zwidth.loops.rigid.spectral_radius import bound_radius
 from zwidth.words.status import Status
 
 # Walls that are judged at one time: few enough for NumPy, so that nothing is compiled.
@@ -311,7 +311,7 @@ def test_an_assessment_says_what_the_functions_say():
             "passive": zwidth.is_passive(*wall),
             "passivity_margin": zwidth.passivity_margin(*wall),
             "decay_rate": rate,
-            "spectral_radius": np.exp(-rate),
+            "spectral_radius": zwidth.spectral_radius(*wall),
             "stiffness_limit": zwidth.boundary_point(delta, found.d, beta=beta).alpha,
             "stiffness_max": zwidth.alpha_max(delta, found.d).alpha,
             "gain_margin": stands.gain_margin,

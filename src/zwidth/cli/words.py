@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from math import isfinite, isinf, isnan
+from math import isfinite, isnan
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
@@ -154,7 +154,9 @@ def passivity_words(scene: Scene, verdict: Assessment) -> str:
 def pole_words(constant: float, frequency: float) -> str:
     """How the slowest pole moves: its time constant in s, negative for a growing one, and its frequency in Hz."""
     swing = f", oscillating at {with_unit(frequency, 'Hz')}" if frequency else ""
-    if isinf(constant):
+    if isnan(constant):
+        return f"its rate is lost in rounding, next to the boundary or to poles of one size{swing}"
+    if not isfinite(constant):
         return f"neither decays nor grows{swing}"
     verb = "decays" if constant >= 0 else "grows"
     return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"

@@ -26,7 +26,7 @@ def make_edges(store: Store) -> Edges:
     """What gives the outlines of the stable and the passive walls of a part of a sweep, at one device and delay.
 
     The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
-    plane of walls, and where nothing is proved or verified, there are none.
+    plane of walls, and where nothing is proved, there are none.
     """
     grid = store.grid
     at_device = cache(lambda place: _outline(store, place))

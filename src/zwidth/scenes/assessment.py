@@ -14,12 +14,12 @@ from zwidth.loops.linear.poles import is_marginal
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.decay import decay_rate
 from zwidth.loops.rigid.outermost_poles import outermost_poles
-from zwidth.loops.rigid.ridge import RidgeKind
+from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json
-from zwidth.words.status import Status
+from zwidth.words.status import RidgeKind, Status
 
 _POLE_ACCURACY = 1e-9
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
@@ -186,7 +186,7 @@ def _judge_rigid(scene: Scene) -> dict[str, Any]:
     return {
         # The row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
         "marginal": alpha == 0 and row[1] > 0,
-        "spectral_radius": math.exp(-rate),
+        "spectral_radius": float(spectral_radius(alpha, beta, delta, d)),
         "decay_rate": rate / period,
         "stable_stiffness": (row,) if row[1] > 0 else (),
         "stable_damping": (column,) if column[0] < column[1] else (),

@@ -15,7 +15,6 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix
 
 from zwidth.arrays.batching import traced_columns
 from zwidth.arrays.circle import circle
@@ -23,17 +22,16 @@ from zwidth.arrays.xp import is_traced, namespace
 from zwidth.loops.domain import poison
 from zwidth.loops.linear.chain import Chain, chain_of, needed, respond
 from zwidth.loops.linear.ridge import Condition
-from zwidth.loops.rigid.ridge import RidgeKind
+from zwidth.loops.rigid.exact_points import polish
 from zwidth.parts.paths import replace_parameters
 from zwidth.parts.span import in_periods
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.slopes import moving_paths
-from zwidth.scenes.stiffest import StiffestWall, search
+from zwidth.scenes.stiffest import StiffestWall, allows_negative, refuse_fractional_power, search
 from zwidth.words.errors import InputError, TracedDelayError
-from zwidth.words.status import Status
+from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
-_MAX_STEPS = 16
 # A harmless start for a lane without a ridge: no NaN may reach a solver that others share.
 _NOWHERE = (1.0, 1.0, 1.0, 2.0, float(Condition.PAIR), float(Condition.PAIR), float(RidgeKind.SMOOTH))
 
@@ -83,8 +81,10 @@ def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structur
     return Structure(template, paths, whole, held, negative)
 
 
-def traced_wall(scene: Any, negative: bool) -> StiffestWall:
+def traced_wall(scene: Any, negative_damping: bool | None) -> StiffestWall:
     """`zwidth.Scene.max_stiffness` inside a transformation."""
+    refuse_fractional_power(scene)
+    negative = allows_negative(scene, negative_damping)
     values = scene.parameters()
     paths = tuple(path for path in moving_paths(scene) if is_traced(values[path]))
     if not paths:
@@ -155,26 +155,10 @@ def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Arra
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
     args = _prepare(chain, start, codes)
     begin = start / args.scales
-    tolerance = _tolerance(start.dtype)
-    solution = optimistix.root_find(
-        partial(_residual, chain),
-        optimistix.Newton(rtol=tolerance, atol=tolerance),
-        begin,
-        args=args,
-        max_steps=_MAX_STEPS,
-        throw=False,
-    )
-    close = jnp.all(jnp.abs(solution.value - begin) <= _reach(start.dtype))
-    return *(solution.value * args.scales), close
-
-
-def _tolerance(dtype: Any) -> float:
-    return 16 * float(jnp.finfo(dtype).eps)
-
-
-def _reach(dtype: Any) -> float:
-    """How far Newton may go: it must stay where the search put it; a double root is met to half of the digits."""
-    return 64 * _tolerance(dtype) ** 0.5
+    found = polish(partial(_residual, chain), begin, args)
+    # Newton must stay where the search put it; a double root is met to half of the digits.
+    close = jnp.all(jnp.abs(found - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
+    return *(found * args.scales), close
 
 
 def _prepare(chain: Chain, start: Array, codes: Array) -> _Arguments:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.batching import as_float64, join_shapes
+from zwidth.arrays.xp import is_traced
 from zwidth.loops.linear.border import Border, Outline, outlines
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import Chain, chain_of, linear_loop
@@ -256,6 +257,10 @@ class Scene(SceneAnswers):
             >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
             11942 N/m
         """
+        if not self.is_rigid and is_traced(*self.parameters().values()):
+            from zwidth.scenes.ridge_kkt import traced_wall
+
+            return traced_wall(self, negative_damping)
         return stiffest_wall(self, negative_damping)
 
     def sensitivities(self, *, negative_damping: bool | None = None) -> SceneSensitivities:

@@ -12,10 +12,10 @@ from zwidth.loops.linear.columns import stable_dampings
 from zwidth.loops.linear.pieces import Island
 from zwidth.loops.linear.ridge import BoundRidge, find_ridge
 from zwidth.loops.rigid.boundary import boundary_point
-from zwidth.loops.rigid.ridge import RidgeKind, alpha_max
+from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.words.errors import InputError, ZwidthError
-from zwidth.words.status import Status
+from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
 # By what share a row may end below the stiffest wall that is on it.
@@ -38,17 +38,12 @@ def allows_negative(scene: Any, negative_damping: bool | None) -> bool:
 
 
 def stiffest_wall(scene: Any, negative_damping: bool | None = None) -> StiffestWall:
-    """See `zwidth.Scene.max_stiffness`."""
+    """See `zwidth.Scene.max_stiffness`, for numbers that nothing traces, and for rigid devices."""
     negative = allows_negative(scene, negative_damping)
     if scene.is_rigid:
         return _rigid_wall(scene, negative)
     refuse_fractional_power(scene)
-    values = scene.parameters()
-    if is_traced(*values.values()):
-        from zwidth.scenes.ridge_kkt import traced_wall
-
-        return traced_wall(scene, negative)
-    held = {path: float(value) for path, value in values.items() if is_jax(value)}
+    held = {path: float(value) for path, value in scene.parameters().items() if is_jax(value)}
     scene = scene.replace(**held) if held else scene
     found, status = search(scene, negative)
     if found is None:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.double_double import two_sum
 from zwidth.loops.linear.passivity import PassivityCondition, needed_damping
 from zwidth.parts.checks import check_whole
 from zwidth.parts.estimate import Estimate
@@ -224,5 +223,9 @@ def _move(scene: Any, wall: tuple[float, float], x: np.ndarray, damping: float) 
 def _add_up(terms: np.ndarray) -> np.ndarray:
     """The sums of the terms before each, with what rounding left out of each sum added up as well."""
     sums = np.concatenate([[0.0], np.cumsum(terms[:-1])])
-    lost = two_sum(sums[:-1], terms[:-1]).low
+    before, added = sums[:-1], terms[:-1]
+    # Of one sum of two numbers it is known exactly (Knuth).
+    rounded = before + added
+    part = rounded - before
+    lost = (before - (rounded - part)) + (added - part)
     return sums + np.concatenate([[0.0], np.cumsum(lost)])

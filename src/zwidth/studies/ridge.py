@@ -12,11 +12,11 @@ from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.ridge import RidgeKind, RidgePoint, alpha_max
+from zwidth.loops.rigid.ridge import RidgePoint, alpha_max
 from zwidth.loops.rigid.slope import stiffness_slope
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, Table
-from zwidth.words.status import Status
+from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DelayModel
 
 # Every batch has this size, so that a run with many of them compiles the ridge once for each delay model.

@@ -23,10 +23,8 @@ def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
 
 
 def find_edges(delta: float, d: float) -> dict[str, Outlines]:
-    """Where the stable and the passive walls of a rigid device end, normalized; none where that is not verified."""
+    """Where the stable and the passive walls of a rigid device end, normalized."""
     found = stable_region(delta, d)
-    if not found.verified:
-        return {}
     edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
     if delta > 0:
         edges["passive"] = [(delta * np.stack(unit_outline(d), -1), False)]

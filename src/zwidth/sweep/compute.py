@@ -188,9 +188,7 @@ def _radius_columns(accuracy: float, columns: Columns) -> Columns:
     found = outermost_poles(walls, accuracy, few=0)
     rate, error = rates(found, walls), np.where(status == Status.OK, found.error, np.inf)
     rate[status != Status.OK] = np.nan
-    # The rate has more digits of the radius.
-    radius = np.where(np.isfinite(rate), np.exp(-rate), radius_at(found.re, error, walls))
-    return radius, (error <= accuracy).astype(np.float64), rate
+    return radius_at(found.re, error, walls), (error <= accuracy).astype(np.float64), rate
 
 
 def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Columns:

@@ -1,4 +1,4 @@
-"""Status codes that accompany a result point by point, with their messages.
+"""Codes: statuses that accompany a result point by point, with their messages.
 
 Traced code cannot raise, and one bad point must not spoil a batch: it gets NaN and one of these codes.
 """
@@ -27,13 +27,19 @@ class Status(IntEnum):
 
 
 class Method(IntEnum):
-    """What decided a point, in `zwidth.decide_stability`, `bound_radius` and `enclose_poles`."""
+    """What decided a point, in `zwidth.decide_stability`."""
 
     COMPANION = 0
     CROSSOVER = 1
     CERTIFIED = 2
-    NEWTON = 3
-    ABERTH = 4
+
+
+class RidgeKind(IntEnum):
+    """Which kind of optimum the ridge is."""
+
+    SMOOTH = 0
+    CORNER = 1
+    NO_DAMPING = 2  # of a scene where only B >= 0 counts: the end of the row B = 0
 
 
 _MESSAGES = {
@@ -43,7 +49,7 @@ _MESSAGES = {
         "and >= 0."
     ),
     Status.NOT_CONVERGED: "The solver stopped before its tolerance; ask for a nearby point or another method.",
-    Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha, beta or ray.",
+    Status.NO_BOUNDARY: "No stable wall lies on the given line; choose another alpha or beta.",
     Status.UNDECIDED: (
         "The chosen precision cannot tell stable from unstable; use method='certified' "
         "with the extra 'certified' installed."

@@ -132,8 +132,7 @@ def test_strong_damping_is_drawn_with_its_limit():
 
 
 def test_an_outline_has_names_for_its_pieces():
-    edge, verified = outline(3.0, 0.0, "held")
-    assert verified
+    edge = outline(3.0, 0.0, "held")
     assert set(edge["piece"]) == {"complex_pair", "minus_one"}
 
 

@@ -177,8 +177,5 @@ def linear_margins(chain: Chain, boundary: Boundary, alpha: np.ndarray, beta: np
         if good:
             loops = loops or DelayedLoops.lay_out(chain)
             delay = delay_margin(loops, a, b)
-        out[(slice(None), *place)] = (
-            found.gain, found.phase, delay, found.modulus, found.phase_crossover, found.gain_crossover,
-            found.modulus_frequency,
-        )  # fmt: skip
+        out[(slice(None), *place)] = found._replace(delay_margin=delay)
     return Margins(*(part[()] for part in out))

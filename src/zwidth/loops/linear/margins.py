@@ -13,7 +13,9 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle
+from zwidth.arrays.roots import bisect
 from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.rigid.margins import Margins
 from zwidth.words.types import Array
 
 # Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
@@ -98,12 +100,7 @@ class OpenLoop(NamedTuple):
         with np.errstate(invalid="ignore"):
             lowest = np.minimum(size[:-1] - fall[:-1] * step, size[1:] - fall[1:] * step)
         k = np.flatnonzero(toward & (lowest < 0))
-        low, high, sign = w[k], w[k + 1], sign[k]
-        for _ in range(40 if k.size else 0):
-            middle = 0.5 * (low + high)
-            falls = sign * read(self.at(middle))[1] < 0
-            low, high = np.where(falls, middle, low), np.where(falls, high, middle)
-        return 0.5 * (low + high)
+        return bisect(lambda x: sign[k] * read(self.at(x))[1] < 0, w[k], w[k + 1]) if k.size else w[k]
 
     def least_distance(self) -> tuple[float, float]:
         """The least ``|1 + L|`` and its angle."""
@@ -112,14 +109,13 @@ class OpenLoop(NamedTuple):
         rising = (value.conj() * slope).real > 0
         k = np.flatnonzero(~rising[:-1] & rising[1:])
         k = k[np.minimum(distance[k], distance[k + 1]) < 2.0 * np.nanmin(distance)]
-        low, high = self.w[k], self.w[k + 1]
-        for _ in range(50 if k.size else 0):
-            middle = 0.5 * (low + high)
-            jet = self.at(middle)
-            up = ((1.0 + jet.value).conj() * jet.slope).real > 0
-            low, high = np.where(up, low, middle), np.where(up, middle, high)
-        places = np.concatenate([self.w, 0.5 * (low + high)])
-        distances = np.concatenate([distance, np.abs(1.0 + self.at(0.5 * (low + high)).value)])
+
+        def nears(w: np.ndarray) -> np.ndarray:
+            jet = self.at(w)
+            return ~(((1.0 + jet.value).conj() * jet.slope).real > 0)
+
+        places = np.concatenate([self.w, bisect(nears, self.w[k], self.w[k + 1]) if k.size else self.w[k]])
+        distances = np.concatenate([distance, np.abs(1.0 + self.at(places[self.w.size :]).value)])
         rest = self.at_rest()
         if rest is not None:
             places, distances = np.append(places, 0.0), np.append(distances, abs(1.0 + rest))
@@ -140,7 +136,10 @@ def answer(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet
 def polish_roots(
     read: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], low: np.ndarray, high: np.ndarray, falling: np.ndarray
 ) -> np.ndarray:
-    """Newton's method between ends of different sign; a step that leaves them, and every fourth, is a bisection."""
+    """Newton's method between ends of different sign; a step that leaves them, and every fourth, is a bisection.
+
+    `numerics.roots.newton` ends beside a crossing where L is all but 0, and with another gain margin.
+    """
     x = 0.5 * (low + high)
     for step in range(_STEPS if x.size else 0):
         value, slope = read(x)
@@ -157,19 +156,8 @@ def polish_roots(
     return x
 
 
-class WallMargins(NamedTuple):
-    """Margins of one wall, angles in radians a period; `zwidth.Margins` without the delay."""
-
-    gain: float
-    phase: float
-    modulus: float
-    phase_crossover: float
-    gain_crossover: float
-    modulus_frequency: float
-
-
-def margins_of(wall: OpenLoop, stable: bool) -> WallMargins:
-    """The nearest crossovers, and the least distance from -1."""
+def margins_of(wall: OpenLoop, stable: bool) -> Margins:
+    """The nearest crossovers, and the least distance from -1, of one wall; the delay margin is not asked for."""
     w = wall.phase_crossovers()
     places, values = list(w), list(np.abs(wall.at(w).value))
     for place, value in ((np.pi, float(wall.L.value[-1].real)), (0.0, wall.at_rest())):
@@ -187,4 +175,4 @@ def margins_of(wall: OpenLoop, stable: bool) -> WallMargins:
         nearest = int(np.argmin(phases))
         phase, gain_at = phases[nearest] * (1.0 if stable else -1.0), crossed[nearest]
     distance, closest = wall.least_distance()
-    return WallMargins(float(gain), float(phase), distance, float(phase_at), float(gain_at), closest)
+    return Margins(float(gain), float(phase), np.nan, distance, float(phase_at), float(gain_at), closest)

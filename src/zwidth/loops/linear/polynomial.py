@@ -2,19 +2,10 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from zwidth.loops.linear.loop import LinearLoop
-
-
-class AffinePolynomial(NamedTuple):
-    """``P = D + alpha N1 + beta N2``: coefficients of one length, highest power first."""
-
-    D: np.ndarray
-    N1: np.ndarray
-    N2: np.ndarray
+from zwidth.loops.rigid.polynomial import Affine
 
 
 def _product(*offsets: np.ndarray) -> np.ndarray:
@@ -38,7 +29,7 @@ def _raised(polynomial: np.ndarray, power: int) -> np.ndarray:
     return np.concatenate([polynomial, np.zeros(power)])
 
 
-def affine_polynomial(loop: LinearLoop) -> AffinePolynomial:
+def affine_polynomial(loop: LinearLoop) -> Affine:
     """D, N1 and N2 of the closed loop."""
     top, bottom = estimate_polynomials(loop)
     device, answer = _product(loop.poles), loop.gain * _product(loop.zeros)
@@ -48,7 +39,7 @@ def affine_polynomial(loop: LinearLoop) -> AffinePolynomial:
         answer = _raised(answer, -loop.lag)
     parts = [np.convolve(device, bottom), np.convolve(answer, bottom), np.convolve(answer, top)]
     length = max(part.size for part in parts)
-    return AffinePolynomial(*(np.concatenate([np.zeros(length - part.size), part]) for part in parts))
+    return Affine(*(np.concatenate([np.zeros(length - part.size), part]) for part in parts))
 
 
 def closed_loop_roots(loop: LinearLoop, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray, float, int]:

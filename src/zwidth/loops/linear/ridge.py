@@ -20,7 +20,7 @@ from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.loop import LinearLoop
 from zwidth.loops.linear.rows import bound_intervals
-from zwidth.loops.rigid.ridge import RidgeKind
+from zwidth.words.status import RidgeKind
 
 # Newton steps on a corner at most; the residual, as a share of |q|, at which it holds; how far it may move a start.
 _MOST_STEPS, _HOLDS, _NEAR = 12, 1e-11, 1e-5

@@ -10,6 +10,7 @@ import numpy as np
 from zwidth.loops.domain import WALL_RANGE
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.poles import log_size, poles_less_one
+from zwidth.loops.rigid.boundary_map import copy_rows
 
 # Rows whose crossings are laid out at one time.
 _ROWS = 1 << 12
@@ -114,20 +115,14 @@ def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
 
 
 def _mark_rows(alpha: np.ndarray, ends: Intervals, place: np.ndarray) -> np.ndarray:
-    """The same for ascending alpha along the last axis: rows are pieces of one pattern, copied at memory speed.
-
-    The pattern is true up to its middle; a row that ends after ``count`` alphas starts ``count`` before the middle.
-    """
-    pattern = np.zeros(2 * alpha.size, bool)
-    pattern[: alpha.size] = True
-    pieces = np.lib.stride_tricks.sliding_window_view(pattern, alpha.size)
+    """The same for ascending alpha along the last axis, at the speed at which rows are copied."""
     stable = np.zeros((place.size, alpha.size), bool)
     for k in range(ends.low.shape[1]):
         missing = np.isnan(ends.high[:, k])
         until = np.searchsorted(alpha, np.where(missing, -np.inf, ends.high[:, k]))
         start = np.searchsorted(alpha, np.where(missing, -np.inf, ends.low[:, k]), side="right")
-        held: np.ndarray = pieces[alpha.size - until[place]]
+        held = copy_rows(until[place], alpha.size)
         if start.any():
-            held &= ~pieces[alpha.size - np.minimum(start, until)[place]]
+            held &= ~copy_rows(np.minimum(start, until)[place], alpha.size)
         stable = held if k == 0 else stable | held
     return stable

@@ -4,8 +4,8 @@ The text is that of `loops.rigid.crossover`; its numbers are balls of python-fli
 exact, and the precision doubles until a verdict is certain. Loaded only when needed: python-flint is optional.
 
 What no precision decides is a pair of poles exactly on the unit circle. For delta > 0 and alpha > 0 no such point is
-known: c is then transcendental, while alpha, beta, delta and d are rational. For delta = 0 everything is algebraic, and
-whether the crossover is a zero of P is decided by their greatest common divisor, see `_crosses_exactly`.
+known: c is then transcendental, while alpha, beta, delta and d are rational. For delta = 0 there are such walls
+(alpha = 0, beta = 2, d = 0): they stay undecided.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import numpy as np
 
 from zwidth.arrays.phi import PhiFunctions
 from zwidth.arrays.xp import horner
-from zwidth.loops.rigid.crossover import Lag, Verdict, first_zero, gain_cubic, long_verdict, short_verdict
+from zwidth.loops.rigid.crossover import Lag, Verdict, first_zero, long_verdict, short_verdict
 from zwidth.loops.rigid.delay_classes import DeviceTerms
 from zwidth.loops.rigid.plant import discretize
 from zwidth.words.status import Status
@@ -29,10 +29,6 @@ if TYPE_CHECKING:
 
 FIRST_BITS = 128
 _EXTRA_BITS = 64
-# Points that this many bits leave open are looked at exactly where delta = 0, up to this many whole periods.
-_DOUBTFUL_BITS = 512
-_LONGEST_EXACT = 512
-_PRIME = 2**61 - 1
 
 
 class Decision(NamedTuple):
@@ -56,10 +52,7 @@ def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> 
         if found.stable or found.unstable:
             inside = bool(found.stable)
             return Decision(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
-        last = bits == max_bits
-        if delta == 0 and (last or bits == _DOUBTFUL_BITS) and _crosses_exactly(*_exact(alpha, beta, d), bits):
-            return Decision(False, Status.ON_BOUNDARY, bits)
-        if last:
+        if bits == max_bits:
             return Decision(False, Status.UNDECIDED, bits)
         bits = min(2 * bits, max_bits)
 
@@ -136,85 +129,6 @@ def _take_lag(u: flint.arb, whole: int) -> Lag:
     sine, cosine = lag.sin_cos()
     half = (lag / 2).sin()
     return Lag(cosine, sine, half * half, lag < turn, w * (whole + 1) > turn)
-
-
-def _exact(alpha: float, beta: float, d: float) -> tuple[Any, Any, int, Any]:
-    """alpha, beta, n and f as rational numbers."""
-    import flint
-
-    stiffness, damping, f = (flint.fmpq(*value.as_integer_ratio()) for value in (alpha, beta, d - int(d)))
-    return stiffness, damping, int(d), f
-
-
-def _crosses_exactly(alpha: Any, beta: Any, whole: int, f: Any, bits: int) -> bool:
-    """Whether the poles at delta = 0 include the crossover itself, ``z = e^(j w)``: then they are on the unit circle.
-
-    Called where all that precedes the phase is certain, so that the wall borders the stable ones: no pole is outside.
-    With rational alpha, beta and f, ``H(u)`` times a power of z is a polynomial G(z) of degree 6 at most, a simple
-    zero of which is e^(j w). It is a zero of P too exactly if it is one of gcd(P mod G, G).
-    """
-    import flint
-
-    cubic, wall, lead = _rational(alpha, beta, f)
-    z = flint.fmpq_poly([0, 1])
-    coefficients = cubic if alpha != 0 else cubic[1:]
-    # u = -(z - 1)^2/(2 z)
-    degree = len(coefficients) - 1
-    g = sum((h * (-(z - 1) * (z - 1)) ** k * (2 * z) ** (degree - k) for k, h in enumerate(coefficients)), 0 * z)
-    power = whole + lead
-    if not _meet_modulo(g.numer(), (z - 1) * (z - 1), wall, power) or whole > _LONGEST_EXACT:
-        return False
-    common = g.gcd((_power_modulo(z, power, g) * (z - 1) * (z - 1) + wall) % g)
-    if common.degree() == 0:
-        return False
-    with flint.ctx.workprec(bits):
-        u, found = _enclose_zero(tuple(flint.arb(h) for h in cubic))
-        if not found:
-            return False
-        at = flint.acb(1 - u, (u * (2 - u)).sqrt())
-        # G = common * rest vanishes there; where rest does not, common does.
-        rest = flint.acb_poly(flint.fmpq_poly(g / common))
-        return not rest(at).contains(0)
-
-
-def _rational(alpha: Any, beta: Any, f: Any) -> tuple[list[Any], Any, int]:
-    """At delta = 0: H by powers of u, the wall's part of P, and the power of z in ``z^(n + lead) (z - 1)^2``."""
-    import flint
-
-    half, t = flint.fmpq(1, 2), 1 - f
-    a2, a1, a0 = t * t * half, (1 + 2 * t * f) * half, f * f * half
-    numerator, lead = ([a0, a1, a2], 2) if f != 0 else ([a1, a2], 1)
-    nothing: dict[str, Any] = dict.fromkeys(DeviceTerms._fields)
-    here = DeviceTerms(**nothing)._replace(
-        delta=flint.fmpq(0), c=flint.fmpq(1), p1=flint.fmpq(1), a2=a2, a1=a1, a0=a0 if f != 0 else None
-    )
-    cubic = list(gain_cubic(alpha, beta, here))
-    return cubic, flint.fmpq_poly(numerator) * flint.fmpq_poly([-beta, alpha + beta]), lead
-
-
-def _meet_modulo(g: Any, factor: Any, wall: Any, power: int) -> bool:
-    """Whether G and ``z^power factor + wall`` have a common zero modulo a prime: if not, they have none at all."""
-    import flint
-
-    def reduced(p: Any) -> Any:
-        scale = flint.nmod(int(p.denom()), _PRIME)
-        return flint.nmod_poly([flint.nmod(int(value), _PRIME) / scale for value in p.numer().coeffs()], _PRIME)
-
-    small = flint.nmod_poly([int(value) % _PRIME for value in g.coeffs()], _PRIME)
-    if small.degree() != g.degree():
-        return True
-    z = flint.nmod_poly([0, 1], _PRIME)
-    return small.gcd((_power_modulo(z, power, small) * reduced(factor) + reduced(wall)) % small).degree() > 0
-
-
-def _power_modulo(z: Any, power: int, modulus: Any) -> Any:
-    """``z^power`` by repeated squaring."""
-    result = z**0
-    for digit in bin(power)[2:]:
-        result = result * result % modulus
-        if digit == "1":
-            result = result * z % modulus
-    return result
 
 
 def polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> list[Any]:

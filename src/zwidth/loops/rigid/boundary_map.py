@@ -91,26 +91,23 @@ def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
     if len(varying) == 1 and limit.shape[varying[0]] == 1:
         values = alpha.reshape(-1)
         if varying[0] == alpha.ndim - 1 and limit.size >= _ENOUGH_ROWS and np.all(values[1:] >= values[:-1]):
-            return _copied_rows(values, limit)
+            stable = copy_rows(_below(values, limit), values.size)
+            stable[:, : np.searchsorted(values, 0.0, side="right")] = False
+            return stable.reshape(*limit.shape[:-1], values.size)
         if alpha.size < _NEVER:
             return _compare_places(alpha, limit)
     with compute_concretely():
         return np.asarray(_compile_kernel("between")(alpha, limit))
 
 
-def _copied_rows(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """The same for ascending alpha along the last axis: each row is a piece of one pattern, copied at memory speed.
+def copy_rows(count: np.ndarray, size: int) -> np.ndarray:
+    """Rows of a length that are true in their first ``count`` places: pieces of one pattern, copied at memory speed.
 
-    The pattern is true up to its middle; a row that ends after ``count`` alphas starts ``count`` before the middle.
+    The pattern is true up to its middle; a row that ends after ``count`` places starts ``count`` before the middle.
     """
-    pattern = np.zeros(2 * alpha.size, bool)
-    pattern[: alpha.size] = True
-    pieces = np.lib.stride_tricks.sliding_window_view(pattern, alpha.size)
-    stable: np.ndarray = pieces[alpha.size - _below(alpha, limit)]
-    not_positive = np.searchsorted(alpha, 0.0, side="right")
-    if not_positive:
-        stable[:, :not_positive] = False
-    return stable.reshape(*limit.shape[:-1], alpha.size)
+    pattern = np.zeros(2 * size, bool)
+    pattern[:size] = True
+    return np.lib.stride_tricks.sliding_window_view(pattern, size)[size - count]
 
 
 def _below(ordered: np.ndarray, limit: np.ndarray) -> np.ndarray:

@@ -24,7 +24,8 @@ from zwidth.words.status import Status
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(12)
 _LARGEST_ERROR = 0.1
-# Closer to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is.
+# Closer to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is: of the
+# radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
 _DOUBTFUL = 1e-8
 _BELOW_ONE = 1.0 - 2.0**-53
 # Points that are compiled together: one size for all batches that are worth it.

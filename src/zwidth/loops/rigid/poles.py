@@ -5,30 +5,20 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from functools import cache
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
 from zwidth.arrays.batching import as_float64, map_blocks
 from zwidth.arrays.xp import is_traced, namespace, repeat
 from zwidth.loops.domain import LONGEST_DELAY, check_scalars, wall_status
-from zwidth.loops.rigid.aberth import (
-    aberth_kernel,
-    discs,
-    evaluate,
-    join,
-    product_form,
-    replace_invalid,
-    rounding,
-    split,
-    with_zero,
-)
+from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, join, product_form, replace_invalid, split, with_zero
 from zwidth.loops.rigid.degrees import NAMES, Degree, few_poles, find_degree, map_by_degree
 from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import MOST_POLES
-from zwidth.words.status import Method, Status
-from zwidth.words.types import Array, ArrayLike, Coefficients, Counts, Matrices, Radii, Reals, Roots, RootsFirst
+from zwidth.words.status import Status
+from zwidth.words.types import Array, ArrayLike, Coefficients, Counts, Matrices, Reals, Roots, RootsFirst
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
@@ -39,15 +29,6 @@ _POLISHING_STEPS = 3
 _MOST_AT_ONE_TIME = 24
 # Numbers of one kind that a block of walls holds, which then stay in the cache, and those of a block of matrices.
 _NUMBERS, _MATRICES = 1 << 15, 1 << 15
-
-
-class Poles(NamedTuple):
-    """Poles, how far each is off at most, both with a last axis for the poles; and a status and `Method` a wall."""
-
-    z: Roots
-    within: Radii
-    status: Array
-    method: Array
 
 
 def companion(monic: Coefficients) -> Matrices:
@@ -232,8 +213,8 @@ def poles(
         TracedDelayError: d is traced.
 
     Numerics:
-        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k);
-        `enclose_poles` has bounds. Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is
+        A simple pole is right to about 1e-15 times its condition; a k-fold pole to about 1e-16^(1/k).
+        Eigenvalues by LAPACK, O(degree^3) a point, of one degree less where every beta is
         0; then Newton steps on the factored polynomial. Aberth's iteration works on that polynomial too, O(degree^2) a
         step. Few points need no JAX; many are compiled once for every degree.
 
@@ -253,87 +234,26 @@ def poles(
         )
     if method == "companion" or is_traced(*values):
         return _of_all_poles(_found_poles, values)
-    return _found(values, method).z
-
-
-def enclose_poles(
-    alpha: ArrayLike,
-    beta: ArrayLike,
-    delta: ArrayLike,
-    d: ArrayLike,
-    *,
-    method: PoleMethod = "auto",
-    delay: str = "held",
-) -> Poles:
-    """Return the poles of the closed loop with discs in which they lie.
-
-    Args:
-        alpha, beta, delta, d, method, delay: as for `zwidth.poles`.
-
-    Returns:
-        Poles: ``z`` as `zwidth.poles` has it; ``within``, of the same shape: where the status is OK, exactly one pole
-        of the loop lies in the disc of this radius round each, rounding errors included. ``status``: INVALID_INPUT
-        or OUT_OF_RANGE with NaN; NOT_CONVERGED where the discs are not disjoint (next to multiple poles): all poles
-        lie in their union, and ``within`` says no more. ``method``: the `Method` of each wall.
-
-    Raises:
-        InputError: as for `zwidth.poles`, and for traced values.
-
-    References:
-        Smith 1970, on discs that contain the zeros of a polynomial.
-
-    Example:
-        >>> from zwidth.loops.rigid.poles import enclose_poles
-        >>> bool(enclose_poles(0.5, 0.5, 0.1, 1).within.max() < 1e-12)
-        True
-    """
-    values = (alpha, beta, delta, d)
-    if is_traced(*values):
-        raise InputError("enclose_poles: got traced values; inside a JAX transformation use `zwidth.poles`")
-    _check(values, delay, method)
-    return _found(values, method)
-
-
-def _found(values: tuple[ArrayLike, ...], method: str) -> Poles:
     static = (is_spring(values[1]), method)
     return map_by_degree(_found_on_host, values, static=static, few=lambda degree: sys.maxsize)
 
 
-def _found_on_host(*arguments: Any) -> Poles:
+def _found_on_host(*arguments: Any) -> Roots:
     """Poles of NumPy columns of one degree, by Aberth's iteration where it pays and by eigenvalues where it must."""
     alpha, beta, delta, d, degree, spring, method = arguments
     columns = [alpha, beta, delta, d]
-    of_input = wall_status(alpha, beta, delta, d)
-    few = of_input.size <= few_poles(degree)
+    few = alpha.size <= few_poles(degree)
     if method == "companion" or (method == "auto" and (few or degree.poles > _MOST_AT_ONE_TIME)):
-        z, within, proved = _by_companion(*columns, degree, spring, _disc_kernel)
-        used = np.full_like(of_input, Method.COMPANION)
+        return _by_companion(*columns, degree, spring, _found_poles)
+    if few:
+        z, _, proved = aberth_kernel(alpha, beta, delta, d, degree, spring)
     else:
-        if few:
-            z, within, proved = aberth_kernel(alpha, beta, delta, d, degree, spring)
-        else:
-            block = _block(_NUMBERS // degree.poles)
-            z, within, proved = map_blocks(_compile_by_degree(aberth_kernel, degree, spring), columns, block)
-        used = np.full_like(of_input, Method.ABERTH)
-        left = np.flatnonzero(~proved & (of_input == Status.OK))
-        if left.size:
-            remaining = [column[left] for column in columns]
-            z[left], within[left], proved[left] = _by_companion(*remaining, degree, spring, _disc_kernel)
-            used[left] = Method.COMPANION
-    status = np.where((of_input == Status.OK) & ~proved, np.int32(Status.NOT_CONVERGED), of_input)
-    return Poles(z, within, status, used)
-
-
-def _disc_kernel(
-    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any
-) -> tuple[Roots, Radii, Array]:
-    """Poles, their discs, and whether these are disjoint."""
-    z = find(alpha, beta, delta, d, degree, spring)
-    xp = namespace(z)
-    walls, spoiled = replace_invalid(alpha, beta, delta, d, degree)
-    first = xp.moveaxis(z[..., :-1] if spring else z, -1, 0)
-    within, proved, _ = discs(first, product_form(*walls, degree, spring))
-    return z, with_zero(xp.moveaxis(within, 0, -1), spring) + spoiled[..., None], proved
+        block = _block(_NUMBERS // degree.poles)
+        z, _, proved = map_blocks(_compile_by_degree(aberth_kernel, degree, spring), columns, block)
+    left = np.flatnonzero(~proved & (wall_status(alpha, beta, delta, d) == Status.OK))
+    if left.size:
+        z[left] = _by_companion(*(column[left] for column in columns), degree, spring, _found_poles)
+    return z
 
 
 def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Reals:
@@ -353,30 +273,3 @@ def _count_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Deg
     # Without stiffness a pole is at 1, whatever rounding makes of it.
     count = xp.where(alpha == 0, xp.maximum(count, 1), count)
     return xp.where(xp.isnan(z[..., 0].real), -1, count)
-
-
-def radius_and_bound(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> tuple[Array, ...]:
-    """The spectral radius from the poles, a bound of its error, no certificates, a status and the method."""
-    values = (alpha, beta, delta, d)
-    radius, error, status = _of_all_poles(_bound_kernel, values)
-    return radius, error, 0 * status > 0, status, 0 * status + np.int32(Method.COMPANION)
-
-
-def _bound_kernel(
-    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any
-) -> tuple[Reals, Reals, Array]:
-    """A pole lies within degree |P/P'| of any z. What rounding may do to P itself comes on top."""
-    xp = namespace(alpha, beta, delta, d)
-    poles = find(alpha, beta, delta, d, degree, spring)
-    size = xp.abs(poles)
-    largest = xp.argmax(xp.where(xp.isnan(size), 0.0, size), axis=-1)[..., None]
-    z = split(xp.take_along_axis(poles, largest, axis=-1)[..., 0][None])
-    radius = xp.where(alpha == 0, xp.maximum(xp.max(size, axis=-1), 1.0), xp.max(size, axis=-1))
-    form = product_form(alpha, beta, delta, d, degree, spring)
-    value, slope = evaluate(z, form)
-    off = xp.sqrt(_square(value)) + rounding(z, form, 2.2e-16)
-    error = (degree.poles * off / xp.sqrt(_square(slope)))[0] + 4e-16 * radius
-    status = wall_status(alpha, beta, delta, d)
-    bounded = xp.isfinite(error)
-    status = xp.where((status == Status.OK) & ~bounded, np.int32(Status.NOT_CONVERGED), status)
-    return radius, xp.where(xp.isnan(radius), np.nan, xp.where(bounded, error, np.inf)), status

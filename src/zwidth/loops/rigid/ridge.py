@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import IntEnum
 from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -22,21 +21,13 @@ from zwidth.loops.rigid.ridge_slopes import (
     plant_slopes,
 )
 from zwidth.words.errors import check_choice
-from zwidth.words.status import Status
+from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
 # What fits the second-level cache, for the general route and for this one.
 _CHUNK, _BLOCK = 1 << 13, 1 << 15
-
-
-class RidgeKind(IntEnum):
-    """Which kind of optimum the ridge is."""
-
-    SMOOTH = 0
-    CORNER = 1
-    NO_DAMPING = 2  # of a scene where only B >= 0 counts: the end of the row B = 0
 
 
 class RidgePoint(NamedTuple):
@@ -90,9 +81,9 @@ def alpha_max(
     check_scalars(delta=delta, d=d)
     if method == "kkt":
         # The general route iterates over long formulas; its solvers take a second to import.
-        from zwidth.loops.rigid.ridge_kkt import kkt_kernel
+        from zwidth.loops.rigid.exact_points import kkt_kernel
 
-        return pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK)
+        return RidgePoint(*pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK))
     return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)
 
 

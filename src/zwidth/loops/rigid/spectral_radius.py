@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
@@ -12,10 +12,9 @@ from zwidth.loops.domain import check_scalars
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.outermost_poles import prove_radii
 from zwidth.loops.rigid.pole_search import traced_kernel
-from zwidth.loops.rigid.poles import radius_and_bound, radius_by_companion
+from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.words.errors import InputError, check_choice
-from zwidth.words.status import Method, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
 RadiusMethod: TypeAlias = Literal["auto", "newton", "companion"]
@@ -24,16 +23,6 @@ RADIUS_METHODS: tuple[str, ...] = get_args(RadiusMethod)
 _DEFAULT_ACCURACY = 1e-9
 # Closer in, the rounding of two counts would meet.
 _LEAST_ACCURACY = 1e-12
-
-
-class Radius(NamedTuple):
-    """Spectral radii with absolute error bounds, certificates, status and `Method`, all of the broadcast shape."""
-
-    radius: Array
-    error: Array
-    certified: Array
-    status: Array
-    method: Array
 
 
 def spectral_radius(
@@ -74,8 +63,8 @@ def spectral_radius(
     Numerics:
         Float64 when called directly, few points without JAX; the ambient precision inside `jit`, where d may be traced.
         Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple one.
-        Error bounds and certificates come from `bound_radius`: next to a k-fold pole the radius is known to about
-        1e-16^(1/k). How slowly a loop decays that is stable by less than 1e-16, `decay_rate` tells.
+        Next to a k-fold pole the radius is known to about 1e-16^(1/k). How slowly a loop decays that is stable by less
+        than 1e-16, `decay_rate` tells.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -107,60 +96,6 @@ def _has_fraction(d: ArrayLike) -> bool:
         return True
     delays = np.asarray(d, np.float64)
     return bool(np.any(delays != np.floor(delays)))
-
-
-def bound_radius(
-    alpha: ArrayLike,
-    beta: ArrayLike,
-    delta: ArrayLike,
-    d: ArrayLike,
-    *,
-    method: RadiusMethod = "auto",
-    accuracy: float | None = None,
-    delay: DelayModel = "held",
-) -> Radius:
-    """Return the spectral radius with an error bound for every point.
-
-    Args:
-        alpha, beta, delta, d, method, accuracy, delay: as for `zwidth.spectral_radius`.
-
-    Returns:
-        Radius: ``radius``; ``error``, absolute: where ``certified``, all poles were counted inside ``radius + error``,
-        and one is not inside ``radius - error``, by a count too or because no polynomial of degree N has its zeros
-        farther than N |P/P'| from any z; in float64 arithmetic and with rounding errors that could not have decided
-        either, and the error is within what was asked for. ``status``: INVALID_INPUT or OUT_OF_RANGE with NaN;
-        NOT_CONVERGED where the error is larger than asked for (next to multiple poles; it is then the least one that
-        two counts do prove) or infinite where there is none. With "companion" the error bounds the distance from the
-        largest computed pole to a true one, and nothing is certified. ``method``: a `Method`.
-
-    Raises:
-        InputError: as for `zwidth.spectral_radius`, and for traced values.
-
-    References:
-        Hulin, Preusche, Hirzinger 2006, eq. (17).
-
-    Example:
-        >>> from zwidth.loops.rigid.spectral_radius import bound_radius
-        >>> found = bound_radius(0.5, 0.5, 0.1, 1)
-        >>> bool(found.certified), f"{found.radius:.6f}"
-        (True, '1.207346')
-    """
-    values = (alpha, beta, delta, d)
-    wanted = _check_radius(method, accuracy, delay)
-    if is_traced(*values):
-        raise InputError("bound_radius: got traced values; inside a JAX transformation use `zwidth.spectral_radius`")
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
-    if method == "companion":
-        return Radius(*radius_and_bound(*values))
-    arrays = broadcast(NAMES, values)
-    radius, proved, status = prove_radii(arrays, wanted)
-    ok = status == Status.OK
-    # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
-    error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
-    certified = ok & (proved <= wanted)
-    status = np.where(ok & ~certified, np.int32(Status.NOT_CONVERGED), status).astype(np.int32)
-    leaves = (radius, np.where(ok, error, np.nan), certified, status, np.full(status.size, Method.NEWTON, np.int32))
-    return to_caller(Radius(*(leaf.reshape(arrays[0].shape) for leaf in leaves)), values)
 
 
 def _check_radius(method: str, accuracy: float | None, delay_model: str) -> float:

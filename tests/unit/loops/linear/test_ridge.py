@@ -11,9 +11,9 @@ from waiting import LONGEST
 import zwidth
 from zwidth import Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
 from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge
-from zwidth.loops.rigid.ridge import RidgeKind
 from zwidth.scenes.ridge_kkt import moving_paths
 from zwidth.words.errors import InputError, TracedDelayError
+from zwidth.words.status import RidgeKind
 
 # Mass 0.1 kg, period and delay 1 ms: K_max in kN/m at b = 0 and b = 10 N s/m, by a plain grid search with roots of
 # polynomials, to 10 N/m (which is how wide its grid was).

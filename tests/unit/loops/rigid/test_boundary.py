@@ -286,27 +286,6 @@ def test_rows(ridge, height):
         assert inner < 1 < outer
 
 
-def test_rays(ridge):
-    top = ridge["held"]
-    start = (0.5 * top.alpha, top.beta)
-    points = zwidth.boundary_point(DELTA, D, ray=(*start, top.alpha, -0.3 * (top.beta + DELTA)))
-    assert (points.status == Status.OK).all()
-    along = (points.alpha - start[0]) * -0.3 * (top.beta + DELTA) - (points.beta - start[1]) * top.alpha
-    np.testing.assert_allclose(along / top.alpha, 0, atol=1e-12 * (DELTA + 1).max())
-    curve = zwidth.boundary(points.omega, DELTA, D)
-    size = np.abs(points.alpha) + np.abs(points.beta)
-    complex_pair = points.omega < math.pi
-    assert (np.abs(curve.alpha - points.alpha) <= tol.BOUNDARY_POINT.float64 * size)[complex_pair].all()
-    assert (np.abs(curve.beta - points.beta) <= tol.BOUNDARY_POINT.float64 * size)[complex_pair].all()
-
-
-def test_a_ray_towards_zero_stiffness_meets_the_real_pole_at_one(ridge):
-    top = ridge["held"]
-    points = zwidth.boundary_point(DELTA, D, ray=(0.5 * top.alpha, top.beta, -top.alpha, 0.0))
-    np.testing.assert_array_equal(points.omega, 0.0)
-    np.testing.assert_allclose(points.alpha, 0.0, atol=1e-13)
-
-
 def test_a_strongly_damped_device_is_bounded_by_a_pole_at_minus_one():
     delta, beta = np.full(DELTA.size, 10.0), np.full(DELTA.size, -1.0)
     points = zwidth.boundary_point(delta, np.zeros(DELTA.size), beta=beta)
@@ -337,7 +316,6 @@ def test_lines_without_a_stable_part(ridge):
         {"alpha": -np.ones(DELTA.size), "side": "upper"},
         {"beta": -1.001 * DELTA - 0.01},
         {"beta": 10 * (DELTA + 1)},
-        {"ray": (-1.0, 0.5, 0.0, 1.0)},
     )
     for line in lines:
         points = zwidth.boundary_point(DELTA, D, **line)
@@ -362,9 +340,8 @@ def test_bad_points_are_marked_and_leave_the_others_alone(ridge):
 @pytest.mark.parametrize(
     "line, message",
     [
-        ({}, "beta, alpha, ray: got none; give exactly one of the three"),
-        ({"alpha": 0.1, "beta": 0.1}, "beta, alpha, ray: got beta and alpha; give exactly one"),
-        ({"ray": (0.1, 0.1)}, r"ray: got \(0.1, 0.1\); give the four numbers"),
+        ({}, "beta, alpha: got none; give exactly one of the two"),
+        ({"alpha": 0.1, "beta": 0.1}, "beta, alpha: got both; give exactly one"),
         ({"alpha": 0.1, "side": "top"}, "side: got 'top', allowed are 'lower', 'upper'"),
         ({"alpha": "0.1"}, "alpha.*: got '0.1', a real number"),
     ],

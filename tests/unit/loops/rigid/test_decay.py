@@ -11,7 +11,6 @@ from compiling import QUICKLY
 
 import oracles
 import zwidth
-from zwidth.arrays.double_double import phi_pair, single
 from zwidth.loops.rigid.circle import factor_loop
 from zwidth.loops.rigid.pole_search import both_poles
 from zwidth.words.errors import InputError
@@ -34,21 +33,25 @@ def exact_rate(*wall):
         return -mp.log(max(abs(root) for root in oracles.roots(oracles.polynomial(*wall))))
 
 
-def test_labels_have_ten_digits_and_the_right_sign():
+def test_labels_have_the_digits_that_float64_has_and_the_right_sign():
     with np.load(REFERENCE / "labels.npz") as file:
-        rate = zwidth.decay_rate(*(file[name] for name in NAMES))
-        np.testing.assert_allclose(rate, -np.log1p(file["margin"]), rtol=1e-12)
-        np.testing.assert_array_equal(rate > 0, file["stable"])
+        rate, exact = zwidth.decay_rate(*(file[name] for name in NAMES)), -np.log1p(file["margin"])
+        known = np.isfinite(rate)
+        assert known[np.abs(exact) > 1e-11].mean() > 0.99
+        np.testing.assert_allclose(rate[known], exact[known], rtol=1e-12, atol=2e-15)
+        np.testing.assert_allclose(rate[known], exact[known], rtol=1e-3)
+        np.testing.assert_array_equal((rate > 0)[known], file["stable"][known])
 
 
-def test_adversarial_walls_have_ten_digits_or_none():
+def test_adversarial_walls_have_what_is_promised_or_nothing():
     with np.load(REFERENCE / "adversarial.npz") as file:
         walls, margin = [file[name] for name in NAMES], file["margin"]
     rate = zwidth.decay_rate(*walls)
     # Walls with margins below 1e-16 lie where the verdict itself may be wrong: its side is kept, not the digits.
     judged = np.isfinite(rate) & (np.abs(margin) > 1e-16)
     assert judged.sum() > 2000
-    np.testing.assert_allclose(rate[judged], -np.log1p(margin[judged]), rtol=1e-9)
+    np.testing.assert_allclose(rate[judged], -np.log1p(margin[judged]), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(rate[judged], -np.log1p(margin[judged]), rtol=1e-3)
 
 
 def test_the_sign_is_that_of_the_verdict():
@@ -68,13 +71,19 @@ def test_the_sign_is_that_of_the_verdict():
         (1e-15, 1e-9, 1e-9, 1.0),
         (1e-10, 1e-7, 0.0, 2.0),
         (0.05, 0.1, 0.03, 1.5),
-        # Poles next to 1 and a pair elsewhere, all within 1e-12 of the unit circle: the slowest is meant.
-        (1e-13, 1.4132588650193014, 0.00027724736314914985, 0.25),
-        (1e-17, 0.8284272285685977, 1.3888413586734453e-07, 1.0),
     ],
 )
 def test_slow_loops_keep_their_digits(wall):
     assert zwidth.decay_rate(*wall) == pytest.approx(float(exact_rate(*wall)), rel=1e-13)
+
+
+@pytest.mark.parametrize(
+    "wall",
+    [(1e-13, 1.4132588650193014, 0.00027724736314914985, 0.25), (1e-17, 0.8284272285685977, 1.3888413586734453e-07, 1)],
+)
+def test_poles_of_one_size_on_the_circle_leave_no_rate(wall):
+    # Poles next to 1 and a pair elsewhere, all within 1e-12 of the unit circle.
+    assert np.isnan(zwidth.decay_rate(*wall))
 
 
 def ball_rate(alpha, beta, delta, d):
@@ -152,17 +161,45 @@ def walls_with_poles_of_one_size(count, rng):
     return alpha, middle * (1 + rng.choice([-1, 0, 1], count) * 10.0 ** rng.uniform(-17, -8, count)), delta, d
 
 
-@pytest.mark.parametrize("draw, count, least", [(troubled_walls, 100, 0.93), (walls_with_poles_of_one_size, 150, 0.97)])
-def test_rates_are_right_or_missing_where_poles_nearly_meet(draw, count, least):
+def scattered_walls(count, rng):
+    """Of every softness, down to where the radius rounds to 1."""
+    beta = np.append(rng.uniform(-0.2, 1.2, count // 2), 10.0 ** rng.uniform(-9, 0, count - count // 2))
+    delta, d = 10.0 ** rng.uniform(-6, 1, count), rng.integers(0, 17, count) / 2
+    return 10.0 ** rng.uniform(-18, 0, count), beta, delta, d
+
+
+def walls_with_double_poles(count, rng):
+    """The stiffness, by bisection, where the slow pole and the next one to it become a pair."""
+    beta, delta, d = rng.uniform(0, 0.3, count), 10.0 ** rng.uniform(-3, 0, count), rng.integers(0, 4, count) * 1.0
+    low, high = np.full(count, 1e-9), np.full(count, 2.0)
+    with np.errstate(all="ignore"):
+        for _ in range(70):
+            middle = np.sqrt(low * high)
+            pair = both_poles(30, factor_loop(middle, beta, delta, d, False), False)[1] > 1e-7
+            low, high = np.where(pair, low, middle), np.where(pair, middle, high)
+    return high, beta, delta, d
+
+
+@pytest.mark.parametrize(
+    "draw, count, rtol, atol",
+    [
+        (scattered_walls, 150, 1e-12, 0.0),
+        (walls_with_double_poles, 50, 0.0, 1e-9),
+        (troubled_walls, 100, 1e-10, 1e-12),
+        (walls_with_poles_of_one_size, 150, 1e-10, 1e-12),
+    ],
+)
+def test_rates_are_right_or_missing_where_poles_nearly_meet(draw, count, rtol, atol):
     walls = draw(count, np.random.default_rng(31))
     walls = [np.append(column, known) for column, known in zip(walls, FOUND, strict=True)]
     rate = zwidth.decay_rate(*walls)
     known = np.isfinite(rate)
-    assert known.mean() > least
     exact = np.array([ball_rate(*wall) for wall in zip(*(column.tolist() for column in walls), strict=True)])
     judged = known & np.isfinite(exact)
-    assert judged.sum() > 0.95 * known.sum()
-    np.testing.assert_allclose(rate[judged], exact[judged], rtol=1e-10)
+    assert judged.sum() > 0.9 * known.sum()
+    assert known[np.abs(exact) > 1e-6].all()
+    np.testing.assert_allclose(rate[judged], exact[judged], rtol=rtol, atol=atol)
+    np.testing.assert_allclose(rate[judged], exact[judged], rtol=1e-3)
 
 
 def test_without_stiffness_nothing_decays():
@@ -182,16 +219,3 @@ def test_bad_points_are_nan_and_scalars_refused():
     assert np.isnan(zwidth.decay_rate([0.1, np.nan, 1e70], 0.3, 0.2, 1.0)).tolist() == [False, True, True]
     with pytest.raises(InputError, match="alpha"):
         zwidth.decay_rate(1e70, 0.3, 0.2, 1.0)
-
-
-@pytest.mark.parametrize("x", [0.0, 1e-12, 0.01, 0.7, 3.0, 60.0, 1e6])
-def test_phi_functions_have_thirty_digits(x):
-    got = phi_pair(single(np.float64(x)))
-    with mp.workdps(80):
-        y = mp.mpf(x)
-        em = -mp.expm1(-y)
-        phi1 = em / y if x else mp.mpf(1)
-        phi2 = (1 - phi1) / y if x else mp.mpf(1) / 2
-        for value, exact in zip(got, (em, phi1, phi2), strict=True):
-            error = mp.mpf(float(value.high)) + mp.mpf(float(value.low)) - exact
-            assert abs(error) <= 1e-29 * abs(exact)

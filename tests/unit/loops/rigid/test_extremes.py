@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from bounds import bound_radius
 
 import zwidth
 from methods import extremes
-from zwidth.loops.rigid.spectral_radius import bound_radius
 from zwidth.words.status import Status
 
 # method -> the farthest relative distance from the boundary at which a label may be wrong.
@@ -46,7 +46,7 @@ def test_bad_input_among_good(method):
 @pytest.mark.parametrize("delta", extremes.DELTAS, ids=str)
 def test_the_radius_of_a_stiff_wall_and_a_soft_one(delta):
     walls = (np.array([1e-30, 1e3 * (1 + delta)]), 0.1 * (1 + delta), delta, 0.0)
-    found = bound_radius(*walls, method="newton")
+    found = bound_radius(*walls)
     assert (found.status == Status.OK).all()
     # The soft wall's slowest pole is at 1, to rounding; the stiff one's is far outside.
     assert found.radius[0] == pytest.approx(1.0, abs=1e-8)

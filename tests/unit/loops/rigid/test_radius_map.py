@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
+from bounds import bound_radius
 
 import zwidth
 from zwidth.loops.rigid.folding import Points, fold
 from zwidth.loops.rigid.outermost_poles import outermost_poles
 from zwidth.loops.rigid.radius_map import SMALLEST_MAP, as_map, followed_poles, lay_nodes
-from zwidth.loops.rigid.spectral_radius import bound_radius
 from zwidth.words.status import Status
 
 ALPHA, BETA = np.linspace(-0.1, 1.5, 203), np.linspace(-0.3, 1.5, 157)

@@ -14,9 +14,9 @@ import tolerances as tol
 
 import zwidth
 from zwidth.loops.rigid.poles import unstable_poles
-from zwidth.loops.rigid.ridge import RidgeKind, ridge_kernel
+from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.words.errors import InputError
-from zwidth.words.status import Status
+from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DELAY_MODELS as MODELS
 
 REFERENCE = Path(__file__).resolve().parents[3] / "reference" / "ridge_extended.json"

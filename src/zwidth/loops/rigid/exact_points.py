@@ -1,0 +1,219 @@
+"""Exact walls by a general solve: a pole pair on the circle and one condition more, by optimistix and jaxopt.
+
+The unknowns alpha, beta and omega are real. The third equation says that the wall lies on a given row or column or, for
+the ridge, maximize alpha subject to P(e^(j omega)) = 0, that moving along the curve changes beta only (the stationarity
+of the Lagrangian with the multipliers eliminated):
+
+    Re P = 0,  Im P = 0,  Im(conj(dP/dbeta) dP/domega) = 0
+
+Of the loop nothing is used but its frequency response, affine in (alpha, beta), and that its lobe is met once by a row,
+and by a column once on either side of the ridge: an independent judge of the closed forms of `loops.rigid.curve`
+(any loop whose stable set is bounded by one lobe). jaxopt's bisection brackets, optimistix' Newton method finishes and
+supplies the implicit derivatives.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optimistix
+
+from zwidth.arrays.xla import store_once
+from zwidth.loops.domain import device_status, poison, wall_status
+from zwidth.loops.rigid.crossover import stable_kernel
+from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, frequency_boundary, frequency_loop
+from zwidth.loops.rigid.ridge_newton import corner, expand_curve
+from zwidth.words.status import RidgeKind, Status
+from zwidth.words.types import Array
+
+# Each step halves the bracket: 52 of them leave one unit in the last place of a float64.
+_HALVINGS = 52
+_NEWTON_STEPS = 16
+
+
+@cache
+def _jaxopt() -> Any:
+    with warnings.catch_warnings():
+        # jaxopt announces at import that it is no longer maintained; a user of zwidth cannot act on that.
+        warnings.filterwarnings("ignore", message="JAXopt is no longer maintained", category=DeprecationWarning)
+        import jaxopt
+
+    return jaxopt
+
+
+def bisect(function: Callable[..., Array], lower: Array, upper: Array, *args: Any) -> tuple[Array, Array]:
+    """A sign change of ``function(x, *args)`` in [lower, upper], and whether the bracket held one.
+
+    No derivative passes through: the result is a starting point, to be polished by something differentiable.
+    """
+    lower, upper, args = jax.lax.stop_gradient((lower, upper, args))
+    solver = _jaxopt().Bisection(
+        optimality_fun=function,
+        lower=lower,
+        upper=upper,
+        maxiter=_HALVINGS,
+        tol=0.0,
+        check_bracket=False,
+        unroll=False,
+        jit=True,
+    )
+    root, state = solver.run(None, *args)
+    return jax.lax.stop_gradient(root), state.sign != 0
+
+
+def polish(residual: Callable[[Array, Any], Array], start: Array, args: Any) -> Array:
+    """The zero of real equations next to a start by Newton's method, differentiable in ``args``."""
+    tolerance = float(16 * jnp.finfo(start.dtype).eps)
+    solver = optimistix.Newton(rtol=tolerance, atol=tolerance)
+    return optimistix.root_find(residual, solver, start, args=args, max_steps=_NEWTON_STEPS, throw=False).value
+
+
+def lobe_end(loop: FrequencyLoop, d: Array, delay_model: str) -> Array:
+    """The frequency at which the boundary curve first returns to alpha = 0, pi where it reaches the corner before."""
+    limit = jnp.minimum(jnp.pi, jnp.pi / (d + 0.5))
+    end, found = bisect(
+        lambda omega, loop: frequency_boundary(omega, loop, delay_model).alpha, 1e-6 * limit, limit, loop
+    )
+    return jnp.where(found & ~corner(expand_curve(loop.plant), loop.lag).reached, end, jnp.pi)
+
+
+def frequency_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLoop) -> Array:
+    """``P(e^(j omega))/e^(j (2 + n) omega)`` as a real pair."""
+    plant, whole = loop
+    sin = jnp.sin(omega)
+    # (z - 1)(z - c), then z^-n M (alpha + beta (1 - 1/z)), all as real pairs: optimistix wants real unknowns.
+    re_1, re_c = -2.0 * jnp.sin(0.5 * omega) ** 2, plant.em - 2.0 * jnp.sin(0.5 * omega) ** 2
+    re_m = -plant.gap + 2.0 * (plant.a2 + plant.a0) * jnp.cos(0.5 * omega) ** 2
+    im_m = (plant.a2 - plant.a0) * sin
+    re_w, im_w = alpha - beta * re_1, beta * sin
+    re_mw, im_mw = re_m * re_w - im_m * im_w, re_m * im_w + im_m * re_w
+    lag_re, lag_im = jnp.cos(whole * omega), -jnp.sin(whole * omega)
+    re = re_1 * re_c - sin * sin + lag_re * re_mw - lag_im * im_mw
+    im = sin * (re_1 + re_c) + lag_re * im_mw + lag_im * re_mw
+    return jnp.stack([re, im])
+
+
+class _Line(NamedTuple):
+    """What the equations depend on beside the unknowns; ``number`` is the alpha or beta of the line."""
+
+    loop: FrequencyLoop
+    number: Array
+    scales: Array
+
+
+def _residual(line: str, unknowns: Array, args: _Line) -> Array:
+    """The three equations, of order one; ``unknowns`` are alpha, beta and omega over their scales."""
+    alpha, beta, omega = unknowns * args.scales
+
+    def pole(beta: Array, omega: Array) -> Array:
+        return frequency_residual(omega, alpha, beta, args.loop)
+
+    if line != "ridge":
+        wall, k = (alpha, beta), int(line == "row")
+        return jnp.append(pole(beta, omega), (wall[k] - args.number) / args.scales[k])
+    zero, one = jnp.zeros_like(beta), jnp.ones_like(beta)
+    value, by_beta = jax.jvp(pole, (beta, omega), (one, zero))
+    _, by_omega = jax.jvp(pole, (beta, omega), (zero, one))
+    size = jnp.sqrt(jnp.sum(by_beta**2) * jnp.sum(by_omega**2))
+    size = jax.lax.stop_gradient(jnp.where(size > 0, size, 1.0))
+    return jnp.append(value, (by_beta[0] * by_omega[1] - by_beta[1] * by_omega[0]) / size)
+
+
+def _solve(line: str, start: Array, number: Array, loop: FrequencyLoop, delay_model: str) -> tuple[Array, Wall]:
+    """The frequency at which the three equations hold, next to a start, and the wall there, differentiable."""
+    wall = jax.lax.stop_gradient(store_once(frequency_boundary(start, loop, delay_model), start))
+    scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
+    scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
+    unknowns = jnp.stack([*wall, start]) / scales
+    omega = polish(lambda *at: _residual(line, *at), unknowns, _Line(loop, number, scales))[2]
+    omega = store_once(omega, start)
+    return omega, frequency_boundary(omega, loop, delay_model)
+
+
+def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
+    """The fields of `zwidth.alpha_max` for one point."""
+    status = device_status(delta, d)
+    ok, inputs = status == Status.OK, (delta, d)
+    # A solver that sees NaN in one lane may stop the others.
+    delta, d = jnp.where(ok, delta, 1.0), jnp.where(ok, d, 1.0)
+    loop = store_once(frequency_loop(delta, d, delay_model), delta)
+    summit = corner(expand_curve(loop.plant), loop.lag)
+
+    def slope(omega: Array, loop: FrequencyLoop) -> Array:
+        return jax.grad(lambda w: frequency_boundary(w, loop, delay_model).alpha)(omega)
+
+    end = store_once(lobe_end(loop, d, delay_model), d)
+    # Below, the slope is positive; at pi itself it vanishes by symmetry whatever the optimum.
+    upper = jnp.where(end < jnp.pi, end, jnp.pi * (1.0 - 1e-7))
+    start, bracketed = bisect(slope, 1e-6 * end, upper, loop)
+    start = store_once(start, d)
+    omega, smooth = _solve("ridge", start, d, loop, delay_model)
+    # Rounding can keep Newton from its last tolerance; what counts is that it stayed where the bracket put it.
+    converged = summit.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
+    spoiled = poison(ok & converged, *inputs)
+    status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
+    return (
+        jnp.where(summit.is_ridge, summit.alpha, smooth.alpha) + spoiled,
+        jnp.where(summit.is_ridge, summit.beta, smooth.beta) + spoiled,
+        jnp.where(summit.is_ridge, jnp.pi, omega) + spoiled,
+        jnp.where(summit.is_ridge, RidgeKind.CORNER, RidgeKind.SMOOTH).astype(jnp.int32),
+        status.astype(jnp.int32),
+    )
+
+
+def point_kernel(
+    delta: Array, d: Array, number: Array, line: str, delay_model: str, find_ridge: Callable[..., Any]
+) -> tuple[Array, ...]:
+    """The fields of `zwidth.boundary_point` for one point; ``line`` is row, lower or upper.
+
+    ``find_ridge(delta, d, delay_model)`` parts the lower from the upper side of the lobe.
+    """
+    inputs, is_row = (delta, d, number), line == "row"
+    given = wall_status(*((0.0 * number, number) if is_row else (number, 0.0 * number)), delta, d)
+    ok = given == Status.OK
+    delta, d, number = (jnp.where(ok, value, 1.0) for value in inputs)
+    loop = frequency_loop(delta, d, delay_model)
+    ridge, end = jax.lax.stop_gradient(find_ridge(delta, d, delay_model)), lobe_end(loop, d, delay_model)
+
+    def offset(wall: Wall, number: Array) -> Array:
+        return (wall.beta if is_row else wall.alpha) - number
+
+    start, on_lobe = bisect(
+        lambda omega, loop, number: offset(frequency_boundary(omega, loop, delay_model), number),
+        ridge.omega if line == "upper" else jnp.zeros_like(end),
+        ridge.omega if line == "lower" else end,
+        loop,
+        number,
+    )
+    omega, wall = _solve(line, start, number, loop, delay_model)
+    near = float(jnp.finfo(start.dtype).eps) ** 0.5
+    # Of a very soft wall the frequency is below what a bracket resolves.
+    hit = jnp.abs(offset(wall, number)) <= 0.1 * near * (jnp.abs(wall.alpha) + jnp.abs(wall.beta))
+    converged = hit & (jnp.abs(omega - start) <= 100.0 * near)
+    found = wall.alpha if is_row else wall.beta
+    exists = on_lobe & (found > 0) if is_row else on_lobe
+    if line != "lower":
+        # Below one period a line meets P(-1) = 0 too, where alpha + 2 beta is known.
+        usable = (loop.lag == 0) & (loop.plant.gap > 0)
+        rest = 2.0 * (1.0 + loop.plant.c) / jnp.where(usable, loop.plant.gap, 1.0)
+        rest = rest - 2.0 * number if is_row else 0.5 * (rest - number)
+        is_real = usable & (rest < jnp.where(exists, found, jnp.inf))
+        is_real = is_real & (rest > 0) if is_row else is_real
+        omega, found = jnp.where(is_real, jnp.pi, omega), jnp.where(is_real, rest, found)
+        exists, converged = exists | is_real, converged | is_real
+    if is_row:
+        # A stable wall before the end.
+        stable = stable_kernel(0.5 * found, number, delta, d)
+        exists = exists & (stable if delay_model == "held" else jnp.where(d == 0, stable, on_lobe))
+    else:
+        exists = exists & (number > 0) & (number < ridge.alpha)
+    status = jnp.where(exists, jnp.where(converged, int(Status.OK), int(Status.NOT_CONVERGED)), int(Status.NO_BOUNDARY))
+    status = jnp.where(ok, status, given)
+    spoiled = poison(status == Status.OK, *inputs)
+    alpha, beta = (found, number) if is_row else (number, found)
+    return alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(jnp.int32)

@@ -1,0 +1,30 @@
+"""Spectral radii with the errors that are proved of them."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.batching import broadcast
+from zwidth.loops.rigid.degrees import NAMES
+from zwidth.loops.rigid.outermost_poles import prove_radii
+from zwidth.words.status import Status
+
+
+class Radius(NamedTuple):
+    """Radii, absolute errors, whether these are as small as asked for, and status."""
+
+    radius: np.ndarray
+    error: np.ndarray
+    certified: np.ndarray
+    status: np.ndarray
+
+
+def bound_radius(alpha, beta, delta, d, *, accuracy=1e-9) -> Radius:
+    """What `zwidth.spectral_radius` knows of each point."""
+    arrays = broadcast(NAMES, (alpha, beta, delta, d))
+    radius, proved, status = prove_radii(arrays, accuracy)
+    certified = (status == Status.OK) & (proved <= accuracy)
+    # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
+    error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
+    status = np.where((status == Status.OK) & ~certified, Status.NOT_CONVERGED, status)
+    return Radius(*(leaf.reshape(arrays[0].shape) for leaf in (radius, error, certified, status)))
