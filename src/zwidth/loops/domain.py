@@ -63,14 +63,14 @@ def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
 # exponent) gets harmless numbers, and its results are poisoned behind.
 
 
-def void(ok: Array, *values: Array) -> tuple[Array, ...]:
+def nan_unless(ok: Array, *values: Array) -> tuple[Array, ...]:
     """The values where ``ok``, else NaN: so is what is computed with them, derivatives included."""
     xp = namespace(ok, *values)
     factor = xp.where(ok, 1.0, np.nan)
     return tuple([value * factor for value in values])
 
 
-def poison(ok: Array, *inputs: Array) -> Array:
+def nan_with_nan_slopes(ok: Array, *inputs: Array) -> Array:
     """Something to add to a result: 0 where ``ok``, else NaN with NaN first and second derivatives in every input."""
     xp = namespace(ok, *inputs)
     # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.

@@ -13,7 +13,7 @@ import numpy as np
 
 from zwidth.arrays.batching import join_shapes, refuse_masked
 from zwidth.arrays.xp import is_jax, is_traced, namespace
-from zwidth.loops.domain import void, within
+from zwidth.loops.domain import nan_unless, within
 from zwidth.parts.span import accept_units, in_periods
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES
@@ -100,7 +100,7 @@ def _formula_at(*arguments: Any) -> tuple[Array, ...]:
     """``formula`` with NaN for what is out of range; the last two arguments are the formula and the names."""
     *values, formula, names = arguments
     good = (_valid(name, value) & within(value, _magnitudes(name)) for name, value in zip(names, values, strict=True))
-    return formula(*(void(ok, value)[0] for ok, value in zip(good, values, strict=True)))
+    return formula(*(nan_unless(ok, value)[0] for ok, value in zip(good, values, strict=True)))
 
 
 def _normalize(mass, damping, period, delay, stiffness, virtual_damping) -> tuple[Array, ...]:

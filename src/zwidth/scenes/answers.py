@@ -13,7 +13,7 @@ from zwidth.loops.linear.chain import Chain
 from zwidth.loops.linear.columns import stable_dampings
 from zwidth.loops.linear.delay_margin import linear_margins
 from zwidth.loops.linear.loop import LinearLoop
-from zwidth.loops.linear.margins import answer
+from zwidth.loops.linear.margins import open_loop_response
 from zwidth.loops.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
 from zwidth.loops.linear.pieces import Island
 from zwidth.loops.linear.poles import all_poles, log_size
@@ -76,7 +76,7 @@ def respond(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: Ar
     # Half the sampling rate is half a turn, whatever the rounding of the quotient.
     w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
     inside = (w > 0) & (w <= np.pi)
-    value = answer(loop, a, b, circle(np.where(inside, w, 1.0))).value
+    value = open_loop_response(loop, a, b, circle(np.where(inside, w, 1.0))).value
     return np.where(inside, value, complex(np.nan, np.nan))[()]
 
 

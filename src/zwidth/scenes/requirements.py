@@ -19,7 +19,14 @@ import numpy as np
 from zwidth.arrays.batching import elementwise
 from zwidth.arrays.roots import last_cell, newton
 from zwidth.arrays.xp import frozen, namespace
-from zwidth.loops.domain import LARGEST_DAMPING, LONGEST_DELAY, check_scalars, device_status, poison, within
+from zwidth.loops.domain import (
+    LARGEST_DAMPING,
+    LONGEST_DELAY,
+    check_scalars,
+    device_status,
+    nan_with_nan_slopes,
+    within,
+)
 from zwidth.loops.normalization import denormalize, normalize, quantity_status
 from zwidth.loops.rigid.delay_classes import ANY, classify_delays
 from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
@@ -185,7 +192,7 @@ def _kernel(*arguments: Any) -> Requirement:
     # Where more of it only helps and there is no zero, nothing at all is required.
     status = xp.where(found | rises, int(Status.OK), int(Status.UNREACHABLE))
     status = xp.where(usable == Status.OK, xp.where(inside, status, int(Status.OUT_OF_RANGE)), usable)
-    return Requirement(value + poison(status == Status.OK, *inputs), status.astype(np.int32))
+    return Requirement(value + nan_with_nan_slopes(status == Status.OK, *inputs), status.astype(np.int32))
 
 
 def _bracket(parameter: Property, given: _Request) -> tuple[Array, Array, Array]:

@@ -19,8 +19,8 @@ import numpy as np
 from zwidth.arrays.batching import traced_columns
 from zwidth.arrays.circle import circle
 from zwidth.arrays.xp import is_traced, namespace
-from zwidth.loops.domain import poison
-from zwidth.loops.linear.chain import Chain, chain_of, needed, respond
+from zwidth.loops.domain import nan_with_nan_slopes
+from zwidth.loops.linear.chain import Chain, chain_of, required_wall, respond
 from zwidth.loops.linear.ridge import Condition
 from zwidth.loops.rigid.exact_points import polish
 from zwidth.parts.paths import replace_parameters
@@ -110,7 +110,7 @@ def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
     scene = _fill(structure, values)
     alpha, beta, w1, w2, close = _solve(_chain(structure, scene), told[:4], told[4:6].astype(jnp.int32))
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
-    spoiled = poison(status == Status.OK, *values)
+    spoiled = nan_with_nan_slopes(status == Status.OK, *values)
     omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
     units = scene.units
     return StiffestWall(
@@ -190,7 +190,7 @@ def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
 
     def distance(w: Array) -> tuple[Array, Array]:
         """``r = alpha + beta F - q`` over the size of q, and F."""
-        q, f = needed(chain, w, args.parts), estimate.jet(circle(w)).value
+        q, f = required_wall(chain, w, args.parts), estimate.jet(circle(w)).value
         size = jax.lax.stop_gradient(jnp.abs(q))
         return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
 

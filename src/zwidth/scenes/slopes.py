@@ -139,7 +139,7 @@ def _needed_slopes(
     steps = (*flow(rate, push, 1.0), flow(rate, push, 1.0 - fraction)[1])
     (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))
     turns, slopes = chain.whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
-    exact, lag = scene.loop.needed(at).value, lag_jet(at, turns)
+    exact, lag = scene.loop.required_wall(at).value, lag_jet(at, turns)
     for k, (zeta, turn) in enumerate(zip(at.before, 1j * at.z, strict=True)):
         with np.errstate(all="ignore"):
             try:
@@ -161,7 +161,7 @@ def _residual(scene: Any, found: BoundRidge) -> tuple[np.ndarray, Jet]:
     """``dr/dw`` of ``r = alpha + beta F - q`` at both angles, and F."""
     at = circle(np.array([found.w1, found.w2]))
     with np.errstate(all="ignore"):
-        q, f = scene.loop.needed(at), scene.loop.estimate.jet(at)
+        q, f = scene.loop.required_wall(at), scene.loop.estimate.jet(at)
         return found.beta * f.slope - q.slope, f
 
 

@@ -10,7 +10,7 @@ from zwidth.arrays.batching import elementwise
 from zwidth.arrays.xp import is_traced, namespace
 from zwidth.loops.domain import check_scalars
 from zwidth.loops.normalization import Normalized, normalize, quantity_status
-from zwidth.loops.rigid.delay_classes import Kind, classify_delays
+from zwidth.loops.rigid.delay_classes import DelayClasses, classify_delays
 from zwidth.loops.rigid.polynomial import check_delay_model
 from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
 from zwidth.parts.span import accept_units
@@ -69,7 +69,7 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
     return elementwise(max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (classify_delays(device.d),))
 
 
-def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: Kind) -> Array:
+def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     return ridge_kernel(delta, d, "held", kind).alpha * (mass / period) / period
 
 
@@ -129,7 +129,14 @@ def sensitivities(
 
 
 def _sensitivities_kernel(
-    mass: Array, damping: Array, period: Array, delay: Array, delta: Array, d: Array, delay_model: str, kind: Kind
+    mass: Array,
+    damping: Array,
+    period: Array,
+    delay: Array,
+    delta: Array,
+    d: Array,
+    delay_model: str,
+    kind: DelayClasses,
 ) -> Sensitivities:
     xp = namespace(mass, delta, d)
     found = slopes_kernel(delta, d, delay_model, kind)

@@ -4,7 +4,15 @@ import jax
 import numpy as np
 import pytest
 
-from zwidth.loops.domain import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE, device_status, poison, void, wall_status
+from zwidth.loops.domain import (
+    LARGEST_DAMPING,
+    LONGEST_DELAY,
+    WALL_RANGE,
+    device_status,
+    nan_unless,
+    nan_with_nan_slopes,
+    wall_status,
+)
 from zwidth.words.status import Status
 
 
@@ -35,7 +43,9 @@ def test_ends_of_a_wall(place, sign):
         assert wall_status(wall[0], wall[1], np.float64(0.0), np.float64(0.0)) == status
 
 
-@pytest.mark.parametrize("mark", [lambda ok, x: void(ok, x)[0] ** 2, lambda ok, x: x * x + poison(ok, x)])
+@pytest.mark.parametrize(
+    "mark", [lambda ok, x: nan_unless(ok, x)[0] ** 2, lambda ok, x: x * x + nan_with_nan_slopes(ok, x)]
+)
 def test_a_bad_point_is_nan_with_its_derivatives_and_a_good_one_untouched(mark):
     for order in range(3):
         value = lambda x: mark(x < 2.0, x)  # noqa: E731

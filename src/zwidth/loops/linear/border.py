@@ -72,7 +72,7 @@ class Border:
         """The curve's limit at z = 1 or z = -1."""
         at = circle(np.array([w]))
         with np.errstate(all="ignore"):
-            q, f = self.boundary.loop.needed(at), self.boundary.loop.estimate.jet(at)
+            q, f = self.boundary.loop.required_wall(at), self.boundary.loop.estimate.jet(at)
             beta = q.slope[0].imag / f.slope[0].imag
             return float(q.value[0].real - beta * f.value[0].real), float(beta)
 

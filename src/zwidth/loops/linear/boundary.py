@@ -193,7 +193,7 @@ class Boundary:
         loop = self.loop
         depth = depths(loop.zeros)
         on = np.abs(depth) <= ON_CIRCLE
-        answer = loop.answer(circle(np.abs(np.angle(1.0 - loop.zeros[on]))))
+        answer = loop.response(circle(np.abs(np.angle(1.0 - loop.zeros[on]))))
         # Towards a zero on the circle: G(w) = -1/alpha, and |z| > 1 where Im w < 0.
         leaving = int(np.sum(side * answer.slope.imag < 0))
         return loop.lag + loop.poles.size - loop.zeros.size + int(np.sum(depth[~on] < 0)) + leaving
@@ -249,7 +249,7 @@ def _residual(loop: LinearLoop, fixed: list[float], beta: np.ndarray, w: np.ndar
     """``Im(q - beta F)`` over ``sin w prod(cos w - cos fixed)``, its derivative; and ``Re(q - beta F)``."""
     at = circle(w)
     with np.errstate(all="ignore"):
-        q, f = loop.needed(at), loop.estimate.jet(at)
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
         value, slope = q.value - beta * f.value, q.slope - beta * f.slope
         whole = np.where(w >= np.pi, 0.0, np.sin(w))
         turn = np.cos(w)

@@ -215,7 +215,7 @@ def sampled(chain: Chain) -> Sampled:
     return Sampled(psi, full, late)
 
 
-def needed(chain: Chain, w: Any, parts: Sampled | Plant | None = None) -> Any:
+def required_wall(chain: Chain, w: Any, parts: Sampled | Plant | None = None) -> Any:
     """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
     at: CirclePoints = circle(w)
     parts = respond(chain) if parts is None else parts

@@ -46,7 +46,7 @@ def interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
     if np.min(np.abs(at.before + loop.zeros), initial=1.0) < 1e-9:
         # q is infinite, not real.
         return None
-    q, f = loop.needed(at), loop.estimate.jet(at)
+    q, f = loop.required_wall(at), loop.estimate.jet(at)
     if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
         return None
     value, turn = float(q.value[0].real), float(q.slope[0].imag)
@@ -66,7 +66,7 @@ def end_lines(loop: LinearLoop) -> list[CrossingLine]:
     for w in (0.0, np.pi):
         at = circle(np.array([w]))
         with np.errstate(all="ignore"):
-            q, f = loop.needed(at), loop.estimate.jet(at)
+            q, f = loop.required_wall(at), loop.estimate.jet(at)
         numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
         infinite = np.any(np.abs(loop.zeros - (2.0 if w else 0.0)) <= ON_CIRCLE)
         if np.all(np.isfinite(numbers)) and not infinite:

@@ -38,7 +38,7 @@ def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
     """The boundary curve at angles in (0, pi)."""
     at = circle(w)
     with np.errstate(all="ignore"):
-        q, f = loop.needed(at), loop.estimate.jet(at)
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
         beta = q.value.imag / f.value.imag
         alpha = q.value.real - beta * f.value.real
         turn = q.slope.imag * f.value.imag - q.value.imag * f.slope.imag

@@ -29,12 +29,12 @@ class LinearLoop:
     poles: Array
     estimate: Estimate
 
-    def needed(self, at: CirclePoints) -> Jet:
+    def required_wall(self, at: CirclePoints) -> Jet:
         """``q = -1/G``: what the wall must answer to put a pole at z."""
         over = product_jet(at, self.poles, -1.0).over(product_jet(at, self.zeros, self.gain))
         return over.times(lag_jet(at, self.lag))
 
-    def answer(self, at: CirclePoints) -> Jet:
+    def response(self, at: CirclePoints) -> Jet:
         """G: the sampled position that the wall's force leads to."""
         over = product_jet(at, self.zeros, self.gain).over(product_jet(at, self.poles, 1.0))
         return over.times(lag_jet(at, -self.lag))

@@ -35,7 +35,7 @@ class OpenLoop(NamedTuple):
     L: Jet
 
     @classmethod
-    def lay_out(cls, loop: LinearLoop, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
+    def fold_arguments(cls, loop: LinearLoop, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
         """Refine the nodes of a loop for a wall."""
         w = np.append(nodes[nodes < np.pi], np.pi)
         for _ in range(_HALVINGS):
@@ -47,11 +47,11 @@ class OpenLoop(NamedTuple):
             if not wide.any():
                 break
             w = np.sort(np.concatenate([w, w[:-1][wide] + 0.5 * step[wide]]))
-        return cls(loop, alpha, beta, w, answer(loop, alpha, beta, circle(w)))
+        return cls(loop, alpha, beta, w, open_loop_response(loop, alpha, beta, circle(w)))
 
     def at(self, w: np.ndarray) -> Jet:
         """L and its derivative."""
-        return answer(self.loop, self.alpha, self.beta, circle(w))
+        return open_loop_response(self.loop, self.alpha, self.beta, circle(w))
 
     def at_rest(self) -> float | None:
         """``L(1)`` where it is finite and not 0."""
@@ -123,11 +123,11 @@ class OpenLoop(NamedTuple):
         return float(distances[best]), float(places[best])
 
 
-def answer(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet:
+def open_loop_response(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet:
     """L and its derivative in w."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(at)
-        found = Jet(alpha + beta * f.value, beta * f.slope).times(loop.answer(at))
+        found = Jet(alpha + beta * f.value, beta * f.slope).times(loop.response(at))
         # At pi it is real.
         real = at.w >= np.pi
         return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)

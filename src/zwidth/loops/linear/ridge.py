@@ -164,7 +164,7 @@ def _polish(loop: LinearLoop, start: BoundRidge) -> BoundRidge | None:
     best, worst = x, np.inf
     for _ in range(_MOST_STEPS):
         at = circle(x[2:])
-        q, f = loop.needed(at), loop.estimate.jet(at)
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
         rest, slope = x[0] + x[1] * f.value - q.value, x[1] * f.slope - q.slope
         size = np.abs(q.value) + np.abs(x[1] * f.value) + 1e-300
         error = float(np.max(np.abs(np.where(moves, rest, rest.real)) / size))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.xp import epsilon, namespace, repeat
-from zwidth.loops.domain import poison, valid_wall
+from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.degrees import Degree
 from zwidth.loops.rigid.polynomial import choose_plant
 from zwidth.words.types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirst
@@ -197,7 +197,7 @@ def replace_invalid(
     ok = valid_wall(alpha, beta, delta, d)
     alpha_in, beta_in, delta_in = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     inside = (alpha_in, beta_in, delta_in, xp.where(ok, d, float(degree.whole)))
-    return inside, poison(ok, alpha, beta, delta, d)
+    return inside, nan_with_nan_slopes(ok, alpha, beta, delta, d)
 
 
 def with_zero(poles: Array, spring: bool) -> Array:

@@ -6,9 +6,9 @@ import numpy as np
 
 from zwidth.arrays.batching import elementwise
 from zwidth.arrays.xp import along, frozen, namespace
-from zwidth.loops.domain import check_scalars, poison, valid_device
+from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device
 from zwidth.loops.rigid.curve import lobe, spread, wall
-from zwidth.loops.rigid.delay_classes import Kind, classify_delays
+from zwidth.loops.rigid.delay_classes import DelayClasses, classify_delays
 from zwidth.words.types import Array, ArrayLike
 
 # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic.
@@ -49,7 +49,7 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
     return elementwise(_area_kernel, ("delta", "d"), (delta, d), (kind,), few=_FEW, block=_BLOCK)
 
 
-def _area_kernel(delta: Array, d: Array, kind: Kind) -> Array:
+def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = lobe(delta, d, "held", kind)
     end = frozen(curve.end, xp)
@@ -58,4 +58,4 @@ def _area_kernel(delta: Array, d: Array, kind: Kind) -> Array:
     under_lobe = xp.sum(at.alpha * at.d_b * weight, axis=-1) * end
     # From a corner back to alpha = 0 along alpha + 2 beta = const.
     last = xp.where(curve.to_corner, wall(end, curve).alpha, 0.0)
-    return under_lobe + 0.25 * last * last + poison(valid_device(delta, d), delta, d)
+    return under_lobe + 0.25 * last * last + nan_with_nan_slopes(valid_device(delta, d), delta, d)

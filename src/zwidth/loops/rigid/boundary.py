@@ -9,7 +9,7 @@ import numpy as np
 
 from zwidth.arrays.batching import elementwise, pointwise
 from zwidth.arrays.xp import frozen, namespace, repeat
-from zwidth.loops.domain import check_scalars, poison, valid_device, wall_status
+from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device, wall_status
 from zwidth.loops.rigid.curve import Lobe, LobePoint, column_end, creeps, frequency, lobe, on_line, peak, row_end, wall
 from zwidth.loops.rigid.delay_classes import classify_delays
 from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
@@ -66,7 +66,7 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
 def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> Wall:
     xp = namespace(omega, delta, d)
     ok = valid_device(delta, d) & (omega >= 0) & (omega <= np.pi)
-    spoiled = poison(ok, omega, delta, d)
+    spoiled = nan_with_nan_slopes(ok, omega, delta, d)
     omega, delta, d = (xp.where(ok, value, 1.0) for value in (omega, delta, d))
     curve = frequency_boundary(omega, frequency_loop(delta, d, delay_model), delay_model)
     return Wall(curve.alpha + spoiled, curve.beta + spoiled)
@@ -182,7 +182,7 @@ def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model:
         status = xp.where(exists & undecided, int(Status.UNDECIDED), status)
     status = xp.where(given == int(Status.OK), status, given)
     # NaN, derivatives included, where there is no point.
-    spoiled = poison(status == int(Status.OK), delta, d, number)
+    spoiled = nan_with_nan_slopes(status == int(Status.OK), delta, d, number)
     return BoundaryPoint(alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(np.int32))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from zwidth.arrays.batching import BLOCK, compile_strips, compute_concretely, map_blocks
 from zwidth.loops.domain import WALL_RANGE, within
 from zwidth.loops.rigid.delay_classes import device
-from zwidth.loops.rigid.folding import Points, assemble, split
+from zwidth.loops.rigid.folding import Points, assemble_groups, group_by
 from zwidth.loops.rigid.row_limit import long_device, long_row, short_row
 from zwidth.words.types import Array
 
@@ -71,7 +71,7 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0)
         limits = map_blocks(compile_strips(kernel), [array.reshape(-1) for array in whole], BLOCK)
         return limits.reshape(whole[0].shape)
 
-    return assemble(split((beta, delta, d), d >= 1), shape, np.float64, of)
+    return assemble_groups(group_by((beta, delta, d), d >= 1), shape, np.float64, of)
 
 
 def _short_limit(beta: Array, delta: Array, d: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid import balls
 from zwidth.loops.rigid.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
-from zwidth.loops.rigid.folding import Points, lay_out
+from zwidth.loops.rigid.folding import Points, fold_arguments
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
@@ -68,7 +68,7 @@ def certified_stable(
     """
     if max_bits < 64:
         raise InputError(f"max_bits: got {max_bits}, 64 or more is needed")
-    laid = lay_out((alpha, beta, delta, d))
+    laid = fold_arguments((alpha, beta, delta, d))
     points, shape = laid.points, laid.points.shape
     code = filter_walls(points)
     stable, status, bits = np.asarray(code == STABLE), np.zeros(shape, np.int32), np.zeros(shape, np.int32)

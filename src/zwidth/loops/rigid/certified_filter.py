@@ -27,7 +27,7 @@ from zwidth.arrays.xp import horner, namespace
 from zwidth.loops.domain import WALL_RANGE, wall_status
 from zwidth.loops.rigid.boundary_map import row_limits
 from zwidth.loops.rigid.crossover import Lag, first_zero, long_verdict, short_verdict
-from zwidth.loops.rigid.delay_classes import DeviceTerms, Kind, classify_delays, device
+from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, classify_delays, device
 from zwidth.loops.rigid.enclosure import TINY, UNIT, Ball
 from zwidth.loops.rigid.folding import Points, pick_points
 from zwidth.words.status import Status
@@ -73,7 +73,7 @@ def functions(x: Array) -> Any:
     return phi_functions(x, exp)
 
 
-def enclosed_device(delta: Array, d: Array, kind: Kind) -> DeviceTerms:
+def enclosed_device(delta: Array, d: Array, kind: DelayClasses) -> DeviceTerms:
     """The device of exact delta and d in balls, NaN where they are out of range."""
     here = device(delta, d, kind, functions)
     if kind.fractional and kind.long:
@@ -133,7 +133,7 @@ def take_lag(u: Ball, whole: Array) -> Lag:
     )
 
 
-def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) -> Array:
+def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     """The codes of walls, elementwise."""
     xp = namespace(alpha, beta, delta)
     here = enclosed_device(delta, d, kind)

@@ -22,7 +22,7 @@ import numpy as np
 
 from zwidth.arrays.xla import angle, find_turn
 from zwidth.arrays.xp import epsilon, namespace
-from zwidth.loops.domain import valid_wall, void
+from zwidth.loops.domain import nan_unless, valid_wall
 from zwidth.loops.rigid.plant import held_plant, split_delay, undelayed_plant
 from zwidth.words.types import Array
 
@@ -58,7 +58,7 @@ def factor_loop(alpha: Array, beta: Array, delta: Array, d: Array, fractional: b
     else:
         plant = undelayed_plant(delta)
         h, q = plant.a1, 0.0 * plant.a1
-    alpha, beta, s = void(ok, alpha, beta, alpha + beta)
+    alpha, beta, s = nan_unless(ok, alpha, beta, alpha + beta)
     return Loop(alpha, beta, s, whole + 1.0, d + 1.0, plant.c, plant.em, plant.a2, h, q)
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from zwidth.arrays.xla import ARCSINE, COSINE, SINE
 from zwidth.arrays.xp import horner, namespace, roots
 from zwidth.loops.domain import WALL_RANGE, within
-from zwidth.loops.rigid.delay_classes import ANY, DeviceTerms, Kind, device
+from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, DeviceTerms, device
 from zwidth.loops.rigid.row_limit import long_curve, short_curve
 from zwidth.words.types import Array
 
@@ -191,13 +191,13 @@ def gain_crossover(alpha: Array, beta: Array, here: DeviceTerms) -> Crossover:
     return Crossover(xp.where(far, 2.0 - near, near), xp.where(far, near, 2.0 - near), exists)
 
 
-def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind = ANY) -> Array:
+def stable_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
     """Whether each wall is stable, elementwise; False for what is NaN."""
     here = device(delta, d, kind)
     return stable_at(alpha, beta, here, kind)
 
 
-def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: Kind) -> Array:
+def stable_at(alpha: Array, beta: Array, here: DeviceTerms, kind: DelayClasses) -> Array:
     """The same on a discretized device."""
     plain = here._replace(a0=None)
     if not kind.fractional:

@@ -18,7 +18,7 @@ import numpy as np
 from zwidth.arrays.batching import tree_map
 from zwidth.arrays.roots import bisect
 from zwidth.arrays.xp import frozen, horner, namespace, repeat
-from zwidth.loops.rigid.delay_classes import DeviceTerms, Kind, device
+from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, device
 from zwidth.loops.rigid.plant import Plant
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
@@ -70,14 +70,14 @@ class Peak(NamedTuple):
     alpha: Array
 
 
-def describe_device(delta: Array, d: Array, delay_model: str, kind: Kind) -> DeviceTerms:
+def describe_device(delta: Array, d: Array, delay_model: str, kind: DelayClasses) -> DeviceTerms:
     """The device whose curve is meant. A fractional power is the formula of whole delays at any other number."""
     if delay_model == "held":
         return device(delta, d, kind)
-    return device(delta, 0.0 * d, Kind(True, False, False))._replace(whole=d)
+    return device(delta, 0.0 * d, DelayClasses(True, False, False))._replace(whole=d)
 
 
-def creeps(delay_model: str, kind: Kind) -> bool:
+def creeps(delay_model: str, kind: DelayClasses) -> bool:
     """Whether there may be a fractional power of less than one, whose lobe ends within any distance of pi.
 
     No fit holds for it: it is solved by halving.
@@ -85,8 +85,8 @@ def creeps(delay_model: str, kind: Kind) -> bool:
     return delay_model == "fractional_power" and kind.short and kind.fractional
 
 
-def lobe(delta: Array, d: Array, delay_model: str, kind: Kind) -> Lobe:
-    """The lobe of a device, or of arrays of one shape, from the delays that `Kind` says may occur."""
+def lobe(delta: Array, d: Array, delay_model: str, kind: DelayClasses) -> Lobe:
+    """The lobe of a device, or of arrays of one shape, from the delays that `DelayClasses` says may occur."""
     xp = namespace(delta, d)
     here = describe_device(delta, d, delay_model, kind)
     creeping = creeps(delay_model, kind)
@@ -184,7 +184,7 @@ class RowEnd(NamedTuple):
     alpha: Array  # the stiffest stable one, for held delays what `zwidth.is_stable` compares with
 
 
-def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: Kind) -> RowEnd:
+def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: DelayClasses) -> RowEnd:
     """The end of a row: the one zero of ``b - beta - delta``."""
     xp = namespace(beta, lobe.d)
     b = beta + lobe.here.delta
@@ -209,7 +209,7 @@ def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: Kind) -> RowEnd:
     return RowEnd(x, meets, beyond, xp.where(beyond, on_line(lobe) - 2.0 * beta, wall(x, lobe).alpha))
 
 
-def peak(lobe: Lobe, delay_model: str, kind: Kind) -> Peak:
+def peak(lobe: Lobe, delay_model: str, kind: DelayClasses) -> Peak:
     """The largest alpha of the lobe: the ridge, which may be the corner."""
     here = lobe.here
     plant = Plant(here.c, here.em, here.a2, here.a1, here.a0, here.gap)

@@ -10,7 +10,7 @@ from zwidth.loops.domain import check_scalars
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.outermost_poles import OutermostPoles, outermost_poles, usable
-from zwidth.loops.rigid.pole_search import traced_kernel, window
+from zwidth.loops.rigid.pole_search import certification_width, traced_kernel
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 
@@ -70,7 +70,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
 
 def rates(found: OutermostPoles, columns: list[np.ndarray]) -> np.ndarray:
     """The rates of decay of outermost poles; NaN where their relative errors are not proved to be small."""
-    rate, allowed, beyond = 0.0 - found.re, _LARGEST_ERROR * np.abs(found.re), window(found.re, _ACCURACY)
+    rate, allowed, beyond = 0.0 - found.re, _LARGEST_ERROR * np.abs(found.re), certification_width(found.re, _ACCURACY)
     # Other poles may be larger by what the count allows.
     error = np.minimum(found.error, found.doubt + beyond)
     # Without stiffness and damping both poles next to 1 are at 1.

@@ -9,13 +9,13 @@ import numpy as np
 from zwidth.arrays import phi
 from zwidth.arrays.batching import as_float64
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import valid_device, void
+from zwidth.loops.domain import nan_unless, valid_device
 from zwidth.loops.rigid.plant import Functions, discretize, split_delay
 from zwidth.loops.rigid.polynomial import tilt_at_minus_one
 from zwidth.words.types import Array
 
 
-class Kind(NamedTuple):
+class DelayClasses(NamedTuple):
     """Which delays occur among the points of a kernel; what does not occur costs nothing."""
 
     short: bool  # below one period
@@ -23,18 +23,18 @@ class Kind(NamedTuple):
     fractional: bool
 
 
-ANY = Kind(True, True, True)
+ANY = DelayClasses(True, True, True)
 
 
-def classify_delays(d: Any) -> Kind:
-    """The `Kind` of an array of delays, `ANY` where they are traced; what is no delay counts as short."""
+def classify_delays(d: Any) -> DelayClasses:
+    """The `DelayClasses` of an array of delays, `ANY` where they are traced; what is no delay counts as short."""
     if isinstance(d, float | int):
-        return Kind(not d >= 1, d >= 1, d % 1.0 != 0)
+        return DelayClasses(not d >= 1, d >= 1, d % 1.0 != 0)
     if is_traced(d):
         return ANY
     d = as_float64("d", d)
     long = d >= 1
-    return Kind(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
+    return DelayClasses(not (long.size and np.all(long)), bool(np.any(long)), bool(np.any(np.floor(d) != d)))
 
 
 class DeviceTerms(NamedTuple):
@@ -57,9 +57,9 @@ class DeviceTerms(NamedTuple):
     tilt: Array  # P(-1) has the stable sign where tilt (alpha + 2 beta) < 1
 
 
-def device(delta: Array, d: Array, kind: Kind = ANY, functions: Functions = phi.phi_functions) -> DeviceTerms:
+def device(delta: Array, d: Array, kind: DelayClasses = ANY, functions: Functions = phi.phi_functions) -> DeviceTerms:
     """The `DeviceTerms` of one (delta, d), or of arrays of one shape."""
-    delta, d = void(valid_device(delta, d), delta, d)
+    delta, d = nan_unless(valid_device(delta, d), delta, d)
     whole, f = split_delay(d)
     at = functions(delta)
     late = functions(delta * (1.0 - f)) if kind.fractional and kind.short else at

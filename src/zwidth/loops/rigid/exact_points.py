@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import optimistix
 
 from zwidth.arrays.xla import store_once
-from zwidth.loops.domain import device_status, poison, wall_status
+from zwidth.loops.domain import device_status, nan_with_nan_slopes, wall_status
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge_newton import corner, expand_curve
@@ -155,7 +155,7 @@ def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
     omega, smooth = _solve("ridge", start, d, loop, delay_model)
     # Rounding can keep Newton from its last tolerance; what counts is that it stayed where the bracket put it.
     converged = summit.is_ridge | (bracketed & (jnp.abs(omega - start) <= 1e-5 * end))
-    spoiled = poison(ok & converged, *inputs)
+    spoiled = nan_with_nan_slopes(ok & converged, *inputs)
     status = jnp.where(ok & ~converged, int(Status.NOT_CONVERGED), status)
     return (
         jnp.where(summit.is_ridge, summit.alpha, smooth.alpha) + spoiled,
@@ -214,6 +214,6 @@ def point_kernel(
         exists = exists & (number > 0) & (number < ridge.alpha)
     status = jnp.where(exists, jnp.where(converged, int(Status.OK), int(Status.NOT_CONVERGED)), int(Status.NO_BOUNDARY))
     status = jnp.where(ok, status, given)
-    spoiled = poison(status == Status.OK, *inputs)
+    spoiled = nan_with_nan_slopes(status == Status.OK, *inputs)
     alpha, beta = (found, number) if is_row else (number, found)
     return alpha + spoiled, beta + spoiled, omega + spoiled, status.astype(jnp.int32)

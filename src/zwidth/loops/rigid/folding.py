@@ -50,7 +50,7 @@ class Points(NamedTuple):
         return self.size >= _WORTH_OWN_SHAPE and shape[-1] >= 32 and 4 * sum(a.size for a in self) <= self.size
 
 
-class Laid(NamedTuple):
+class FoldedArguments(NamedTuple):
     """Folded arguments and the shape the caller's arguments broadcast to."""
 
     points: Points
@@ -61,14 +61,14 @@ class Laid(NamedTuple):
         return values if values.shape == self.shape else np.broadcast_to(values, self.shape)
 
 
-def lay_out(values: tuple[Any, Any, Any, Any]) -> Laid:
+def fold_arguments(values: tuple[Any, Any, Any, Any]) -> FoldedArguments:
     """Convert concrete arguments, check that they broadcast, and fold what repeats."""
     arrays = [as_float64(name, value) for name, value in zip(NAMES, values, strict=True)]
     shape = join_shapes(zip(NAMES, (array.shape for array in arrays), strict=True))
     ranked = [array.reshape((1,) * (len(shape) - array.ndim) + array.shape) for array in arrays]
     points = Points(*map(fold, ranked))
-    # An axis along which nothing varies has nothing to compute; `Laid.spread` restores it.
-    return Laid(points, shape)
+    # An axis along which nothing varies has nothing to compute; `FoldedArguments.spread` restores it.
+    return FoldedArguments(points, shape)
 
 
 def fold(array: np.ndarray) -> np.ndarray:
@@ -95,7 +95,7 @@ def pick_points(points: Points, mask: np.ndarray) -> Points:
     return Points(*(a.reshape(1) if a.size == 1 and shape else np.broadcast_to(a, shape)[mask] for a in points))
 
 
-class Part(NamedTuple):
+class Group(NamedTuple):
     """The arguments of all points with one value of a key, and the places of their results in the whole array."""
 
     value: Any
@@ -103,7 +103,7 @@ class Part(NamedTuple):
     place: tuple[Any, ...]
 
 
-def split(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> list[Part]:
+def group_by(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> list[Group]:
     """Group arguments by the values of a key that broadcasts with them.
 
     Where the key varies along one axis the parts keep their layout; where it varies along several, the points are
@@ -112,7 +112,7 @@ def split(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> list[Part]:
     key = fold(key)
     values = np.unique(key)
     if values.size <= 1:
-        return [Part(values[0] if values.size else 0, arrays, (...,))]
+        return [Group(values[0] if values.size else 0, arrays, (...,))]
     varying = [axis for axis, length in enumerate(key.shape) if length > 1]
     parts = []
     if len(varying) == 1:
@@ -120,16 +120,18 @@ def split(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> list[Part]:
         for value in values:
             index = np.flatnonzero(along == value)
             taken = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
-            parts.append(Part(value, taken, ((slice(None),) * axis + (index,))))
+            parts.append(Group(value, taken, ((slice(None),) * axis + (index,))))
         return parts
     everywhere = np.broadcast_arrays(key, *arrays)
     for value in values:
         mine = everywhere[0] == value
-        parts.append(Part(value, tuple(array[mine] for array in everywhere[1:]), (mine,)))
+        parts.append(Group(value, tuple(array[mine] for array in everywhere[1:]), (mine,)))
     return parts
 
 
-def assemble(parts: list[Part], shape: tuple[int, ...], dtype: Any, work: Callable[..., np.ndarray]) -> np.ndarray:
+def assemble_groups(
+    parts: list[Group], shape: tuple[int, ...], dtype: Any, work: Callable[..., np.ndarray]
+) -> np.ndarray:
     """Put the results of ``work(value, *arrays)`` where they belong."""
     if len(parts) == 1:
         return work(parts[0].value, *parts[0].arrays)

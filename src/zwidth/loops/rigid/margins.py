@@ -13,7 +13,7 @@ import numpy as np
 from zwidth.arrays.batching import elementwise
 from zwidth.arrays.roots import false_position, follow_root
 from zwidth.arrays.xp import along, epsilon, frozen, namespace
-from zwidth.loops.domain import check_scalars, poison, valid_wall
+from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.crossover import gain_crossover, stable_at
 from zwidth.loops.rigid.delay_classes import ANY, DeviceTerms, device
 from zwidth.loops.rigid.modulus import modulus
@@ -98,7 +98,7 @@ def margins_kernel(
     """`margins` of arrays of one shape; the two margins that take a search may be left out, as NaN."""
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d) & (alpha > 0)
-    spoiled = poison(ok, alpha, beta, delta, d)
+    spoiled = nan_with_nan_slopes(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
     here = device(delta, d)

@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth.arrays.batching import elementwise
 from zwidth.arrays.xp import along, frozen, namespace, repeat
-from zwidth.loops.domain import check_scalars, poison, valid_wall
+from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.crossover import gain_crossover
 from zwidth.loops.rigid.delay_classes import DeviceTerms, device
 from zwidth.loops.rigid.open_loop import find_angle, size_and_phase
@@ -61,7 +61,7 @@ def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     inputs = (alpha, beta, delta, d)
     xp = namespace(*inputs)
     alpha, beta, delta, d = (xp.where(ok, value, 1.0) for value in inputs)
-    return modulus(alpha, beta, device(delta, d))[0] + poison(ok, *inputs)
+    return modulus(alpha, beta, device(delta, d))[0] + nan_with_nan_slopes(ok, *inputs)
 
 
 def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:

@@ -32,7 +32,7 @@ import numpy as np
 from zwidth.arrays.roots import newton
 from zwidth.arrays.xla import ARCSINE, COSINE, SINE
 from zwidth.arrays.xp import epsilon, frozen, horner, namespace
-from zwidth.loops.rigid.delay_classes import ANY, Kind
+from zwidth.loops.rigid.delay_classes import ANY, DelayClasses
 from zwidth.loops.rigid.plant import split_delay
 from zwidth.words.types import Array
 
@@ -80,7 +80,7 @@ def larger_root(linear: Array, square: Array, xp: Any) -> tuple[Array, Array]:
     return xp.where(linear > 0, 0.5 * (root + linear), 0.5 * square / xp.where(other > 0, other, 1.0)), root
 
 
-def _rise(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> tuple[Array, Array, Array]:
+def _rise(a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> tuple[Array, Array, Array]:
     """At w = 0: what is needed, E, and the derivative of E in beta."""
     f, k, kappa = delay
     xp = namespace(a, f)
@@ -97,7 +97,7 @@ def _rise(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> tuple[Array,
     return needed, rise, by_beta
 
 
-def turns(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> Turns:
+def turns(a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> Turns:
     """What the wall ``(2 a, beta)`` needs at w = 0 and at w = pi, and where it needs more in between."""
     f, k, _ = delay
     xp = namespace(a, f)
@@ -107,7 +107,7 @@ def turns(a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> Turns:
     return Turns(at_zero, xp.where(beta > 0, rise, -1.0), b * (1.0 - f), (k == 1) & (end >= 0))
 
 
-def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: Kind = ANY) -> PeakCondition:
+def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> PeakCondition:
     """The condition at ``u = 1 - cos w`` in (0, 2], for n >= 1 in (0, 1]."""
     f, k, kappa = delay
     xp = namespace(u, a)
@@ -161,7 +161,7 @@ def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
     return (cosine - sine) * (cosine + sine), 2.0 * sine * cosine
 
 
-def peak(a: Array, beta: Array, delay: Delay, rise: Array, kind: Kind = ANY) -> Array:
+def peak(a: Array, beta: Array, delay: Delay, rise: Array, kind: DelayClasses = ANY) -> Array:
     """u of the one peak between w = 0 and pi, where it exists; ``rise`` is E at u = 0.
 
     The start, from ``(1 - x cot x)/x^2 = 2 sum 1/(i^2 pi^2 - x^2)``, is within a few per cent. An error of u enters
@@ -193,7 +193,7 @@ def peak(a: Array, beta: Array, delay: Delay, rise: Array, kind: Kind = ANY) -> 
     return u
 
 
-def needed_damping(alpha: Array, beta: Array, d: Array, kind: Kind = ANY) -> Array:
+def needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY) -> Array:
     """The supremum over frequency of the damping needed, for alpha >= 0, elementwise, with its derivatives."""
     xp = namespace(alpha, beta, d)
     if not (kind.long or kind.fractional):
@@ -234,7 +234,7 @@ def directions(d: Array) -> Directions:
     f, k, _ = delay
     half, zero = 0.5 + 0.0 * d, 0.0 * d
     # E at w = 0 grows with beta. Without the pull of a fraction it vanishes at the first guess.
-    _, short, by_beta = _rise(half, zero, delay, Kind(True, True, False))
+    _, short, by_beta = _rise(half, zero, delay, DelayClasses(True, True, False))
     highest = -short / by_beta
     first, _ = newton(lambda beta: _rise(half, beta, delay)[1:], zero, highest, highest, _DIRECTION_STEPS)
     # (2 - 9 f) t^2 + (1 - 6 f) t = f

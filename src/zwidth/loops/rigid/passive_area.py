@@ -19,7 +19,7 @@ import numpy as np
 
 from zwidth.arrays.batching import elementwise
 from zwidth.arrays.xp import along, frozen, namespace
-from zwidth.loops.domain import check_scalars, poison, valid_device
+from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device
 from zwidth.loops.rigid.needed_damping import directions, needed_damping
 from zwidth.words.types import Array, ArrayLike
 
@@ -93,7 +93,7 @@ def _passive_area_kernel(delta: Array, d: Array) -> Array:
 
     edges = (-end, first, last, end)
     parts = [_integral(needed, edges[i], edges[i + 1], nodes) for i, nodes in enumerate(_NODES)]
-    return 0.5 * delta * delta * unit * (parts[0] + parts[1] + parts[2]) + poison(ok, delta, d)
+    return 0.5 * delta * delta * unit * (parts[0] + parts[1] + parts[2]) + nan_with_nan_slopes(ok, delta, d)
 
 
 def _integral(needed: Callable[[Array], Array], low: Array, high: Array, nodes: int) -> Array:

@@ -22,10 +22,10 @@ import numpy as np
 
 from zwidth.arrays.batching import FEW, as_float64, elementwise, map_blocks, to_caller
 from zwidth.arrays.xp import horner, is_traced, namespace
-from zwidth.loops.domain import LONGEST_DELAY, check_scalars, poison, valid_wall
+from zwidth.loops.domain import LONGEST_DELAY, check_scalars, nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.degrees import NAMES
-from zwidth.loops.rigid.delay_classes import ANY, Kind, classify_delays
-from zwidth.loops.rigid.folding import lay_out, split
+from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
+from zwidth.loops.rigid.folding import fold_arguments, group_by
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array, ArrayLike
@@ -35,15 +35,15 @@ _TERMS = 30
 _MAP_BLOCK = 1 << 15
 # Each narrows the bracket of a direction eightfold.
 _ROUNDS = 17
-_NO_DELAY = Kind(True, False, False)
+_NO_DELAY = DelayClasses(True, False, False)
 
 
-def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: Kind) -> Array:
+def _margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(alpha, beta, delta, d)
     ok = valid_wall(alpha, beta, delta, d)
     stiff, damper, delay = xp.where(ok, xp.maximum(alpha, 0.0), 0.0), xp.where(ok, beta, 0.0), xp.where(ok, d, 0.0)
     margin = delta - needed_damping(stiff, damper, delay, kind)
-    return _limit_margin(margin, alpha) + poison(ok, alpha, beta, delta, d)
+    return _limit_margin(margin, alpha) + nan_with_nan_slopes(ok, alpha, beta, delta, d)
 
 
 def _limit_margin(margin: Array, alpha: Array) -> Array:
@@ -127,12 +127,12 @@ def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, 
 
 def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
     """`passivity_margin` of many walls that share few delays; None where they do not."""
-    laid = lay_out(values)
+    laid = fold_arguments(values)
     alpha, beta, delta, d = laid.points
     if laid.points.size <= FEW or np.unique(d).size * FEW > laid.points.size:
         return None
     out = np.full(laid.points.shape, np.nan)
-    for delay, arrays, place in split((alpha, beta, delta), d):
+    for delay, arrays, place in group_by((alpha, beta, delta), d):
         if not 0 <= delay <= LONGEST_DELAY:
             continue
         columns = np.broadcast_arrays(*arrays)

@@ -13,7 +13,7 @@ import numpy as np
 
 from zwidth.arrays.xla import angle
 from zwidth.arrays.xp import epsilon, frozen, namespace, repeat
-from zwidth.loops.domain import poison, valid_wall, void
+from zwidth.loops.domain import nan_unless, nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.circle import Loop, count, factor_loop
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
 from zwidth.words.types import Array
@@ -102,7 +102,7 @@ def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     return repeat(_LARGER, lambda at: halley_step(*at, loop, fractional), state, xp)
 
 
-def window(re: Array, tolerance: Any) -> Array:
+def certification_width(re: Array, tolerance: Any) -> Array:
     """How far outside of a pole the count finds no other: as near as its rounding allows, for rates of decay."""
     xp = namespace(re)
     return xp.minimum(tolerance, xp.maximum(_COUNTED * epsilon(re), _RELATIVE * xp.abs(re)))
@@ -115,7 +115,7 @@ def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional:
     at_one = (loop.alpha == 0) & ~(re > tolerance)
     step = newton_step(re, im, loop, fractional)
     re, im = (xp.where(at_one, 0.0, part) for part in move_pole(re, im, step.re, step.im))
-    seen = count(re + window(re, tolerance), loop, fractional, single)
+    seen = count(re + certification_width(re, tolerance), loop, fractional, single)
     proved = (at_one | (_AFTER * step.within <= tolerance)) & seen.full & seen.sure
     return Found(re, im, proved, xp.where(at_one, 0.0, step.doubt))
 
@@ -173,7 +173,9 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
         step = newton_step(re, im, loop, fractional)
         re, im = re + step.re, im + step.im
     known = simple | has_bound(start, eps**0.25, still, fractional)
-    (change,) = void(simple, re - start)
+    (change,) = nan_unless(simple, re - start)
     value = frozen(xp.where(simple, re, start), xp)
     value = xp.where(simple, value + (change - frozen(change, xp)), value + 0.0 * change)
-    return xp.where(known, value, np.nan) + poison(valid_wall(alpha, beta, delta, d), alpha, beta, delta, d)
+    return xp.where(known, value, np.nan) + nan_with_nan_slopes(
+        valid_wall(alpha, beta, delta, d), alpha, beta, delta, d
+    )

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.xp import horner, namespace
-from zwidth.loops.domain import check_scalars, poison, valid_wall
+from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.degrees import Degree, few_poles, map_by_degree
 from zwidth.loops.rigid.plant import Plant, held_plant, split_delay, undelayed_plant
 from zwidth.words.errors import InputError, check_choice
@@ -235,7 +235,7 @@ def char_poly(
 
 def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
     ok = valid_wall(alpha, beta, delta, d)
-    spoiled = poison(ok, alpha, beta, delta, d)[..., None]
+    spoiled = nan_with_nan_slopes(ok, alpha, beta, delta, d)[..., None]
     xp = namespace(alpha, beta, delta, d)
     alpha, beta, delta = (xp.where(ok, value, 0.0) for value in (alpha, beta, delta))
     return coefficients(alpha, beta, delta, xp.where(ok, d, float(degree.whole)), degree) + spoiled

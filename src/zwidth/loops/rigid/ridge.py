@@ -8,8 +8,8 @@ import numpy as np
 
 from zwidth.arrays.batching import elementwise, pointwise
 from zwidth.arrays.xp import epsilon, namespace
-from zwidth.loops.domain import check_scalars, device_status, void
-from zwidth.loops.rigid.delay_classes import ANY, Kind, classify_delays
+from zwidth.loops.domain import check_scalars, device_status, nan_unless
+from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
 from zwidth.loops.rigid.plant import Plant, split_delay, undelayed_plant
 from zwidth.loops.rigid.polynomial import check_delay_model
 from zwidth.loops.rigid.ridge_newton import Ridge, guess_start, is_undelayed
@@ -87,7 +87,7 @@ def alpha_max(
     return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)
 
 
-def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgePoint:
+def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgePoint:
     """`alpha_max`, elementwise."""
     return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
 
@@ -100,7 +100,7 @@ class RidgeSlopes(NamedTuple):
     by_d: Array
 
 
-def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) -> RidgeSlopes:
+def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgeSlopes:
     """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
     ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
     by_delta, by_f = plant_slopes(delta, f)
@@ -108,7 +108,7 @@ def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: Kind = ANY) ->
     fractional = delay_model == "fractional_power"
     by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
     by_delta = alpha_change(ridge.s, plant, lag, by_delta, undelayed)
-    by_delta, by_d = void(converged(ridge), by_delta, by_d)
+    by_delta, by_d = nan_unless(converged(ridge), by_delta, by_d)
     return RidgeSlopes(_point(ridge, status), by_delta, by_d)
 
 
@@ -133,11 +133,11 @@ def stiffness_slopes(
 
 
 def _solve_ridge(
-    delta: Array, d: Array, delay_model: str, kind: Kind
+    delta: Array, d: Array, delay_model: str, kind: DelayClasses
 ) -> tuple[Ridge, Array, Plant, Array, tuple[Array, Array]]:
     """The ridge, its status, the plant behind a lag, and the plant's damping and fraction."""
     status = device_status(delta, d)
-    delta, d = void(status == Status.OK, delta, d)
+    delta, d = nan_unless(status == Status.OK, delta, d)
     whole, f = split_delay(d)
     if not kind.fractional:
         # Both models are one, except for derivatives in d, which nobody can ask for where `kind` is known.
@@ -161,5 +161,5 @@ def _point(ridge: Ridge, status: Array) -> RidgePoint:
     arrived = converged(ridge)
     status = xp.where((status == Status.OK) & ~arrived, int(Status.NOT_CONVERGED), status)
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
-    alpha, beta, omega = void(arrived, ridge.alpha, ridge.beta, ridge.omega)
+    alpha, beta, omega = nan_unless(arrived, ridge.alpha, ridge.beta, ridge.omega)
     return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))

@@ -28,7 +28,7 @@ import numpy as np
 
 from zwidth.arrays.xla import ARCSINE, COSINE, SINE, store_once
 from zwidth.arrays.xp import epsilon, frozen, horner, namespace, repeat
-from zwidth.loops.rigid.delay_classes import ANY, Kind
+from zwidth.loops.rigid.delay_classes import ANY, DelayClasses
 from zwidth.loops.rigid.plant import Plant
 from zwidth.words.types import Array
 
@@ -199,7 +199,9 @@ def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Arra
     return horner(t, [horner(u, list(row)) for row in rows])
 
 
-def guess_start(delta: Array, d: Array, fraction: Array, kind: Kind = ANY, strength: Array | None = None) -> Start:
+def guess_start(
+    delta: Array, d: Array, fraction: Array, kind: DelayClasses = ANY, strength: Array | None = None
+) -> Start:
     """Where to begin for one (delta, d); ``strength`` 1 stands for delta -> infinity."""
     xp = namespace(delta, d)
     delta, d, f = frozen((delta, d, fraction), xp)
@@ -277,12 +279,12 @@ def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Ar
     return s, s - state[0]
 
 
-def is_undelayed(delay_model: str, kind: Kind) -> bool:
+def is_undelayed(delay_model: str, kind: DelayClasses) -> bool:
     """Whether every D is 1."""
     return delay_model == "held" and not kind.long
 
 
-def solve(plant: Plant, lag: Array, start: Start, delay_model: str, kind: Kind) -> Ridge:
+def solve(plant: Plant, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
     """The ridge of one plant behind ``lag`` periods (whole in the held model)."""
     xp = namespace(plant.a2, lag)
     undelayed = is_undelayed(delay_model, kind)

@@ -19,7 +19,7 @@ import numpy as np
 
 from zwidth.arrays import phi
 from zwidth.arrays.xp import horner, namespace
-from zwidth.loops.rigid.delay_classes import Kind
+from zwidth.loops.rigid.delay_classes import DelayClasses
 from zwidth.loops.rigid.plant import Plant, held_plant
 from zwidth.loops.rigid.ridge_newton import (
     Ridge,
@@ -90,7 +90,7 @@ def differentiable_plant(delta: Array, fraction: Array) -> Plant:
     return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
 
 
-def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: str, kind: Kind) -> Ridge:
+def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
     """`loops.rigid.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
     if namespace(plant.a2, lag) is np:
         return solve(plant, lag, start, delay_model, kind)
@@ -128,7 +128,7 @@ def _jax_ridge() -> Any:
     function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
 
     @function.defjvp
-    def rule(delay_model: str, kind: Kind, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
+    def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # The rule calls the function itself and is made of differentiable formulas: hence right to any order.
         plant, lag, start = primals
         change, lag_change = tangents[:2]

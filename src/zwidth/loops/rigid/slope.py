@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from zwidth.arrays.batching import elementwise
-from zwidth.loops.domain import check_scalars, valid_device, void
-from zwidth.loops.rigid.delay_classes import ANY, Kind, classify_delays
+from zwidth.loops.domain import check_scalars, nan_unless, valid_device
+from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
 from zwidth.loops.rigid.plant import Plant, split_delay
 from zwidth.loops.rigid.polynomial import check_delay_model
 from zwidth.loops.rigid.ridge import converged
@@ -52,13 +52,13 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
     return elementwise(slope_kernel, ("d",), (d,), (delay, classify_delays(d)))
 
 
-def slope_kernel(d: Array, delay_model: str, kind: Kind = ANY) -> Array:
+def slope_kernel(d: Array, delay_model: str, kind: DelayClasses = ANY) -> Array:
     """`stiffness_slope`, elementwise."""
-    (d,) = void(valid_device(0.0 * d, d), d)
+    (d,) = nan_unless(valid_device(0.0 * d, d), d)
     zero = 0.0 * d
     lag, f = split_delay(d) if delay_model == "held" else (d, zero)
     # delta N(z) for delta -> infinity: the velocity follows the force at once, e^-delta and its like vanish.
     plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
     start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
     ridge = differentiable_ridge(plant, lag, start, delay_model, kind)
-    return void(converged(ridge), ridge.alpha)[0]
+    return nan_unless(converged(ridge), ridge.alpha)[0]

@@ -13,7 +13,7 @@ from zwidth.loops.rigid.boundary_map import boundary_map
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.delay_classes import classify_delays
-from zwidth.loops.rigid.folding import Points, lay_out
+from zwidth.loops.rigid.folding import Points, fold_arguments
 from zwidth.loops.rigid.poles import unstable_poles
 from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.words.errors import InputError, check_choice
@@ -83,7 +83,7 @@ def is_stable(
         return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
     if is_traced(*values):
         return _traced(values, method)
-    laid = lay_out(values)
+    laid = fold_arguments(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
 
 
@@ -121,7 +121,7 @@ def decide_stability(
     _check(method, delay, values)
     if is_traced(*values):
         raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
-    laid = lay_out(values)
+    laid = fold_arguments(values)
     stable, used, status = _decide(laid.points, method)
     ranged = wall_status(*laid.points)
     status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
