@@ -106,10 +106,12 @@ def refuse_fractional_power(scene: Any) -> None:
 def search(scene: Any, negative: bool) -> tuple[BoundRidge | None, Status]:
     """The ridge of a scene of plain numbers, or why there is none."""
     border = scene.border
-    try:
-        found = find_ridge(border, negative)
-    except (ArithmeticError, ZwidthError):
-        return None, Status.NOT_CONVERGED
+    if negative not in border.ridges:
+        try:
+            border.ridges[negative] = find_ridge(border, negative)
+        except (ArithmeticError, ZwidthError):
+            return None, Status.NOT_CONVERGED
+    found = border.ridges[negative]
     return found, Status.NO_BOUNDARY if found is None else Status.OK
 
 
