@@ -14,26 +14,8 @@ from waiting import LONGEST
 ROOT = Path(__file__).resolve().parents[2]
 QUICK = ROOT / "tests" / "quick.txt"
 ON_EVERY_CORE = ["--numprocesses", "auto", "--dist", "loadfile"]
-# What the quick tests must hold something of; the scene is described by a module, the others by folders.
-ROOMS = (
-    "test_scene.py",
-    "test_loop.py",
-    *[
-        "parts",
-        "linear",
-        "simulation",
-        "stability",
-        "design",
-        "fitting",
-        "sweep",
-        "studies",
-        "config",
-        "cli",
-        "figures",
-        "html_report",
-        "explorer",
-    ],
-)
+# What the quick tests must hold something of.
+ROOMS = sorted(path.name for path in (ROOT / "tests" / "unit").iterdir() if path.is_dir() and path.name[0] != "_")
 
 # Every call becomes a line in the file "calls"; uv makes an environment whose pytest does the same.
 NOTE = """#!/usr/bin/env bash
@@ -60,7 +42,7 @@ def project(tmp_path):
         (root / "scripts").mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / "scripts" / name, root / "scripts")
     (root / "pyproject.toml").write_text("# as at first\n", encoding="utf-8")
-    for name in ("tests/unit/scenes/test_scene.py", "tests/unit/loops/rigid/test_polynomial.py"):
+    for name in ("tests/unit/test_one.py", "tests/unit/test_other.py"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         (root / name).touch()
     calls = tmp_path / "calls"
@@ -104,11 +86,11 @@ def test_every_room_has_a_quick_test(room):
         (["--quick", "-x"], [*ON_EVERY_CORE, "@tests/quick.txt", "-x"]),
         (["-k", "scene"], [*ON_EVERY_CORE, "-k", "scene"]),
         (["{tests}/unit"], [*ON_EVERY_CORE, "{root}/{tests}/unit"]),
-        (["{tests}/unit/test_scene.py", "-x"], ["{root}/{tests}/unit/test_scene.py", "-x"]),
-        (["{tests}/unit/test_scene.py::test_derivatives"], ["{root}/{tests}/unit/test_scene.py::test_derivatives"]),
+        (["{tests}/unit/test_one.py", "-x"], ["{root}/{tests}/unit/test_one.py", "-x"]),
+        (["{tests}/unit/test_one.py::test_derivatives"], ["{root}/{tests}/unit/test_one.py::test_derivatives"]),
         (
-            ["{tests}/unit/test_scene.py", "{tests}/unit/test_loop.py"],
-            [*ON_EVERY_CORE, "{root}/{tests}/unit/test_scene.py", "{root}/{tests}/unit/test_loop.py"],
+            ["{tests}/unit/test_one.py", "{tests}/unit/test_other.py"],
+            [*ON_EVERY_CORE, "{root}/{tests}/unit/test_one.py", "{root}/{tests}/unit/test_other.py"],
         ),
         (["-n", "3"], ["-n", "3"]),
         (["-n0", "--quick"], ["-n0", "@tests/quick.txt"]),
@@ -128,7 +110,7 @@ def test_the_tests_run_on_every_core_unless_told_otherwise(project, given, hande
 
 def test_a_path_is_looked_for_where_one_is_and_then_in_the_project(project):
     unit = project / "tests" / "unit"
-    assert calls_of(project, "test", "./test_scene.py", cwd=unit)[1][-1] == ["pytest", f"{unit}/./test_scene.py"]
+    assert calls_of(project, "test", "./test_one.py", cwd=unit)[1][-1] == ["pytest", f"{unit}/./test_one.py"]
     # Not there, so pytest finds it from the root, or says that there is none.
     assert calls_of(project, "test", "tests/unit", cwd=unit)[1][-1] == ["pytest", *ON_EVERY_CORE, "tests/unit"]
 

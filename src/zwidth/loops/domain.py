@@ -22,7 +22,8 @@ def within(value: Array, limits: tuple[float, float]) -> Array:
     """Whether a value is 0 or of a magnitude within ``limits``."""
     size = abs(value)
     # In single precision the limits lie outside of what there is.
-    most = limits[1] if size.dtype == np.float64 else min(limits[1], float(np.finfo(size.dtype).max))
+    kind = getattr(size, "dtype", np.float64)
+    most = limits[1] if kind == np.float64 else min(limits[1], float(np.finfo(kind).max))
     return (size == 0) | ((size >= limits[0]) & (size <= most))
 
 

@@ -72,7 +72,8 @@ def _by_closed_form(scene: Any, negative: bool) -> SceneSensitivities | None:
     found = elementwise(slopes_kernel, ("delta", "d"), values, (model, classify_delays(device.d)))
     if not negative and found.point.beta < 0:
         return None
-    stiffness, *slopes = stiffness_slopes(found, scene.mass, scene.timing.period, *values)
+    with np.errstate(invalid="ignore"):
+        stiffness, *slopes = stiffness_slopes(found, scene.mass, scene.timing.period, *values)
     per = dict(zip(("mass", "damping", "period", "delay"), slopes, strict=True))
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}

@@ -102,7 +102,7 @@ def own_cluster(folder):
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
     address, python = f"tcp://127.0.0.1:{port}", [sys.executable, "-m"]
-    paths = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
+    paths = [str(Path(__file__).parents[2] / "support"), os.environ.get("PYTHONPATH", "")]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths)}
     scheduler = ["distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", port, "--no-dashboard"]
     worker = ["distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard"]
