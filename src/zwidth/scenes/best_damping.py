@@ -46,7 +46,7 @@ def find_best_damping(
 
     @np.vectorize
     def margin(beta: float) -> float:
-        loop = OpenLoop.fold_arguments(scene.loop, stiffness / units.stiffness, beta, scene.traced_boundary.w)
+        loop = OpenLoop.lay_out(scene.loop, stiffness / units.stiffness, beta, scene.traced_boundary.w)
         return loop.least_distance()[0]
 
     cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)

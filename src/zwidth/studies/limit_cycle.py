@@ -90,7 +90,7 @@ class CycleAxes(Strict):
         """Those with several values."""
         return {name: axis for name, axis in self.given.items() if axis.size > 1}
 
-    def fold_arguments(self) -> dict[str, np.ndarray]:
+    def lay_out(self) -> dict[str, np.ndarray]:
         """The values of every axis, so that they broadcast to the grid."""
         grid = np.meshgrid(*(axis.values() for axis in self.varied.values()), indexing="ij", sparse=True)
         return {name: axis.values()[0] for name, axis in self.given.items()} | dict(zip(self.varied, grid, strict=True))
@@ -166,7 +166,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """What becomes of every wall, as arrays with a first axis of conditions, and how much of them stays silent."""
-        axes, varied = self.axes.fold_arguments(), self.axes.varied
+        axes, varied = self.axes.lay_out(), self.axes.varied
         labels = [each.label for each in self.conditions]
         found: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}
         edges, notes = [], []

@@ -59,7 +59,7 @@ class DelayedLoops:
     nodes: list[np.ndarray]
 
     @classmethod
-    def fold_arguments(cls, chain: Chain) -> DelayedLoops:
+    def lay_out(cls, chain: Chain) -> DelayedLoops:
         """At every thirty-second of a period, whole ones among them."""
         own = float(chain.d)
         grid = (np.floor(own * _PARTS) + 1.0 + np.arange(_PARTS)) / _PARTS
@@ -74,7 +74,7 @@ def loop_at(chain: Chain, delay: float) -> LinearLoop:
 
 
 def _cross(loop: LinearLoop, alpha: float, beta: float, nodes: np.ndarray) -> Crossovers:
-    wall = OpenLoop.fold_arguments(loop, alpha, beta, nodes)
+    wall = OpenLoop.lay_out(loop, alpha, beta, nodes)
     w = wall.gain_crossovers()
     return Crossovers(w, np.angle(-wall.at(w).value), float(wall.L.value[-1].real))
 
@@ -151,7 +151,7 @@ def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: fl
 
 
 def _last(loop: LinearLoop, alpha: float, beta: float) -> float:
-    return float(OpenLoop.fold_arguments(loop, alpha, beta, np.array([3.0])).L.value[-1].real)
+    return float(OpenLoop.lay_out(loop, alpha, beta, np.array([3.0])).L.value[-1].real)
 
 
 def _is_first_loss(chain: Chain, alpha: float, beta: float, margin: float) -> bool:
@@ -172,10 +172,10 @@ def linear_margins(chain: Chain, boundary: Boundary, alpha: np.ndarray, beta: np
         a, b, good = float(alpha[place]), float(beta[place]), bool(stable[place])
         if not inside[place]:
             continue
-        found = margins_of(OpenLoop.fold_arguments(boundary.loop, a, b, boundary.w), good)
+        found = margins_of(OpenLoop.lay_out(boundary.loop, a, b, boundary.w), good)
         delay = 0.0
         if good:
-            loops = loops or DelayedLoops.fold_arguments(chain)
+            loops = loops or DelayedLoops.lay_out(chain)
             delay = delay_margin(loops, a, b)
         out[(slice(None), *place)] = found._replace(delay_margin=delay)
     return Margins(*(part[()] for part in out))

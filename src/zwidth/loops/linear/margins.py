@@ -35,7 +35,7 @@ class OpenLoop(NamedTuple):
     L: Jet
 
     @classmethod
-    def fold_arguments(cls, loop: LinearLoop, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
+    def lay_out(cls, loop: LinearLoop, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
         """Refine the nodes of a loop for a wall."""
         w = np.append(nodes[nodes < np.pi], np.pi)
         for _ in range(_HALVINGS):
