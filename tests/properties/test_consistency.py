@@ -283,8 +283,8 @@ def test_settling_times_belong_to_stable_walls():
     random = np.random.default_rng(22)
     walls = draw(600, random)
     # Settling is searched backwards period by period: slow loops take too long for a test.
-    slow = np.abs(zwidth.decay_rate(*walls)) < 1e-2
-    walls = walls.select((walls.d <= 40) & (walls.alpha != 0) & ~slow)
+    quick = np.abs(zwidth.decay_rate(*walls)) >= 1e-2
+    walls = walls.select((walls.d <= 40) & (walls.alpha != 0) & quick)
     stable = zwidth.is_stable(*walls)
     times = np.array([settling_time(*(float(value) for value in wall)) for wall in zip(*walls, strict=True)])
     assert np.all(np.isnan(times) | (stable & np.isfinite(times) & (times >= 0)))
