@@ -11,10 +11,10 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly
-from zwidth.loops.rigid.passive_area import passive_edge
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
+from zwidth.scenes.passive import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome
