@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from zwidth.figures import style
 from zwidth.figures.region import MARKS, mark_wall, name_axes, shade_region
 from zwidth.figures.table import SI_COLUMNS, Table, curves, select
+from zwidth.words.formatting import with_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -31,6 +32,11 @@ def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[s
     """Walls as columns, normalized and in SI units."""
     normalized = {"alpha": stiffness / scene.units.stiffness, "beta": virtual_damping / scene.units.virtual_damping}
     return {**normalized, **dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))}
+
+
+def name_wall(stiffness: float, virtual_damping: float) -> str:
+    """A wall in words."""
+    return f"K = {with_unit(stiffness, 'N/m')}, B = {with_unit(virtual_damping, 'N s/m')}"
 
 
 @style.house_style()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -14,13 +14,12 @@ from zwidth.arrays.batching import map_flat
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
-from zwidth.config.study import DelayModels
+from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop, line_at_minus_one
 from zwidth.loops.rigid.region import Piece, stable_region
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device
+from zwidth.studies.outcome import CurvesStudy, Outcome, add_si_of_scene, share_of_device
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
 from zwidth.words.types import DelayModel
@@ -34,13 +33,14 @@ _RIDGE_POINTS = 101
 _BATCH = 256
 
 
+@register
 class BoundaryStudy(CurvesStudy):
     """Stability boundaries, one for every delta, d and delay model."""
 
-    what: ClassVar[str] = "a boundary study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_models")
-    reads_scene: ClassVar[bool] = True
-    takes_parts: ClassVar[bool] = True
+    method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
+    from_scene = ("delta", "d", "delay_models")
+    reads_scene = True
+    takes_parts = True
 
     kind: Literal["boundary"]
 

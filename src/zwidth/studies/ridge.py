@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import DelayModels
+from zwidth.config.study import DelayModels, register
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.ridge import RidgePoint, alpha_max
 from zwidth.loops.rigid.slope import stiffness_slope
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, Table
+from zwidth.studies.outcome import CurvesStudy, Outcome, Table
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DelayModel
 
@@ -27,11 +26,12 @@ _STRONG_DAMPING = 100.0
 _SLOPE_SAMPLES = 64
 
 
+@register
 class RidgeStudy(CurvesStudy):
     """Maximum stiffness over delta, one curve for every d and delay model."""
 
-    what: ClassVar[str] = "a ridge study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_models")
+    method = "Stationary points of the closed form and corners at z = -1, to some ten rounding errors."
+    from_scene = ("delta", "d", "delay_models")
 
     kind: Literal["ridge"]
 

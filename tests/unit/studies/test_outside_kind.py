@@ -2,7 +2,7 @@
 
 import json
 from importlib.metadata import EntryPoint
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ from zwidth.words.errors import ConfigError, StoreError
 class RatioStudy(ComputedStudy):
     """How much stiffer the stiffest stable wall is than the stiffest passive one, without delay."""
 
-    what: ClassVar[str] = "a ratio study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta",)
+    method = "Closed forms, without delay."
+    from_scene = ("delta",)
 
     kind: Literal["ratio"]
 
@@ -28,10 +28,6 @@ class RatioStudy(ComputedStudy):
     @property
     def points(self):
         return self.delta.size
-
-    @property
-    def nbytes(self):
-        return 16 * self.points
 
     @property
     def extent(self):
@@ -47,11 +43,11 @@ CONFIG = "{version: 1, name: outside, scene: {delta: 0.5, d: 0}, studies: [{kind
 
 
 @pytest.fixture
-def config(tmp_path, monkeypatch):
-    monkeypatch.setattr(document, "KINDS", dict(document.KINDS))
+def config(tmp_path):
     file = tmp_path / "outside.yaml"
     file.write_text(CONFIG, encoding="utf-8")
-    return file
+    yield file
+    document.KINDS.pop("ratio", None)
 
 
 def test_it_is_run_resumed_and_refused_like_every_other(config, tmp_path, capsys):
