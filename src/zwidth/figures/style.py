@@ -267,13 +267,16 @@ def span(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
 
 def spread(positions: Sequence[float], gap: float) -> np.ndarray:
     """Positions at least ``gap`` apart, as close to the given ones as their order allows."""
-    # It takes a moment to import, and most figures need it not.
-    from scipy.optimize import isotonic_regression
-
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(positions))
+    # Of those that would be closer, as many as it takes share their mean.
+    groups: list[list[float]] = []
+    for place in np.asarray(positions, dtype=np.float64)[order] - steps:
+        groups.append([place])
+        while len(groups) > 1 and np.mean(groups[-2]) > np.mean(groups[-1]):
+            groups[-2:] = [groups[-2] + groups[-1]]
     placed = np.empty(len(positions))
-    placed[order] = isotonic_regression(np.asarray(positions, dtype=np.float64)[order] - steps).x + steps
+    placed[order] = [np.mean(group) for group in groups for _ in group] + steps
     return placed
 
 

@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.axes import Axis
 from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
-from zwidth.config.fields import Generated, describe_parameter, members
+from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.numbers import number
 from zwidth.config.parameters import parameter_axis
 from zwidth.config.parts import list_parts, make_parts_base
@@ -60,7 +60,7 @@ def _axis_field(name: str) -> tuple[Any, Any]:
 _OF_WALL, _OF_DEVICE = ("stiffness", "virtual_damping"), ("mass", "damping", "period", "rate", "delay")
 _FIELDS: Any = {name: _axis_field(name) for name in (*OF_PARTS, "devices", *NORMALIZED, *_OF_WALL, *_OF_DEVICE)}
 # Some of the names have dots, which a class body cannot have.
-_Axes: Any = create_model("_Axes", __base__=Generated, **_FIELDS)
+_Axes: Any = create_model("_Axes", __base__=Strict, **_FIELDS)
 
 
 class Axes(_Axes):
