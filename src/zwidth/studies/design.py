@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
@@ -15,6 +15,7 @@ from zwidth import figures
 from zwidth.config.axes import Axis, axis_of, read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.wall import VirtualWall
@@ -62,12 +63,13 @@ Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
 Reserve = Annotated[float, Quantity(allowed=Range(1.0, 100.0))]
 
 
+@register
 class DesignStudy(ComputedStudy):
     """The value of one parameter at which the stiffest wall reaches a wanted stiffness, and what tolerances leave."""
 
-    what: ClassVar[str] = "a design study"
-    from_scene: ClassVar[tuple[str, ...]] = ("device", "stiffness")
-    takes_parts: ClassVar[bool] = True
+    method = "The stiffest wall, solved for the parameter to 1e-11."
+    from_scene = ("device", "stiffness")
+    takes_parts = True
 
     kind: Literal["design"]
 
@@ -155,10 +157,6 @@ class DesignStudy(ComputedStudy):
     @property
     def points(self) -> int:
         return self.stiffness.size * (_TRIALS + self.draws) + self.num
-
-    @property
-    def nbytes(self) -> int:
-        return self.points * 80
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The value that each stiffness needs, K_max over the parameter, and a figure of both."""

@@ -15,7 +15,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.parts import list_parts, make_parts_base
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
-from zwidth.config.study import HeldOnly, Study
+from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Quantity
 from zwidth.sweep.part_axes import find_faults
 from zwidth.words.quantities import (
@@ -150,12 +150,13 @@ class _Swept(Study):
 _Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
 
 
+@register
 class SweepStudy(_Parts, _Swept):
     """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
 
-    what: ClassVar[str] = "a sweep study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
-    takes_parts: ClassVar[bool] = True
+    method = "Closed forms in float64; the same bits whatever the chunks and workers."
+    from_scene = ("delay_model",)
+    takes_parts = True
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""
