@@ -95,7 +95,6 @@ def _draw(arrays: dict[str, Any], name: str, share: float) -> Any:
     """A figure with the exact edges of the panels that it has."""
     from zwidth.figures.stability_map import PANELS
     from zwidth.figures.style import pick_evenly
-    from zwidth.studies.stable_set import find_edges
 
     delta, d = arrays["delta"], arrays["d"]
     shown = product(delta[pick_evenly(delta.size, PANELS)], d[pick_evenly(d.size, PANELS)])
