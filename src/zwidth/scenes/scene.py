@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, join_shapes
+from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.arrays.xp import is_traced
 from zwidth.loops.linear.border import Border, Outline, outlines
 from zwidth.loops.linear.boundary import Boundary

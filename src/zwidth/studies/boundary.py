@@ -10,14 +10,14 @@ from typing import Any, ClassVar, Literal, TypeAlias
 import numpy as np
 
 from zwidth import figures
-from zwidth.arrays.batching import map_flat
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop, line_at_minus_one
+from zwidth.loops.rigid.curve import lobe, on_line, wall
+from zwidth.loops.rigid.delay_classes import classify_delays
 from zwidth.loops.rigid.region import Piece, stable_region
 from zwidth.studies.curves import CurvesStudy
 from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device
@@ -31,7 +31,6 @@ Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 _POINTS_PER_CURVE = 1000
 _RIDGE_POINTS = 101
 # Batches of one size: a run with several studies over delta compiles once for each delay model.
-_BATCH = 256
 
 
 class BoundaryStudy(CurvesStudy):
@@ -162,25 +161,14 @@ def outline(delta: float, d: float, delay: DelayModel) -> dict[str, Any]:
 
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
     """The virtual damping that is stable for alpha -> 0, over delta, as columns for every delay."""
-    columns = [np.tile(deltas, delays.size), np.repeat(delays, deltas.size)]
-    upper = map_flat(_upper_kernel, columns, (delay,), _BATCH)
-    rows = np.asarray(upper).reshape(delays.size, deltas.size)
+    upper = _largest_damping(np.tile(deltas, delays.size), np.repeat(delays, deltas.size), delay)
+    rows = upper.reshape(delays.size, deltas.size)
     shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
     return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in zip(delays, rows, strict=True)]
 
 
-def _upper_kernel(delta, d, delay: str):
-    """The largest stable beta as alpha -> 0: the lobe's end, or the line P(-1) = 0 where it comes first."""
-    import jax.numpy as jnp
-
-    from zwidth.loops.rigid.exact_points import lobe_end
-
-    loop = frequency_loop(delta, d, delay)
-    omega = lobe_end(loop, d, delay)
-    end = frequency_boundary(omega, loop, delay)
-    # A lobe that runs to omega = pi is left along the line alpha + 2 beta = const.
-    upper = jnp.where(omega >= jnp.pi, end.beta + 0.5 * end.alpha, end.beta)
-    line = 0.5 * line_at_minus_one(delta, d)
-    # A fractional power has no real pole at z = -1.
-    has_line = (delay == "held") | (d == jnp.floor(d))
-    return jnp.where(has_line & (line > -delta), jnp.minimum(upper, line), upper)
+def _largest_damping(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> np.ndarray:
+    """The largest stable beta as alpha -> 0: at the lobe's end, or on the line of z = -1 that it is left along."""
+    with np.errstate(all="ignore"):
+        curve = lobe(delta, d, delay, classify_delays(d))
+        return np.where(curve.to_corner, 0.5 * on_line(curve), wall(curve.end, curve).b - delta)

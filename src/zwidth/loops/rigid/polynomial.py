@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.xp import horner, namespace
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_wall
-from zwidth.loops.rigid.degrees import Degree, few_poles, map_by_degree
+from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
+from zwidth.loops.rigid.degrees import Degree, map_by_degree
 from zwidth.loops.rigid.plant import Plant, held_plant, split_delay, undelayed_plant
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
@@ -229,8 +229,7 @@ def char_poly(
         [ 1.   -1.5   1.25 -0.25]
     """
     check_has_poles(delay)
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
-    return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
+    return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
 
 
 def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:
