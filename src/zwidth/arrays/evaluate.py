@@ -85,7 +85,7 @@ def evaluate_columns(
             result = kernel(*(part[0] if part.size == 1 < count else part for part in parts), *static)
         # A copy: a view of an argument, or of one value, could not be written to.
         shape = (_length(parts),)
-        return tree_map(lambda leaf: np.array(leaf if np.ndim(leaf) > 1 else np.broadcast_to(leaf, shape)), result)
+        return tree_map(lambda leaf: leaf if np.ndim(leaf) > 1 else np.array(np.broadcast_to(leaf, shape)), result)
 
     return at_once(*columns) if count <= few else map_blocks(at_once, columns, few)
 

@@ -138,10 +138,9 @@ def boundary_point(
     arguments = {"delta": delta, "d": d, name: value}
     if method == "optimistix":
         # Its solvers take a second to import.
-        from zwidth.loops.rigid.exact_points import WEIGHT, point_kernel
+        from zwidth.loops.rigid.exact_points import point_kernel
 
-        options = (line, delay, ridge_kernel)
-        return BoundaryPoint(*evaluate(point_kernel, arguments, *options, weight=WEIGHT, route="jax"))
+        return BoundaryPoint(*evaluate(point_kernel, arguments, line, delay, ridge_kernel, route="jax"))
     return evaluate(_point_kernel, arguments, line, delay, classify_delays(d))
 
 

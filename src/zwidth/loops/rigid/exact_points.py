@@ -34,8 +34,6 @@ from zwidth.words.types import Array
 # Each step halves the bracket: 52 of them leave one unit in the last place of a float64.
 _HALVINGS = 52
 _NEWTON_STEPS = 16
-# In batches of which the slowest point keeps few waiting.
-WEIGHT = 8
 
 
 @cache

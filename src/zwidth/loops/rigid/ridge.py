@@ -79,9 +79,9 @@ def alpha_max(
     arguments = {"delta": delta, "d": d}
     if method == "kkt":
         # The general route iterates over long formulas; its solvers take a second to import.
-        from zwidth.loops.rigid.exact_points import WEIGHT, kkt_kernel
+        from zwidth.loops.rigid.exact_points import kkt_kernel
 
-        return RidgePoint(*evaluate(kkt_kernel, arguments, delay, weight=WEIGHT, route="jax"))
+        return RidgePoint(*evaluate(kkt_kernel, arguments, delay, route="jax"))
     return evaluate(ridge_kernel, arguments, delay, classify_delays(d))
 
 
