@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -13,16 +13,15 @@ from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
-from zwidth.config.study import DelayModels
+from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.curve import lobe, on_line, wall
-from zwidth.loops.rigid.delay_classes import classify_delays
+from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.region import Piece, stable_region
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device
+from zwidth.studies.outcome import CurvesStudy, Outcome, add_si_of_scene, share_of_device
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
@@ -30,16 +29,16 @@ Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 # Samples of a boundary over frequency; only an estimate of a result's size rests on it.
 _POINTS_PER_CURVE = 1000
 _RIDGE_POINTS = 101
-# Batches of one size: a run with several studies over delta compiles once for each delay model.
 
 
+@register
 class BoundaryStudy(CurvesStudy):
     """Stability boundaries, one for every delta, d and delay model."""
 
-    what: ClassVar[str] = "a boundary study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_models")
-    reads_scene: ClassVar[bool] = True
-    takes_parts: ClassVar[bool] = True
+    method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
+    from_scene = ("delta", "d", "delay_models")
+    reads_scene = True
+    takes_parts = True
 
     kind: Literal["boundary"]
 
@@ -161,14 +160,8 @@ def outline(delta: float, d: float, delay: DelayModel) -> dict[str, Any]:
 
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
     """The virtual damping that is stable for alpha -> 0, over delta, as columns for every delay."""
-    upper = _largest_damping(np.tile(deltas, delays.size), np.repeat(delays, deltas.size), delay)
-    rows = upper.reshape(delays.size, deltas.size)
+    # At the softest wall that there is.
+    upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper", delay=delay).beta
     shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
-    return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in zip(delays, rows, strict=True)]
-
-
-def _largest_damping(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> np.ndarray:
-    """The largest stable beta as alpha -> 0: at the lobe's end, or on the line of z = -1 that it is left along."""
-    with np.errstate(all="ignore"):
-        curve = lobe(delta, d, delay, classify_delays(d))
-        return np.where(curve.to_corner, 0.5 * on_line(curve), wall(curve.end, curve).b - delta)
+    rows = zip(delays, np.asarray(upper), strict=True)
+    return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in rows]

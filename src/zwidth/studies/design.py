@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
 from zwidth import figures
-from zwidth.config.axes import Axis, read_entries
+from zwidth.config.axes import Axis, axis_of, read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Fraction
-from zwidth.config.numbers import number, whole_number
-from zwidth.config.parameters import parameter_axis
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
-from zwidth.config.units import make_entry_reader
+from zwidth.config.study import register
+from zwidth.config.values import Fraction, Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.required import RequiredValue
@@ -46,7 +45,7 @@ def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
     name = info.data.get("find")
     if not isinstance(raw, list | tuple) or len(raw) != 2:
         raise problem(f"got {describe(raw)}", "a range is a list of its two ends", "write [low, high]")
-    ends = read_entries(raw, make_entry_reader(name) if name else float)
+    ends = read_entries(raw, replace(quantity_of(name), periods=False).read if name else float)
     if not 0 < ends[0] < ends[1]:
         raise problem(f"got {short(ends[0])} and {short(ends[1])}", "0 < low < high", "write the lower end first")
     return ends
@@ -60,16 +59,17 @@ Ends = Annotated[
         {"type": "array", "items": {"anyOf": [{"type": "number"}, {"type": "string"}]}, "minItems": 2, "maxItems": 2}
     ),
 ]
-Count = Annotated[int, BeforeValidator(whole_number(Range(2, 100_000)))]
-Reserve = Annotated[float, BeforeValidator(number(Range(1.0, 100.0)))]
+Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
+Reserve = Annotated[float, Quantity(allowed=Range(1.0, 100.0))]
 
 
+@register
 class DesignStudy(ComputedStudy):
     """The value of one parameter at which the stiffest wall reaches a wanted stiffness, and what tolerances leave."""
 
-    what: ClassVar[str] = "a design study"
-    from_scene: ClassVar[tuple[str, ...]] = ("device", "stiffness")
-    takes_parts: ClassVar[bool] = True
+    method = "The stiffest wall, solved for the parameter to 1e-11."
+    from_scene = ("device", "stiffness")
+    takes_parts = True
 
     kind: Literal["design"]
 
@@ -79,7 +79,7 @@ class DesignStudy(ComputedStudy):
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
 
-    stiffness: Annotated[Axis, *parameter_axis("stiffness")]
+    stiffness: Annotated[Axis, axis_of("stiffness")]
     """Wanted stiffness K in N/m or with a unit, one or several; the scene's where left out."""
 
     reserve: Reserve = 1.0
@@ -157,10 +157,6 @@ class DesignStudy(ComputedStudy):
     @property
     def points(self) -> int:
         return self.stiffness.size * (_TRIALS + self.draws) + self.num
-
-    @property
-    def nbytes(self) -> int:
-        return self.points * 80
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The value that each stiffness needs, K_max over the parameter, and a figure of both."""
