@@ -166,17 +166,6 @@ def tilt_at_minus_one(plant: Plant, whole: Array) -> Array:
     return (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
 
 
-def line_at_minus_one(delta: Array, d: Array) -> Array:
-    """``alpha + 2 beta`` on the line where a real pole crosses at z = -1 (held delay), for one point.
-
-    ``alpha + 2 beta = (-1)^n 2 (1 + c)/N(-1)``; infinite where N(-1) = 0.
-    """
-    whole, fraction = split_delay(d)
-    plant = held_plant(delta, fraction)
-    sign = 1.0 - 2.0 * namespace(whole).mod(whole, 2.0)
-    return sign * 2.0 * (1.0 + plant.c) / plant.gap
-
-
 def check_delay_model(delay_model: str) -> None:
     """Raise `InputError` unless the name of a delay model is known."""
     check_choice("delay", delay_model, DELAY_MODELS)
