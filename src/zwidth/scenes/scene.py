@@ -298,7 +298,7 @@ class Scene(SceneAnswers):
         """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
 
         Args:
-            parameter: its dotted path, such as "damping" or "velocity.cutoff".
+            parameter: its dotted path, such as "damping", "velocity.cutoff" or "rate".
             stiffness: wanted, in N/m, > 0.
             within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value.
             negative_damping: as for `max_stiffness`.
