@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.batching import FEW
+from zwidth.arrays.evaluate import FEW
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import is_stable

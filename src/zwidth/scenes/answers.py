@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, join_shapes
+from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.arrays.circle import circle
 from zwidth.loops.linear.margins import open_loop_response
 from zwidth.loops.linear.passivity import check_has_condition

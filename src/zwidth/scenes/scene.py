@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import are_numbers, as_float64, join_shapes
+from zwidth.arrays.arguments import are_numbers, as_float64, join_shapes
 from zwidth.loops.linear.border import Outline, outlines
 from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.slopes import SceneSensitivities

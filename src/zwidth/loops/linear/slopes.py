@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
+from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.chain import chain_of, flow, rates
 from zwidth.loops.linear.ridge import BoundRidge, Condition
 from zwidth.loops.rigid.delay_classes import classify_delays
@@ -57,7 +57,7 @@ def moving_paths(scene: Any) -> tuple[str, ...]:
 def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None:
     """Those of a rigid device by closed forms; None where its ridge lies at a damping that does not count."""
     values, model = (scene.delta, scene.d), scene.timing.delay_model
-    found = elementwise(slopes_kernel, ("delta", "d"), values, (model, classify_delays(scene.d)))
+    found = evaluate(slopes_kernel, {"delta": scene.delta, "d": scene.d}, model, classify_delays(scene.d))
     if not negative and found.point.beta < 0:
         return None
     with np.errstate(invalid="ignore"):

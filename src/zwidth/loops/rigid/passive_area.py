@@ -16,16 +16,15 @@ from collections.abc import Callable
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import along, frozen, namespace
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device
+from zwidth.loops.domain import nan_with_nan_slopes, valid_device
 from zwidth.loops.rigid.needed_damping import directions, needed_damping
 from zwidth.words.types import Array, ArrayLike
 
 # Gauss-Legendre nodes for each of the three parts.
 _NODES = (64, 64, 32)
-# A point becomes 160 of them.
-_FEW, _BLOCK = 1 << 6, 1 << 7
+_WEIGHT = 64
 
 
 def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
@@ -54,8 +53,7 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{passive_area(0.5, 0):.4f}")
         0.5000
     """
-    check_scalars(delta=delta, d=d)
-    return elementwise(_passive_area_kernel, ("delta", "d"), (delta, d), few=_FEW, block=_BLOCK)
+    return evaluate(_passive_area_kernel, {"delta": delta, "d": d}, weight=_WEIGHT)
 
 
 def _passive_area_kernel(delta: Array, d: Array) -> Array:

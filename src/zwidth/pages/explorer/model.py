@@ -30,7 +30,7 @@ _STRIDES = ((9, 1), (15, 2), (26, 4), (42, 8))
 # Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
 _ON_EDGE = 1e-5
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
-# By how many poles a radius takes; so few points that no compiler is asked for (`arrays.batching.FEW`).
+# By how many poles a radius takes; so few points that no compiler is asked for (`arrays.evaluate.FEW`).
 _GRIDS = ((1, (72, 56)), (12, (48, 40)), (inf, (36, 30)))
 _DIRECTIONS, _RIDGE_POINTS, _MOST_DAMPING = 181, 61, 4.0
 _SHORTEST, _LONGEST = 30, 3000
