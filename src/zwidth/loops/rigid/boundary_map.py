@@ -16,7 +16,7 @@ from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.loops.domain import WALL_RANGE, within
 from zwidth.loops.rigid.delay_classes import device
 from zwidth.loops.rigid.folding import Points, group_by
-from zwidth.loops.rigid.row_limit import long_device, long_row, short_row
+from zwidth.loops.rigid.row_limit import long_lobe, long_row, short_row
 from zwidth.words.types import Array
 
 # Smaller maps are compared by NumPy, with nothing to compile.
@@ -79,7 +79,7 @@ def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
 
 
 def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
-    return long_row(beta, long_device(device(delta, d)))
+    return long_row(beta, long_lobe(device(delta, d)))
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
