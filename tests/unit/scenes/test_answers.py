@@ -8,6 +8,7 @@ import scipy.linalg
 from independent_scenes import KINDS, closed_loop_matrix, continuous, flow, random_scene, random_walls
 
 import zwidth
+from zwidth.loops.linear.radius import spectral_radius
 from zwidth.words.errors import InputError
 
 FILTERED = zwidth.Scene(
@@ -65,6 +66,19 @@ def test_on_both_sides_of_the_boundary_radius_and_verdict_agree():
     assert np.abs(radius - 1).max() < 1e-5
     assert np.all(radius[[0, 1]] < 1)
     assert np.all(radius[[-2, -1]] > 1)
+
+
+def test_a_radius_within_rounding_takes_the_side_of_the_label_and_one_that_contradicts_it_is_not_given():
+    edge = FILTERED.stable_stiffness(5.0)[0, 1] / FILTERED.units.stiffness
+    beta, labels = np.full(2, 5.0 / FILTERED.units.virtual_damping), np.array([True, False])
+    on, inside, outside = (
+        spectral_radius(FILTERED.loop, np.full(2, alpha), beta, labels) for alpha in (edge, 0.5 * edge, 2.0 * edge)
+    )
+    np.testing.assert_allclose(on, 1.0, rtol=1e-12)
+    assert on[0] < 1 <= on[1]
+    assert inside[0] < 0.999
+    assert outside[1] > 1.001
+    assert np.isnan([inside[1], outside[0]]).all()
 
 
 def test_slow_poles_keep_their_digits():
