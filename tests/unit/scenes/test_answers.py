@@ -10,6 +10,7 @@ from independent_scenes import KINDS, closed_loop_matrix, continuous, flow, rand
 import zwidth
 from zwidth.loops.linear.radius import spectral_radius
 from zwidth.words.errors import InputError
+from zwidth.words.status import Method, Status
 
 FILTERED = zwidth.Scene(
     zwidth.Device(mass=0.1, damping=3.0), zwidth.Timing(period=1e-3, delay=1e-3), velocity=zwidth.LowPass(cutoff=100.0)
@@ -145,6 +146,14 @@ def test_shapes_and_what_is_not_finite():
     assert FILTERED.frequency_response(1e3, 0.0, 500.0).imag == pytest.approx(0.0, abs=1e-15)
     with pytest.raises(InputError, match="one wall of finite numbers"):
         FILTERED.state_space(K)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("method, used", [("auto", Method.CROSSOVER), ("companion", Method.COMPANION)])
+def test_a_decision_says_what_decided_and_where_it_could_not(method, used):
+    found = FILTERED.decide_stability([1e3, 60e3, np.nan, np.inf], 4.0, method=method)
+    np.testing.assert_array_equal(found.stable, [True, False, False, False])
+    np.testing.assert_array_equal(found.status, [Status.OK, Status.OK, *[Status.INVALID_INPUT] * 2])
+    np.testing.assert_array_equal(found.method, [used] * 4)
 
 
 def test_rigid_scenes_take_the_closed_functions():
