@@ -73,7 +73,8 @@ def test_a_radius_within_rounding_takes_the_side_of_the_label_and_one_that_contr
     edge = FILTERED.stable_stiffness(5.0)[0, 1] / FILTERED.units.stiffness
     beta, labels = np.full(2, 5.0 / FILTERED.units.virtual_damping), np.array([True, False])
     on, inside, outside = (
-        spectral_radius(FILTERED.loop, np.full(2, alpha), beta, labels) for alpha in (edge, 0.5 * edge, 2.0 * edge)
+        spectral_radius(FILTERED.loop.roots, np.full(2, alpha), beta, labels)
+        for alpha in (edge, 0.5 * edge, 2.0 * edge)
     )
     np.testing.assert_allclose(on, 1.0, rtol=1e-12)
     assert on[0] < 1 <= on[1]
