@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator
+from pydantic import ConfigDict
 
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Delay, Duration, Quantity, Strict
-from zwidth.config.numbers import whole_number
+from zwidth.config.fields import Strict
 from zwidth.config.parts import SimulatedVelocityField
+from zwidth.config.values import Delay, Duration, Quantity
 from zwidth.parts.span import Span
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.simulate import Contact
@@ -18,7 +18,7 @@ from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 
 Length = Annotated[float, Quantity("m", NOT_NEGATIVE)]
 Friction = Annotated[float, Quantity("N", NOT_NEGATIVE)]
-Seed = Annotated[int, BeforeValidator(whole_number(NOT_NEGATIVE))]
+Seed = Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)]
 
 LONGEST = 1_000_000
 """Periods that one motion may take."""
@@ -26,6 +26,9 @@ LONGEST = 1_000_000
 
 class Circumstances(Strict):
     """How a device meets a wall: start, push, contact, and what motor, encoder, bearings and clock add."""
+
+    # A study has the same fields of its own, with what is said of them here.
+    model_config = ConfigDict(use_attribute_docstrings=True)
 
     duration: Duration = Span(1000.0, "periods")
     """Length of the motion, in s or in periods."""

@@ -23,8 +23,8 @@ from pydantic_core.core_schema import no_info_wrap_validator_function
 
 from zwidth.config.axes import read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Generated, Quantity, describe_parameter
-from zwidth.config.numbers import number, whole_number
+from zwidth.config.fields import Strict, describe_parameter
+from zwidth.config.values import Quantity
 from zwidth.parts.checks import find_range
 from zwidth.parts.paths import PARTS
 from zwidth.parts.velocity import ESTIMATES, FOAW
@@ -46,7 +46,7 @@ def locate_refusal(error: InputError) -> LocatedProblem:
     return tuple(field.split(".")), problem(what, allowed, remedy)
 
 
-class PartSection(Generated):
+class PartSection(Strict):
     """Base of the sections: what the keys give is checked by the part itself."""
 
     part: ClassVar[Any]
@@ -67,7 +67,7 @@ class PartSection(Generated):
 def _read_coefficients(raw: Any) -> tuple[float, ...]:
     if not isinstance(raw, list | tuple):
         raise problem(f"got {describe(raw)}", "coefficients are a list, highest power first", "write [1000, -1000]")
-    return read_entries(raw, number(), distinct=False)
+    return read_entries(raw, Quantity().read, distinct=False)
 
 
 Coefficients = Annotated[
@@ -105,9 +105,7 @@ def _describe(path: str, item: Any) -> tuple[Any, str]:
     low, high, low_open, _ = allowed
     bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
     words = f"{describe_parameter(known)}, {bounds}{'; ' if known.note else ''}{known.note}."
-    if known.whole:
-        return Annotated[int, BeforeValidator(whole_number(allowed))], words
-    return Annotated[float, Quantity(known.unit, allowed)], words
+    return Annotated[int if known.whole else float, Quantity(known.unit, allowed, known.whole)], words
 
 
 _ESTIMATES = {
@@ -157,7 +155,7 @@ _SECTIONS: Any = {
 }
 
 
-def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Generated]:
+def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:
     """A base of what has a section for each of the parts that a scene need not have."""
     known: dict[str, Any] = {"velocity": ("How the velocity is estimated", VelocityField, no_estimate)}
     known |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
@@ -165,7 +163,7 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Gene
         name: (form | None, Field(default=None, description=f"{words}; {absent} where left out.{more}"))
         for name, (words, form, absent) in known.items()
     }
-    return create_model("Parts", __base__=Generated, **keys)
+    return create_model("Parts", __base__=Strict, **keys)
 
 
 def list_parts(owner: Any) -> dict[str, PartSection]:

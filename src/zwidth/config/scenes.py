@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Delay, NonNegative, Number, Strict, describe_entry, quantity_of
-from zwidth.config.numbers import number
+from zwidth.config.fields import Strict
 from zwidth.config.parts import (
     PART_NAMES,
     SimulatedVelocityField,
@@ -20,7 +19,7 @@ from zwidth.config.parts import (
     locate_refusal,
     make_parts_base,
 )
-from zwidth.config.units import make_entry_reader
+from zwidth.config.values import Delay, NonNegative, Number, describe_entry, quantity_of
 from zwidth.loops.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.loops.normalization import normalize
 from zwidth.parts.device import Device
@@ -31,7 +30,7 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
-from zwidth.words.quantities import MAX_DELAY_PERIODS, PARAMETERS
+from zwidth.words.quantities import MAX_DELAY_PERIODS
 from zwidth.words.types import DelayModel
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES})
@@ -65,7 +64,7 @@ class _OneKind(Strict):
 def _period(value: Any, info: ValidationInfo) -> float:
     """The period itself, or one over the rate."""
     if value is not None:
-        return make_entry_reader("period")(value)
+        return quantity_of("period").read(value)
     # A rate that failed its own check is absent from the data; that fault is enough.
     rate = info.data.get("rate", 1.0)
     if rate is None:
@@ -123,8 +122,8 @@ class _PhysicalPlant(_Parts, _Mass):
             return
         try:
             scene = self.to_scene()
-            # Where it is not rigid: what the parts refuse only together, such as a cut-off beyond half the rate.
-            _ = scene.is_rigid or is_adaptive(self) or scene.loop
+            if not is_adaptive(self):
+                scene.check_parts()
         except InputError as error:
             yield locate_refusal(error)
             return
@@ -141,9 +140,9 @@ class _PhysicalPlant(_Parts, _Mass):
                 yield (field,), problem(what, allowed, "check the units and the mass")
 
     @property
-    def is_rigid(self) -> bool:
-        """Whether it is a rigid mass with the backward difference, for which every kind of study answers."""
-        return self.to_scene().is_rigid
+    def parts_beyond(self) -> tuple[str, ...]:
+        """What makes it more than a rigid mass with the difference of two samples, which every kind of study takes."""
+        return self.to_scene().parts_beyond
 
     @property
     def moving_mass(self) -> float:
@@ -180,7 +179,7 @@ class _NormalizedPlant(_OneKind):
     delta: NonNegative
     """Normalized damping b T/m of the device, >= 0."""
 
-    d: Annotated[float, BeforeValidator(number(PARAMETERS["d"].allowed))] = 0.0
+    d: Annotated[float, quantity_of("d")] = 0.0
     """Delay in periods, whole or not, >= 0."""
 
 
@@ -262,7 +261,7 @@ class PhysicalScene(_PhysicalPlant):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        if self.delay_model != "held" and not self.is_rigid:
+        if self.delay_model not in self.to_scene().loop.delay_models:
             allowed = "velocity filters, hands and couplings are computed in the model 'held'"
             yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
 
@@ -335,7 +334,7 @@ def is_adaptive(owner: Any) -> bool:
 
 def is_with_parts(owner: AnyScene | AnyDevice) -> bool:
     """Whether a scene or a device is more than a rigid mass with the difference of two samples."""
-    return isinstance(owner, PhysicalScene | PhysicalDevice) and not owner.is_rigid
+    return isinstance(owner, PhysicalScene | PhysicalDevice) and bool(owner.parts_beyond)
 
 
 def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:

@@ -5,24 +5,22 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from zwidth import figures
-from zwidth.arrays.batching import map_flat
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
-from zwidth.config.study import DelayModels
+from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop, line_at_minus_one
+from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.region import Piece, stable_region
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device
+from zwidth.studies.outcome import CurvesStudy, Outcome, add_si_of_scene, share_of_device
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
@@ -30,17 +28,16 @@ Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 # Samples of a boundary over frequency; only an estimate of a result's size rests on it.
 _POINTS_PER_CURVE = 1000
 _RIDGE_POINTS = 101
-# Batches of one size: a run with several studies over delta compiles once for each delay model.
-_BATCH = 256
 
 
+@register
 class BoundaryStudy(CurvesStudy):
     """Stability boundaries, one for every delta, d and delay model."""
 
-    what: ClassVar[str] = "a boundary study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_models")
-    reads_scene: ClassVar[bool] = True
-    takes_parts: ClassVar[bool] = True
+    method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
+    from_scene = ("delta", "d", "delay_models")
+    reads_scene = True
+    takes_parts = True
 
     kind: Literal["boundary"]
 
@@ -100,11 +97,11 @@ class BoundaryStudy(CurvesStudy):
             if getattr(self, name).values().tolist() != [getattr(self.device, name)]:
                 what = f"got {name!r} beside a device"
                 yield (name,), problem(what, "a device has its own", "remove one", on_key=True)
-        if self.device.is_rigid:
+        if not self.device.parts_beyond:
             return
         asked = {"plane": "alpha_beta", "delay_models": ("held",), "ridge_path": False, "passivity": False}
         for name in [name for name, known in asked.items() if getattr(self, name) != known]:
-            parts = " and ".join(list_parts(self.device))
+            parts = " and ".join(self.device.parts_beyond)
             allowed = f"it is known for a rigid mass with the difference of two samples, not for one with {parts}"
             yield (name,), problem(f"got {name!r}", allowed, "remove it", on_key=True)
 
@@ -115,7 +112,7 @@ class BoundaryStudy(CurvesStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """One boundary for every delta, d and delay model, or that of a device with parts, as a table and a figure."""
-        if self.device is not None and not self.device.is_rigid:
+        if self.device is not None and self.device.parts_beyond:
             return outline_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
         models = needed_models(self.delay_models, delays)
@@ -162,25 +159,8 @@ def outline(delta: float, d: float, delay: DelayModel) -> dict[str, Any]:
 
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
     """The virtual damping that is stable for alpha -> 0, over delta, as columns for every delay."""
-    columns = [np.tile(deltas, delays.size), np.repeat(delays, deltas.size)]
-    upper = map_flat(_upper_kernel, columns, (delay,), _BATCH)
-    rows = np.asarray(upper).reshape(delays.size, deltas.size)
+    # At the softest wall that there is.
+    upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper", delay=delay).beta
     shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
-    return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in zip(delays, rows, strict=True)]
-
-
-def _upper_kernel(delta, d, delay: str):
-    """The largest stable beta as alpha -> 0: the lobe's end, or the line P(-1) = 0 where it comes first."""
-    import jax.numpy as jnp
-
-    from zwidth.loops.rigid.exact_points import lobe_end
-
-    loop = frequency_loop(delta, d, delay)
-    omega = lobe_end(loop, d, delay)
-    end = frequency_boundary(omega, loop, delay)
-    # A lobe that runs to omega = pi is left along the line alpha + 2 beta = const.
-    upper = jnp.where(omega >= jnp.pi, end.beta + 0.5 * end.alpha, end.beta)
-    line = 0.5 * line_at_minus_one(delta, d)
-    # A fractional power has no real pole at z = -1.
-    has_line = (delay == "held") | (d == jnp.floor(d))
-    return jnp.where(has_line & (line > -delta), jnp.minimum(upper, line), upper)
+    rows = zip(delays, np.asarray(upper), strict=True)
+    return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in rows]

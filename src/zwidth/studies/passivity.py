@@ -4,28 +4,30 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import HeldOnly
-from zwidth.loops.rigid.passive_area import passive_edge
+from zwidth.config.study import HeldOnly, register
+from zwidth.figures.region import Outlines
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
+from zwidth.loops.rigid.region import stable_region
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
+from zwidth.scenes.passive import passive_edge
 from zwidth.scenes.scene import Scene
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome
+from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
 
 
+@register
 class PassivityStudy(CurvesStudy):
     """What passivity costs: the largest passive and the largest stable stiffness over delta."""
 
-    what: ClassVar[str] = "a passivity study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_model")
+    method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
+    from_scene = ("delta", "d", "delay_model")
 
     kind: Literal["passivity"]
 
@@ -45,6 +47,15 @@ class PassivityStudy(CurvesStudy):
 def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     """alpha and beta of the passive set's edge for delta = 1, from the smallest beta to the largest."""
     return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
+
+
+def find_edges(delta: float, d: float) -> dict[str, Outlines]:
+    """Where the stable and the passive walls of a rigid device end, normalized."""
+    found = stable_region(delta, d)
+    edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
+    if delta > 0:
+        edges["passive"] = [(delta * np.stack(unit_outline(d), -1), False)]
+    return edges
 
 
 def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:

@@ -6,13 +6,14 @@ import json
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zwidth import figures
-from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
+from zwidth.config.study import register
+from zwidth.config.values import Fraction
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.settling import decay_time
@@ -47,13 +48,14 @@ _PASSIVE = {True: "yes", False: "no", None: "not known, the sensor is not where 
 _OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
 
 
+@register
 class RecommendStudy(ResponseStudy):
     """Maximum stiffness and recommended damping of a device in SI units, and its response."""
 
-    what: ClassVar[str] = "a recommend study"
-    from_scene: ClassVar[tuple[str, ...]] = ("device", "delay_model")
+    method = "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings."
+    from_scene = ("device", "delay_model")
 
-    takes_parts: ClassVar[bool] = True
+    takes_parts = True
 
     kind: Literal["recommend"]
 
@@ -80,7 +82,7 @@ class RecommendStudy(ResponseStudy):
         elif wall.virtual_damping != top.virtual_damping:
             notes.append(_OTHER_DAMPING)
         found = _summarize(bare, top, wall, verdict, share)
-        if bare.is_rigid and verdict is not None:
+        if not bare.parts_beyond and verdict is not None:
             # The wall as it was judged: from SI units and back, a last digit may be another.
             columns, note = self.respond(self.device, verdict.alpha, verdict.beta, label=label, physical=True)
             found["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
@@ -201,7 +203,7 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
         f"Device: m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, sampled every "
         f"{with_unit(scene.timing.period, 's')}, force delayed by",
         f"{with_unit(scene.timing.delay, 's')} (normalized: delta = {plain(scene.delta)}, d = {plain(scene.d)}).",
-        *([] if scene.is_rigid and scene.operator is None else [f"Its parts, in SI units: {', '.join(parts)}."]),
+        *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
         "",
         "| | stiffness K | virtual damping B | alpha | beta |",
         "|---|---|---|---|---|",
@@ -216,6 +218,6 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
         f"- is passive: {passive}.",
         "",
     ]
-    if scene.is_rigid:
+    if not scene.parts_beyond:
         lines += ["No virtual damping makes a stiffness above the maximum stable.", ""]
     return "\n".join(lines)
