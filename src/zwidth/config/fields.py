@@ -37,6 +37,9 @@ class Strict(BaseModel):
     what: ClassVar[str] = "a mapping"
     """What the mapping describes, for messages."""
 
+    described_by: ClassVar[tuple[type[Strict], ...]] = ()
+    """Other models, which say what the fields of their names are."""
+
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         """Hook: fill in what another part of the file supplies."""
@@ -69,7 +72,7 @@ class Strict(BaseModel):
         """Describe every field as the source does below it; pydantic would look there for every run."""
         found = handler(schema)
         properties = handler.resolve_ref_schema(found)["properties"]
-        for model in reversed(cls.__mro__):
+        for model in (*cls.described_by, *reversed(cls.__mro__)):
             for name, words in _find_docstrings(model) if issubclass(model, Strict) else ():
                 properties[name]["description"] = words
         return found
