@@ -31,7 +31,6 @@ from zwidth.words.status import Status
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
 # Scenes that the search for one value asks about.
 _TRIALS = 60
-_OTHER_SIDE = {"above": "below", "below": "above"}
 
 
 def _read_parameter(raw: Any) -> str:
@@ -53,7 +52,7 @@ def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
 
 Parameter = Annotated[str, BeforeValidator(_read_parameter), WithJsonSchema({"type": "string", "enum": list(FINDS)})]
 Ends = Annotated[
-    tuple[float, ...],
+    tuple[float, float],
     BeforeValidator(_read_range),
     WithJsonSchema(
         {"type": "array", "items": {"anyOf": [{"type": "number"}, {"type": "string"}]}, "minItems": 2, "maxItems": 2}
@@ -163,7 +162,7 @@ class DesignStudy(ComputedStudy):
         nominal = self.device.to_scene()
         rows, notes, ranges = [], [], []
         for stiffness in self.stiffness.values().tolist():
-            needed = self._require(nominal, self.reserve * stiffness)
+            needed = nominal.required(self.find, self.reserve * stiffness, within=self.within)
             ranges.append(needed.range)
             rows.append(self._describe(nominal, stiffness, needed))
             notes += self._note(stiffness, needed)
@@ -176,21 +175,6 @@ class DesignStudy(ComputedStudy):
             documents={f"{self.name}_curve.csv": csv_text(curve)},
             notes=tuple(notes),
         )
-
-    def _require(self, nominal: Scene, stiffness: float) -> RequiredValue:
-        """The value that is enough; a rate by its period."""
-        within = None if self.within is None else (self.within[0], self.within[1])
-        if self.find != "rate":
-            return nominal.required(self.find, stiffness, within=within)
-        periods = None if within is None else (1.0 / within[1], 1.0 / within[0])
-        found = nominal.required("period", stiffness, within=periods)
-        low, high = found.range
-        crossings = tuple(
-            crossing._replace(value=1.0 / crossing.value, enough=_OTHER_SIDE[crossing.enough])
-            for crossing in reversed(found.crossings)
-        )
-        enough: Any = _OTHER_SIDE.get(found.enough, found.enough)
-        return RequiredValue(1.0 / found.value, enough, crossings, (1.0 / high, 1.0 / low), found.status)
 
     def _describe(self, nominal: Scene, stiffness: float, needed: RequiredValue) -> dict[str, Any]:
         """A row of the table: what is needed, the wall there, and what tolerances leave of it."""

@@ -18,8 +18,7 @@ from zwidth.config.values import Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table
-from zwidth.studies.stable_set import summarize_stiffest
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table, summarize_stiffest
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE
 
