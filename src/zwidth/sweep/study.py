@@ -197,8 +197,7 @@ class SweepStudy(_Parts, _Swept):
         least = {name: self.axes.ends(name)[0] for name in self.axes.given if name not in WALL}
         for changed in ({}, *({name: self.axes.ends(name)[1]} for name in self.axes.given_of_parts)):
             try:
-                scene = self.make_scene({**least, **changed})
-                _ = scene.is_rigid or scene.loop
+                self.make_scene({**least, **changed}).check_parts()
             except InputError as error:
                 yield error
 
