@@ -12,9 +12,8 @@ import numpy as np
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.loops.linear.poles import is_marginal
 from zwidth.loops.rigid.boundary import boundary_point
-from zwidth.loops.rigid.decay import decay_rate
 from zwidth.loops.rigid.outermost_poles import outermost_poles
-from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.spectral_radius import decay_rate, spectral_radius
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError

@@ -15,9 +15,8 @@ from typing import TypeAlias
 import numpy as np
 
 from zwidth.loops.rigid.boundary_map import row_limits
-from zwidth.loops.rigid.decay import rates
 from zwidth.loops.rigid.margins import margins_kernel
-from zwidth.loops.rigid.outermost_poles import outermost_poles, radius_at, usable
+from zwidth.loops.rigid.outermost_poles import outermost_poles, radius_at, rates, usable
 from zwidth.loops.rigid.passivity import margin_at_one_delay
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.settling import decay_time
@@ -186,7 +185,7 @@ def _radius_columns(accuracy: float, columns: Columns) -> Columns:
     walls, status = usable(list(columns))
     # Always compiled, however few they are: a value must not depend on the size of its chunk.
     found = outermost_poles(walls, accuracy, few=0)
-    rate, error = rates(found, walls), np.where(status == Status.OK, found.error, np.inf)
+    rate, error = rates(found, walls, accuracy), np.where(status == Status.OK, found.error, np.inf)
     rate[status != Status.OK] = np.nan
     return radius_at(found.re, error, walls), (error <= accuracy).astype(np.float64), rate
 

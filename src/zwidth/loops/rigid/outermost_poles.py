@@ -1,6 +1,6 @@
 """Outermost poles of arrays, each proved: most of them compiled, the rest by more patient means in NumPy.
 
-On maps of alpha and beta the poles of neighboring points are followed (`loops.rigid.radius_map`).
+On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 from zwidth.arrays.batching import BLOCK, FEW, map_blocks
 from zwidth.arrays.xla import WIDE
 from zwidth.loops.domain import wall_status
-from zwidth.loops.rigid.circle import factor_loop
+from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.delay_classes import classify_delays
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.pole_search import Found, certify_pole, has_bound, quick_kernel, search
-from zwidth.loops.rigid.radius_map import SMALLEST_MAP, Map, as_map, followed_poles, lay_nodes
+from zwidth.loops.rigid.pole_map import Area, follow_poles
+from zwidth.loops.rigid.pole_search import Found, certification_width, certify_pole, has_bound, quick_kernel, search
 from zwidth.words.status import Status
 
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
@@ -28,6 +28,12 @@ _LARGEST_ERROR = 0.1
 # radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
 _DOUBTFUL = 1e-8
 _BELOW_ONE = 1.0 - 2.0**-53
+# A rate of which no more is proved than this share of it is no answer; on maps a smaller one is looked at wall by wall.
+_LARGEST_SHARE, _KNOWN = 1e-3, 1e-6
+# Poles so near to the real axis are taken for single ones.
+_REAL = 1e-6
+# Smaller maps are not worth their cells.
+SMALLEST_MAP = 1 << 11
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 
@@ -122,43 +128,116 @@ def _store_poles(
     return left[~new.proved], type(loop)(*(part[~new.proved] for part in loop))
 
 
-def _by_map(area: Map, accuracy: float) -> tuple[np.ndarray, np.ndarray]:
-    """The logarithms of radii and their errors in the order of the axes that the caller gave."""
-    fractional = area.d != np.floor(area.d)
-    if fractional.all() or not fractional.any():
-        found = _map_poles(area, accuracy, bool(fractional.any()))
-    else:
-        found = tuple(np.empty((area.d.size, area.beta.size, area.alpha.size)) for _ in range(2))
-        for kind in (False, True):
-            part = np.flatnonzero(fractional == kind)
-            found[0][part], found[1][part] = _map_poles(area.of(part), accuracy, kind)
-    back = np.argsort(area.order)
-    re, error = (leaf.reshape(area.shape).transpose(back).reshape(-1) for leaf in found)
-    return re, error
+def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
+    """The points as a map of one or several devices, where they are one that is large enough.
+
+    With it the caller's axes in the map's order, those of the devices, then beta's, then alpha's; and its shape.
+    """
+    shape, alone = points.shape, []
+    for name in ("beta", "alpha"):
+        varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1]
+        # By name: one and the same array may be given twice.
+        others = [array for other, array in points._asdict().items() if other != name]
+        if len(varying) != 1 or any(other.shape[varying[0]] > 1 for other in others):
+            return None
+        alone.append(varying[0])
+    if points.alpha.size * points.beta.size < SMALLEST_MAP:
+        return None
+    others = tuple(axis for axis in range(len(shape)) if axis not in alone)
+    order = (*others, *alone)
+    delta, d = (
+        np.broadcast_to(array, shape).transpose(order)[..., 0, 0].reshape(-1) for array in (points.delta, points.d)
+    )
+    area = Area(points.alpha.reshape(1, -1), points.beta.reshape(1, -1), delta, d)
+    return area, order, tuple(shape[axis] for axis in order)
 
 
-def _map_poles(area: Map, accuracy: float, kind: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The same of devices whose delays are all whole, or none; axes as in the map."""
-    nodes = lay_nodes(area)
-    start = outermost_poles(nodes, accuracy, patient=False)
-    re, proved = followed_poles(area, nodes, start.re, start.im, accuracy, kind)
-    error = np.where(proved, accuracy, np.inf)
-    left = np.nonzero(~proved)
-    late = outermost_poles([area.alpha[left[2]], area.beta[left[1]], area.delta[left[0]], area.d[left[0]]], accuracy)
-    re[left], error[left] = late.re, late.error
-    return re, error
+class AreaPoles(NamedTuple):
+    """Logarithms of radii of a map (devices, betas, alphas), their errors, infinite where none is proved, and rates."""
+
+    re: np.ndarray
+    error: np.ndarray
+    rate: np.ndarray | None
+
+
+def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> AreaPoles:
+    """The outermost poles of a map: by series, the rest wall by wall; with rates of decay to three digits or NaN."""
+    found, missing = follow_poles(area, accuracy)
+    re, error = found.re, found.error
+    if with_rate:
+        known = np.zeros(area.shape, bool)
+        known[tuple(missing)] = True
+        np.logical_or(known, error > _KNOWN * np.abs(re), out=known)
+        missing = np.stack(np.nonzero(known))
+    columns, status = usable(area.walls(missing))
+    place = tuple(missing)
+    late = outermost_poles(columns, accuracy)
+    rate = -re if with_rate else None
+    re[place], error[place] = late.re, np.where(status == Status.OK, late.error, np.inf)
+    if rate is not None:
+        rate[place] = np.where(status == Status.OK, rates(late, columns, accuracy), np.nan)
+    return AreaPoles(re, error, rate)
+
+
+class WallPoles(NamedTuple):
+    """Of arrays of walls: logarithms of radii, their errors (infinite where none is proved), rates of decay, status."""
+
+    re: np.ndarray
+    error: np.ndarray
+    rate: np.ndarray | None
+    status: np.ndarray
+
+
+def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
+    """The outermost poles of arrays of one shape, as a map where they are one."""
+    laid = as_area(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
+    if laid is not None:
+        area, order, shape = laid
+        back = np.argsort(order)
+        found = [
+            None if leaf is None else np.ascontiguousarray(leaf.reshape(shape).transpose(back))
+            for leaf in area_poles(area, accuracy, with_rate)
+        ]
+        re, error, rate = (None if leaf is None else np.broadcast_to(leaf, arrays[0].shape) for leaf in found)
+        bad = np.isinf(error).any()
+        return WallPoles(re, error, rate, np.asarray(wall_status(*arrays)) if bad else np.zeros(re.shape, np.int32))
+    columns, status = usable([array.reshape(-1) for array in arrays])
+    found = outermost_poles(columns, accuracy)
+    bad = status != Status.OK
+    rate = rates(found, columns, accuracy) if with_rate else None
+    for leaf, fill in ((found.error, np.inf), (rate, np.nan)):
+        if leaf is not None:
+            leaf[bad] = fill
+    leaves = (found.re, found.error, rate, status)
+    return WallPoles(*(None if leaf is None else leaf.reshape(arrays[0].shape) for leaf in leaves))
 
 
 def prove_radii(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Radii, relative errors (infinite where none is proved) and status of arrays of one shape, flat."""
-    area = as_map(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
-    if area is not None and area.good():
-        (re, error), status = _by_map(area, accuracy), np.zeros(arrays[0].size, np.int32)
-    else:
-        columns, status = usable([array.reshape(-1) for array in arrays])
-        found = outermost_poles(columns, accuracy)
-        re, error = found.re, np.where(status == Status.OK, found.error, np.inf)
-    return radius_at(re, error, arrays), error, status
+    """Radii, relative errors (infinite where none is proved) and status of arrays of one shape."""
+    shape, arrays = arrays[0].shape, [np.atleast_1d(array) for array in arrays]
+    found = find_poles(arrays, accuracy)
+    leaves = radius_at(found.re, found.error, arrays), found.error, found.status
+    radius, error, status = (leaf.reshape(shape) for leaf in leaves)
+    return radius, error, status
+
+
+def rates(found: OutermostPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:
+    """The rates of decay of outermost poles; NaN where their relative errors are not proved to be small."""
+    rate, allowed, beyond = 0.0 - found.re, _LARGEST_SHARE * np.abs(found.re), certification_width(found.re, accuracy)
+    # Other poles may be larger by what the count allows.
+    error = np.minimum(found.error, found.doubt + beyond)
+    # Without stiffness and damping both poles next to 1 are at 1.
+    error[(found.re == 0) & (columns[0] == 0) & (columns[1] == -columns[2])] = 0.0
+    held = columns[3] % 1.0 != 0.0
+    with np.errstate(all="ignore"):
+        for kind in (False, True):
+            part = np.flatnonzero((error > allowed) & (found.doubt <= allowed) & (held == kind))
+            loop = factor_loop(*(column[part] for column in columns), fractional=kind)
+            # Whether a count proves that no other pole is nearly as large.
+            seen = count(found.re[part] - beyond[part], loop, kind)
+            alone = seen.sure & (seen.missing == np.where(np.sin(found.im[part]) < _REAL, 1, 2))
+            error[part] = np.where(alone, found.doubt[part], error[part])
+    return np.where(error <= allowed, rate, np.nan)
 
 
 def usable(columns: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
@@ -174,11 +253,12 @@ def radius_at(re: np.ndarray, error: np.ndarray, arrays: list[np.ndarray]) -> np
     """Radii on the verdict's side of the circle, which the proved error alone may not tell."""
     radius = np.exp(re)
     radius[np.isinf(error)] = np.nan
-    near = np.flatnonzero(np.abs(re) <= _DOUBTFUL)
-    if near.size:
-        alpha, beta, delta, d = (array.reshape(-1)[near] for array in arrays)
+    near = np.nonzero(np.abs(re) <= _DOUBTFUL)
+    if near[0].size:
+        alpha, beta, delta, d = (array[near] for array in arrays)
         with np.errstate(all="ignore"):
             stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
-        # The largest number below 1 is as near to the truth as 1 itself.
-        radius[near] = np.where(stable, np.minimum(radius[near], _BELOW_ONE), np.maximum(radius[near], 1.0))
+        # The largest number below 1 is as near to the truth as 1 itself. A wall without stiffness has a pole at 1.
+        known = np.where((alpha == 0) & (radius[near] <= 1.0 + error[near]), 1.0, np.maximum(radius[near], 1.0))
+        radius[near] = np.where(stable, np.minimum(radius[near], _BELOW_ONE), known)
     return radius
