@@ -24,7 +24,7 @@ from typing import Any
 import yaml
 from refresh_readme import ROOT, show_commands
 
-from zwidth.studies import paper_values as report
+from zwidth.studies import published as report
 
 DOCS = ROOT / "docs"
 FIGURES = DOCS / "figures"

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import re
 import shlex
 import subprocess
-import sys
 from pathlib import Path
+
+from click.testing import CliRunner
+
+from zwidth.cli import cli
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
@@ -28,9 +30,11 @@ def output_of(command: str) -> str:
         return "".join(Path(name).read_text(encoding="utf-8") for name in words[1:])
     if words[0] != "zwidth":
         raise SystemExit(f"{command!r} is neither zwidth nor cat")
-    call = [sys.executable, "-m", "zwidth", *words[1:]]
-    environment = {**os.environ, "NO_COLOR": "1", "COLUMNS": "100"}
-    return subprocess.run(call, env=environment, check=True, capture_output=True, text=True).stdout
+    # In this process, which has loaded what commands need.
+    done = CliRunner(env={"NO_COLOR": "1", "COLUMNS": "100"}).invoke(cli, words[1:], prog_name="zwidth")
+    if done.exit_code:
+        raise subprocess.CalledProcessError(done.exit_code, command, done.output) from done.exception
+    return done.stdout
 
 
 def show_commands(block: str) -> str:

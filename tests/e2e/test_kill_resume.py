@@ -73,11 +73,10 @@ def test_killed_at_any_moment_a_run_resumes(config, undisturbed, tmp_path):
         kill_group(process)
         assert before.items() <= flags(tmp_path).items()
         before = flags(tmp_path)
-    result = zwidth("run", config, "--out", tmp_path, "--resume")
-    assert result.returncode == 0, result.stderr
+    assert main_of("run", config, "--out", tmp_path, "--resume") == 0
     # Nothing that was marked as done was computed again.
     assert before.items() <= flags(tmp_path).items()
-    assert zwidth("verify", tmp_path).returncode == 0
+    assert main_of("verify", tmp_path) == 0
     assert_same(reference, tmp_path)
     assert list(tmp_path.rglob("*.partial")) == []
 
@@ -95,8 +94,7 @@ def test_a_folder_in_which_a_run_computes_is_refused_until_it_is_killed(config, 
         assert line.startswith(f"zwidth: out: {tmp_path}: another run computes in this folder (process {process.pid} ")
     assert flags(tmp_path) == before
     kill_group(process)
-    result = zwidth("run", config, "--out", tmp_path, "--resume")
-    assert result.returncode == 0, result.stderr
+    assert main_of("run", config, "--out", tmp_path, "--resume") == 0
     assert before.items() <= flags(tmp_path).items()
     assert_same(undisturbed[0], tmp_path)
 
@@ -107,8 +105,7 @@ def test_a_parent_that_is_killed_takes_its_workers_along(config, undisturbed, tm
     os.kill(process.pid, signal.SIGKILL)
     process.communicate()
     wait_for(lambda: not group_lives(process.pid))
-    result = zwidth("run", config, "--out", tmp_path, "--resume")
-    assert result.returncode == 0, result.stderr
+    assert main_of("run", config, "--out", tmp_path, "--resume") == 0
     assert_same(undisturbed[0], tmp_path)
 
 
@@ -143,8 +140,7 @@ def test_every_kind_of_study_survives_kills_at_any_moment(tmp_path):
             path = out / name
             assert (path.stat().st_ino, path.stat().st_mtime_ns) == before, f"{name} was made again"
         kept = done_files(out)
-    result = zwidth("run", config, "--out", out, "--resume")
-    assert result.returncode == 0, result.stderr
+    assert main_of("run", config, "--out", out, "--resume") == 0
     expected = set(os.listdir(tmp_path / "undisturbed"))
     assert set(os.listdir(out)) == expected | {".mine"}
     for name in expected:
@@ -189,8 +185,7 @@ def test_stopped_before_its_first_chunk_a_run_says_the_same(config, tmp_path, mo
     assert capsys.readouterr().err == says
 
 
-def test_the_plan_is_printed_without_doing_anything(config, tmp_path):
-    result = zwidth("run", config, "--out", tmp_path / "out", "--dry-run")
-    assert result.returncode == 0, result.stderr
-    assert "100,000,000 (d 2 x delta 50 x alpha 1000 x beta 1000)" in result.stdout
+def test_the_plan_is_printed_without_doing_anything(config, tmp_path, capsys):
+    assert main_of("run", config, "--out", tmp_path / "out", "--dry-run") == 0
+    assert "100,000,000 (d 2 x delta 50 x alpha 1000 x beta 1000)" in capsys.readouterr().out
     assert list(tmp_path.iterdir()) == []

@@ -22,7 +22,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
-from zwidth.config.fields import Generated, repeated
+from zwidth.config.fields import Strict, repeated
 from zwidth.config.numbers import number, whole_number
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, NOT_NEGATIVE, PARAMETERS, Range
@@ -65,7 +65,7 @@ class Axis:
         return written if self.form == "list" else written[0]
 
 
-class _Spacing(Generated):
+class _Spacing(Strict):
     """Base of the mappings below ``linear`` and ``log``."""
 
     @classmethod

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 import re
-from collections.abc import Callable, Iterable
+import textwrap
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Annotated, Any, ClassVar
 
 from pydantic import (
@@ -35,7 +39,7 @@ from zwidth.words.units import PERIOD_WORDS, find_dimension
 class Strict(BaseModel):
     """A frozen mapping that knows all its keys and reports all its faults at once."""
 
-    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, strict=True, extra="forbid", defer_build=True)
 
     what: ClassVar[str] = "a mapping"
     """What the mapping describes, for messages."""
@@ -66,6 +70,16 @@ class Strict(BaseModel):
     def limits(self) -> Iterable[LocatedProblem]:
         """Hook: faults that only valid values show."""
         return ()
+
+    @classmethod
+    def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        """Describe every field as the source does below it; pydantic would look there for every run."""
+        found = handler(schema)
+        properties = handler.resolve_ref_schema(found)["properties"]
+        for model in reversed(cls.__mro__):
+            for name, words in _find_docstrings(model) if issubclass(model, Strict) else ():
+                properties[name]["description"] = words
+        return found
 
     @model_validator(mode="wrap")
     @classmethod
@@ -111,10 +125,19 @@ class Strict(BaseModel):
             yield path, problem("missing", *cls.missing(str(path[0]))) if detail["type"] == "missing" else what
 
 
-class Generated(Strict):
-    """Base of models whose fields no source has: pydantic would look for their docstrings in every frame."""
-
-    model_config = ConfigDict(use_attribute_docstrings=False)
+def _find_docstrings(model: type[Strict]) -> Iterator[tuple[str, str]]:
+    """The names of the fields that a class adds, and the texts below them."""
+    try:
+        body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0]
+    except (OSError, TypeError):
+        # Made of quantities, or by a program: there is no source.
+        return
+    assert isinstance(body, ast.ClassDef), "this is a class"
+    for field, below in pairwise(body.body):
+        if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+            name = ast.unparse(field.target)
+            if name in model.model_fields:
+                yield name, inspect.cleandoc(str(below.value.value))
 
 
 def _name(value: Any) -> str:

@@ -23,7 +23,7 @@ from pydantic_core.core_schema import no_info_wrap_validator_function
 
 from zwidth.config.axes import read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Generated, Quantity, describe_parameter
+from zwidth.config.fields import Quantity, Strict, describe_parameter
 from zwidth.config.numbers import number, whole_number
 from zwidth.parts.checks import find_range
 from zwidth.parts.paths import PARTS
@@ -46,7 +46,7 @@ def locate_refusal(error: InputError) -> LocatedProblem:
     return tuple(field.split(".")), problem(what, allowed, remedy)
 
 
-class PartSection(Generated):
+class PartSection(Strict):
     """Base of the sections: what the keys give is checked by the part itself."""
 
     part: ClassVar[Any]
@@ -157,7 +157,7 @@ _SECTIONS: Any = {
 }
 
 
-def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Generated]:
+def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:
     """A base of what has a section for each of the parts that a scene need not have."""
     known: dict[str, Any] = {"velocity": ("How the velocity is estimated", VelocityField, no_estimate)}
     known |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
@@ -165,7 +165,7 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Gene
         name: (form | None, Field(default=None, description=f"{words}; {absent} where left out.{more}"))
         for name, (words, form, absent) in known.items()
     }
-    return create_model("Parts", __base__=Generated, **keys)
+    return create_model("Parts", __base__=Strict, **keys)
 
 
 def list_parts(owner: Any) -> dict[str, PartSection]:

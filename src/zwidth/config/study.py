@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Annotated, Any, ClassVar, Literal, get_args
+from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
 from pydantic import BeforeValidator, ConfigDict, WrapValidator
 from pydantic_core import PydanticCustomError
@@ -20,6 +20,23 @@ MAX_BYTES = 2**30
 
 KINDS: dict[str, type[Study]] = {}
 """The models of the studies by the name of their kind."""
+
+_Kind = TypeVar("_Kind", bound="type[Study]")
+
+
+def register(model: _Kind) -> _Kind:
+    """Make a kind of study known; it stands above the class.
+
+    Args:
+        model: a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal type, the name of the kind.
+
+    Returns:
+        The model.
+    """
+    KINDS[model.kind_name()] = model
+    if "what" not in vars(model):
+        model.what = f"a {model.kind_name()} study"
+    return model
 
 
 def _only_held(value: Any) -> str:
@@ -39,7 +56,7 @@ def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticC
     """The problem of a device with parts in a study that would forget them."""
     what = f"got a device with {' and '.join(parts)}"
     allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
-    kinds = f"use one of the kinds {listing(name for name, model in KINDS.items() if model.takes_parts)}"
+    kinds = f"use one of the kinds {listing(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
     return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)
 
 
@@ -67,6 +84,12 @@ class Study(Strict):
     simulates: ClassVar[bool] = False
     """Whether it answers for a velocity estimate without a linear form."""
 
+    method: ClassVar[str] = ""
+    """How it computes, and how far its numbers may be off: a sentence for the report of a run."""
+
+    point_bytes: ClassVar[int] = 80
+    """About how many bytes the result has for each point."""
+
     remedy_if_too_large: ClassVar[str] = "use fewer values on an axis, or split the study"
 
     name: Name
@@ -89,6 +112,8 @@ class Study(Strict):
         }
         if "device" in cls.from_scene and isinstance(scene, PhysicalScene):
             supplied["device"] = scene.simulated_device if cls.simulates else scene.device
+        if "devices" in cls.from_scene:
+            supplied["devices"] = [scene.device]
         return {**{name: supplied[name] for name in cls.from_scene if name in supplied}, **raw}
 
     @classmethod
@@ -125,7 +150,7 @@ class Study(Strict):
     @property
     def nbytes(self) -> int:
         """About how many bytes the result has."""
-        raise NotImplementedError
+        return self.points * self.point_bytes
 
     @property
     def extent(self) -> str:

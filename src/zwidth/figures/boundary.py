@@ -88,12 +88,11 @@ def _draw_panel(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[f
 def _draw_edge(ax: Axes, edge: Any, color: Any, shade: float) -> None:
     """The shaded region, its curve, and the straight part where a real pole is at z = -1."""
     shade_region(ax, [(np.stack([edge.alpha, edge.beta], -1), False)], color, alpha=shade)
-    dash = style.SOLID if edge.delay_model == "held" else style.DASHED
     line = np.flatnonzero(edge.omega >= np.pi)
     curve = slice(None) if line.size < 2 else slice(0, line[0] + 1)
     device = f"delta = {edge.delta:g}, d = {edge.d:g}"
     look: dict[str, Any] = {"color": color, "zorder": 3}
-    ax.plot(edge.alpha[curve], edge.beta[curve], linestyle=dash, label=f"boundary, {device}", **look)
+    ax.plot(edge.alpha[curve], edge.beta[curve], linestyle=style.dash_of(edge), label=f"boundary, {device}", **look)
     if line.size >= 2:
         look |= {"linestyle": style.DOTTED, "linewidth": 1.9, "dash_capstyle": "butt"}
         ax.plot(edge.alpha[line], edge.beta[line], label=f"z = -1, {device}", **look)
@@ -114,8 +113,7 @@ def _legend_handles(table: Table, colors: dict[float, Any]) -> list[Line2D]:
     """What the colors and the line styles of the drawn curves mean."""
     edges = curves(table, "d", "delta", "delay_model", curve="boundary")
     handles = [style.line(rf"$\delta = {delta:g}$", color=color) for delta, color in colors.items()]
-    if any(edge.delay_model == "fractional_power" for edge in edges):
-        handles += style.delay_model_handles()
+    handles += style.delay_model_handles(edges)
     if any(np.count_nonzero(edge.omega >= np.pi) >= 2 for edge in edges):
         handles.append(style.line("real pole at $z = -1$", style.DOTTED, 1.9))
     kinds = np.asarray(table["curve"])

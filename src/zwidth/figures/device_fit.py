@@ -93,11 +93,11 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
     (time, _), (place, unit), (model, _), (rest, _) = (
         _column(first, name) for name in ("time", "position", "modelled", "residual")
     )
-    clock, second = style.si_unit(float(time[-1] - time[0]), "s")
+    clock, second = style.si_unit(time[-1] - time[0], "s")
     time = (time - time[0]) * clock
     if "position" in panels:
         ax = panels["position"]
-        factor, length = style.si_unit(float(np.ptp(place)), unit)
+        factor, length = style.si_unit(np.ptp(place), unit)
         ax.plot(time[thin], place[thin] * factor, color=style.GRAY, linewidth=2.4, alpha=0.55, label="measured")
         ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modelled")
         ax.set(ylabel=f"position  in {length}", xlim=(0.0, time[-1]))
@@ -107,7 +107,7 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
         ax.set_title(f"the first of {count} logs" if count > 1 else "")
     if "residuals" in panels:
         ax = panels["residuals"]
-        factor, length = style.si_unit(float(np.nanmax(np.abs(rest), initial=0.0)), unit)
+        factor, length = style.si_unit(rest, unit)
         ax.plot(time[thin], rest[thin] * factor, color=style.BLUE, label="residual", **_DOT)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
         for end in (-0.5 * step, 0.5 * step) if step else ():
@@ -121,7 +121,7 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
 
 def _draw_correlation(ax: Axes, correlation: Table) -> None:
     (lag, unit), band = _column(correlation, "lag"), np.asarray(correlation["band"])
-    factor, second = style.si_unit(float(lag[-1]), unit)
+    factor, second = style.si_unit(lag, unit)
     values = np.asarray(correlation["autocorrelation"])
     far = lag[-1] * factor * 1.02
     ax.axhspan(-band[0], band[0], color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 % of white noise")
@@ -170,8 +170,8 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     """The stable walls: B over K."""
     (every, spring), (high, _) = _column(walls, "stiffness"), _column(boundary, "stiffness_high")
     dampings, damper = _column(boundary, "virtual_damping")
-    stiffness, spring = style.si_unit(float(np.nanmax(every)), spring)
-    damping, damper = style.si_unit(float(dampings.max()), damper)
+    stiffness, spring = style.si_unit(every, spring)
+    damping, damper = style.si_unit(dampings, damper)
     to = _Scales(stiffness, spring, damping, damper)
     handles = []
     for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):

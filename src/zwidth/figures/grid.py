@@ -60,30 +60,20 @@ def prepare(data: xarray.Dataset, names: list[str]) -> xarray.Dataset:
         if output.dtype == "bool":
             values = values.astype(float).where(data[status] == 0)
         elif output.dtype == "float64":
-            unit, factor = str(values.attrs.get("units", "1")), 1.0
-            if unit not in ("1", "sampling periods"):
-                # Two digits of the first slice are enough to choose a prefix.
-                part = np.abs(values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values)
-                part = part[np.isfinite(part)]
-                factor, unit = style.si_unit(float(np.median(part)) if part.size else 1.0, unit)
+            # Two digits of the first slice are enough to choose a prefix.
+            part = values.isel({dim: slice(0, 1) for dim in values.dims[:-2]}).values
+            part = np.abs(part[np.isfinite(part)])
+            middle = np.median(part) if part.size else 1.0
+            factor, unit = style.si_unit(middle, str(values.attrs.get("units", "1")))
             values = (values * factor).where(data[status] != NOT_COMPUTED).assign_attrs(units=unit)
         data[name] = values
     for name, values in data.coords.items():
         if name in VARIABLES:
-            factor, unit = _readable(values.values, str(values.attrs.get("units", "1")))
+            factor, unit = style.si_unit(values.values, str(values.attrs.get("units", "1")))
             # Without the coordinates of its own, which would bring back those that are scaled already.
             scaled = (values.dims, values.values * factor, {**values.attrs, "units": unit, "factor": factor})
             data = data.assign_coords({name: scaled})
     return data.drop_vars(status)
-
-
-def _readable(values: np.ndarray, unit: str) -> tuple[float, str]:
-    """The factor and the unit in which the values of a parameter have few digits."""
-    if unit in ("1", "sampling periods"):
-        return 1.0, unit
-    if unit == "kg":
-        return (1.0, unit) if np.max(np.abs(values)) >= 1 else (1e3, "g")
-    return style.si_unit(float(np.max(np.abs(values))), unit)
 
 
 def panels(

@@ -49,9 +49,9 @@ def draw_limit_cycles(
     rows = -(-len(labels) // columns)
     size = (max(1.3 + 2.5 * columns, 5.6), 1.3 + 2.4 * rows) if len(labels) > 1 else (5.8, 4.3)
     panels = style.panels(axes, len(labels), *size, columns, sharex=True, sharey=True)
-    scales = {name: style.si_unit(float(np.abs(arrays[name]).max()), _AXES[name][2]) for name in (across, along)}
+    scales = {name: style.si_unit(arrays[name], _AXES[name][2]) for name in (across, along)}
     beyond = _find_beyond(arrays, bounds)
-    factor, meter = style.si_unit(float(np.sqrt(bounds[0] * bounds[1])), "m")
+    factor, meter = style.si_unit(np.sqrt(bounds[0] * bounds[1]), "m")
     norm = LogNorm(bounds[0] * factor, bounds[1] * factor)
     colors = matplotlib.colormaps["viridis_r"].with_extremes(under="white", bad=(0, 0, 0, 0))
     image: Any = None
@@ -111,13 +111,13 @@ def draw_limit_cycle_curves(
     (over,) = (name for name in _AXES if name in arrays and name != family)
     size = (max(1.0 + 2.7 * len(labels), 5.8), 4.8)
     panels = style.panels(axes, 2 * len(labels), *size, len(labels), sharex=True, sharey="row")
-    scale, unit = style.si_unit(float(np.abs(arrays[over]).max()), _AXES[over][2])
+    scale, unit = style.si_unit(arrays[over], _AXES[over][2])
     # The curves along the axis before the last one.
     turn = 1 if family and [name for name in _AXES if name in arrays].index(family) else 0
     cycles = {name: arrays[name] if arrays[name].ndim == 3 else arrays[name][:, None] for name in _CYCLES}
     cycles = {name: values.swapaxes(1, 2) if turn else values for name, values in cycles.items()}
     buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
-    factor, meter = style.si_unit(float(np.max(cycles["amplitude_m"], where=buzzes, initial=0.0)), "m")
+    factor, meter = style.si_unit(cycles["amplitude_m"][buzzes], "m")
     # Panels of a row share the axis: ticks that fit all of them.
     shown_amplitudes = cycles["amplitude_m"][buzzes] * factor
     amplitudes = (float(shown_amplitudes.min(initial=np.inf)), float(shown_amplitudes.max(initial=0.0)))
@@ -149,7 +149,7 @@ def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarra
     if not family:
         return [{**style.look(0), "label": "buzz"}]
     values, (_, symbol, unit) = arrays[family], _AXES[family]
-    times, unit = style.si_unit(float(np.abs(values).max()), unit)
+    times, unit = style.si_unit(values, unit)
     colors = style.ordered_colors(values.size)
     unstable = [not np.any(stable[:, k]) for k in range(values.size)]
     texts = [f"${symbol} = {value * times:.4g}$ {unit}" for value in values]

@@ -33,7 +33,7 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """
     motions = _read_motions(table)
     panels = style.panels(axes, 2, 6.4, 4.8, height_ratios=(1.6, 1.0), sharex=True)
-    clock, second = style.si_unit(max(float(each.time_s[-1]) for each in motions), "s")
+    clock, second = style.si_unit([each.time_s[-1] for each in motions], "s")
     behind = [name for name in ("tip_position_m", "hand_position_m") if hasattr(motions[0], name)]
     quantities = (("position_m", "position  $x$", behind), ("wall_force_N", "wall force", []))
     for ax, (name, words, others) in zip(panels, quantities, strict=False):
@@ -95,9 +95,9 @@ def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     rows = -(-len(motions) // columns)
     panels = style.panels(axes, len(motions), 0.9 + 2.5 * columns if columns > 1 else 5.6, 0.9 + 2.4 * rows, columns)
     shown = [name for name in _ENERGIES if any(np.any(getattr(each, name) != 0) for each in motions)]
-    clock, second = style.si_unit(max(float(each.time_s[-1]) for each in motions), "s")
+    clock, second = style.si_unit([each.time_s[-1] for each in motions], "s")
     for ax, each in zip(panels, motions, strict=False):
-        factor, joule = style.si_unit(max(float(np.nanmax(np.abs(getattr(each, name)))) for name in shown), "J")
+        factor, joule = style.si_unit([getattr(each, name) for name in shown], "J")
         for name in shown:
             words, color, dash = _ENERGIES[name]
             values = getattr(each, name) * factor
@@ -128,7 +128,7 @@ def _limit(ax: Axes, which: str, values: list[np.ndarray], unit: str) -> tuple[f
     most = _CUT * min((size for size in largest if size > 0), default=1.0)
     low = min(float(np.clip(each.min(initial=0.0), -most, 0.0)) for each in finite)
     high = max(float(np.clip(each.max(initial=0.0), 0.0, most)) for each in finite)
-    factor, unit = style.si_unit(max(-low, high), unit)
+    factor, unit = style.si_unit((low, high), unit)
     getattr(ax, f"set_{which}lim")(*style.span(low * factor, high * factor))
     return factor, unit
 

@@ -25,7 +25,7 @@ from zwidth.arrays.batching import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import logarithmic
 from zwidth.figures.motion import draw_motion
-from zwidth.figures.stable_set import draw_stable_set, tabulate_walls, trace_outlines
+from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls, trace_outlines
 from zwidth.figures.step import draw_step
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.passive_area import passive_edge
@@ -33,7 +33,6 @@ from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.types import ArrayLike
 
@@ -97,7 +96,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     walls = [scene.replace(**{parameter: value}).max_stiffness() for value in grid.tolist()]
     top = np.array([float(wall.stiffness) for wall in walls])
     ax = _axes(ax, 5.2, 3.6)
-    factor, unit = style.si_unit(float(np.nanmax(top, initial=0.0)), "N/m")
+    factor, unit = style.si_unit(top, "N/m")
     ax.plot(grid, top * factor, color=style.BLUE, label="stiffest stable wall")
     ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
     known = PARAMETERS.get(parameter)
@@ -128,15 +127,9 @@ def step(
         periods: how many sampling periods.
     """
     K, B = map(float, resolve_wall(scene.wall, stiffness, virtual_damping))
-    loop = scene.state_space(K, B)
-    state, positions = np.zeros(loop.A.shape[0]), np.empty(periods)
-    for k in range(periods):
-        positions[k] = (loop.C @ state)[0]
-        state = loop.A @ state + loop.B[:, 0]
-    columns = tabulate_walls(scene, K, B)
-    columns |= {"time_s": np.arange(periods) * loop.dt, "position_m": positions}
+    columns = {**tabulate_walls(scene, K, B), "label": name_wall(K, B)}
+    columns |= {"time_s": np.arange(periods) * scene.timing.period, "position_m": scene.state_space(K, B).step(periods)}
     columns["final_position_m"] = 1.0 / K if K else math.nan
-    columns["label"] = f"K = {with_unit(K, 'N/m')}, B = {with_unit(B, 'N s/m')}"
     drawn = draw_step(stack([columns]), _axes(ax, 5.2, 3.4))[0]
     drawn.lines[0].set(marker=".", markersize=3)
     return drawn

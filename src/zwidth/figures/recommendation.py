@@ -10,9 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from zwidth.figures import style
-from zwidth.figures.region import mark_wall, name_axes, shade_region
+from zwidth.figures.stable_set import draw_stable_set
 from zwidth.figures.step import draw_positions
-from zwidth.figures.table import SI_COLUMNS, Table, curves
+from zwidth.figures.table import SI_COLUMNS, Table
 
 
 @style.house_style()
@@ -28,53 +28,25 @@ def draw_recommendation(
         axes: an Axes of yours for the region alone, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.5, 2)
-    _draw_region(panels[0], found, region)
+    wall, maximum = found["recommended"], found["maximum"]
+    curve = np.asarray(region["curve"])
+    outlines = {name: region[name] for name in SI_COLUMNS} | {"number": np.zeros(curve.size, int)}
+    outlines |= {"label": np.full(curve.size, ""), "piece": np.where(curve == "passive", curve, "outline")}
+    kinds = np.array(["stiffest", f"recommended ({100 * wall['stiffness_fraction']:g} %)"])
+    walls = {name: np.array([row[key] for row in (maximum, wall)]) for name, key in zip(SI_COLUMNS, _WALL, strict=True)}
+    draw_stable_set(outlines, {"label": np.array(["", ""]), "wall": kinds, **walls}, panels[:1])
+    factor, _ = style.si_unit(maximum["stiffness"], "N/m")
+    # A bound that is not known is None in JSON.
+    interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)
+    look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
+    panels[0].plot([wall["stiffness"] * factor] * 2, interval, **look)
     for ax in panels[1:]:
         _draw_response(ax, found, response)
     style.letter(panels)
     return panels
 
 
-def _draw_region(ax: Axes, found: Mapping[str, Any], region: Table) -> None:
-    factor, unit = style.si_unit(found["maximum"]["stiffness"], "N/m")
-    for curve in curves(region, "curve"):
-        stiffness, damping = getattr(curve, SI_COLUMNS[0]) * factor, getattr(curve, SI_COLUMNS[1])
-        if curve.curve == "passive":
-            _draw_passive(ax, stiffness, damping)
-        elif curve.curve == "boundary":
-            shade_region(ax, [(np.stack([stiffness, damping], -1), False)], style.SKY, alpha=0.25)
-            ax.plot(stiffness, damping, color=style.BLUE, label="boundary", zorder=3)
-            ax.set_xlim(-0.02 * float(stiffness.max()), 1.26 * float(stiffness.max()))
-    _mark_walls(ax, found, factor, unit)
-    name_axes(ax, unit)
-
-
-def _draw_passive(ax: Axes, stiffness: np.ndarray, virtual_damping: np.ndarray) -> None:
-    """The passive walls among the stable ones."""
-    look: dict[str, Any] = {"color": style.VERMILION, "linestyle": style.DASH_DOTTED, "linewidth": 1.2, "zorder": 3}
-    shade_region(ax, [(np.stack([stiffness, virtual_damping], -1), False)], style.VERMILION, alpha=0.15, zorder=1.5)
-    ax.plot(stiffness, virtual_damping, label="passive", **look)
-    # Above the upper edge, which runs from the stiffest passive wall back to K = 0.
-    tip = int(np.argmax(stiffness))
-    middle = tip + int(np.argmin(np.abs(stiffness[tip:] - 0.5 * stiffness[tip])))
-    place = (stiffness[middle], virtual_damping[middle])
-    above: dict[str, Any] = {"xytext": (0, 8), "textcoords": "offset points", "ha": "center", "va": "center"}
-    ax.annotate("passive", place, color=style.VERMILION, fontsize=8, zorder=6, **above)
-
-
-def _mark_walls(ax: Axes, found: Mapping[str, Any], factor: float, unit: str) -> None:
-    """The stiffest wall, the recommended one, and the damping that may go with its stiffness."""
-    wall, maximum = found["recommended"], found["maximum"]
-    stiffness, damping = wall["stiffness"] * factor, wall["virtual_damping"]
-    # A bound that is not known is None in JSON.
-    interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)
-    ax.plot([stiffness, stiffness], interval, color=style.GRAY, linewidth=1.0, label="virtual_damping_interval")
-    top = (maximum["stiffness"] * factor, maximum["virtual_damping"])
-    words = r"$K_{\max} =$" + f"\n{top[0]:.3g} {unit}"
-    mark_wall(ax, top, "stiffness_max", kind="stiffest", text=words, right=True)
-    share = f"{100 * wall['stiffness_fraction']:g} %"
-    text = f"recommended ({share}):\n$K = {stiffness:.3g}$ {unit}\n$B = {damping:.3g}$ N s/m"
-    mark_wall(ax, (stiffness, damping), "recommended", kind="recommended", text=text)
+_WALL = ("stiffness", "virtual_damping")
 
 
 def _draw_response(ax: Axes, found: Mapping[str, Any], response: Table) -> None:

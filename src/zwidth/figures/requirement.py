@@ -34,12 +34,9 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
     values, stiffness = np.asarray(curve[value_in]), np.asarray(curve[SI_COLUMNS[0]])
     wanted = np.asarray(required[SI_COLUMNS[0]])
     targets = wanted * required["reserve"]
-    largest = float(np.nanmax([np.nanmax(stiffness, initial=0.0), targets.max()]))
-    factor, unit = style.si_unit(largest, "N/m")
+    factor, unit = style.si_unit(np.append(stiffness, targets), "N/m")
     known = np.concatenate([values, required[value_in], required[present_in]])
-    scale, spelled = style.si_unit(float(np.sqrt(np.nanmax(known) * values.min())), parameter.unit)
-    if parameter.unit == "kg":
-        scale, spelled = 1e3, "g"
+    scale, spelled = style.si_unit(np.sqrt(np.nanmax(known) * values.min()), parameter.unit)
     ax.plot(values * scale, stiffness * factor, color=style.BLACK, label="K_max", zorder=3)
     colors = style.color_by_value(targets.tolist())
     ax.set(xscale="log", yscale="log")

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import Table, curves, held_or_all, select
+from zwidth.figures.table import Table, curves, select
 
 # The first scaling of Fig. 10 shows this share of the range of delta.
 _ZOOM = 0.1
@@ -39,10 +39,10 @@ def _draw_panel(ax: Axes, table: Table, share: float) -> None:
     shown = curves(columns, "d", "delay_model")
     colors = style.color_by_value([path.d for path in shown])
     for path in shown:
-        held, color = path.delay_model == "held", colors[path.d]
-        look = {"color": color, "linestyle": style.SOLID if held else style.DASHED, "zorder": 3}
+        color = colors[path.d]
+        look = {"color": color, "linestyle": style.dash_of(path), "zorder": 3}
         ax.plot(path.delta, path.alpha_max, label=f"alpha_max, d = {path.d:g}, {path.delay_model}", **look)
-        if held:
+        if path.delay_model == "held":
             ax.fill_between(path.delta, 0.0, path.alpha_max, color=color, alpha=0.07, linewidth=0.0, zorder=1)
     ax.set_xlim(float(columns["delta"].min()), end)
     highest = float(np.nanmax(columns["alpha_max"]))
@@ -52,8 +52,7 @@ def _draw_panel(ax: Axes, table: Table, share: float) -> None:
         style.use_logarithmic(ax, "x", float(columns["delta"].min()), end)
         style.use_logarithmic(ax, "y", float(np.nanmin(columns["alpha_max"])), highest)
         ax.set_ylim(float(np.nanmin(columns["alpha_max"])), 1.2 * highest)
-    named = held_or_all(shown)
-    style.label_ends(ax, named, [path.alpha_max[-1] for path in named], colors)
+    style.label_ends(ax, shown, [path.alpha_max[-1] for path in shown], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=style.ALPHA_MAX_LABEL)
-    if "fractional_power" in columns["delay_model"]:
-        ax.legend(handles=style.delay_model_handles(), loc="upper left")
+    if handles := style.delay_model_handles(shown):
+        ax.legend(handles=handles, loc="upper left")

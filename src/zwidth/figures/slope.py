@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import style
-from zwidth.figures.table import Table, curves, held_or_all
+from zwidth.figures.table import Table, curves
 
 # Below, alpha_max hardly depends on delta and the ratio says nothing.
 _LEAST_DELTA = 0.1
@@ -39,7 +39,7 @@ def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -
 def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
     """alpha_max/delta on logarithmic axes, the limits dotted across."""
     for path in paths:
-        color, dash = colors[path.d], style.SOLID if path.delay_model == "held" else style.DASHED
+        color, dash = colors[path.d], style.dash_of(path)
         label = f"alpha_max/delta, d = {path.d:g}, {path.delay_model}"
         shown = path.delta >= _LEAST_DELTA
         delta = path.delta[shown]
@@ -50,8 +50,7 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
     style.use_logarithmic(ax, "y", min(limits), max(limits))
     ax.set_xlim(_LEAST_DELTA, max(float(path.delta.max()) for path in paths))
     ax.set_ylim(0.7 * min(limits), 3.0 * max(limits))
-    named = held_or_all(paths)
-    style.label_ends(ax, named, [path.limit for path in named], colors)
+    style.label_ends(ax, paths, [path.limit for path in paths], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=r"$\alpha_{\max}/\delta = K_{\max}T/b$")
     limit = style.line(r"its limit $g(d)$", style.DOTTED, 0.9)
     ax.legend(handles=[style.line(r"$\alpha_{\max}/\delta$"), limit], loc="upper right")
@@ -60,12 +59,12 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
 def _draw_limit(ax: Axes, paths: list[Any], models: list[Any], colors: dict[float, Any]) -> None:
     """g over the delay, with the delays of the paths marked."""
     for model in models:
-        dash = style.SOLID if model.delay_model == "held" else style.DASHED
-        ax.plot(model.d, model.slope, color=style.GRAY, linestyle=dash, label=f"g, {model.delay_model}", zorder=2)
+        look = {"color": style.GRAY, "linestyle": style.dash_of(model), "zorder": 2}
+        ax.plot(model.d, model.slope, label=f"g, {model.delay_model}", **look)
     for path in paths:
         ax.plot([path.d], [path.limit], "o", color=colors[path.d], markersize=5, zorder=3, clip_on=False)
     ax.set_xlim(0.0, max(float(model.d.max()) for model in models))
     ax.set_ylim(0.0, 1.04 * max(float(model.slope.max()) for model in models))
     ax.set(xlabel=r"delay  $d = t_d/T$", ylabel=r"limit slope  $g(d)$")
-    if len(models) > 1:
-        ax.legend(handles=style.delay_model_handles(), loc="upper right")
+    if handles := style.delay_model_handles(models):
+        ax.legend(handles=handles, loc="upper right")

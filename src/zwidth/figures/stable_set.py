@@ -11,6 +11,7 @@ from matplotlib.axes import Axes
 from zwidth.figures import style
 from zwidth.figures.region import MARKS, mark_wall, name_axes, shade_region
 from zwidth.figures.table import SI_COLUMNS, Table, curves, select
+from zwidth.words.formatting import with_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -33,6 +34,11 @@ def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[s
     return {**normalized, **dict(zip(SI_COLUMNS, (stiffness, virtual_damping), strict=True))}
 
 
+def name_wall(stiffness: float, virtual_damping: float) -> str:
+    """A wall in words."""
+    return f"K = {with_unit(stiffness, 'N/m')}, B = {with_unit(virtual_damping, 'N s/m')}"
+
+
 @style.house_style()
 def draw_stable_set(
     outlines: Table, walls: Table, axes: style.AnyAxes | None = None, *, normalized: bool = False
@@ -52,23 +58,28 @@ def draw_stable_set(
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
     tables = [table for table in (walls, outlines) if "label" in table]
     labels = list(dict.fromkeys(label for table in tables for label in np.asarray(table["label"]).tolist()))
+    alone = len(labels) == 1
     colors = {label: style.look(k)["color"] for k, label in enumerate(labels)}
     names = ("alpha", "beta") if normalized else SI_COLUMNS
-    largest = max(float(np.nanmax(np.abs(table[names[0]]), initial=0.0)) for table in tables)
-    factor, unit = (1.0, "") if normalized else style.si_unit(largest, "N/m")
+    stiffness = np.concatenate([np.asarray(table[names[0]]) for table in tables])
+    factor, unit = (1.0, "") if normalized else style.si_unit(stiffness, "N/m")
     pieces = set()
     for label, color in colors.items() if "label" in outlines else ():
         pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factor, 0.5 / (1 + len(labels)))
     symbols = ((r"\alpha", ""), (r"\beta", "")) if normalized else (("K", f" {unit}"), ("B", " N s/m"))
-    alone = len(labels) == 1
     rows = select(walls)
     for kind, label, *wall in zip(*(rows[name] for name in ("wall", "label", *names)), strict=True):
         wall[0] *= factor
         numbers = [f"${symbol} = {value:.3g}${own}" for value, (symbol, own) in zip(wall, symbols, strict=True)]
         text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
-        mark_wall(ax, wall, kind, kind=kind, color=style.BLACK if alone else colors[label], text=text)
+        color = style.BLACK if alone else colors[label]
+        mark_wall(ax, wall, kind, kind=kind.split()[0], color=color, text=text, right=kind == "stiffest")
     name_axes(ax, unit)
     ax.margins(0.04)
+    if alone and np.isfinite(rows[names[0]]).any():
+        # Room for words to the right of the stiffest wall.
+        low, high = ax.get_xlim()
+        ax.set_xlim(low, high + 0.28 * (high - low))
     handles = [style.line(style.literal(label), color=color) for label, color in colors.items() if not alone]
     handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
     if not alone:
@@ -78,13 +89,14 @@ def draw_stable_set(
 
 
 def _draw_pieces(ax: Axes, table: Table, names: tuple[str, ...], color: Any, factor: float, shade: float) -> set[str]:
-    """One device's outlines, what is stable shaded; returns which kinds of them there are."""
+    """One device's outlines, what is stable and what is passive shaded; returns which kinds of them there are."""
+    edges: dict[bool, list[Any]] = {False: [], True: []}
     found = curves(table, "number", "piece")
-    edges = []
     for one in found:
         path = np.stack([getattr(one, names[0]) * factor, getattr(one, names[1])], -1)
         look = {"color": color, "linestyle": _DASHES[one.piece], "zorder": 3}
         ax.plot(*path.T, label=f"{one.piece} {one.number}", **look)
-        edges += [(path, one.piece == "hole")] if one.piece != "passive" else []
-    shade_region(ax, edges, color, alpha=shade)
+        edges[one.piece == "passive"].append((path, one.piece == "hole"))
+    for passive, outlines in edges.items():
+        shade_region(ax, outlines, style.GRAY if passive else color, alpha=shade, zorder=1.5 if passive else 1.0)
     return {str(one.piece) for one in found}

@@ -48,7 +48,7 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
     responses, physical = _read_responses(table), "time_s" in table
     clock, unit, factor, length = 1.0, "", 1.0, ""
     if physical:
-        clock, unit = style.si_unit(max(float(each.time[-1]) for each in responses), "s")
+        clock, unit = style.si_unit([each.time[-1] for each in responses], "s")
         # The final position: an unstable response has no largest one worth a unit.
         finals = [abs(each.final_position) for each in responses if np.isfinite(each.final_position)]
         largest = max(float(np.nanmax(np.abs(each.position))) for each in responses)

@@ -153,8 +153,11 @@ def use_logarithmic(ax: Axes, which: str, low: float, high: float, wide: float =
 
 
 def label_ends(ax: Axes, found: Sequence[Any], ends: Sequence[float], colors: dict[float, Any]) -> None:
-    """Write the delay of each curve to the right of its end."""
-    name_heights(ax, [f"$d = {curve.d:g}$" for curve in found], ends, [colors[curve.d] for curve in found])
+    """Write the delay of each curve to the right of its end; where the held delay is drawn it stands for the other."""
+    held = {curve.d for curve in found if getattr(curve, "delay_model", "") == "held"}
+    named = [k for k, curve in enumerate(found) if not held or curve.delay_model == "held"]
+    texts = [f"$d = {found[k].d:g}$" for k in named]
+    name_heights(ax, texts, [ends[k] for k in named], [colors[found[k].d] for k in named])
 
 
 def name_heights(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: Sequence[Any]) -> None:
@@ -182,9 +185,15 @@ def line(label: str, dash: Any = SOLID, width: float | None = None, color: str =
     return Line2D([], [], color=color, linestyle=dash, linewidth=width, label=label, **keywords)
 
 
-def delay_model_handles() -> list[Line2D]:
-    """What solid and dashed mean where both delay models are drawn."""
-    return [line("held delay (exact)"), line(r"fractional power $z^{1+d}$", DASHED)]
+def dash_of(curve: Any) -> Any:
+    """The line style of a curve's delay model."""
+    return SOLID if curve.delay_model == "held" else DASHED
+
+
+def delay_model_handles(found: Sequence[Any]) -> list[Line2D]:
+    """What solid and dashed mean, where the fractional power is drawn."""
+    both = any(dash_of(curve) == DASHED for curve in found)
+    return [line("held delay (exact)"), line(r"fractional power $z^{1+d}$", DASHED)] if both else []
 
 
 def figure_of(drawn: AnyAxes | Figure) -> Figure:
@@ -258,13 +267,16 @@ def span(low: float, high: float, margin: float = 0.05) -> tuple[float, float]:
 
 def spread(positions: Sequence[float], gap: float) -> np.ndarray:
     """Positions at least ``gap`` apart, as close to the given ones as their order allows."""
-    # It takes a moment to import, and most figures need it not.
-    from scipy.optimize import isotonic_regression
-
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(positions))
+    # Of those that would be closer, as many as it takes share their mean.
+    groups: list[list[float]] = []
+    for place in np.asarray(positions, dtype=np.float64)[order] - steps:
+        groups.append([place])
+        while len(groups) > 1 and np.mean(groups[-2]) > np.mean(groups[-1]):
+            groups[-2:] = [groups[-2] + groups[-1]]
     placed = np.empty(len(positions))
-    placed[order] = isotonic_regression(np.asarray(positions, dtype=np.float64)[order] - steps).x + steps
+    placed[order] = [np.mean(group) for group in groups for _ in group] + steps
     return placed
 
 
@@ -282,10 +294,13 @@ def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 
 
-def si_unit(largest: float, unit: str) -> tuple[float, str]:
-    """The factor and the unit in which values up to ``largest`` have one to three digits before the point."""
-    if not np.isfinite(largest) or largest <= 0 or unit.startswith("1/"):
+def si_unit(values: Any, unit: str) -> tuple[float, str]:
+    """The factor and the unit in which the largest of some values has one to three digits before the point."""
+    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    if not np.isfinite(largest) or largest <= 0 or unit == "sampling periods" or unit.startswith("1"):
         # Of an inverse the prefix would be read as its unit's.
         return 1.0, unit
+    if unit == "kg":
+        return (1.0, unit) if largest >= 1 else (1e3, "g")
     power = int(np.clip(3 * np.floor(np.log10(largest) / 3), -12, 9))
     return 10.0**-power, _PREFIXES[power] + unit

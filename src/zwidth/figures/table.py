@@ -69,11 +69,6 @@ def stack(parts: Iterable[Mapping[str, object]]) -> dict[str, np.ndarray]:
     return table
 
 
-def held_or_all(found: list[Any]) -> list[Any]:
-    """The curves of the held delay, which stand for the other model's as well; all where there are none."""
-    return [curve for curve in found if curve.delay_model == "held"] or found
-
-
 def si_scale(table: Table) -> tuple[float, float] | None:
     """N/m for alpha = 1 and N s/m for beta = 1; None for a table that has no walls in SI units."""
     if SI_COLUMNS[0] not in table:

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import Table, curves, held_or_all
+from zwidth.figures.table import Table, curves
 
 
 @style.house_style()
@@ -29,11 +29,10 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     passive = curves(table, "d", curve="passive")
     colors = style.color_by_value([interval.d for interval in stable])
     for interval in stable:
-        held = interval.delay_model == "held"
-        if held:
+        if interval.delay_model == "held":
             _shade(ax, interval, colors[interval.d], zorder=1)
         label = f"beta_upper, d = {interval.d:g}, {interval.delay_model}"
-        look = {"color": colors[interval.d], "linestyle": style.SOLID if held else style.DASHED, "zorder": 3}
+        look = {"color": colors[interval.d], "linestyle": style.dash_of(interval), "zorder": 3}
         ax.plot(interval.delta, interval.beta_upper, label=label, **look)
     look = {"color": style.VERMILION, "linestyle": style.DASH_DOTTED, "linewidth": 1.3, "zorder": 4}
     for interval in passive:
@@ -46,11 +45,9 @@ def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     values = np.concatenate([np.r_[interval.beta_lower, interval.beta_upper] for interval in stable])
     ax.set_ylim(*style.span(float(values.min()), float(values.max())))
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
-    named = held_or_all(stable)
-    style.label_ends(ax, named, [interval.beta_upper[-1] for interval in named], colors)
+    style.label_ends(ax, stable, [interval.beta_upper[-1] for interval in stable], colors)
     ax.set(title=r"$\alpha \to 0$", xlabel=style.DELTA_LABEL, ylabel=style.BETA_LABEL)
-    both = any(interval.delay_model == "fractional_power" for interval in stable)
-    handles = style.delay_model_handles() if both else []
+    handles = style.delay_model_handles(stable)
     if passive:
         handles.append(style.line("passivity condition", style.DASH_DOTTED, 1.3, style.VERMILION))
     if handles:

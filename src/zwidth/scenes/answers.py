@@ -43,6 +43,15 @@ class StateSpace(NamedTuple):
     D: np.ndarray
     dt: float
 
+    def step(self, periods: int) -> np.ndarray:
+        """The output at so many samples, with an input of 1 from the first one on; inf or NaN beyond float64."""
+        state, found = np.zeros(self.A.shape[0]), np.empty(periods)
+        with np.errstate(all="ignore"):
+            for k in range(periods):
+                found[k] = (self.C @ state)[0] + self.D[0, 0]
+                state = self.A @ state + self.B[:, 0]
+        return found
+
 
 class PoleTable(NamedTuple):
     """Poles, the slowest first, and the motions they stand for; arrays with a last axis of poles."""

@@ -5,24 +5,23 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 from itertools import product
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
 from zwidth import figures
-from zwidth.arrays.batching import map_flat
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
-from zwidth.config.study import DelayModels
+from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.polynomial import frequency_boundary, frequency_loop, line_at_minus_one
+from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.region import Piece, stable_region
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, add_si_of_scene, share_of_device
+from zwidth.studies.outcome import CurvesStudy, Outcome, add_si_of_scene, share_of_device
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import DelayModel
 
 Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
@@ -30,17 +29,16 @@ Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 # Samples of a boundary over frequency; only an estimate of a result's size rests on it.
 _POINTS_PER_CURVE = 1000
 _RIDGE_POINTS = 101
-# Batches of one size: a run with several studies over delta compiles once for each delay model.
-_BATCH = 256
 
 
+@register
 class BoundaryStudy(CurvesStudy):
     """Stability boundaries, one for every delta, d and delay model."""
 
-    what: ClassVar[str] = "a boundary study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_models")
-    reads_scene: ClassVar[bool] = True
-    takes_parts: ClassVar[bool] = True
+    method = "Closed form of the boundary, to a few rounding errors; the stable side by counting poles."
+    from_scene = ("delta", "d", "delay_models")
+    reads_scene = True
+    takes_parts = True
 
     kind: Literal["boundary"]
 
@@ -162,25 +160,8 @@ def outline(delta: float, d: float, delay: DelayModel) -> dict[str, Any]:
 
 def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) -> list[dict[str, Any]]:
     """The virtual damping that is stable for alpha -> 0, over delta, as columns for every delay."""
-    columns = [np.tile(deltas, delays.size), np.repeat(delays, deltas.size)]
-    upper = map_flat(_upper_kernel, columns, (delay,), _BATCH)
-    rows = np.asarray(upper).reshape(delays.size, deltas.size)
+    # At the softest wall that there is.
+    upper = boundary_point(deltas, delays[:, None], alpha=WALL_RANGE[0], side="upper", delay=delay).beta
     shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
-    return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in zip(delays, rows, strict=True)]
-
-
-def _upper_kernel(delta, d, delay: str):
-    """The largest stable beta as alpha -> 0: the lobe's end, or the line P(-1) = 0 where it comes first."""
-    import jax.numpy as jnp
-
-    from zwidth.loops.rigid.exact_points import lobe_end
-
-    loop = frequency_loop(delta, d, delay)
-    omega = lobe_end(loop, d, delay)
-    end = frequency_boundary(omega, loop, delay)
-    # A lobe that runs to omega = pi is left along the line alpha + 2 beta = const.
-    upper = jnp.where(omega >= jnp.pi, end.beta + 0.5 * end.alpha, end.beta)
-    line = 0.5 * line_at_minus_one(delta, d)
-    # A fractional power has no real pole at z = -1.
-    has_line = (delay == "held") | (d == jnp.floor(d))
-    return jnp.where(has_line & (line > -delta), jnp.minimum(upper, line), upper)
+    rows = zip(delays, np.asarray(upper), strict=True)
+    return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in rows]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import WrapValidator
 
@@ -13,6 +13,7 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
+from zwidth.config.study import register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
@@ -22,12 +23,14 @@ from zwidth.studies.stable_set import summarize_stiffest
 _POINTS_PER_OUTLINE = 1000
 
 
+@register
 class CompareStudy(ComputedStudy):
     """The stable walls of several devices in one figure, and the stiffest wall of each in a table."""
 
-    what: ClassVar[str] = "a compare study"
-    from_scene: ClassVar[tuple[str, ...]] = ()
-    takes_parts: ClassVar[bool] = True
+    method = "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge."
+    from_scene = ()
+    takes_parts = True
+    point_bytes = 64
 
     kind: Literal["compare"]
 
@@ -55,10 +58,6 @@ class CompareStudy(ComputedStudy):
     @property
     def points(self) -> int:
         return len(self.devices) * _POINTS_PER_OUTLINE
-
-    @property
-    def nbytes(self) -> int:
-        return self.points * 64
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The outlines of every device, and a table of the stiffest walls."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
@@ -17,6 +17,7 @@ from zwidth.config.fields import Fraction
 from zwidth.config.numbers import number, whole_number
 from zwidth.config.parameters import parameter_axis
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.study import register
 from zwidth.config.units import make_entry_reader
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.wall import VirtualWall
@@ -64,12 +65,13 @@ Count = Annotated[int, BeforeValidator(whole_number(Range(2, 100_000)))]
 Reserve = Annotated[float, BeforeValidator(number(Range(1.0, 100.0)))]
 
 
+@register
 class DesignStudy(ComputedStudy):
     """The value of one parameter at which the stiffest wall reaches a wanted stiffness, and what tolerances leave."""
 
-    what: ClassVar[str] = "a design study"
-    from_scene: ClassVar[tuple[str, ...]] = ("device", "stiffness")
-    takes_parts: ClassVar[bool] = True
+    method = "The stiffest wall, solved for the parameter to 1e-11."
+    from_scene = ("device", "stiffness")
+    takes_parts = True
 
     kind: Literal["design"]
 
@@ -157,10 +159,6 @@ class DesignStudy(ComputedStudy):
     @property
     def points(self) -> int:
         return self.stiffness.size * (_TRIALS + self.draws) + self.num
-
-    @property
-    def nbytes(self) -> int:
-        return self.points * 80
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The value that each stiffness needs, K_max over the parameter, and a figure of both."""

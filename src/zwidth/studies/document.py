@@ -5,8 +5,10 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
+from pkgutil import iter_modules
 from typing import Annotated, Any, ClassVar, Union
 
 from pydantic import (
@@ -22,62 +24,22 @@ from pydantic import (
 )
 from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
+import zwidth.sweep.study  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
-from zwidth.config.study import KINDS, Study
-from zwidth.studies.boundary import BoundaryStudy
-from zwidth.studies.compare import CompareStudy
-from zwidth.studies.design import DesignStudy
-from zwidth.studies.filters import FiltersStudy
-from zwidth.studies.fit import FitStudy
-from zwidth.studies.limit_cycle import LimitCycleStudy
-from zwidth.studies.map import MapStudy
-from zwidth.studies.passivity import PassivityStudy
-from zwidth.studies.published import PublishedStudy
-from zwidth.studies.recommend import RecommendStudy
-from zwidth.studies.ridge import RidgeStudy
-from zwidth.studies.simulate import SimulateStudy
-from zwidth.studies.step import StepStudy
-from zwidth.sweep.study import SweepStudy
+from zwidth.config.study import KINDS, Study, register
 from zwidth.words.formatting import describe, suggestion
 from zwidth.words.units import looks_like_number
 
 FORMAT_VERSION = 1
 
 
-def register(model: type[Study]) -> type[Study]:
-    """Make a kind of study known; it may stand above the class.
-
-    Args:
-        model: a `zwidth.studies.ComputedStudy` whose field ``kind`` has one literal type, the name of the kind.
-
-    Returns:
-        The model.
-    """
-    KINDS[model.kind_name()] = model
-    return model
-
-
-for _model in (
-    BoundaryStudy,
-    MapStudy,
-    RidgeStudy,
-    PassivityStudy,
-    StepStudy,
-    RecommendStudy,
-    CompareStudy,
-    FiltersStudy,
-    DesignStudy,
-    SimulateStudy,
-    LimitCycleStudy,
-    FitStudy,
-    PublishedStudy,
-    SweepStudy,
-):
-    register(_model)
+# Every file of this room registers the kind that it holds.
+for _module in iter_modules([str(Path(__file__).parent)], "zwidth.studies."):
+    import_module(_module.name)
 
 
 def _find_model(kind: Any) -> type[Study] | None:
@@ -94,7 +56,7 @@ def _read_study(raw: Any) -> Any:
         return raw
     if isinstance(raw, PydanticCustomError):
         raise raw
-    kinds = f"a study is a mapping with one of the kinds {listing(KINDS)}"
+    kinds = f"a study is a mapping with one of the kinds {listing(sorted(KINDS))}"
     if not isinstance(raw, dict):
         raise problem(f"got {describe(raw)}", kinds, "write '- kind: boundary' and its fields, or remove the entry")
     kind = raw.get("kind")
@@ -103,7 +65,9 @@ def _read_study(raw: Any) -> Any:
     model = _find_model(kind)
     if model is None:
         what = problem(
-            f"got {describe(kind)}", f"the kinds are {listing(KINDS)}", suggestion(kind, KINDS, "write one of these")
+            f"got {describe(kind)}",
+            f"the kinds are {listing(sorted(KINDS))}",
+            suggestion(kind, KINDS, "write one of these"),
         )
         raise validation_error("study", [(("kind",), what)])
     return model.model_validate(raw)
@@ -122,7 +86,7 @@ class _OfAnyKind:
 
     @classmethod
     def __get_pydantic_json_schema__(cls, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        every = Annotated[Union[tuple(KINDS.values())], Field(discriminator="kind")]  # noqa: UP007
+        every = Annotated[Union[tuple(KINDS[kind] for kind in sorted(KINDS))], Field(discriminator="kind")]  # noqa: UP007
         return handler(TypeAdapter[Any](every).core_schema)  # pyright: ignore[reportArgumentType]
 
 

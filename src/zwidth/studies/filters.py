@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator
@@ -17,6 +17,7 @@ from zwidth.config.numbers import whole_number
 from zwidth.config.parameters import parameter_axis
 from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
+from zwidth.config.study import register
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
@@ -26,12 +27,13 @@ from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, POSITIVE
 
 
+@register
 class FiltersStudy(ComputedStudy):
     """The stiffest wall over the cut-off of a low-pass and over the length of a window, and its noise."""
 
-    what: ClassVar[str] = "a filters study"
-    from_scene: ClassVar[tuple[str, ...]] = ("device",)
-    takes_parts: ClassVar[bool] = True
+    method = "The highest point of all edges of the stable set, one filter after the other, to about 1e-13."
+    from_scene = ("device",)
+    takes_parts = True
 
     kind: Literal["filters"]
 
@@ -84,10 +86,6 @@ class FiltersStudy(ComputedStudy):
     def points(self) -> int:
         sizes = [axis.size for axis in (self.cutoff, self.samples) if axis is not None]
         return self.dampings.size * (1 + sum(sizes))
-
-    @property
-    def nbytes(self) -> int:
-        return self.points * 80
 
     def estimates(self) -> Iterator[tuple[dict[str, Any], Velocity]]:
         """Every estimate with the columns that name it; the difference of two samples first."""

@@ -18,6 +18,7 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Fraction, Quantity, Strict, describe_entry, members, quantity_of
 from zwidth.config.parts import VelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene
+from zwidth.config.study import register
 from zwidth.figures.table import stack
 from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step
@@ -144,12 +145,15 @@ class _Fitted(NamedTuple):
     points: tuple[BuzzPoint, ...] = ()
 
 
+@register
 class FitStudy(ComputedStudy):
     """Mass, damping and delay of a device from records of it, and the walls that follow."""
 
-    what: ClassVar[str] = "a fit study"
-    from_scene: ClassVar[tuple[str, ...]] = ()
-    remedy_if_too_large: ClassVar[str] = "shorten the logs"
+    method = "Least squares with exact derivatives; the band of the boundary by 200 devices drawn from the covariance."
+    from_scene = ()
+    remedy_if_too_large = "shorten the logs"
+    # Time, force, position, model, residual and number of the log.
+    point_bytes = 48
 
     kind: Literal["fit"]
 
@@ -239,11 +243,6 @@ class FitStudy(ComputedStudy):
     @property
     def points(self) -> int:
         return sum(motion.position.size for motion in self._motions) + len(self.buzz or ())
-
-    @property
-    def nbytes(self) -> int:
-        """Time, force, position, model, residual and number of the log a sample."""
-        return self.points * 48
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The fits as a table, their evidence as tables and a figure, and a configuration of each fitted device."""

@@ -17,14 +17,15 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Quantity, Strict, members
 from zwidth.config.parameters import parameter_axis, quantity_axis
 from zwidth.config.scenes import AnyScene
+from zwidth.config.study import register
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
-from zwidth.studies.simulate import SimulatedStudy, check_circumstances, name_column
-from zwidth.words.formatting import with_unit
+from zwidth.studies.simulate import SimulatedStudy, check_circumstances
+from zwidth.words.formatting import header, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 from zwidth.words.status import Status
 
@@ -96,10 +97,12 @@ class CycleAxes(Strict):
         return {name: axis.values()[0] for name, axis in self.given.items()} | dict(zip(self.varied, grid, strict=True))
 
 
+@register
 class LimitCycleStudy(SimulatedStudy, Circumstances):
     """Amplitude of the buzz over one or two parameters, under one or several conditions."""
 
-    what: ClassVar[str] = "a limit_cycle study"
+    method = "Simulations, exact between samples, each judged by the end of what was simulated."
+    point_bytes = 8 * (1 + len(_OUTPUTS))
 
     kind: Literal["limit_cycle"]
 
@@ -160,10 +163,6 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
     def points(self) -> int:
         return len(self.conditions) * math.prod(axis.size for axis in self.axes.varied.values())
 
-    @property
-    def nbytes(self) -> int:
-        return self.points * 8 * (1 + len(_OUTPUTS))
-
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """What becomes of every wall, as arrays with a first axis of conditions, and how much of them stays silent."""
         axes, varied = self.axes.lay_out(), self.axes.varied
@@ -183,7 +182,7 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
             notes.append(f"{label}: {describe_shares(motion, stable, self.silence, self.widest)}")
         units = {name: unit for name, (_, unit) in OF_WHOLE.items()}
         arrays = {"condition": np.array(labels)} | {_COLUMNS[name]: axis.values() for name, axis in varied.items()}
-        arrays |= {name_column(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
+        arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
         table, bounds = stack(edges), (self.silence, self.widest)
         family = choose_curves(varied)
         draw = (

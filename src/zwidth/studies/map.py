@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from itertools import product
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 from pydantic import WrapValidator
@@ -14,7 +14,7 @@ from zwidth import figures
 from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.config.fields import members
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import HeldOnly
+from zwidth.config.study import HeldOnly, register
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
@@ -27,12 +27,13 @@ _TYPES = {"stable": np.bool_, "spectral_radius": np.float64, "passive": np.bool_
 _FUNCTIONS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": is_passive}
 
 
+@register
 class MapStudy(ComputedStudy):
     """Stability and passivity on a grid of alpha, beta, delta and d."""
 
-    what: ClassVar[str] = "a map study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_model")
-    reads_scene: ClassVar[bool] = True
+    method = "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors."
+    from_scene = ("delta", "d", "delay_model")
+    reads_scene = True
 
     kind: Literal["map"]
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar, TypeAlias
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
+from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.axes import Axis
-from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.axes import Axis, DelayAxis, DeltaAxis
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import members
+from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.words.formatting import to_cell
@@ -56,8 +59,8 @@ class Outcome:
 class ComputedStudy(Study):
     """A study whose results are tables, figures and texts: a kind is such a class, its model and its computation.
 
-    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``points``, ``nbytes`` and
-    ``extent`` for the plan, and `compute`. `zwidth.studies.register` makes it known.
+    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``points`` and ``extent`` for the
+    plan, and `compute`. `zwidth.studies.register` makes it known.
     """
 
     reads_scene: ClassVar[bool] = False
@@ -71,6 +74,60 @@ class ComputedStudy(Study):
             alone: whether this is the file's only study of its kind.
         """
         raise NotImplementedError
+
+
+class CurvesStudy(ComputedStudy):
+    """What the studies over delta and d share."""
+
+    # alpha, beta, frequency and two codes.
+    point_bytes = 32
+
+    delta: DeltaAxis
+    """Normalized damping of the device, an axis; the scene's where left out."""
+
+    d: DelayAxis
+    """Delay in periods, an axis; the scene's where left out."""
+
+    @property
+    def models(self) -> int:
+        """How many delay models are computed."""
+        return len(getattr(self, "delay_models", ("held",)))
+
+    @property
+    def extent(self) -> str:
+        return f"delta x d x delay models = {self.delta.size} x {self.d.size} x {self.models}"
+
+    @property
+    def points(self) -> int:
+        return self.delta.size * self.d.size * self.models
+
+
+class WallsStudy(ComputedStudy):
+    """What the studies of walls share that are a share of the maximum stiffness or given outright."""
+
+    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
+    """Walls, any number for one device; of several devices one for all, or one for each. The scene's where left out."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        filled = super().fill(raw, scene)
+        if scene.wall is not None and not {"device", "devices", *_CHOICE} & set(raw):
+            filled["walls"] = [scene.wall]
+        return filled
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        given = [key for key in raw if key in _CHOICE]
+        if len(given) == 2:
+            allowed = "walls are shares of the maximum stiffness or given outright"
+            what = "stiffness_fraction and walls are both given"
+            yield (given[1],), problem(what, allowed, "remove one", on_key=True)
+        elif not given:
+            what, needed = "stiffness_fraction or walls is missing", "the study needs a wall"
+            yield (), problem(what, needed, "add 'stiffness_fraction: 0.75'")
+
+
+_CHOICE = ("stiffness_fraction", "walls")
 
 
 def si_scales(device: PhysicalDevice | PhysicalScene) -> tuple[float, float]:

@@ -4,28 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import HeldOnly
+from zwidth.config.study import HeldOnly, register
 from zwidth.loops.rigid.passive_area import passive_edge
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.scenes.scene import Scene
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome
+from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
 
 
+@register
 class PassivityStudy(CurvesStudy):
     """What passivity costs: the largest passive and the largest stable stiffness over delta."""
 
-    what: ClassVar[str] = "a passivity study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_model")
+    method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
+    from_scene = ("delta", "d", "delay_model")
 
     kind: Literal["passivity"]
 

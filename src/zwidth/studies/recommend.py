@@ -6,13 +6,14 @@ import json
 import math
 from dataclasses import replace
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
+from zwidth.config.study import register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.settling import decay_time
@@ -47,13 +48,14 @@ _PASSIVE = {True: "yes", False: "no", None: "not known, the sensor is not where 
 _OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
 
 
+@register
 class RecommendStudy(ResponseStudy):
     """Maximum stiffness and recommended damping of a device in SI units, and its response."""
 
-    what: ClassVar[str] = "a recommend study"
-    from_scene: ClassVar[tuple[str, ...]] = ("device", "delay_model")
+    method = "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings."
+    from_scene = ("device", "delay_model")
 
-    takes_parts: ClassVar[bool] = True
+    takes_parts = True
 
     kind: Literal["recommend"]
 

@@ -4,34 +4,32 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import DelayModels
+from zwidth.config.study import DelayModels, register
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.ridge import RidgePoint, alpha_max
+from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.slope import stiffness_slope
-from zwidth.studies.curves import CurvesStudy
-from zwidth.studies.outcome import Outcome, Table
+from zwidth.studies.outcome import CurvesStudy, Outcome, Table
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DelayModel
 
-# Every batch has this size, so that a run with many of them compiles the ridge once for each delay model.
-_BATCH = 4096
 # A path that goes this far shows what alpha_max/delta tends to: within some percent.
 _STRONG_DAMPING = 100.0
 # Delays at which g(d) is sampled between two whole ones; it has kinks at these.
 _SLOPE_SAMPLES = 64
 
 
+@register
 class RidgeStudy(CurvesStudy):
     """Maximum stiffness over delta, one curve for every d and delay model."""
 
-    what: ClassVar[str] = "a ridge study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta", "d", "delay_models")
+    method = "Stationary points of the closed form and corners at z = -1, to some ten rounding errors."
+    from_scene = ("delta", "d", "delay_models")
 
     kind: Literal["ridge"]
 
@@ -55,23 +53,10 @@ class RidgeStudy(CurvesStudy):
         return Outcome(table=table, figures=drawn, notes=tuple(notes))
 
 
-def ridges(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> RidgePoint:
-    """`zwidth.alpha_max` of flat arrays, in batches of one size."""
-    delta, d = np.broadcast_arrays(np.asarray(delta, dtype=np.float64), np.asarray(d, dtype=np.float64))
-    count = delta.size
-    missing = -count % _BATCH
-    padded = [np.pad(column, (0, missing), mode="edge") for column in (delta, d)]
-    pieces = [
-        alpha_max(*(column[start : start + _BATCH] for column in padded), delay=delay)
-        for start in range(0, count + missing, _BATCH)
-    ]
-    return RidgePoint(*(np.concatenate(column)[:count] for column in zip(*pieces, strict=True)))
-
-
 def ridge_table(delta: np.ndarray, d: np.ndarray, delay: DelayModel) -> tuple[Table, list[str]]:
     """The stiffest stable walls over ``delta``, delay by delay, and notes about points without an answer."""
     deltas, delays = np.tile(delta, d.size), np.repeat(d, delta.size)
-    points = ridges(deltas, delays, delay)
+    points = alpha_max(deltas, delays, delay=delay)
     columns = {"alpha_max": points.alpha, "beta": points.beta, "omega": points.omega}
     columns["kind"] = np.array([RidgeKind(int(code)).name.lower() for code in points.kind])
     failed = [(value, np.count_nonzero(points.status[delays == value] != Status.OK)) for value in d]

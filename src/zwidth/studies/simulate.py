@@ -4,28 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, PlainValidator, WrapValidator
+from pydantic import BeforeValidator, PlainValidator
 
 from zwidth import figures
 from zwidth.config.axes import SPELLED, Axis, axis, axis_schema
 from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import members
 from zwidth.config.numbers import whole_number
 from zwidth.config.parts import NO_LINEAR_FORM, locate_refusal
-from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice, WallField
-from zwidth.config.study import HeldOnly
+from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
+from zwidth.config.study import HeldOnly, register
+from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, si_scales
-from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
+from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text, si_scales
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import with_unit
+from zwidth.words.formatting import header, with_unit
 from zwidth.words.quantities import POSITIVE, Range
 
 _POSITIVE = {"type": "number", "exclusiveMinimum": 0}
@@ -45,9 +44,9 @@ _WORDS = {
 class SimulatedStudy(ComputedStudy):
     """What the studies that simulate share."""
 
-    from_scene: ClassVar[tuple[str, ...]] = ("device", "delay_model")
-    takes_parts: ClassVar[bool] = True
-    simulates: ClassVar[bool] = True
+    from_scene = ("device", "delay_model")
+    takes_parts = True
+    simulates = True
 
     device: SimulatedDevice
     """Device in SI units; the scene's where left out."""
@@ -66,11 +65,13 @@ def check_circumstances(given: Circumstances, scene: Scene) -> Iterable[LocatedP
             yield locate_refusal(error)
 
 
-class SimulateStudy(SimulatedStudy, Circumstances):
+@register
+class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
     """Motions of a device on one or several walls over time."""
 
-    what: ClassVar[str] = "a simulate study"
-    remedy_if_too_large: ClassVar[str] = "shorten the duration, lower substeps, or use fewer walls"
+    method = "Matrix exponentials between events, instants of friction to the last bit; rounding alone."
+    remedy_if_too_large = "shorten the duration, lower substeps, or use fewer walls"
+    point_bytes = 8 * len(OF_MOTION)
 
     kind: Literal["simulate"]
 
@@ -79,24 +80,6 @@ class SimulateStudy(SimulatedStudy, Circumstances):
 
     stiffness_fraction: Fractions | None = None
     """Stiffness as a share of the maximum, with the virtual damping of that wall; give this or walls."""
-
-    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
-    """Walls; the scene's where left out."""
-
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        filled = super().fill(raw, scene)
-        if scene.wall is not None and "device" not in raw and not gives_walls(raw):
-            filled["walls"] = [scene.wall]
-        return filled
-
-    @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        return check_choice_of_walls(
-            raw,
-            both="walls are shares of the maximum stiffness or given outright",
-            neither="the study needs a wall to meet",
-        )
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -119,10 +102,6 @@ class SimulateStudy(SimulatedStudy, Circumstances):
     @property
     def points(self) -> int:
         return int(self.count * min(self.duration.periods(self.device.period), 1e15) * self.substeps)
-
-    @property
-    def nbytes(self) -> int:
-        return self.points * 8 * len(OF_MOTION)
 
     def list_walls(self, scene: Scene) -> list[tuple[str, float, float]]:
         """Each wall by its name, stiffness and virtual damping."""
@@ -149,7 +128,7 @@ class SimulateStudy(SimulatedStudy, Circumstances):
             parts.append({**named, **tabulate_motion(motion, k, self.substeps)})
             words = describe_end(motion, k)
             judged = {} if linear is None else {"linearly_stable": bool(linear[k])}
-            whole = {name_column(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
+            whole = {header(name, unit): getattr(motion, name)[k] for name, (_, unit) in OF_WHOLE.items()}
             rows.append({**named, **judged, **whole, "outcome": words})
             verdict = "" if linear is None else f" (linearly {'stable' if linear[k] else 'unstable'})"
             notes.append(f"{label}{verdict}: {words}")
@@ -171,11 +150,6 @@ def wall_in_si(device: PhysicalDevice, wall: AnyWall) -> tuple[float, float]:
     return wall.alpha * stiffness, wall.beta * damping
 
 
-def name_column(name: str, unit: str) -> str:
-    """The name of a quantity with its unit, as in velocity_m_per_s."""
-    return name if unit == "1" else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
-
-
 def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarray]:
     """One motion of several over time, as columns."""
     assert motion.time is not None, "it is recorded"
@@ -184,7 +158,7 @@ def tabulate_motion(motion: Motion, k: int, substeps: int) -> dict[str, np.ndarr
         values = getattr(motion, name)
         if values is not None:
             own = np.repeat(values[k], substeps) if name in _OF_SAMPLES else values[k]
-            columns[name_column(name, unit)] = own.astype(int) if own.dtype == bool else own
+            columns[header(name, unit)] = own.astype(int) if own.dtype == bool else own
     return columns
 
 

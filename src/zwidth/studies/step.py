@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import BeforeValidator, WrapValidator
@@ -24,17 +24,16 @@ from zwidth.config.scenes import (
     NormalizedDevice,
     PhysicalDevice,
     PhysicalWall,
-    WallField,
     is_with_parts,
     normalized_wall,
 )
-from zwidth.config.study import HeldOnly, refuse_parts
+from zwidth.config.study import HeldOnly, refuse_parts, register
+from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.parts.span import Span
-from zwidth.studies.outcome import ComputedStudy, Outcome
-from zwidth.studies.walls import check_choice_of_walls, gives_walls, name_wall
+from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, Range
 
@@ -42,7 +41,9 @@ from zwidth.words.quantities import LONGEST_SETTLING, Range
 class ResponseStudy(ComputedStudy):
     """What the studies that compute responses share."""
 
-    remedy_if_too_large: ClassVar[str] = "shorten the duration, or lower substeps"
+    remedy_if_too_large = "shorten the duration, or lower substeps"
+    # Time, position, velocity and force.
+    point_bytes = 32
 
     duration: Duration = Span(100.0, "periods")
     """Length of the response, in s or in periods."""
@@ -108,17 +109,13 @@ class ResponseStudy(ComputedStudy):
         periods = sum(min(self.periods(device), 1e15) for device, _ in self.pairs())
         return int(periods * self.substeps) + len(self.pairs())
 
-    @property
-    def nbytes(self) -> int:
-        """Time, position, velocity and force a point."""
-        return self.points * 32
 
-
-class StepStudy(ResponseStudy):
+@register
+class StepStudy(WallsStudy, ResponseStudy):
     """Response of the position to a step of force, for one or more devices."""
 
-    what: ClassVar[str] = "a step study"
-    from_scene: ClassVar[tuple[str, ...]] = ("devices", "delay_model")
+    method = "Exact solution between the instants at which a force changes; rounding alone."
+    from_scene = ("devices", "delay_model")
 
     kind: Literal["step"]
 
@@ -127,26 +124,6 @@ class StepStudy(ResponseStudy):
 
     stiffness_fraction: Fraction | None = None
     """Stiffness as a share of alpha_max, with beta as at the ridge; give this or walls."""
-
-    walls: Annotated[tuple[WallField, ...], WrapValidator(members("walls"))] | None = None
-    """Walls, one for all devices or one for each; a single device takes any number of them."""
-
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        filled = {"delay_model": scene.delay_model, **raw}
-        if "devices" not in raw:
-            filled["devices"] = [scene.device]
-            if scene.wall is not None and not gives_walls(raw):
-                filled["walls"] = [scene.wall]
-        return filled
-
-    @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        return check_choice_of_walls(
-            raw,
-            both="the wall is a share of the maximum stiffness or given outright",
-            neither="the study needs a wall to respond to",
-        )
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()

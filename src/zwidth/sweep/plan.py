@@ -32,16 +32,8 @@ _FEWEST_CHUNKS = 16
 _SMALLEST_CHUNK = 2**15
 _LAID_OUT_BYTES = 96 * 2**20
 
-# Points a second on one core, roughly: only the size of chunks and a first guess of the time rest on it.
-_RATES = {
-    **{"alpha_max": 1e6, "stable": 3e8, "passive": 4e6, "spectral_radius": 1e6},
-    **{"gain_margin": 2e5, "delay_margin": 2e4, "modulus_margin": 2e4},
-}
-# Of devices with parts; and the seconds that it takes to lay out the boundary of one.
-_RATES_WITH_PARTS = {"alpha_max": 10.0, "stable": 3e8, "passive": 100.0, "spectral_radius": 5e4}
+# To lay out the boundary of a device with parts.
 _SCENE_SECONDS = 0.1
-_FOLLOWS_FROM = dict.fromkeys(RADIUS_OUTPUTS, "spectral_radius")
-_FOLLOWS_FROM |= {"passivity_margin": "passive", "phase_margin": "gain_margin"}
 
 Methods: TypeAlias = dict[str, str]
 
@@ -167,14 +159,14 @@ class Plan:
 
 
 def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
-    """Cut a study into chunks of so many bytes, from the points a second that each output takes at a ``rate``."""
+    """Cut a study into chunks of so many bytes, by the points a second of each output."""
     grid = Grid(study)
     chosen = choose_methods(study)
     methods = {name: method for name, (method, _) in chosen.items()}
     families, seconds = [], 0.0
     for family, outputs in study.families.items():
-        rates = _RATES_WITH_PARTS if study.with_parts else _RATES
-        slowness = sum(1.0 / rates[name] for name in _costly(outputs))
+        sources = {OUTPUTS[name].source or name for name in outputs}
+        slowness = sum(1.0 / OUTPUTS[name].rates[study.with_parts] for name in sources)
         if study.with_parts:
             slowness += _SCENE_SECONDS * grid.size_of("device") / grid.size_of(family)
         per_point = _bytes_per_point(outputs)
@@ -270,11 +262,6 @@ def _machine_memory() -> int:
     except (OSError, ValueError):
         # No container, or one without a limit.
         return total
-
-
-def _costly(outputs: tuple[str, ...]) -> set[str]:
-    """The outputs that cost something; the others follow from them."""
-    return {"alpha_max" if OUTPUTS[name].family == "device" else _FOLLOWS_FROM.get(name, name) for name in outputs}
 
 
 def _bytes_per_point(outputs: tuple[str, ...]) -> int:

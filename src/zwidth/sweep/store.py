@@ -280,7 +280,7 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
         }
         for name in family.outputs:
             output = OUTPUTS[name]
-            attributes = {"long_name": output.long_name, **output.attributes}
+            attributes = {"long_name": output.long_name, **output.flags}
             if output.dtype == "float64":
                 attributes["units"] = output.units_in(grid.physical)
             attributes["ancillary_variables"] = STATUS_OF[family.family]

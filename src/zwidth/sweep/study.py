@@ -12,12 +12,12 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.axes import Axis
 from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
-from zwidth.config.fields import Generated, describe_parameter, members
+from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.numbers import number
 from zwidth.config.parameters import parameter_axis
 from zwidth.config.parts import list_parts, make_parts_base
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
-from zwidth.config.study import HeldOnly, Study
+from zwidth.config.study import HeldOnly, Study, register
 from zwidth.sweep.part_axes import find_faults
 from zwidth.words.quantities import (
     MAX_DELAY_PERIODS,
@@ -60,7 +60,7 @@ def _axis_field(name: str) -> tuple[Any, Any]:
 _OF_WALL, _OF_DEVICE = ("stiffness", "virtual_damping"), ("mass", "damping", "period", "rate", "delay")
 _FIELDS: Any = {name: _axis_field(name) for name in (*OF_PARTS, "devices", *NORMALIZED, *_OF_WALL, *_OF_DEVICE)}
 # Some of the names have dots, which a class body cannot have.
-_Axes: Any = create_model("_Axes", __base__=Generated, **_FIELDS)
+_Axes: Any = create_model("_Axes", __base__=Strict, **_FIELDS)
 
 
 class Axes(_Axes):
@@ -153,12 +153,13 @@ class _Swept(Study):
 _Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
 
 
+@register
 class SweepStudy(_Parts, _Swept):
     """Outputs over a grid of parameters, in a store that can be resumed, verified and opened with xarray."""
 
-    what: ClassVar[str] = "a sweep study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delay_model",)
-    takes_parts: ClassVar[bool] = True
+    method = "Closed forms in float64; the same bits whatever the chunks and workers."
+    from_scene = ("delay_model",)
+    takes_parts = True
 
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""

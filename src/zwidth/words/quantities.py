@@ -231,179 +231,126 @@ class Output:
 
     Attributes:
         name: in files and stores.
-        family: what it belongs to.
         long_name: its definition, for the readers of a store.
+        symbol: what a figure writes behind its words, in mathtext.
+        look: how its values become colors.
+        family: what it belongs to.
         dtype: how it is kept.
         units: its unit in a normalized sweep.
         physical_units: its unit in a sweep over SI quantities; None where that is the same.
         physical_only: whether a normalized sweep cannot have it.
-        attributes: more CF attributes.
-        words, symbol: what a figure calls it; nothing where it is never a figure's own quantity.
-        look: how its values become colors.
+        with_parts: whether it is known of devices with a velocity filter, a hand or a coupling.
+        source: the output that it follows from at no cost; itself where left out.
+        rates: points a second on one core, roughly: of rigid devices, and of devices with parts.
+        label: what a figure calls it; its name where left out.
         center: where a diverging quantity changes sides: the edge of what is stable or passive.
         below: whether the good side lies below the center.
+        flags: of codes and truth values, their meanings by CF's attributes.
     """
 
     name: str
-    family: Family
     long_name: str
+    symbol: str = ""
+    look: Look = "truth"
+    family: Family = "wall"
     dtype: Literal["bool", "float64", "uint8"] = "float64"
     units: str = "1"
     physical_units: str | None = None
     physical_only: bool = False
-    attributes: dict[str, Any] = field(default_factory=dict)
-    words: str = ""
-    symbol: str = ""
-    look: Look = "truth"
+    with_parts: bool = False
+    source: str = ""
+    rates: tuple[float, float] = (1e6, 10.0)
+    label: str = ""
     center: float = 0.0
     below: bool = False
+    flags: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def words(self) -> str:
+        """What a figure calls it."""
+        return self.label or self.name.replace("_", " ")
 
     def units_in(self, physical: bool) -> str:
         """The unit that the store states."""
         return self.physical_units if physical and self.physical_units else self.units
 
 
-def _truth(name: str, long_name: str, no: str) -> Output:
-    flags = {"flag_values": [0, 1], "flag_meanings": f"{no} {name}"}
-    return Output(name, "wall", long_name, "bool", attributes=flags)
+def _flags(values: list[int], meanings: str) -> dict[str, Any]:
+    return {"flag_values": values, "flag_meanings": meanings}
 
 
 _OUTPUTS = (
-    _truth("stable", "whether every pole lies strictly inside the unit circle", "unstable"),
     Output(
-        "spectral_radius",
-        "wall",
-        "largest pole magnitude",
-        words="spectral radius",
-        symbol=r"\rho",
-        look="diverging",
-        center=1.0,
-        below=True,
+        "stable", "whether every pole lies strictly inside the unit circle", dtype="bool", with_parts=True,
+        rates=(3e8, 3e8), flags=_flags([0, 1], "unstable stable"),
     ),
     Output(
-        "margin",
-        "wall",
-        "1 - spectral radius, positive for a stable wall",
-        words="margin",
-        symbol=r"1 - \rho",
-        look="diverging",
+        "spectral_radius", "largest pole magnitude", r"\rho", "diverging", with_parts=True, rates=(1e6, 5e4),
+        center=1.0, below=True,
     ),
     Output(
-        "decay_rate",
-        "wall",
-        "rate at which the slowest pole decays, -ln(spectral radius); negative where it grows",
-        units="1/period",
-        physical_units="1/s",
-        words="rate of decay",
-        symbol=r"-\ln\rho",
-        look="diverging",
+        "margin", "1 - spectral radius, positive for a stable wall", r"1 - \rho", "diverging", source="spectral_radius"
     ),
     Output(
-        "gain_margin",
-        "wall",
-        "factor by which stiffness and damping together may grow; below 1: must fall",
-        words="gain margin",
-        symbol="g_m",
-        look="logarithmic",
+        "decay_rate", "rate at which the slowest pole decays, -ln(spectral radius); negative where it grows",
+        r"-\ln\rho", "diverging", units="1/period", physical_units="1/s", source="spectral_radius",
+        label="rate of decay",
     ),
     Output(
-        "phase_margin",
-        "wall",
-        "phase above -180 degrees at the gain crossover",
-        units="degree",
-        words="phase margin",
-        symbol=r"\varphi_m",
-        look="diverging",
+        "gain_margin", "factor by which stiffness and damping together may grow; below 1: must fall", "g_m",
+        "logarithmic", rates=(2e5, 0.0),
     ),
     Output(
-        "delay_margin",
-        "wall",
-        "delay that the wall bears beyond its own; 0 for an unstable wall",
-        units="sampling periods",
-        physical_units="s",
-        words="delay margin",
-        symbol=r"\tau_m",
-        look="logarithmic",
+        "phase_margin", "phase above -180 degrees at the gain crossover", r"\varphi_m", "diverging", units="degree",
+        source="gain_margin",
     ),
     Output(
-        "modulus_margin",
-        "wall",
-        "least distance of the open loop from -1",
-        words="modulus margin",
-        symbol="s_m",
-        look="sequential",
+        "delay_margin", "delay that the wall bears beyond its own; 0 for an unstable wall", r"\tau_m", "logarithmic",
+        units="sampling periods", physical_units="s", rates=(2e4, 0.0),
     ),
-    _truth("passive", "whether the wall is passive at its delay", "not_passive"),
     Output(
-        "passivity_margin",
-        "wall",
-        "physical damping in excess of what a passive wall needs, in units of delta",
-        words="passivity margin, in units of",
-        symbol=r"\delta",
-        look="diverging",
+        "modulus_margin", "least distance of the open loop from -1", "s_m", "sequential", rates=(2e4, 0.0)
+    ),
+    Output(
+        "passive", "whether the wall is passive at its delay", dtype="bool", with_parts=True, rates=(4e6, 100.0),
+        flags=_flags([0, 1], "not_passive passive"),
+    ),
+    Output(
+        "passivity_margin", "physical damping in excess of what a passive wall needs, in units of delta", r"\delta",
+        "diverging", source="passive", label="passivity margin, in units of",
     ),
     Output(
         "settling_time",
-        "wall",
-        "time in which the slowest pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall",
-        units="sampling periods",
-        physical_units="s",
-        words="decay time to 2 %",
-        symbol=r"t_{2\%}",
-        look="steep",
+        "time in which the slowest pole decays to 2 %, ln(50)/decay_rate; infinite for an unstable wall", r"t_{2\%}",
+        "steep", units="sampling periods", physical_units="s", source="spectral_radius", label="decay time to 2 %",
     ),
     Output(
-        "alpha_max",
-        "device",
-        "largest normalized stiffness that some virtual damping makes stable",
-        words="maximum stable stiffness",
-        symbol=r"\alpha_{\max}",
-        look="logarithmic",
+        "alpha_max", "largest normalized stiffness that some virtual damping makes stable", r"\alpha_{\max}",
+        "logarithmic", "device", label="maximum stable stiffness",
     ),
     Output(
-        "beta_at_max",
-        "device",
-        "normalized virtual damping of that wall",
-        words="virtual damping of that wall",
-        symbol=r"\beta",
-        look="sequential",
+        "beta_at_max", "normalized virtual damping of that wall", r"\beta", "sequential", "device",
+        source="alpha_max", label="virtual damping of that wall",
     ),
     Output(
-        "kind",
-        "device",
-        "kind of that optimum: smooth, or a corner with a double pole at z = -1",
-        "uint8",
-        attributes={"flag_values": [0, 1, NOT_COMPUTED], "flag_meanings": "smooth corner unknown"},
+        "kind", "kind of that optimum: smooth, or a corner with a double pole at z = -1", family="device",
+        dtype="uint8", source="alpha_max", flags=_flags([0, 1, NOT_COMPUTED], "smooth corner unknown"),
     ),
     Output(
-        "stiffness_max",
-        "device",
-        "largest stable stiffness K",
-        units="N/m",
-        physical_only=True,
-        words="maximum stable stiffness",
-        symbol=r"K_{\max}",
-        look="logarithmic",
+        "stiffness_max", "largest stable stiffness K", r"K_{\max}", "logarithmic", "device", units="N/m",
+        physical_only=True, with_parts=True, source="alpha_max", label="maximum stable stiffness",
     ),
     Output(
-        "virtual_damping_at_max",
-        "device",
-        "virtual damping B of that wall",
-        units="N s/m",
-        physical_only=True,
-        words="virtual damping of that wall",
-        symbol="B",
-        look="sequential",
+        "virtual_damping_at_max", "virtual damping B of that wall", "B", "sequential", "device", units="N s/m",
+        physical_only=True, with_parts=True, source="alpha_max", label="virtual damping of that wall",
     ),
-)
+)  # fmt: skip
 OUTPUTS = {output.name: output for output in _OUTPUTS}
 
-RADIUS_OUTPUTS = frozenset({"spectral_radius", "margin", "decay_rate", "settling_time"})
+RADIUS_OUTPUTS = frozenset(name for name, output in OUTPUTS.items() if "spectral_radius" in (name, output.source))
 MARGIN_OUTPUTS = frozenset({"gain_margin", "phase_margin", "delay_margin", "modulus_margin"})
 """NaN there means that the wall has no such margin, as `zwidth.margins` says."""
-
-OUTPUTS_WITH_PARTS = ("stable", "spectral_radius", "passive", "stiffness_max", "virtual_damping_at_max")
-"""What is known of devices with a velocity filter, a hand or a coupling."""
+OUTPUTS_WITH_PARTS = tuple(name for name, output in OUTPUTS.items() if output.with_parts)
 
 STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 """The variable that says for each point of a family why it has the values it has."""
@@ -411,9 +358,6 @@ STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 
 def status_flags() -> dict[str, Any]:
     """The CF description of a status."""
-    meanings = [*(status.name.lower() for status in Status), "not_computed"]
-    return {
-        "long_name": "why a point has its values",
-        "flag_values": [*(int(status) for status in Status), NOT_COMPUTED],
-        "flag_meanings": " ".join(meanings),
-    }
+    codes = [*(int(status) for status in Status), NOT_COMPUTED]
+    meanings = " ".join([*(status.name.lower() for status in Status), "not_computed"])
+    return {"long_name": "why a point has its values", **_flags(codes, meanings)}

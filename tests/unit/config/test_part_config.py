@@ -116,25 +116,16 @@ def test_a_sweep_of_passivity_needs_the_sensor_where_the_force_acts(load):
     assert [fault.field for fault in caught.value.faults] == ["studies[0].outputs[1]"]
 
 
-OTHERS = {
-    "ridge": "",
-    "passivity": "",
-    "step": ", stiffness_fraction: 0.5",
-    "map": ", alpha: 1, beta: 1",
-}
+# What such studies cannot do without.
+NEEDED = {"step": ", stiffness_fraction: 0.5", "map": ", alpha: 1, beta: 1"}
 
 
-def test_every_kind_answers_for_parts_or_is_among_those_that_refuse():
-    with_parts = {name for name, model in KINDS.items() if model.takes_parts}
-    # A fit finds a device and takes none, the paper has its own.
-    assert set(OTHERS) | with_parts | {"fit", "published"} == set(KINDS)
-
-
-@pytest.mark.parametrize("kind", OTHERS)
-def test_other_kinds_name_those_that_answer(load, kind):
-    studies = f"studies: [{{kind: {kind}, name: s{OTHERS[kind]}}}]\n"
+# A fit finds a device and takes none, the paper has its own.
+@pytest.mark.parametrize("kind", [name for name, model in KINDS.items() if model.from_scene and not model.takes_parts])
+def test_kinds_that_forget_parts_name_those_that_answer(load, kind):
+    studies = f"studies: [{{kind: {kind}, name: s{NEEDED.get(kind, '')}}}]\n"
     with pytest.raises(
-        ConfigFileError, match=r"got a device with velocity and operator; .* 'boundary', 'recommend'"
+        ConfigFileError, match=r"got a device with velocity and operator; .* 'boundary', 'compare'"
     ) as caught:
         load(part("velocity: {kind: low_pass, cutoff: 100}, operator: {stiffness: 10}", studies))
     assert [fault.field for fault in caught.value.faults] == ["studies[0]"]

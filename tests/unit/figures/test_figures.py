@@ -324,9 +324,9 @@ def test_a_map_of_many_deltas_shows_the_ends_and_the_middle():
 def test_a_recommendation_is_marked_inside_its_interval():
     region, _ = drawn("draw_recommendation").axes
     marks = curves(region)
-    np.testing.assert_allclose(marks["recommended"][:, 0], (80.0, 100.0))
+    np.testing.assert_allclose(marks["recommended (75 %)"][:, 0], (80.0, 100.0))
     np.testing.assert_allclose(marks["virtual_damping_interval"][1], (20.0, 180.0))
-    np.testing.assert_allclose(marks["stiffness_max"][:, 0], (110.0, 100.0))
+    np.testing.assert_allclose(marks["stiffest"][:, 0], (110.0, 100.0))
     assert "kN/m" in region.get_xlabel()
 
 

@@ -2,7 +2,7 @@
 
 import json
 from importlib.metadata import EntryPoint
-from typing import ClassVar, Literal
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ from zwidth.words.errors import ConfigError, StoreError
 class RatioStudy(ComputedStudy):
     """How much stiffer the stiffest stable wall is than the stiffest passive one, without delay."""
 
-    what: ClassVar[str] = "a ratio study"
-    from_scene: ClassVar[tuple[str, ...]] = ("delta",)
+    method = "Closed forms, without delay."
+    from_scene = ("delta",)
 
     kind: Literal["ratio"]
 
@@ -28,10 +28,6 @@ class RatioStudy(ComputedStudy):
     @property
     def points(self):
         return self.delta.size
-
-    @property
-    def nbytes(self):
-        return 16 * self.points
 
     @property
     def extent(self):
@@ -47,11 +43,11 @@ CONFIG = "{version: 1, name: outside, scene: {delta: 0.5, d: 0}, studies: [{kind
 
 
 @pytest.fixture
-def config(tmp_path, monkeypatch):
-    monkeypatch.setattr(document, "KINDS", dict(document.KINDS))
+def config(tmp_path):
     file = tmp_path / "outside.yaml"
     file.write_text(CONFIG, encoding="utf-8")
-    return file
+    yield file
+    document.KINDS.pop("ratio", None)
 
 
 def test_it_is_run_resumed_and_refused_like_every_other(config, tmp_path, capsys):
@@ -65,6 +61,7 @@ def test_it_is_run_resumed_and_refused_like_every_other(config, tmp_path, capsys
     np.testing.assert_allclose([float(text) for text in row.split(",")], [0.5, zwidth.alpha_max(0.5, 0).alpha / 1.0])
     entry = json.loads((out / "run.json").read_text(encoding="utf-8"))["studies"][0]
     assert (entry["kind"], entry["state"], list(entry["files"])) == ("ratio", "done", ["r.csv"])
+    assert '<p class="soft">Closed forms, without delay.</p>' in zwidth.write_report(out).read_text(encoding="utf-8")
     assert [study.state for study in zwidth.run(config, out=out, resume=True).studies] == ["kept"]
     config.write_text(CONFIG.replace("0.5", "0.6"), encoding="utf-8")
     with pytest.raises(StoreError, match=r"studies\[r\]\.delta: the run was made with 0.5, the configuration has 0.6"):

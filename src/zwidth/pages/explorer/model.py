@@ -100,8 +100,7 @@ def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
 
 def judge_quickly(scene: Scene) -> tuple[bool, np.ndarray]:
     """Whether the scene's wall is stable, and its poles."""
-    wall = scene.wall.stiffness, scene.wall.virtual_damping
-    return bool(scene.decide_stability(*wall, method="companion").stable), scene.poles(*wall)
+    return bool(scene.decide_stability(method="companion").stable), scene.poles()
 
 
 def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
@@ -121,17 +120,13 @@ def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
 
 def nyquist_curve(scene: Scene) -> np.ndarray:
     """The open loop L up to half the sampling rate, complex."""
-    top = 0.5 / scene.timing.period
-    return scene.frequency_response(
-        scene.wall.stiffness, scene.wall.virtual_damping, np.geomspace(1e-4, 1.0, 600) * top
-    )
+    return scene.frequency_response(frequency=np.geomspace(1e-4, 1.0, 600) * 0.5 / scene.timing.period)
 
 
 def crossover(scene: Scene, verdict: Assessment) -> complex:
     """The open loop where its magnitude is 1, the frequency of which the verdict has; NaN without one."""
     hertz = verdict.gain_crossover
-    wall = scene.wall.stiffness, scene.wall.virtual_damping
-    return complex(scene.frequency_response(*wall, hertz)) if isfinite(hertz) else complex("nan+nanj")
+    return complex(scene.frequency_response(frequency=hertz)) if isfinite(hertz) else complex("nan+nanj")
 
 
 def length_of(scene: Scene, verdict: Assessment) -> int:
@@ -142,13 +137,7 @@ def length_of(scene: Scene, verdict: Assessment) -> int:
 
 def step_motion(scene: Scene, periods: int) -> Curve:
     """Time and position at the samples under a force of 1 that sets in at 0, with the wall on both sides."""
-    loop = scene.state_space(scene.wall.stiffness, scene.wall.virtual_damping)
-    state, position = np.zeros(loop.A.shape[0]), np.empty(periods + 1)
-    with np.errstate(all="ignore"):
-        for k in range(periods + 1):
-            position[k] = (loop.C @ state)[0] + loop.D[0, 0]
-            state = loop.A @ state + loop.B[:, 0]
-    return np.arange(periods + 1) * scene.timing.period, position
+    return np.arange(periods + 1) * scene.timing.period, scene.state_space().step(periods + 1)
 
 
 def passive_set(scene: Scene) -> Curve | None:

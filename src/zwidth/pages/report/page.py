@@ -12,30 +12,13 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+from zwidth.config.study import KINDS
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.files.whole import write_whole
 from zwidth.sweep.store import SUFFIX, open_dataset
 from zwidth.words.errors import StoreError
 
 FILE = "report.html"
-
-# How each kind of study computes, and how far its numbers may be off.
-_METHODS = {
-    "boundary": "Closed form of the boundary, to a few rounding errors; the stable side by counting poles.",
-    "ridge": "Stationary points of the closed form and corners at z = -1, to some ten rounding errors.",
-    "map": "Labels by the phase at the one gain crossover; radii by Newton's method, to some rounding errors.",
-    "passivity": "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms.",
-    "step": "Exact solution between the instants at which a force changes; rounding alone.",
-    "published": "The paper's numbers, from closed forms.",
-    "recommend": "Closed forms of boundary, stiffest wall and margins; with parts, signed crossings.",
-    "compare": "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge.",
-    "filters": "The highest point of all edges of the stable set, one filter after the other, to about 1e-13.",
-    "design": "The stiffest wall, solved for the parameter to 1e-11.",
-    "sweep": "Closed forms in float64; the same bits whatever the chunks and workers.",
-    "simulate": "Matrix exponentials between events, instants of friction to the last bit; rounding alone.",
-    "fit": "Least squares with exact derivatives; the band of the boundary by 200 devices drawn from the covariance.",
-    "limit_cycle": "Simulations, exact between samples, each judged by the end of what was simulated.",
-}
 
 
 def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | None = None) -> Path:
@@ -119,7 +102,7 @@ def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> s
 def _section(where: Path, entry: dict[str, Any]) -> str:
     kind, name = str(entry["kind"]), escape(str(entry["name"]))
     notes = "".join(f"<p>{escape(str(note))}</p>" for note in entry.get("notes", ()))
-    method = f'<p class="soft">{escape(_METHODS.get(kind, ""))}</p>' if kind in _METHODS else ""
+    method = f'<p class="soft">{escape(KINDS[kind].method)}</p>' if kind in KINDS and KINDS[kind].method else ""
     body = "".join(_contents(where, entry))
     listed = ", ".join(escape(file) for file in sorted(entry.get("files", {})))
     beside = f'<p class="soft">Files beside this report: {listed}</p>' if listed else ""

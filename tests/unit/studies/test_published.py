@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.studies import paper_values as report
+from zwidth.studies import published as report
 
 
 def comparison(printed, computed):
