@@ -284,7 +284,7 @@ def count_in_cell(
     ends = []
     for side in (-1.0, 1.0):
         h = tuple(part + side * change for part, change in zip(at.h, by, strict=True))
-        zeros = _cubic_zeros(at._replace(h=h), np) if fractional else _quadratic_zeros(*h[:3], np)
+        zeros = _cubic_zeros(at._replace(h=h), np) if fractional else _quadratic_zeros(h[0], h[1], h[2], np)
         zeros = np.sort([np.where((x >= 0) & (x < 1.0), x, np.nan) for x in zeros], axis=0)
         ends.append((h[0] > 0, h[0] + h[1] + h[2] + h[3] > 0, zeros))
     (outer, ends_outer, low), (other, ends_other, high) = ends

@@ -5,12 +5,14 @@ On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import BLOCK, FEW, map_blocks
+from zwidth.arrays.batching import BLOCK, FEW, map_blocks, processors
 from zwidth.arrays.xla import WIDE
 from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.circle import count, factor_loop
@@ -36,6 +38,9 @@ _REAL = 1e-6
 SMALLEST_MAP = 1 << 11
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
+
+
+_NONE = np.empty(0)
 
 
 class OutermostPoles(NamedTuple):
@@ -148,77 +153,78 @@ def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | N
     delta, d = (
         np.broadcast_to(array, shape).transpose(order)[..., 0, 0].reshape(-1) for array in (points.delta, points.d)
     )
-    area = Area(points.alpha.reshape(1, -1), points.beta.reshape(1, -1), delta, d)
+    area = Area.whole(points.alpha.reshape(1, -1), points.beta.reshape(1, -1), delta, d)
     return area, order, tuple(shape[axis] for axis in order)
 
 
-class AreaPoles(NamedTuple):
-    """Logarithms of radii of a map (devices, betas, alphas), their errors, infinite where none is proved, and rates."""
-
-    re: np.ndarray
-    error: np.ndarray
-    rate: np.ndarray | None
-
-
-def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> AreaPoles:
-    """The outermost poles of a map: by series, the rest wall by wall; with rates of decay to three digits or NaN."""
-    found, missing = follow_poles(area, accuracy)
-    re, error = found.re, found.error
-    if with_rate:
-        known = np.zeros(area.shape, bool)
-        known[tuple(missing)] = True
-        np.logical_or(known, error > _KNOWN * np.abs(re), out=known)
-        missing = np.stack(np.nonzero(known))
-    columns, status = usable(area.walls(missing))
-    place = tuple(missing)
-    late = outermost_poles(columns, accuracy)
-    rate = -re if with_rate else None
-    re[place], error[place] = late.re, np.where(status == Status.OK, late.error, np.inf)
-    if rate is not None:
-        rate[place] = np.where(status == Status.OK, rates(late, columns, accuracy), np.nan)
-    return AreaPoles(re, error, rate)
-
-
 class WallPoles(NamedTuple):
-    """Of arrays of walls: logarithms of radii, their errors (infinite where none is proved), rates of decay, status."""
+    """Logarithms of the radii of walls, their errors, infinite where none is proved, and rates of decay if wanted."""
 
     re: np.ndarray
     error: np.ndarray
-    rate: np.ndarray | None
-    status: np.ndarray
+    rate: np.ndarray  # NaN where less than three digits are known
+
+    def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
+        """The same in another layout."""
+        return WallPoles(*(function(leaf) if leaf.size else leaf for leaf in self))
+
+
+def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
+    """The outermost poles of a map (devices, betas, alphas): by series, and where these fail wall by wall.
+
+    Nothing is compiled, and a wall's value does not depend on the others of its window.
+    """
+    (re, error), missing = follow_poles(area, accuracy)
+    if with_rate:
+        left = error > _KNOWN * np.abs(re)
+        left[tuple(missing)] = True
+        missing = np.stack(np.nonzero(left))
+    found = WallPoles(re, error, -re if with_rate else _NONE)
+    held = (area.d % 1.0 != 0.0)[missing[0]]
+    kinds = [missing[:, held == kind] for kind in (False, True)]
+    pieces = [part[:, start : start + FEW] for part in kinds for start in range(0, part.shape[1], FEW)]
+
+    def solve(places: np.ndarray) -> None:
+        # A multiple of 16: NumPy rounds odd ones at the end of a list otherwise.
+        walls = area.walls(np.pad(places, ((0, 0), (0, -places.shape[1] % 16)), mode="edge"))
+        for whole, leaf in zip(found, list_poles(walls, accuracy, with_rate), strict=True):
+            if leaf.size:
+                whole[tuple(places)] = leaf[: places.shape[1]]
+
+    with ThreadPoolExecutor(processors()) as pool:
+        list(pool.map(solve, pieces))
+    return found
+
+
+def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, few: int = FEW) -> WallPoles:
+    """The outermost poles of equally long columns; as for `outermost_poles`, bad walls among them."""
+    columns, status = usable(columns)
+    found, bad = outermost_poles(columns, accuracy, few), status != Status.OK
+    rate = rates(found, columns, accuracy) if with_rate else _NONE
+    found.error[bad] = np.inf
+    rate[bad[: rate.size]] = np.nan
+    return WallPoles(found.re, found.error, rate)
 
 
 def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
     """The outermost poles of arrays of one shape, as a map where they are one."""
+    shape = arrays[0].shape
     laid = as_area(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
-    if laid is not None:
-        area, order, shape = laid
-        back = np.argsort(order)
-        found = [
-            None if leaf is None else np.ascontiguousarray(leaf.reshape(shape).transpose(back))
-            for leaf in area_poles(area, accuracy, with_rate)
-        ]
-        re, error, rate = (None if leaf is None else np.broadcast_to(leaf, arrays[0].shape) for leaf in found)
-        bad = np.isinf(error).any()
-        return WallPoles(re, error, rate, np.asarray(wall_status(*arrays)) if bad else np.zeros(re.shape, np.int32))
-    columns, status = usable([array.reshape(-1) for array in arrays])
-    found = outermost_poles(columns, accuracy)
-    bad = status != Status.OK
-    rate = rates(found, columns, accuracy) if with_rate else None
-    for leaf, fill in ((found.error, np.inf), (rate, np.nan)):
-        if leaf is not None:
-            leaf[bad] = fill
-    leaves = (found.re, found.error, rate, status)
-    return WallPoles(*(None if leaf is None else leaf.reshape(arrays[0].shape) for leaf in leaves))
+    if laid is None:
+        columns = [array.reshape(-1) for array in arrays]
+        return list_poles(columns, accuracy, with_rate).map(lambda leaf: leaf.reshape(shape))
+    area, order, sizes = laid
+    back = np.argsort(order)
+    return area_poles(area, accuracy, with_rate).map(
+        lambda leaf: np.broadcast_to(np.ascontiguousarray(leaf.reshape(sizes).transpose(back)), shape)
+    )
 
 
-def prove_radii(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Radii, relative errors (infinite where none is proved) and status of arrays of one shape."""
+def prove_radii(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray]:
+    """Radii and relative errors (infinite where none is proved) of arrays of one shape."""
     shape, arrays = arrays[0].shape, [np.atleast_1d(array) for array in arrays]
     found = find_poles(arrays, accuracy)
-    leaves = radius_at(found.re, found.error, arrays), found.error, found.status
-    radius, error, status = (leaf.reshape(shape) for leaf in leaves)
-    return radius, error, status
+    return radius_at(found.re, found.error, arrays).reshape(shape), found.error.reshape(shape)
 
 
 def rates(found: OutermostPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:

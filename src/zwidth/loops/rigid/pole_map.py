@@ -54,22 +54,24 @@ _WALLS = 1 << 15
 
 
 class Area(NamedTuple):
-    """Walls of several devices: arrays (devices or 1, walls) of alpha and beta; delta and d of each device."""
+    """A map of several devices, or a window of it: alpha and beta (devices or 1, walls), delta and d of each device."""
 
     alpha: np.ndarray
     beta: np.ndarray
     delta: np.ndarray
     d: np.ndarray
+    window: tuple[slice, slice]  # of the betas and the alphas
 
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """How many devices, betas and alphas there are."""
-        return self.d.size, self.beta.shape[1], self.alpha.shape[1]
+    @classmethod
+    def whole(cls, alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: np.ndarray) -> Area:
+        """All of a map."""
+        return cls(alpha, beta, delta, d, (slice(0, beta.shape[1]), slice(0, alpha.shape[1])))
 
     def walls(self, place: np.ndarray) -> list[np.ndarray]:
-        """alpha, beta, delta and d at places (3, walls) by device, row and column."""
+        """alpha, beta, delta and d at places (3, walls) by device, row and column in the window."""
         device, row, column = place
         alpha, beta = (device if part.shape[0] > 1 else 0 * device for part in (self.alpha, self.beta))
+        row, column = row + self.window[0].start, column + self.window[1].start
         return [self.alpha[alpha, column], self.beta[beta, row], self.delta[device], self.d[device]]
 
 
@@ -82,10 +84,9 @@ class _Axis(NamedTuple):
 
 
 class MapPoles(NamedTuple):
-    """Outermost poles ``e^(re + j im)`` (devices, betas, alphas) and their errors, infinite where nothing is proved."""
+    """Logarithms of the moduli of outermost poles (devices, betas, alphas), and their errors."""
 
     re: np.ndarray
-    im: np.ndarray | None
     error: np.ndarray
 
 
@@ -111,10 +112,10 @@ class _Nodes(NamedTuple):
 class _Series(NamedTuple):
     """The poles of the middles, and what the coefficients of log z are made from."""
 
-    log_z: np.ndarray
-    a: np.ndarray  # coefficients of A by u, (order + 1, cells)
-    f: np.ndarray
-    w: np.ndarray  # 1/z
+    log_z: Any  # complex, as the next three
+    a: Any  # coefficients of A by u, (order + 1, cells)
+    f: Any
+    w: Any  # 1/z
     errors: np.ndarray  # of series of each order, (orders, cells)
 
 
@@ -190,7 +191,7 @@ def _bound_errors(a: np.ndarray, nodes: _Nodes, moduli: list[np.ndarray], fracti
 
 
 def _coefficients(series: _Series, half: tuple[np.ndarray, np.ndarray], m: int) -> np.ndarray:
-    """The coefficients of log z to order m, (cells, powers of eta, powers of xi)."""
+    """The coefficients of log |z| to order m, (cells, powers of eta, powers of xi)."""
     count, by, first = series.f.size, half[1] / half[0], 1.0 / series.a[1]
     ratio, phi = series.a[2 : m + 1] * first, np.empty((m, count), complex)
     phi[0] = half[0] * first
@@ -205,8 +206,8 @@ def _coefficients(series: _Series, half: tuple[np.ndarray, np.ndarray], m: int) 
         for k in range(m - 2, -1, -1):
             part = tilt[j, k + 1] - part
             tilt[j + 1, k] += step * part
-    found = np.zeros((m + 1, m + 1, count), complex)
-    found[0, 0] = series.log_z
+    found = np.zeros((m + 1, m + 1, count))
+    found[0, 0] = series.log_z.real
     power = np.repeat((-1.0 + 0.0j) ** np.arange(m)[:, None], count, 1)
     for k in range(1, m + 1):
         last, power = power, power * phi[0]
@@ -214,7 +215,7 @@ def _coefficients(series: _Series, half: tuple[np.ndarray, np.ndarray], m: int) 
             power[j:] += last[: m - j] * phi[j]
         places = np.arange(k + 1)
         shares = np.array([[comb(k, j) / k] for j in places])
-        found[places, k - places] = (power[:k] * tilt[: k + 1, m - k :]).sum(1) * shares
+        found[places, k - places] = (power[:k] * tilt[: k + 1, m - k :]).real.sum(1) * shares
     return np.ascontiguousarray(found.transpose(2, 0, 1))
 
 
@@ -235,8 +236,7 @@ def _find(mask: np.ndarray) -> np.ndarray:
 class _Followed(NamedTuple):
     """One pole in all of a cell."""
 
-    re: np.ndarray  # coefficients of log z, (cells, powers of eta, powers of xi)
-    im: np.ndarray
+    re: np.ndarray  # coefficients of log |z|, (cells, powers of eta, powers of xi)
     error: np.ndarray
     low: np.ndarray  # the least logarithm of its modulus
     many: np.ndarray  # 2 with its conjugate
@@ -244,11 +244,11 @@ class _Followed(NamedTuple):
     @classmethod
     def expand(cls, series: _Series, nodes: _Nodes, k: int) -> _Followed:
         """By the series of the k-th order."""
-        found = _coefficients(series, nodes.half, _ORDERS[k])
-        re, im = found.real.copy(), found.imag.copy()
+        re = _coefficients(series, nodes.half, _ORDERS[k])
         spread = np.abs(re).sum((1, 2)) - np.abs(re[:, 0, 0])
         error = series.errors[k] + 1e-14 * spread
-        return cls(re, im, error, re[:, 0, 0] - spread - error, np.where(np.sin(im[:, 0, 0]) < _REAL, 1, 2))
+        many = np.where(np.sin(series.log_z.imag) < _REAL, 1, 2)
+        return cls(re, error, re[:, 0, 0] - spread - error, many)
 
     def pick(self, index: Any) -> _Followed:
         """The same of some of the cells."""
@@ -273,8 +273,8 @@ def _prove(followed: list[_Followed], nodes: _Nodes, fractional: bool) -> np.nda
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, accuracy: float, out: MapPoles) -> None:
-        self.area, self.side, self.accuracy, self.out = area, side, accuracy, out
+    def __init__(self, area: Area, side: int, accuracy: float, out: MapPoles, first: list[int]) -> None:
+        self.area, self.side, self.accuracy, self.out, self.first = area, side, accuracy, out, first
         self.axes = _cut(area.alpha, side), _cut(area.beta, side)
 
     def split(self, cells: np.ndarray) -> np.ndarray:
@@ -309,7 +309,7 @@ class _Level:
             for axis, place in zip(self.axes, (column, row), strict=True)
         ]
         alpha, beta = (axis.middle[place] for axis, place in zip(self.axes, along, strict=True))
-        half = tuple(axis.half[place] for axis, place in zip(self.axes, along, strict=True))
+        half = self.axes[0].half[along[0]], self.axes[1].half[along[1]]
         places = tuple(axis.place[:, place[0], place[1]] for axis, place in zip(self.axes, along, strict=True))
         loop = factor_loop(alpha, beta, self.area.delta[device], self.area.d[device], fractional)
         nodes = _Nodes(loop, half)
@@ -329,7 +329,7 @@ class _Level:
         written, rest = alone.copy(), _find(~alone & (needed < len(_ORDERS)))
         if rest.size:
             # Where another pole is about to take over, both are followed.
-            start = (np.where(first, *pair)[rest] for pair in ((re, slow_re), (im, slow_im)))
+            start = np.where(first, re, slow_re)[rest], np.where(first, im, slow_im)[rest]
             other = _expand(*start, _pick(nodes, rest), fractional)
             apart = np.abs(other.log_z - larger.log_z[rest]) > _APART
             good = _find((other.errors[-1] <= self.accuracy) & apart)
@@ -343,19 +343,16 @@ class _Level:
     def _write(self, cells: np.ndarray, index: np.ndarray, followed: list[_Followed], places: Any) -> None:
         """The poles of all walls of some cells."""
         size = max(1, _WALLS // self.side**2)
-        tiles = [None if leaf is None else self._tiles(leaf) for leaf in self.out]
+        tiles = [leaf.reshape(leaf.shape[0], -1, self.side, leaf.shape[2] // self.side, self.side) for leaf in self.out]
         for start in range(0, index.size, size):
             part = slice(start, start + size)
             device, row, column = cells[:, index[part]]
+            row, column = row - self.first[0], column - self.first[1]
             xi, eta = (self._powers(place[:, index[part]], followed[0].re.shape[1]) for place in places)
             values = [eta @ (one.re[part] @ xi.transpose(0, 2, 1)) for one in followed]
             tiles[0][device, row, :, column, :] = values[0] if len(values) == 1 else np.maximum(*values)
-            if tiles[1] is not None:
-                turns = [eta @ (one.im[part] @ xi.transpose(0, 2, 1)) for one in followed]
-                turn = turns[0] if len(turns) == 1 else np.where(values[0] >= values[1], *turns)
-                tiles[1][device, row, :, column, :] = turn
             error = followed[0].error if len(followed) == 1 else np.maximum(followed[0].error, followed[1].error)
-            tiles[2][device, row, :, column, :] = error[part, None, None]
+            tiles[1][device, row, :, column, :] = error[part, None, None]
 
     @staticmethod
     def _powers(place: np.ndarray, count: int) -> np.ndarray:
@@ -365,31 +362,33 @@ class _Level:
             np.multiply(powers[..., k - 1], place.T, out=powers[..., k])
         return powers
 
-    def _tiles(self, leaf: np.ndarray) -> np.ndarray:
-        return leaf.reshape(leaf.shape[0], -1, self.side, leaf.shape[2] // self.side, self.side)
 
+def follow_poles(area: Area, accuracy: float) -> tuple[MapPoles, np.ndarray]:
+    """The outermost poles in the window (devices, betas, alphas), and the places (3, walls) of those without a series.
 
-def follow_poles(area: Area, accuracy: float, with_im: bool = False) -> tuple[MapPoles, np.ndarray]:
-    """The outermost poles (devices, betas, alphas), and the places (3, walls) of those that no series has."""
-    shape, top = area.shape, _SIDES[0]
-    rows, columns = -(-shape[1] // top), -(-shape[2] // top)
-    padded = (shape[0], rows * top, columns * top)
-    out = MapPoles(np.empty(padded), np.empty(padded) if with_im else None, np.empty(padded))
+    A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
+    """
+    top, window = _SIDES[0], area.window
+    first = [part.start // top for part in window]
+    last = [-(-part.stop // top) for part in window]
+    shape = (area.d.size, *(top * (stop - start) for start, stop in zip(first, last, strict=True)))
+    out = MapPoles(np.empty(shape), np.empty(shape))
     held, missing = area.d != np.floor(area.d), []
     for kind in (False, True):
-        pieces = np.flatnonzero(held == kind), np.arange(rows), np.arange(columns)
+        pieces = np.flatnonzero(held == kind), *map(np.arange, first, last)
         cells = np.stack([part.reshape(-1) for part in np.meshgrid(*pieces, indexing="ij")])
         for side in _SIDES:
-            level = _Level(area, side, accuracy, out)
+            level = _Level(area, side, accuracy, out, [start * (top // side) for start in first])
             cells = level.solve_all(cells if side == top else level.split(cells), kind)
-        missing.append(_list_walls(cells, side, shape))
-    found = MapPoles(*(None if leaf is None else leaf[:, : shape[1], : shape[2]] for leaf in out))
-    return found, np.concatenate(missing, axis=1)
+        missing.append(_list_walls(cells, _SIDES[-1], window))
+    inside = tuple(slice(w.start - top * start, w.stop - top * start) for w, start in zip(window, first, strict=True))
+    return MapPoles(*(leaf[:, *inside] for leaf in out)), np.concatenate(missing, axis=1)
 
 
-def _list_walls(cells: np.ndarray, side: int, shape: tuple[int, ...]) -> np.ndarray:
-    """The walls of cells, by device, row and column."""
+def _list_walls(cells: np.ndarray, side: int, window: tuple[slice, slice]) -> np.ndarray:
+    """The walls of cells in a window, by device, row and column in it."""
     device, row, column = np.repeat(cells, side * side, axis=1)
     inner = np.tile(np.arange(side * side), cells.shape[1])
-    walls = np.stack([device, row * side + inner // side, column * side + inner % side])
-    return walls[:, (walls[1] < shape[1]) & (walls[2] < shape[2])]
+    row, column = row * side + inner // side - window[0].start, column * side + inner % side - window[1].start
+    size = [part.stop - part.start for part in window]
+    return np.stack([device, row, column])[:, (row >= 0) & (row < size[0]) & (column >= 0) & (column < size[1])]
