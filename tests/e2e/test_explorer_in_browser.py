@@ -69,14 +69,36 @@ def server(tmp_path_factory):
     assert list(folder.iterdir()) == []
 
 
-@pytest.fixture
-def page(server, browser):
+@contextlib.contextmanager
+def visit(server, browser):
     permissions = ["clipboard-read", "clipboard-write"]
     with open_page(browser, viewport={"width": 1280, "height": 1000}, permissions=permissions) as opened:
         opened.sockets = []
         opened.on("websocket", lambda socket: opened.sockets.append(socket.url))
         opened.goto(server.address)
         settle(opened)
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def shared(server, browser):
+    with visit(server, browser) as opened:
+        yield opened
+
+
+@pytest.fixture
+def page(shared):
+    """A rigid scene, wherever the tests before have moved it."""
+    yield shared
+    settle(shared)
+    assert shared.asked == []
+    assert shared.complaints == []
+
+
+@pytest.fixture
+def fresh(server, browser):
+    """A page of its own, as it opens."""
+    with visit(server, browser) as opened:
         yield opened
         assert opened.asked == []
         assert opened.complaints == []
@@ -193,29 +215,29 @@ def test_arrow_keys_move_the_wall(page):
     assert (wall["x"][0], wall["y"][0]) == (after.stiffness, after.virtual_damping)
 
 
-def test_what_is_copied_runs(page, tmp_path):
-    page.fill("#damping", "7.5")
-    page.press("#damping", "Enter")
-    page.select_option("#velocity", "LowPass")
-    settle(page)
-    page.click("[data-copy=yaml]")
-    wait(page, "document.getElementById('copied').textContent === 'copied'")
-    text = page.evaluate("navigator.clipboard.readText()")
+def test_what_is_copied_runs(fresh, tmp_path):
+    fresh.fill("#damping", "7.5")
+    fresh.press("#damping", "Enter")
+    fresh.select_option("#velocity", "LowPass")
+    settle(fresh)
+    fresh.click("[data-copy=yaml]")
+    wait(fresh, "document.getElementById('copied').textContent === 'copied'")
+    text = fresh.evaluate("navigator.clipboard.readText()")
     file = tmp_path / "copied.yaml"
     file.write_text(text, encoding="utf-8")
     assert zwidth.run(file, out=tmp_path / "run").ok
     given: Any = zwidth.load_config(file).scene
     scene = given.to_scene()
     assert scene.device.damping == 7.5
-    assert scene.velocity == zwidth.LowPass(cutoff=value_of(page, "velocity.cutoff"), order=1)
+    assert scene.velocity == zwidth.LowPass(cutoff=value_of(fresh, "velocity.cutoff"), order=1)
 
 
-def test_a_contact_is_simulated_on_demand(page):
-    assert data_of(page, "contact")["x"].size == 0
-    page.check("#contact-wanted")
-    wait(page, "document.getElementById('contact_words').textContent !== ''")
-    settle(page)
-    scene, shown = shown_scene(page), data_of(page, "contact")
+def test_a_contact_is_simulated_on_demand(fresh):
+    assert data_of(fresh, "contact")["x"].size == 0
+    fresh.check("#contact-wanted")
+    wait(fresh, "document.getElementById('contact_words').textContent !== ''")
+    settle(fresh)
+    scene, shown = shown_scene(fresh), data_of(fresh, "contact")
     start = -0.5 * scene.timing.period
     hit = scene.simulate(start_position=start, start_velocity=0.1, contact="unilateral", periods=shown["x"].size)
     np.testing.assert_array_equal(shown["force"], hit.wall_force)

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from zwidth.cli.options import flag_of, json_option, scene_options
+from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.cli.words import print_json, row
 from zwidth.words.formatting import plain, with_unit
 
@@ -22,30 +22,21 @@ _FINDS = {
 _BOX = ("mass", "damping", "period", "delay")
 
 
-class ToleranceType(click.ParamType):
-    """A parameter and the share by which it may differ: ``mass=10%`` or ``damping=0.2``."""
+def _read_tolerance(text: str) -> tuple[str, float]:
+    """A parameter and the share by which it may differ."""
+    name, _, share = text.partition("=")
+    return name.strip(), read_share(share)
 
-    name = "NAME=SHARE"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
-        """Parse one option."""
-        if isinstance(value, tuple):
-            return value
-        name, _, text = value.partition("=")
-        text = text.strip()
-        try:
-            share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-        except ValueError:
-            self.fail(
-                f"got {value!r}; write the parameter and its share, as mass=10% or velocity.cutoff=0.05", param, ctx
-            )
-        return name.strip(), share
+_TOLERANCE = Parsed(
+    "NAME=SHARE", _read_tolerance, "write the parameter and its share, as mass=10% or velocity.cutoff=0.05"
+)
 
 
 @click.command()
 @scene_options(wall=True, required=True)
 @click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose such that K_max reaches the stiffness.")
-@click.option("--tolerance", "tolerances", type=ToleranceType(), multiple=True, help="As mass=10%; may be repeated.")
+@click.option("--tolerance", "tolerances", type=_TOLERANCE, multiple=True, help="As mass=10%; may be repeated.")
 @click.option(
     "--distribution",
     type=click.Choice(("uniform", "normal")),

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from zwidth.cli.options import QuantityType, json_option, velocity_options
-from zwidth.cli.words import row
+from zwidth.cli.options import Parsed, json_option, number_or_text, quantity_type, read_share, velocity_options
+from zwidth.cli.words import print_json, row
 from zwidth.words.errors import InputError, UnusableValueError
 from zwidth.words.quantities import POSITIVE
 
@@ -29,29 +28,21 @@ class HeardWall(NamedTuple):
     rotary: bool | None
 
 
-class WallType(click.ParamType):
-    """A wall at the onset of buzzing: ``K=3.2kN/m B=0 f=71Hz``."""
-
-    name = "WALL"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse one option."""
-        if isinstance(value, HeardWall):
-            return value
-        entries = _ENTRY.findall(value.replace(",", " "))
-        found = dict(entries)
-        if _ENTRY.sub("", value.replace(",", " ")).strip() or {"K", "f"} - set(found) or len(found) < len(entries):
-            self.fail(f"got {value!r}; write K, B and f, as 'K=3.2kN/m B=0 f=71Hz'", param, ctx)
-        numbers, kinds = {"B": 0.0}, set()
-        for letter, text in found.items():
-            try:
-                numbers[letter], rotary = _read_letter(letter, text)
-            except UnusableValueError as error:
-                self.fail(f"{letter}: {error}", param, ctx)
-            kinds |= set() if rotary is None else {rotary}
-        if len(kinds) > 1:
-            self.fail(f"got {value!r}; N/m goes with N s/m, N m/rad with N m s/rad", param, ctx)
-        return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
+def _read_wall(text: str) -> HeardWall:
+    entries = _ENTRY.findall(text.replace(",", " "))
+    found = dict(entries)
+    if _ENTRY.sub("", text.replace(",", " ")).strip() or {"K", "f"} - set(found) or len(found) < len(entries):
+        raise ValueError(f"got {text!r}; write K, B and f, as 'K=3.2kN/m B=0 f=71Hz'")
+    numbers, kinds = {"B": 0.0}, set()
+    for letter, amount in found.items():
+        try:
+            numbers[letter], rotary = _read_letter(letter, amount)
+        except UnusableValueError as error:
+            raise ValueError(f"{letter}: {error}") from None
+        kinds |= set() if rotary is None else {rotary}
+    if len(kinds) > 1:
+        raise ValueError(f"got {text!r}; N/m goes with N s/m, N m/rad with N m s/rad")
+    return HeardWall((numbers["K"], numbers["B"], numbers["f"]), kinds.pop() if kinds else None)
 
 
 def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
@@ -60,7 +51,7 @@ def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
 
     angular = {"K": ANGULAR_STIFFNESS, "B": ANGULAR_DAMPING}.get(letter)
     linear = {"K": STIFFNESS, "B": DAMPING, "f": RATE}[letter]
-    number = _as_number(text)
+    number = number_or_text(text)
     try:
         told = isinstance(number, str) and angular is not None
         return read_quantity(number, linear)[0], False if told else None
@@ -70,37 +61,30 @@ def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
         return read_quantity(number, angular)[0], True
 
 
-class ShareType(click.ParamType):
-    """A share: ``2%`` or ``0.02``."""
-
-    name = "SHARE"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Parse one option."""
-        text = str(value).strip()
-        try:
-            return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-        except ValueError:
-            self.fail(f"got {value!r}; write a share, as 2% or 0.02", param, ctx)
-
-
-def _as_number(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
+_WALL = Parsed("WALL", _read_wall)
+_SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 
 
 @click.command()
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
-@click.option("--buzz", "walls", type=WallType(), multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
-@click.option("--period", type=QuantityType("s", POSITIVE), help="T, in s; of logs in place of --time.")
-@click.option("--noise", type=ShareType(), help="Relative noise of K and f of buzzing walls, as 2%.")
+@click.option(
+    "--buzz",
+    "walls",
+    type=_WALL,
+    multiple=True,
+    help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.",
+)
+@click.option("--period", type=quantity_type("s", POSITIVE), help="T, in s; of logs in place of --time.")
+@click.option(
+    "--noise",
+    type=_SHARE,
+    help="Relative noise of K and f of buzzing walls, as 2%.",
+)
 @click.option("--time", help="Column of the time: its header, or HEADER:ms. Found by its name where left out.")
 @click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts, :deg.")
 @click.option("--force", help="Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.")
 @click.option("--resolution", metavar="QUANTITY", help="One count of the encoder, as 0.03mm or 0.09deg.")
-@click.option("--max-delay", type=QuantityType("s", POSITIVE), help="Longest delay looked for in a log, in s.")
+@click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
 @click.option("--unknown-cutoff", is_flag=True, help="Find the velocity's cut-off, too; needs --buzz at B > 0.")
@@ -168,7 +152,7 @@ def fit(
     if figure is not None:
         _draw(found, source, points, units, figure)
     if as_json:
-        click.echo(json.dumps({**found.as_dict(), "units": units._asdict()}, indent=2, allow_nan=False))
+        print_json({**found.as_dict(), "units": units._asdict()})
         return
     if as_yaml:
         click.echo("\n".join(write_scene(found, source, units)))

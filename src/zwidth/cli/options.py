@@ -21,30 +21,47 @@ _PART_NAMES = tuple(dict.fromkeys(path.partition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.partition(".")[0]))
 
 
-class QuantityType(click.ParamType):
-    """A number in its SI unit, or a number with a unit, as in configuration files."""
+class Parsed(click.ParamType):
+    """What a function reads of an option's text, or raises a `ValueError` for: then ``remedy`` says what to write."""
 
-    name = "quantity"
-
-    def __init__(self, unit: str, allowed: Range = ANY, *, periods: bool = False) -> None:
-        self.unit, self.allowed, self.periods = unit, allowed, periods
+    def __init__(self, name: str, read: Callable[[str], Any], remedy: str = "") -> None:
+        self.name, self.read, self.remedy = name, read, remedy
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Parse one option; a length of time that may be in periods becomes a `Span`."""
+        """Parse one option; one that is parsed, or a default that is no text, stays as it is."""
+        if not isinstance(value, str):
+            return value
+        try:
+            return self.read(value)
+        except ValueError as error:
+            self.fail(f"got {value!r}; {self.remedy}" if self.remedy else str(error), param, ctx)
+
+
+def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> Parsed:
+    """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`."""
+
+    def read(text: str) -> Any:
         from zwidth.parts.span import read_span
-        from zwidth.words.errors import UnusableValueError
         from zwidth.words.units import find_dimension, read_quantity
 
-        try:
-            number: Any = float(value)
-        except (TypeError, ValueError):
-            number = value
-        try:
-            if self.periods:
-                return read_span(number, self.allowed)
-            return read_quantity(number, find_dimension(self.unit), self.allowed)[0]
-        except UnusableValueError as error:
-            self.fail(str(error), param, ctx)
+        number = number_or_text(text)
+        return read_span(number, allowed) if periods else read_quantity(number, find_dimension(unit), allowed)[0]
+
+    return Parsed("quantity", read)
+
+
+def number_or_text(text: str) -> float | str:
+    """What stands there without a unit, or with one."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def read_share(text: str) -> float:
+    """A share: ``2%`` or ``0.02``."""
+    text = text.strip()
+    return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
 
 
 def flag_of(path: str) -> str:
@@ -60,7 +77,7 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
         known = PARAMETERS[path]
         # The parts themselves check the ranges of theirs.
         allowed = ANY if path in OF_PARTS else known.allowed
-        kind = click.INT if known.whole else QuantityType(known.unit, allowed, periods=path == "delay")
+        kind = click.INT if known.whole else quantity_type(known.unit, allowed, periods=path == "delay")
         unit, note = "" if known.whole else f", in {known.unit}", f"; {known.note}" if known.note else ""
         text = f"{known.sentence}{unit}{note}"
     return click.option(flag_of(path), path.replace(".", "__"), type=kind, required=required, help=f"{text}.")(command)
@@ -180,8 +197,8 @@ def _velocity(given: dict[str, Any]) -> Any:
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 friction_option = click.option(
-    "--friction", type=QuantityType("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N."
+    "--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N."
 )
 resolution_option = click.option(
-    "--resolution", type=QuantityType("m", Range(0.0, low_open=True)), help="One step Q of the position sensor, in m."
+    "--resolution", type=quantity_type("m", Range(0.0, low_open=True)), help="One step Q of the position sensor, in m."
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import re
 import shlex
 import signal
 from collections.abc import Iterator
@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from zwidth.cli.options import json_option
+from zwidth.cli.options import Parsed, json_option
+from zwidth.cli.words import print_json
 
 if TYPE_CHECKING:
     from zwidth.runs.result import RunResult
@@ -20,41 +21,40 @@ if TYPE_CHECKING:
 _EXIT_FAILED = 1
 
 
-class Shard(click.ParamType):
-    """One of n runs that share the chunks: ``3/8``."""
-
-    name = "i/n"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Parse one option."""
-        if isinstance(value, tuple):
-            return value
-        first, slash, second = str(value).partition("/")
-        if slash and first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second) <= 10**6:
-            return int(first), int(second)
-        self.fail(f"got {value!r}; write i/n with 1 <= i <= n, as in 3/8", param, ctx)
+def _read_shard(text: str) -> tuple[int, int]:
+    first, _, second = text.partition("/")
+    if not (first.isdecimal() and second.isdecimal() and 1 <= int(first) <= int(second) <= 10**6):
+        raise ValueError
+    return int(first), int(second)
 
 
-class Size(click.ParamType):
-    """A size of memory: ``512 MiB``."""
+def _read_size(text: str) -> int:
+    found = re.fullmatch(r"(.*?)\s*(B|KiB|MiB|GiB|)", text.strip())
+    assert found is not None, "any text is a number and perhaps a unit"
+    size = float(found[1]) * 1024 ** ("B", "KiB", "MiB", "GiB").index(found[2] or "B")
+    if not 2**27 <= size <= 2**40:
+        raise ValueError
+    return int(size)
 
-    name = "size"
-    _UNITS = ("B", "KiB", "MiB", "GiB")
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Parse one option."""
-        text = str(value).strip()
-        for power, unit in reversed(list(enumerate(self._UNITS))):
-            number = text.removesuffix(unit).strip()
-            if number != text or unit == "B":
-                try:
-                    size = int(float(number) * 1024**power)
-                except (ValueError, OverflowError):
-                    break
-                if 2**27 <= size <= 2**40:
-                    return size
-                break
-        self.fail(f"got {value!r}; write a size from 128 MiB to 1024 GiB, as in '512 MiB'", param, ctx)
+def _read_slice(text: str) -> tuple[str, str]:
+    name, _, wanted = (part.strip() for part in text.partition("="))
+    if not name or not wanted:
+        raise ValueError
+    return name, wanted
+
+
+def _read_figure_size(text: str) -> tuple[float, float]:
+    width, height = (float(part) for part in text.lower().split("x"))
+    if not (1 <= width <= 100 and 1 <= height <= 100):
+        raise ValueError
+    return width, height
+
+
+_SHARD = Parsed("i/n", _read_shard, "write i/n with 1 <= i <= n, as in 3/8")
+_SIZE = Parsed("size", _read_size, "write a size from 128 MiB to 1024 GiB, as in '512 MiB'")
+_SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, as in delta=0.1")
+_FIGURE_SIZE = Parsed("WxH", _read_figure_size, "write width x height from 1 to 100 inches, as in 7x4.5")
 
 
 @click.command()
@@ -64,8 +64,8 @@ class Size(click.ParamType):
 @click.option("--resume", is_flag=True, help="Go on with a run that was stopped; repair what is damaged.")
 @click.option("--workers", type=click.IntRange(min=1), help="Processes for sweeps.  [default: this one]")
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
-@click.option("--shard", type=Shard(), help="Compute every n-th chunk of sweeps only, as one of n jobs.")
-@click.option("--memory", type=Size(), default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
+@click.option("--shard", type=_SHARD, help="Compute every n-th chunk of sweeps only, as one of n jobs.")
+@click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
 def run(path: Path, dry_run: bool, **options: Any) -> None:
     """Run the studies of a CONFIG file.
@@ -189,9 +189,7 @@ def verify(folder: Path, as_json: bool) -> None:
     found = verify_stores(folder)
     if as_json:
         keys = ("chunks", "done", "damaged", "error", "ok")
-        click.echo(
-            json.dumps({store.path.name: {key: getattr(store, key) for key in keys} for store in found}, indent=2)
-        )
+        print_json({store.path.name: {key: getattr(store, key) for key in keys} for store in found})
     for store in () if as_json else found:
         state = store.error or f"{store.done} of {store.chunks} chunks done, {len(store.damaged) or 'none'} damaged"
         click.echo(f"{store.path.name}: {state}")
@@ -222,42 +220,9 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
         click.echo(f"zwidth: {folder}: {missing} {text}", err=True)
 
 
-class Slice(click.ParamType):
-    """A value of a parameter: ``delta=0.1``."""
-
-    name = "name=value"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, str]:
-        """Parse one option."""
-        if isinstance(value, tuple):
-            return value
-        name, equals, wanted = str(value).partition("=")
-        if equals and name.strip() and wanted.strip():
-            return name.strip(), wanted.strip()
-        self.fail(f"got {value!r}; write NAME=VALUE, as in delta=0.1", param, ctx)
-
-
-class FigureSize(click.ParamType):
-    """Width and height in inches: ``7x4.5``."""
-
-    name = "WxH"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Parse one option."""
-        if isinstance(value, tuple):
-            return value
-        try:
-            width, height = (float(part) for part in str(value).lower().split("x"))
-        except ValueError:
-            width = height = 0.0
-        if 1 <= width <= 100 and 1 <= height <= 100:
-            return width, height
-        self.fail(f"got {value!r}; write width x height from 1 to 100 inches, as in 7x4.5", param, ctx)
-
-
 @click.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
-@click.option("--at", multiple=True, type=Slice(), help="Draw this slice, as in --at delta=0.1 --at d=1.")
+@click.option("--at", multiple=True, type=_SLICE, help="Draw this slice, as in --at delta=0.1 --at d=1.")
 @click.option("--x", metavar="NAME", help="The parameter from left to right.")
 @click.option("--y", metavar="NAME", help="The parameter from bottom to top, of a plane.")
 @click.option("--hue", metavar="NAME", help="Draw curves, one for each value of this parameter.")
@@ -265,7 +230,7 @@ class FigureSize(click.ParamType):
 @click.option("--format", "formats", multiple=True, type=click.Choice(("png", "svg", "pdf")), default=("png", "svg"),
               help="Kind of file; may be repeated.  [default: png, svg]")  # fmt: skip
 @click.option("--dpi", type=click.IntRange(10, 2400), help="Dots an inch.")
-@click.option("--size", type=FigureSize(), help="Width and height in inches, as in 7x4.5.")
+@click.option("--size", type=_FIGURE_SIZE, help="Width and height in inches, as in 7x4.5.")
 @click.option("--style", type=click.Path(path_type=Path), help="A style sheet of matplotlib.")
 @click.option("--text", is_flag=True, help="Keep text as text in an SVG: it can be searched, and needs the font.")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the figures.  [default: DIR/figures]")
@@ -288,7 +253,7 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
         note=lambda text: click.echo(f"zwidth: {text}", err=True),
     )
     if as_json:
-        click.echo(json.dumps({"files": [str(file) for file in files]}, indent=2))
+        print_json({"files": [str(file) for file in files]})
     if not files:
         raise SystemExit(_EXIT_FAILED)
 

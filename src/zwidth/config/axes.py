@@ -7,25 +7,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Any, TypeAlias
 
 import numpy as np
-from pydantic import (
-    BeforeValidator,
-    PlainSerializer,
-    PlainValidator,
-    ValidationError,
-    WithJsonSchema,
-    create_model,
-)
-from pydantic_core import PydanticCustomError
+from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, create_model
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
 from zwidth.config.fields import Strict, repeated
-from zwidth.config.numbers import number, whole_number
+from zwidth.config.values import Quantity, quantity_of
+from zwidth.parts.span import Span
 from zwidth.words.formatting import describe, short, suggestion
-from zwidth.words.quantities import ANY, NOT_NEGATIVE, PARAMETERS, Range
+from zwidth.words.quantities import Range
 
 LONGEST_AXIS = 10_000_000
 """More values than any result could use, few enough to be laid out in memory."""
@@ -86,15 +80,6 @@ class _Spacing(Strict):
         return []
 
 
-def _spacing_model(name: str, entry: Entry) -> type[_Spacing]:
-    """The mapping below ``linear`` or ``log`` for ends that ``entry`` reads."""
-    end = Annotated[float, BeforeValidator(entry)]
-    count = Annotated[int, BeforeValidator(whole_number(Range(2, LONGEST_AXIS)))]
-    model = create_model(name, __base__=_Spacing, start=(end, ...), stop=(end, ...), num=(count, ...))
-    model.what = f"an axis with {name!r}"
-    return model
-
-
 def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
     """The entries of a list, each read by ``entry``; all faults are reported with their positions."""
     if not raw:
@@ -114,73 +99,105 @@ def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bo
     return tuple(entries)
 
 
-def axis(allowed: Range = ANY) -> Callable[[Any], Axis]:
-    """A validator for an axis whose values lie in a given range."""
-    # Equal ratios need values of one sign; a log axis of negative numbers has no use here.
-    return make_axis_reader(number(allowed), number(Range(0.0, allowed.high, low_open=True)))
+def in_one_unit(read: Callable[[Any], Span]) -> tuple[Entry, set[str]]:
+    """Read lengths of time that are all in seconds or all in sampling periods; and the unit that those read have."""
+    units: set[str] = set()
+
+    def entry(raw: Any) -> float:
+        value, unit = read(raw)
+        if units - {unit}:
+            allowed = "the delays of an axis are all in seconds or all in periods"
+            raise problem(f"got {describe(raw)}", allowed, f"write all of them in {next(iter(units))}")
+        units.add(unit)
+        return value
+
+    return entry, units
 
 
-def make_axis_reader(entry: Entry, positive: Entry) -> Callable[[Any], Axis]:
-    """A validator for an axis of what ``entry`` reads; ``positive`` reads the ends of equal ratios."""
-    models = {"linear": _spacing_model("linear", entry), "log": _spacing_model("log", positive)}
+@dataclass(frozen=True)
+class AxisOf:
+    """Makes an `Axis` one of a quantity: read, checked, spelled and described in the schema."""
 
-    def validate(raw: Any) -> Axis:
+    quantity: Quantity
+
+    @property
+    def _forms(self) -> dict[str, Quantity]:
+        """What the ends of equal steps and of equal ratios are: those need values of one sign."""
+        low, high, low_open, high_open = self.quantity.allowed
+        positive = Range(max(low, 0.0), high, low_open or low <= 0.0, high_open)
+        return {"linear": self.quantity, "log": replace(self.quantity, allowed=positive)}
+
+    def read(self, raw: Any) -> Axis:
+        """A validator."""
         if isinstance(raw, Axis):
             return raw
+        form, ends = "number", raw
         if isinstance(raw, list | tuple):
-            return Axis("list", read_entries(raw, entry), len(raw))
-        if not isinstance(raw, dict):
-            return Axis("number", (entry(raw),), 1)
-        if len(raw) != 1:
-            raise problem(f"got {describe(raw)}", f"an axis is {_FORMS}", "keep one of these forms")
-        ((form, ends),) = raw.items()
-        if form not in models:
-            remedy = suggestion(form, models, "write one of these forms")
-            unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
-            raise validation_error("axis", [((form,), unknown)])
-        try:
-            spaced: Any = models[form].model_validate(ends)
-        except ValidationError as error:
-            raise validation_error("axis", problems_of(error, form)) from None
-        return Axis(form, (spaced.start, spaced.stop), spaced.num)
+            form = "list"
+        elif isinstance(raw, dict):
+            if len(raw) != 1:
+                raise problem(f"got {describe(raw)}", f"an axis is {_FORMS}", "keep one of these forms")
+            ((form, ends),) = raw.items()
+            if form not in self._forms:
+                remedy = suggestion(form, self._forms, "write one of these forms")
+                unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
+                raise validation_error("axis", [((form,), unknown)])
+        quantity = self._forms.get(form, self.quantity)
+        entry, units = in_one_unit(quantity.read) if quantity.periods else (quantity.read, set())
+        if quantity.whole:
+            # 5.0 is 5, as a store spells the ends of equal steps.
+            entry = _accept_whole_floats(entry)
+        if form in self._forms:
+            try:
+                spaced = _model_spacing(form, entry).model_validate(ends)
+            except ValidationError as error:
+                raise validation_error("axis", problems_of(error, form)) from None
+            entries, size = (spaced.start, spaced.stop), spaced.num
+        else:
+            entries = read_entries(ends, entry) if form == "list" else (entry(ends),)
+            size = len(entries)
+        axis = Axis(form, entries, size, "periods" in units)
+        missed = [value for value in axis.values().tolist() if not value.is_integer()] if quantity.whole else []
+        if missed:
+            allowed = "every value is a whole number"
+            raise problem(f"got {short(missed[0])} as one of the steps", allowed, "change num, or write a list")
+        return axis
 
-    return validate
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        spelling = core_schema.plain_serializer_function_ser_schema(lambda axis: axis.spelling())
+        return core_schema.no_info_plain_validator_function(self.read, serialization=spelling)
 
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        def mapping(**properties: dict[str, Any]) -> dict[str, Any]:
+            required = list(properties)
+            return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
 
-def _schema(allowed: Range) -> WithJsonSchema:
-    entry: dict[str, Any] = {"type": "number"}
-    if allowed.low == 0.0:
-        entry["minimum"] = 0
-    if allowed.high < np.inf:
-        entry["maximum"] = allowed.high
-    positive = {**{key: entry[key] for key in entry if key != "minimum"}, "exclusiveMinimum": 0}
-    return axis_schema(entry, positive)
-
-
-def axis_schema(entry: dict[str, Any], positive: dict[str, Any]) -> WithJsonSchema:
-    """The JSON Schema of an axis, from those of an entry and of the end of a log axis."""
-
-    def mapping(**properties: dict[str, Any]) -> dict[str, Any]:
-        required = list(properties)
-        return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
-
-    count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
-    keyed = [
-        mapping(**{form: mapping(start=end, stop=end, num=count)})
-        for form, end in (("linear", entry), ("log", positive))
-    ]
-    listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
-    return WithJsonSchema({"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]})
-
-
-SPELLED = PlainSerializer(lambda value: value.spelling(), return_type=Any)
-
-
-def number_axis(allowed: Range) -> tuple[Any, ...]:
-    """What makes an `Axis` one of plain numbers: its validator, its spelling and its schema."""
-    return PlainValidator(axis(allowed)), SPELLED, _schema(allowed)
+        count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
+        ends = {form: quantity.schema for form, quantity in self._forms.items()}
+        keyed = [mapping(**{form: mapping(start=end, stop=end, num=count)}) for form, end in ends.items()]
+        entry = self.quantity.schema
+        listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
+        return {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]}
 
 
-AnyAxis = Annotated[Axis, *number_axis(ANY)]
-DeltaAxis = Annotated[Axis, *number_axis(NOT_NEGATIVE)]
-DelayAxis = Annotated[Axis, *number_axis(PARAMETERS["d"].allowed)]
+def _model_spacing(form: str, entry: Entry) -> Any:
+    """The mapping below ``linear`` or ``log`` for ends that ``entry`` reads."""
+    end = Annotated[float, BeforeValidator(entry)]
+    count = Annotated[int, Quantity(allowed=Range(2, LONGEST_AXIS), whole=True)]
+    model = create_model(form, __base__=_Spacing, start=(end, ...), stop=(end, ...), num=(count, ...))
+    model.what = f"an axis with {form!r}"
+    return model
+
+
+def _accept_whole_floats(entry: Entry) -> Entry:
+    return lambda raw: entry(int(raw) if isinstance(raw, float) and raw.is_integer() else raw)
+
+
+def axis_of(name: str) -> AxisOf:
+    """That of a parameter."""
+    return AxisOf(quantity_of(name))
+
+
+AnyAxis = Annotated[Axis, AxisOf(Quantity())]
+DeltaAxis = Annotated[Axis, axis_of("delta")]
+DelayAxis = Annotated[Axis, axis_of("d")]

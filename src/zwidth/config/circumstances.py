@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, ConfigDict
+from pydantic import ConfigDict
 
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Delay, Duration, Quantity, Strict
-from zwidth.config.numbers import whole_number
+from zwidth.config.fields import Strict
 from zwidth.config.parts import SimulatedVelocityField
+from zwidth.config.values import Delay, Duration, Quantity
 from zwidth.parts.span import Span
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.simulate import Contact
@@ -18,7 +18,7 @@ from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 
 Length = Annotated[float, Quantity("m", NOT_NEGATIVE)]
 Friction = Annotated[float, Quantity("N", NOT_NEGATIVE)]
-Seed = Annotated[int, BeforeValidator(whole_number(NOT_NEGATIVE))]
+Seed = Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)]
 
 LONGEST = 1_000_000
 """Periods that one motion may take."""

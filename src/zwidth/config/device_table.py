@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import PlainValidator, ValidationError, WithJsonSchema
+from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import SPELLED, Entry, read_entries
+from zwidth.config.axes import Entry, in_one_unit, read_entries
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
-from zwidth.config.parameters import make_delay_readers
-from zwidth.config.units import make_entry_reader
+from zwidth.config.values import quantity_of
 from zwidth.words.cells import read_rows, split_title
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion
@@ -96,23 +95,23 @@ def _read_lists(raw: dict[str, Any]) -> DeviceTable:
             what = problem(f"got {describe(cells)}", "a column of devices is a list", "write [value, value, ...]")
             found.append(((key,), what))
         else:
-            entry, counts_periods = _cell_reader(key)
+            entry, units = _cell_reader(key)
             try:
                 columns[key] = read_entries(cells, entry, distinct=False) if cells or key != LABEL else ()
             except (PydanticCustomError, ValidationError) as error:
                 found += problems_of(error, key)
-            in_periods |= counts_periods()
+            in_periods |= "periods" in units
     if found:
         raise validation_error("devices", found)
     return _check_lengths(columns, in_periods)
 
 
-def _cell_reader(key: str) -> tuple[Entry, Callable[[], bool]]:
-    """What reads the cells of a column, and whether those read so far are delays in sampling periods."""
-    if key == "delay":
-        entry, _, in_periods = make_delay_readers()
-        return entry, in_periods
-    return _check_label if key == LABEL else make_entry_reader(key), lambda: False
+def _cell_reader(key: str) -> tuple[Entry, set[str]]:
+    """What reads the cells of a column, and of delays the unit of those read so far."""
+    if key == LABEL:
+        return _check_label, set()
+    quantity = quantity_of(key)
+    return in_one_unit(quantity.read) if quantity.periods else (quantity.read, set())
 
 
 def _check_label(cell: Any) -> Any:
@@ -216,9 +215,9 @@ def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, 
         if key == LABEL:
             columns[key] = tuple(from_cell(cell) for _, cell in cells)
             continue
-        entry, counts_periods = _cell_reader(key)
+        entry, units = _cell_reader(key)
         columns[key] = tuple(_read_cell(entry, cell, unit, place) for place, cell in cells)
-        in_periods |= counts_periods()
+        in_periods |= "periods" in units
     return _check_lengths(columns, in_periods)
 
 
@@ -246,4 +245,5 @@ def _make_schema() -> dict[str, Any]:
     return {"description": f"Devices: {_FORMS}.", "anyOf": forms}
 
 
-TableField = Annotated[DeviceTable, PlainValidator(read_table), SPELLED, WithJsonSchema(_make_schema())]
+_SPELLED = PlainSerializer(DeviceTable.spelling, return_type=dict[str, Any])
+TableField = Annotated[DeviceTable, PlainValidator(read_table), _SPELLED, WithJsonSchema(_make_schema())]

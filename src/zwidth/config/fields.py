@@ -1,4 +1,4 @@
-"""Building blocks of the configuration's models: a strict base class and the plain kinds of values."""
+"""Building blocks of the configuration's models: a strict base class, names and lists."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import Annotated, Any, ClassVar
 
@@ -15,25 +14,17 @@ from pydantic import (
     BaseModel,
     BeforeValidator,
     ConfigDict,
-    GetCoreSchemaHandler,
     GetJsonSchemaHandler,
-    PlainSerializer,
-    PlainValidator,
     ValidationError,
     WithJsonSchema,
     model_validator,
 )
 from pydantic import ModelWrapValidatorHandler as Handler
 from pydantic_core import CoreSchema
-from pydantic_core.core_schema import no_info_before_validator_function
 
 from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, validation_error
-from zwidth.config.numbers import number
-from zwidth.config.units import quantity, span
-from zwidth.parts.span import Span
 from zwidth.words.formatting import describe, resembling, suggestion
-from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Parameter, Range
-from zwidth.words.units import PERIOD_WORDS, find_dimension
+from zwidth.words.quantities import Parameter
 
 
 class Strict(BaseModel):
@@ -187,50 +178,8 @@ def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:
 
 
 Name = Annotated[str, BeforeValidator(_name), WithJsonSchema({"type": "string", "pattern": "^[a-z0-9_-]{1,64}$"})]
-Number = Annotated[float, BeforeValidator(number())]
-NonNegative = Annotated[float, BeforeValidator(number(NOT_NEGATIVE)), WithJsonSchema({"type": "number", "minimum": 0})]
-Fraction = Annotated[
-    float,
-    BeforeValidator(number(FRACTION, "write 75 % as 0.75")),
-    WithJsonSchema({"type": "number", "exclusiveMinimum": 0, "exclusiveMaximum": 1}),
-]
-
-
-def describe_entry(unit: str, *more: str) -> dict[str, Any]:
-    """The JSON Schema of a number in an SI unit, or with one of the units beside it."""
-    dimension = find_dimension(unit)
-    pattern = r"^\s*[-+]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][-+]?[0-9]+)?\s*\S"
-    return {
-        "description": f"A number in {unit}, or a number with one of the units {', '.join((*dimension.units, *more))}.",
-        "examples": [dimension.example],
-        "anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}],
-    }
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """Makes a float a quantity: read in its SI unit or with a unit, checked, and described in the schema."""
-
-    unit: str
-    allowed: Range = ANY
-
-    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        return no_info_before_validator_function(quantity(find_dimension(self.unit), self.allowed), handler(source))
-
-    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
-        return describe_entry(self.unit)
-
-
-def quantity_of(name: str) -> Quantity:
-    """The unit and range of a parameter."""
-    return Quantity(PARAMETERS[name].unit, PARAMETERS[name].allowed)
 
 
 def describe_parameter(parameter: Parameter) -> str:
     """What a schema says of a parameter."""
     return parameter.sentence + ("" if parameter.unit == "1" else f", in {parameter.unit} or with a unit")
-
-
-_SPAN = PlainSerializer(str, return_type=str), WithJsonSchema(describe_entry("s", *PERIOD_WORDS))
-Delay = Annotated[Span, PlainValidator(span(NOT_NEGATIVE)), *_SPAN]
-Duration = Annotated[Span, PlainValidator(span(POSITIVE)), *_SPAN]

@@ -23,8 +23,8 @@ from pydantic_core.core_schema import no_info_wrap_validator_function
 
 from zwidth.config.axes import read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Quantity, Strict, describe_parameter
-from zwidth.config.numbers import number, whole_number
+from zwidth.config.fields import Strict, describe_parameter
+from zwidth.config.values import Quantity
 from zwidth.parts.checks import find_range
 from zwidth.parts.paths import PARTS
 from zwidth.parts.velocity import ESTIMATES, FOAW
@@ -67,7 +67,7 @@ class PartSection(Strict):
 def _read_coefficients(raw: Any) -> tuple[float, ...]:
     if not isinstance(raw, list | tuple):
         raise problem(f"got {describe(raw)}", "coefficients are a list, highest power first", "write [1000, -1000]")
-    return read_entries(raw, number(), distinct=False)
+    return read_entries(raw, Quantity().read, distinct=False)
 
 
 Coefficients = Annotated[
@@ -105,9 +105,7 @@ def _describe(path: str, item: Any) -> tuple[Any, str]:
     low, high, low_open, _ = allowed
     bounds = f"{low:g} to {high:g}" if isfinite(high) else f"{'>' if low_open else '>='} {low:g}"
     words = f"{describe_parameter(known)}, {bounds}{'; ' if known.note else ''}{known.note}."
-    if known.whole:
-        return Annotated[int, BeforeValidator(whole_number(allowed))], words
-    return Annotated[float, Quantity(known.unit, allowed)], words
+    return Annotated[int if known.whole else float, Quantity(known.unit, allowed, known.whole)], words
 
 
 _ESTIMATES = {

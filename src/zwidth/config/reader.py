@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
-from yaml.composer import Composer
 from yaml.emitter import Emitter
 from yaml.parser import Parser
 from yaml.reader import Reader
@@ -109,21 +108,12 @@ def write_yaml(data: Mapping[str, Any]) -> str:
 def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
     """Every text that a file without faults has under a key: the value, and where it begins and ends in the file."""
     found: dict[int, tuple[str, int, int]] = {}
-    nodes = [_Tree("", text).root]
-    while nodes:
-        node = nodes.pop()
-        if isinstance(node, yaml.SequenceNode):
-            nodes += node.value
-        for name, value in node.value if isinstance(node, yaml.MappingNode) else ():
-            scalar = value.value if isinstance(value, _Alias) else value
-            if name.value == key and isinstance(scalar, yaml.ScalarNode):
-                first, last = scalar.start_mark.index, scalar.end_mark.index
-                piece = text[first:last]
-                # Marks take in an anchor and the end of the line behind a folded text.
-                anchor = re.match(r"&\S+\s+", piece)
-                first += anchor.end() if anchor else 0
-                found[first] = (scalar.value, first, first + len(text[first:last].rstrip()))
-            nodes.append(value)
+    for path, (value, first, last) in _Tree("", text).scalars.items():
+        if path[-1:] == (key,):
+            # Marks take in an anchor and the end of the line behind a folded text.
+            anchor = re.match(r"&\S+\s+", text[first:last])
+            first += anchor.end() if anchor else 0
+            found[first] = (value, first, first + len(text[first:last].rstrip()))
     return list(found.values())
 
 
@@ -175,12 +165,6 @@ def _mark_place(mark: yaml.Mark) -> tuple[int, int]:
     return mark.line + 1, mark.column + 1
 
 
-class _Alias(yaml.Node):
-    """An alias where it stands; the place of its target is the anchor's."""
-
-    id = "alias"
-
-
 class _Resolver(BaseResolver):
     """The core schema of YAML 1.2, in place of PyYAML's 1.1."""
 
@@ -211,87 +195,31 @@ class _Dumper(Emitter, Serializer, SafeRepresenter, _Resolver):
         return True
 
 
-class _Loader(Reader, Scanner, Parser, Composer, _Resolver):
-    """PyYAML up to its nodes, with limits on their number and depth; PyYAML itself has none."""
+class _Tree(Reader, Scanner, Parser, _Resolver):
+    """A file of a name and a text as plain Python values, with the places of all of them.
 
-    def __init__(self, file: str, text: str) -> None:
-        Reader.__init__(self, text)
-        Scanner.__init__(self)
-        Parser.__init__(self)
-        Composer.__init__(self)
-        _Resolver.__init__(self)
-        self.file = file
-        self.faults: list[Fault] = []
-        self._path: FieldPath = ()
-        self._depth = 0
-        self._nodes = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node:
-        """Compose one node, unless it is one too many."""
-        event = self.peek_event()
-        place = _mark_place(event.start_mark)
-        path = (*self._path, *_step(index))
-        self._nodes += 1
-        if self._nodes > MAX_NODES:
-            what, allowed = "too many values", f"at most {MAX_NODES} values a file"
-            raise _fail(self.file, place, what, allowed, "write long axes as linear or log", path=path)
-        if self._depth >= MAX_DEPTH:
-            what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
-            raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
-        if getattr(event, "tag", None) is not None:
-            field = dotted((*path, event.value) if _is_key(parent, index, event) else path)
-            what = f"got the tag {describe(event.tag)}"
-            self.faults.append(Fault(self.file, *place, field, what, "tags are not used", "remove the tag"))
-        above, self._path = self._path, path
-        self._depth += 1
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        self._path = above
-        assert node is not None, "an event begins every node"
-        if isinstance(event, yaml.ScalarEvent) and event.tag is not None:
-            # The tag is a fault of its own; the value is read as if it were not there.
-            node.tag = self.resolve(yaml.ScalarNode, event.value, (event.style is None, True))
-        if isinstance(event, yaml.AliasEvent):
-            return _Alias("", node, event.start_mark, event.end_mark)
-        return node
-
-
-def _step(index: Any) -> FieldPath:
-    """The way from a node to one below it: the place in a list, or the key; nothing where that is no text."""
-    if isinstance(index, int):
-        return (index,)
-    return (index.value,) if isinstance(index, yaml.ScalarNode) else ()
-
-
-def _is_key(parent: yaml.Node | None, index: Any, event: yaml.Event) -> bool:
-    """Whether a node begins that is a key, and text."""
-    return isinstance(parent, yaml.MappingNode) and index is None and isinstance(event, yaml.ScalarEvent)
-
-
-class _Tree:
-    """A file of a name and a text as plain Python values, with the places of all of them."""
+    What an alias stands for is read once more, from the events that its anchor was read from.
+    """
 
     def __init__(self, file: str, text: str) -> None:
         self.file = file
         self.values: dict[FieldPath, tuple[int, int]] = {}
         self.keys: dict[FieldPath, tuple[int, int]] = {}
+        self.scalars: dict[FieldPath, tuple[str, int, int]] = {}  # as written, with the ends in the text
         self.faults: list[Fault] = []
-        self._alias_nodes = 0
-        self.root = self._compose(text)
-        self.data = self._convert(self.root, ())
-
-    def _compose(self, text: str) -> yaml.Node:
-        """The one document of the file as PyYAML's nodes."""
+        self._nodes = self._alias_nodes = 0
+        self._anchors: dict[str, list[yaml.Event]] = {}
+        self._unfinished: dict[str, list[yaml.Event]] = {}
         try:
-            loader = _Loader(self.file, text)
+            Reader.__init__(self, text)
+            Scanner.__init__(self)
+            Parser.__init__(self)
+            _Resolver.__init__(self)
+            self.data = self._read_document()
         except yaml.reader.ReaderError as error:
             what = f"got the character {describe(text[error.position])}"
             allowed, remedy = "YAML allows no control characters", "remove it"
             raise _fail(self.file, _place(text, error.position), what, allowed, remedy) from error
-        self.faults = loader.faults
-        try:
-            loader.get_event()
-            return self._only_document(loader)
         except yaml.MarkedYAMLError as error:
             raise self._syntax_error(error) from error
         except (ValueError, OverflowError) as error:
@@ -299,20 +227,29 @@ class _Tree:
             if isinstance(error, ConfigFileError):
                 raise
             what = "an escape or a number that does not exist"
-            raise _fail(self.file, _mark_place(loader.get_mark()), what, "", "correct or remove it") from error
+            raise _fail(self.file, _mark_place(self.get_mark()), what, "", "correct or remove it") from error
 
-    def _only_document(self, loader: _Loader) -> yaml.Node:
-        if loader.check_event(yaml.StreamEndEvent):
+    def _read_document(self) -> Any:
+        """The one document of the file."""
+        self.get_event()
+        if self.check_event(yaml.StreamEndEvent):
             allowed = "a configuration has version, name and studies"
             raise _fail(self.file, (1, 1), "the file is empty", allowed, "start with 'version: 1'")
-        loader.get_event()
-        node = loader.compose_node(None, None)
-        loader.get_event()
-        if not loader.check_event(yaml.StreamEndEvent):
-            place = _mark_place(loader.peek_event().start_mark)
+        self.get_event()
+        data = self._read((), self._parse_events())
+        self.get_event()
+        if not self.check_event(yaml.StreamEndEvent):
+            place = _mark_place(self.peek_event().start_mark)
             what = "a second document begins here"
             raise _fail(self.file, place, what, "one document a file", "remove the '---' or split the file")
-        return node
+        return data
+
+    def _parse_events(self) -> Iterator[yaml.Event]:
+        while True:
+            event = self.get_event()
+            for events in self._unfinished.values():
+                events.append(event)
+            yield event
 
     def _syntax_error(self, error: yaml.MarkedYAMLError) -> ConfigFileError:
         """PyYAML's account of a syntax error, with a remedy."""
@@ -321,10 +258,6 @@ class _Tree:
         remedy = "check the indentation, the colons and the quotes here"
         if r"'\t'" in what:
             what, remedy = "got a tab where the line is indented", "indent with spaces"
-        elif "undefined alias" in what:
-            remedy = "define it before with '&', or remove the '*'"
-        elif "duplicate anchor" in what:
-            remedy = "give each anchor its own name"
         elif error.context_mark is not None and "flow" in (error.context or ""):
             line, column = _mark_place(error.context_mark)
             remedy = f"close the bracket opened at line {line}, column {column}"
@@ -334,65 +267,114 @@ class _Tree:
         place = _mark_place(mark) if mark else (1, 1)
         return _fail(self.file, place, "not valid YAML", what, remedy)
 
-    def _convert(self, node: yaml.Node, path: FieldPath, in_alias: bool = False) -> Any:
-        """Plain Python values of a node; places go to ``values`` and ``keys``."""
+    def _read(self, path: FieldPath, events: Iterator[Any], event: Any = None, in_alias: bool = False) -> Any:
+        """The value that begins with an event, the next one if none is given; places go to ``values`` and ``keys``."""
+        event = event or next(events)
         # An alias comes before its target, so that a fault of the whole points at the alias.
-        self.values.setdefault(path, _mark_place(node.start_mark))
-        if isinstance(node, _Alias):
-            return self._convert(node.value, path, in_alias=True)
+        self.values.setdefault(path, _mark_place(event.start_mark))
+        if isinstance(event, yaml.AliasEvent):
+            return self._read(path, iter(self._recall(event, path)), in_alias=True)
         if in_alias:
-            self._alias_nodes += 1
-            if self._alias_nodes > MAX_ALIAS_NODES or len(path) > MAX_DEPTH:
-                allowed = f"aliases may stand for at most {MAX_ALIAS_NODES} values, and never for themselves"
-                raise _fail(
-                    self.file, self.values[path], "too many values by alias", allowed, "write them out", path=path
-                )
-        if isinstance(node, yaml.SequenceNode):
-            return [self._convert(item, (*path, index), in_alias) for index, item in enumerate(node.value)]
-        if isinstance(node, yaml.MappingNode):
-            return dict(self._pairs(node, path, in_alias))
-        assert isinstance(node, yaml.ScalarNode), "nodes are aliases, sequences, mappings or scalars"
-        return _scalar(node)
+            self._count_alias_node(path)
+        else:
+            self._count_node(event, path, path)
+        anchor = None if in_alias else event.anchor
+        if anchor is not None:
+            if anchor in self._anchors or anchor in self._unfinished:
+                what = f"the anchor {describe(anchor)} comes twice"
+                raise self._invalid(event, what, "give each anchor its own name")
+            self._unfinished[anchor] = [event]
+        if isinstance(event, yaml.SequenceStartEvent):
+            value: Any = []
+            while not isinstance(event := next(events), yaml.SequenceEndEvent):
+                value.append(self._read((*path, len(value)), events, event, in_alias))
+        elif isinstance(event, yaml.MappingStartEvent):
+            value = self._read_mapping(path, events, in_alias)
+        else:
+            self.scalars[path] = (event.value, event.start_mark.index, event.end_mark.index)
+            value = self._read_scalar(event)
+        if anchor is not None:
+            self._anchors[anchor] = self._unfinished.pop(anchor)
+        return value
+
+    def _recall(self, alias: yaml.AliasEvent, path: FieldPath) -> list[yaml.Event]:
+        """What an alias stands for."""
+        if alias.anchor in self._unfinished:
+            what, allowed = "an alias of what it is part of", "aliases stand for values that have ended"
+            raise _fail(self.file, _mark_place(alias.start_mark), what, allowed, "write the values out", path=path)
+        if alias.anchor not in self._anchors:
+            what = f"found undefined alias {describe(alias.anchor)}"
+            raise self._invalid(alias, what, "define it before with '&', or remove the '*'")
+        return self._anchors[alias.anchor]
+
+    def _invalid(self, event: yaml.Event, what: str, remedy: str) -> ConfigFileError:
+        return _fail(self.file, _mark_place(event.start_mark), "not valid YAML", what, remedy)
+
+    def _count_node(self, event: Any, path: FieldPath, field: FieldPath) -> None:
+        """Refuse one that is too many, and its tag; PyYAML itself has no limits."""
+        place = _mark_place(event.start_mark)
+        self._nodes += 1
+        if self._nodes > MAX_NODES:
+            what, allowed = "too many values", f"at most {MAX_NODES} values a file"
+            raise _fail(self.file, place, what, allowed, "write long axes as linear or log", path=path)
+        if len(path) >= MAX_DEPTH:
+            what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
+            raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
+        if event.tag is not None:
+            # A fault of its own; the value is read as if it were not there.
+            self._add_fault(place, field, f"got the tag {describe(event.tag)}", "tags are not used", "remove the tag")
+
+    def _count_alias_node(self, path: FieldPath) -> None:
+        self._alias_nodes += 1
+        if self._alias_nodes > MAX_ALIAS_NODES or len(path) > MAX_DEPTH:
+            what, allowed = "too many values by alias", f"aliases may stand for at most {MAX_ALIAS_NODES} values"
+            raise _fail(self.file, self.values[path], what, allowed, "write them out", path=path)
 
     def _add_fault(self, place: tuple[int, int], path: FieldPath, *parts: str) -> None:
         self.faults.append(Fault(self.file, *place, dotted(path), *parts))
 
-    def _pairs(self, node: yaml.MappingNode, path: FieldPath, in_alias: bool) -> Iterator[tuple[str, Any]]:
+    def _read_mapping(self, path: FieldPath, events: Iterator[Any], in_alias: bool) -> dict[str, Any]:
         """The keys and values of a mapping; a key that is no text or comes twice is a fault and left out."""
+        found: dict[str, Any] = {}
         first: dict[str, int] = {}
-        for key_node, value_node in node.value:
-            key = _scalar(key_node) if isinstance(key_node, yaml.ScalarNode) else None
-            place = _mark_place(key_node.start_mark)
-            if not isinstance(key, str):
-                what = f"got the key {describe(key)}" if isinstance(key_node, yaml.ScalarNode) else "got a complex key"
-                self._add_fault(place, path, what, "keys are text", "write the name of a field")
-            elif key in first:
+        while not isinstance(event := next(events), yaml.MappingEndEvent):
+            place, key = _mark_place(event.start_mark), None
+            if isinstance(event, yaml.ScalarEvent):
+                if not in_alias:
+                    self._count_node(event, path, (*path, event.value))
+                    self._anchors |= {event.anchor: [event]} if event.anchor else {}
+                key = self._read_scalar(event)
+                what = f"got the key {describe(key)}"
+            else:
+                self._read(path, events, event, in_alias)
+                what = "got a complex key"
+            if isinstance(key, str) and key not in first:
+                first[key] = place[0]
+                self.keys[*path, key] = place
+                found[key] = self._read((*path, key), events, in_alias=in_alias)
+                continue
+            if isinstance(key, str):
                 what = f"the key comes twice, first in line {first[key]}"
                 self._add_fault(place, (*path, key), what, "each key once", "remove one of them")
             else:
-                first[key] = place[0]
-                self.keys[*path, key] = place
-                yield key, self._convert(value_node, (*path, key), in_alias)
+                self._add_fault(place, path, what, "keys are text", "write the name of a field")
+            self._read((*path, str(key)), events, in_alias=in_alias)
+        return found
 
-
-def _scalar(node: yaml.ScalarNode) -> Any:
-    """The value of a scalar by the core schema; a number beyond float64 becomes infinite."""
-    kind = node.tag.rpartition(":")[2]
-    text = node.value
-    if kind == "null":
-        return None
-    if kind == "bool":
-        return text.lower() == "true"
-    if kind == "float":
-        return _float(text)
-    if kind == "int":
-        if text[:2] in ("0o", "0x"):
+    def _read_scalar(self, event: yaml.ScalarEvent) -> Any:
+        """The value of a scalar by the core schema; a number beyond float64 becomes infinite."""
+        text = event.value
+        kind = self.resolve(yaml.ScalarNode, text, (event.style is None, True)).rpartition(":")[2]
+        if kind == "null":
+            return None
+        if kind == "bool":
+            return text.lower() == "true"
+        if kind == "int" and text[:2] in ("0o", "0x"):
             return int(text, 0)
         # Python refuses to read integers of thousands of digits; float64 ends at 309.
-        return int(text) if len(text) < 400 else _float(text)
-    return text
-
-
-def _float(text: str) -> float:
-    low = text.lower().lstrip("+")
-    return {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf}.get(low) or float(text)
+        if kind == "int" and len(text) < 400:
+            return int(text)
+        if kind not in ("int", "float"):
+            return text
+        low = text.lower().lstrip("+")
+        return {".nan": math.nan, ".inf": math.inf, "-.inf": -math.inf}.get(low) or float(text)

@@ -10,8 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Delay, NonNegative, Number, Strict, describe_entry, quantity_of
-from zwidth.config.numbers import number
+from zwidth.config.fields import Strict
 from zwidth.config.parts import (
     PART_NAMES,
     SimulatedVelocityField,
@@ -20,7 +19,7 @@ from zwidth.config.parts import (
     locate_refusal,
     make_parts_base,
 )
-from zwidth.config.units import make_entry_reader
+from zwidth.config.values import Delay, NonNegative, Number, describe_entry, quantity_of
 from zwidth.loops.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.loops.normalization import normalize
 from zwidth.parts.device import Device
@@ -31,7 +30,7 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
-from zwidth.words.quantities import MAX_DELAY_PERIODS, PARAMETERS
+from zwidth.words.quantities import MAX_DELAY_PERIODS
 from zwidth.words.types import DelayModel
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES})
@@ -65,7 +64,7 @@ class _OneKind(Strict):
 def _period(value: Any, info: ValidationInfo) -> float:
     """The period itself, or one over the rate."""
     if value is not None:
-        return make_entry_reader("period")(value)
+        return quantity_of("period").read(value)
     # A rate that failed its own check is absent from the data; that fault is enough.
     rate = info.data.get("rate", 1.0)
     if rate is None:
@@ -180,7 +179,7 @@ class _NormalizedPlant(_OneKind):
     delta: NonNegative
     """Normalized damping b T/m of the device, >= 0."""
 
-    d: Annotated[float, BeforeValidator(number(PARAMETERS["d"].allowed))] = 0.0
+    d: Annotated[float, quantity_of("d")] = 0.0
     """Delay in periods, whole or not, >= 0."""
 
 

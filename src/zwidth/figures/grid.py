@@ -163,4 +163,5 @@ def scale_axis(ax: Axes, which: str, values: Any) -> None:
     low, high = float(values.min()), float(values.max())
     if logarithmic(values):
         style.use_logarithmic(ax, which, low, high, _FEW_DECADES)
-    getattr(ax, f"set_{which}lim")(low, high)
+    if low < high:
+        getattr(ax, f"set_{which}lim")(low, high)

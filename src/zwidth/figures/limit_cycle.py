@@ -7,13 +7,11 @@ from typing import Any
 
 import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
-from zwidth.figures import style
-from zwidth.figures.grid import logarithmic
+from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, curves
 from zwidth.words.formatting import with_unit
 
@@ -68,7 +66,8 @@ def draw_limit_cycles(
             ax.plot(*ends, color=style.VERMILION, linewidth=1.2, label=f"linear, {one.number}", zorder=3)
         if len(labels) > 1:
             ax.set_title(style.literal(label))
-        _scale_axes(ax, x, y)
+        grid.scale_axis(ax, "x", x)
+        grid.scale_axis(ax, "y", y)
     names = [f"{_AXES[name][0]}  ${_AXES[name][1]}$  in {scales[name][1]}" for name in (across, along)]
     style.label_axes(panels, *names, once=axes is None)
     figure = style.figure_of(panels)
@@ -128,7 +127,7 @@ def draw_limit_cycle_curves(
             for curve, buzz, look in zip(cycles[name][column], buzzes[column], looks, strict=True):
                 shown = np.where(buzz, curve, np.nan) * times
                 ax.plot(arrays[over] * scale, shown, marker=".", markersize=2.5, linewidth=1.0, **look)
-            _scale_axes(ax, arrays[over] * scale)
+            grid.scale_axis(ax, "x", arrays[over] * scale)
             for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
@@ -157,11 +156,3 @@ def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarra
         {**style.look(k), "color": color, "label": text + (", unstable" if lost else "")}
         for k, (color, text, lost) in enumerate(zip(colors, texts, unstable, strict=True))
     ]
-
-
-def _scale_axes(ax: Axes, *values: np.ndarray) -> None:
-    """The range and the spacing of the axes of parameters."""
-    for axis, own in zip("xy", values, strict=False):
-        if logarithmic(own):
-            style.use_logarithmic(ax, axis, float(own.min()), float(own.max()))
-        getattr(ax, f"set_{axis}lim")(float(own.min()), float(own.max()))

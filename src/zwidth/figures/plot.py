@@ -21,9 +21,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
-from zwidth.arrays.batching import as_float64
+from zwidth.arrays.arguments import as_float64
 from zwidth.figures import style
-from zwidth.figures.grid import logarithmic
+from zwidth.figures.grid import scale_axis
 from zwidth.figures.motion import draw_motion
 from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls, trace_outlines
 from zwidth.figures.step import draw_step
@@ -102,9 +102,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     known = PARAMETERS.get(parameter)
     words = f"{known.words}  ${known.symbol}$  in {known.unit}" if known else style.literal(parameter)
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
-    if logarithmic(grid):
-        style.use_logarithmic(ax, "x", float(grid.min()), float(grid.max()))
-    ax.margins(x=0.0)
+    scale_axis(ax, "x", grid)
     return ax
 
 

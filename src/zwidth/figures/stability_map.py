@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any
 
@@ -15,7 +15,7 @@ from zwidth.figures import region, style
 from zwidth.figures.table import si_scale
 
 # A grid of more panels than this says nothing on a page: evenly spaced deltas and delays stand for all.
-PANELS = 3
+_PANELS = 3
 
 # Light, so that labels and curves drawn over them stay legible; in gray, passive is the darker one.
 SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
@@ -27,7 +27,7 @@ def draw_map(
     output: str,
     axes: style.AnyAxes | None = None,
     *,
-    outlines: Mapping[tuple[float, float], region.Outlines] | None = None,
+    edges: Callable[[float, float], region.Outlines | None] = lambda delta, d: None,
 ) -> np.ndarray:
     """Draw one output over alpha and beta: panels for delta (columns) and d (rows), three of each at most.
 
@@ -36,11 +36,11 @@ def draw_map(
             stiffness_N_per_m and virtual_damping_N_s_per_m a single panel is in SI units as well.
         output: "stable", "spectral_radius" or "passive".
         axes: an Axes of yours for the first delta and d alone, or one for each panel.
-        outlines: the exact edge of what is stable or passive, by delta and d, drawn in place of that of the cells where
-            all cells agree with it; where left out, the contour of the spectral radius bounds stable walls.
+        edges: gives the exact edge of what is stable or passive at a delta and d, drawn in place of that of the cells
+            where all cells agree with it; where there is none, the contour of the spectral radius bounds stable walls.
     """
     delta, d = arrays["delta"], arrays["d"]
-    rows, columns = style.pick_evenly(d.size, PANELS), style.pick_evenly(delta.size, PANELS)
+    rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
     places = list(product(rows, columns))
     single = len(places) == 1
     width, height = (5.9, 4.3) if single else (0.6 + 2.3 * len(columns), 1.0 + 2.1 * len(rows))
@@ -49,8 +49,8 @@ def draw_map(
     image: Any = None
     for ax, (row, column) in zip(panels, places, strict=False):
         place = np.s_[:, :, column, row]
-        exact = (outlines or {}).get((float(delta[column]), float(d[row])))
         image = _draw_panel(ax, arrays, output, arrays[output][place].T)
+        exact = edges(float(delta[column]), float(d[row])) if output in SHADES else None
         if output in SHADES and _draw_region(ax, arrays, output, place, exact):
             image.set_cmap(ListedColormap(["white", "white"]))
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")

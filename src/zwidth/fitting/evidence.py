@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.batching import FEW
+from zwidth.arrays.evaluate import FEW
 from zwidth.fitting.buzz import BuzzPoint
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.safe_wall import draw_devices

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import FEW
 from zwidth.arrays.circle import circle
+from zwidth.arrays.evaluate import FEW
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.scenes import scene_of
 from zwidth.loops.domain import device_status

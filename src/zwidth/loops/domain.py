@@ -6,14 +6,12 @@ infinite or negative where it must not be is INVALID_INPUT, one beyond the range
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 
 from zwidth.arrays.xp import namespace
-from zwidth.words.errors import InputError
-from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, SIZES, WALL_RANGE
+from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
 
@@ -77,19 +75,3 @@ def nan_with_nan_slopes(ok: Array, *inputs: Array) -> Array:
     # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
     total = sum(xp.where(ok, 0.0, value) for value in inputs)
     return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
-
-
-_NUMBERS = (int, float, np.floating, np.integer)
-
-
-def check_scalars(**values: Any) -> None:
-    """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
-    for name, value in values.items():
-        if not isinstance(value, _NUMBERS):
-            continue
-        # Every other name is one of a wall's numbers. What is infinite gets a status, as what is negative.
-        least, most = SIZES.get(name, WALL_RANGE)
-        size = abs(value) if least else value
-        if 0 < size < least or most < size < math.inf:
-            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"0 to {most:g}"
-            raise InputError(f"{name}: got {value!r}; it must be {allowed}")

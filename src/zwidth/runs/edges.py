@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, TypeAlias
 import numpy as np
 
 from zwidth.figures.region import Outlines
-from zwidth.studies.stable_set import find_edges
+from zwidth.studies.passivity import find_edges
 from zwidth.sweep.part_axes import make_scene
 from zwidth.sweep.store import Store
 from zwidth.words.errors import InputError

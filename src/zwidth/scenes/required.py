@@ -93,6 +93,7 @@ def require(
 def _present_value(scene: Any, parameter: str) -> float:
     known = scene.parameters()
     known = {path: value for path, value in known.items() if path not in ("stiffness", "virtual_damping")}
+    known["rate"] = 1.0 / known["period"]
     if parameter not in known:
         raise InputError(f"parameter: {describe_choice(parameter, tuple(known))}")
     if isinstance(known[parameter], int | np.integer):

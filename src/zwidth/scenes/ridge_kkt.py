@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth.arrays.batching import traced_columns
+from zwidth.arrays.arguments import broadcast_traced
 from zwidth.arrays.circle import circle
 from zwidth.arrays.xp import is_traced, namespace
 from zwidth.loops.domain import nan_with_nan_slopes
@@ -91,7 +91,7 @@ def traced_wall(scene: Any, negative_damping: bool | None) -> StiffestWall:
         # Only the wall is traced, on which nothing depends.
         paths = ("mass",)
     structure = structure_of(scene, paths, negative)
-    return compiled_wall(structure, *traced_columns(tuple(values[path] for path in paths)))
+    return compiled_wall(structure, *broadcast_traced(values[path] for path in paths))
 
 
 @partial(jax.jit, static_argnums=0)

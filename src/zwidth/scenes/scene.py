@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, join_shapes
+from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.arrays.xp import is_traced
 from zwidth.loops.linear.border import Border, Outline, outlines
 from zwidth.loops.linear.boundary import Boundary
@@ -298,7 +298,7 @@ class Scene(SceneAnswers):
         """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
 
         Args:
-            parameter: its dotted path, such as "damping" or "velocity.cutoff".
+            parameter: its dotted path, such as "damping", "velocity.cutoff" or "rate".
             stiffness: wanted, in N/m, > 0.
             within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value.
             negative_damping: as for `max_stiffness`.

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
 from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import is_jax
 from zwidth.loops.linear.chain import chain_of, flow, rates
 from zwidth.loops.linear.ridge import BoundRidge, Condition
@@ -69,7 +69,7 @@ def _by_closed_form(scene: Any, negative: bool) -> SceneSensitivities | None:
     """Those of a rigid device; None where its ridge lies at a damping that does not count."""
     device, model = scene.normalized, scene.timing.delay_model
     values = device.delta, device.d
-    found = elementwise(slopes_kernel, ("delta", "d"), values, (model, classify_delays(device.d)))
+    found = evaluate(slopes_kernel, {"delta": device.delta, "d": device.d}, model, classify_delays(device.d))
     if not negative and found.point.beta < 0:
         return None
     with np.errstate(invalid="ignore"):

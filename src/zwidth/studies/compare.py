@@ -16,8 +16,7 @@ from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
 from zwidth.config.study import register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
-from zwidth.studies.stable_set import summarize_stiffest
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text, summarize_stiffest
 
 # An outline has some hundreds of points, of which an estimate of the size may rest on.
 _POINTS_PER_OUTLINE = 1000

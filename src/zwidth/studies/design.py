@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
+from dataclasses import replace
 from functools import partial
 from typing import Annotated, Any, Literal
 
@@ -11,14 +12,11 @@ import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
 from zwidth import figures
-from zwidth.config.axes import Axis, read_entries
+from zwidth.config.axes import Axis, axis_of, read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Fraction
-from zwidth.config.numbers import number, whole_number
-from zwidth.config.parameters import parameter_axis
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import register
-from zwidth.config.units import make_entry_reader
+from zwidth.config.values import Fraction, Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.required import RequiredValue
@@ -33,7 +31,6 @@ from zwidth.words.status import Status
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
 # Scenes that the search for one value asks about.
 _TRIALS = 60
-_OTHER_SIDE = {"above": "below", "below": "above"}
 
 
 def _read_parameter(raw: Any) -> str:
@@ -47,7 +44,7 @@ def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
     name = info.data.get("find")
     if not isinstance(raw, list | tuple) or len(raw) != 2:
         raise problem(f"got {describe(raw)}", "a range is a list of its two ends", "write [low, high]")
-    ends = read_entries(raw, make_entry_reader(name) if name else float)
+    ends = read_entries(raw, replace(quantity_of(name), periods=False).read if name else float)
     if not 0 < ends[0] < ends[1]:
         raise problem(f"got {short(ends[0])} and {short(ends[1])}", "0 < low < high", "write the lower end first")
     return ends
@@ -55,14 +52,14 @@ def _read_range(raw: Any, info: ValidationInfo) -> tuple[float, ...]:
 
 Parameter = Annotated[str, BeforeValidator(_read_parameter), WithJsonSchema({"type": "string", "enum": list(FINDS)})]
 Ends = Annotated[
-    tuple[float, ...],
+    tuple[float, float],
     BeforeValidator(_read_range),
     WithJsonSchema(
         {"type": "array", "items": {"anyOf": [{"type": "number"}, {"type": "string"}]}, "minItems": 2, "maxItems": 2}
     ),
 ]
-Count = Annotated[int, BeforeValidator(whole_number(Range(2, 100_000)))]
-Reserve = Annotated[float, BeforeValidator(number(Range(1.0, 100.0)))]
+Count = Annotated[int, Quantity(allowed=Range(2, 100_000), whole=True)]
+Reserve = Annotated[float, Quantity(allowed=Range(1.0, 100.0))]
 
 
 @register
@@ -81,7 +78,7 @@ class DesignStudy(ComputedStudy):
     find: Parameter
     """The parameter to choose, by its path, as damping, rate or velocity.cutoff."""
 
-    stiffness: Annotated[Axis, *parameter_axis("stiffness")]
+    stiffness: Annotated[Axis, axis_of("stiffness")]
     """Wanted stiffness K in N/m or with a unit, one or several; the scene's where left out."""
 
     reserve: Reserve = 1.0
@@ -165,7 +162,7 @@ class DesignStudy(ComputedStudy):
         nominal = self.device.to_scene()
         rows, notes, ranges = [], [], []
         for stiffness in self.stiffness.values().tolist():
-            needed = self._require(nominal, self.reserve * stiffness)
+            needed = nominal.required(self.find, self.reserve * stiffness, within=self.within)
             ranges.append(needed.range)
             rows.append(self._describe(nominal, stiffness, needed))
             notes += self._note(stiffness, needed)
@@ -178,21 +175,6 @@ class DesignStudy(ComputedStudy):
             documents={f"{self.name}_curve.csv": csv_text(curve)},
             notes=tuple(notes),
         )
-
-    def _require(self, nominal: Scene, stiffness: float) -> RequiredValue:
-        """The value that is enough; a rate by its period."""
-        within = None if self.within is None else (self.within[0], self.within[1])
-        if self.find != "rate":
-            return nominal.required(self.find, stiffness, within=within)
-        periods = None if within is None else (1.0 / within[1], 1.0 / within[0])
-        found = nominal.required("period", stiffness, within=periods)
-        low, high = found.range
-        crossings = tuple(
-            crossing._replace(value=1.0 / crossing.value, enough=_OTHER_SIDE[crossing.enough])
-            for crossing in reversed(found.crossings)
-        )
-        enough: Any = _OTHER_SIDE.get(found.enough, found.enough)
-        return RequiredValue(1.0 / found.value, enough, crossings, (1.0 / high, 1.0 / low), found.status)
 
     def _describe(self, nominal: Scene, stiffness: float, needed: RequiredValue) -> dict[str, Any]:
         """A row of the table: what is needed, the wall there, and what tolerances leave of it."""

@@ -7,24 +7,20 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator
 
 from zwidth import figures
-from zwidth.config.axes import Axis
+from zwidth.config.axes import Axis, axis_of
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Quantity
-from zwidth.config.numbers import whole_number
-from zwidth.config.parameters import parameter_axis
 from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
+from zwidth.config.values import Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table
-from zwidth.studies.stable_set import summarize_stiffest
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table, summarize_stiffest
 from zwidth.words.errors import InputError
-from zwidth.words.quantities import PARAMETERS, POSITIVE
+from zwidth.words.quantities import POSITIVE
 
 
 @register
@@ -40,16 +36,16 @@ class FiltersStudy(ComputedStudy):
     device: PhysicalDevice
     """Device in SI units; the scene's where left out. Its velocity estimate is replaced."""
 
-    damping: Annotated[Axis, *parameter_axis("damping")] | None = None
+    damping: Annotated[Axis, axis_of("damping")] | None = None
     """Physical damping of the device, in N s/m or with a unit; the device's own where left out."""
 
-    cutoff: Annotated[Axis, *parameter_axis("velocity.cutoff")] | None = None
+    cutoff: Annotated[Axis, axis_of("velocity.cutoff")] | None = None
     """Cut-offs of a low-pass, in Hz or with a unit."""
 
-    order: Annotated[int, BeforeValidator(whole_number(PARAMETERS["velocity.order"].allowed))] = 1
+    order: Annotated[int, quantity_of("velocity.order")] = 1
     """Order of the low-pass, 1 or 2."""
 
-    samples: Annotated[Axis, *parameter_axis("velocity.samples")] | None = None
+    samples: Annotated[Axis, axis_of("velocity.samples")] | None = None
     """Lengths of a window, in periods."""
 
     resolution: Annotated[float, Quantity("m", POSITIVE)] | None = None

@@ -15,10 +15,11 @@ from pydantic_core import CoreSchema
 from zwidth import figures
 from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Fraction, Quantity, Strict, describe_entry, members, quantity_of
+from zwidth.config.fields import Strict, members
 from zwidth.config.parts import VelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
+from zwidth.config.values import Fraction, Quantity, describe_entry, quantity_of
 from zwidth.figures.table import stack
 from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 from zwidth.fitting.columns import LoggedMotion, fit_motions, read_log, read_step

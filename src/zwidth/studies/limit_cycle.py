@@ -11,13 +11,13 @@ import numpy as np
 from pydantic import Field, WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.axes import Axis
+from zwidth.config.axes import Axis, AxisOf, axis_of
 from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Quantity, Strict, members
-from zwidth.config.parameters import parameter_axis, quantity_axis
+from zwidth.config.fields import Strict, members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
+from zwidth.config.values import Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
@@ -64,16 +64,16 @@ class CycleAxes(Strict):
 
     what: ClassVar[str] = "the axes of a limit_cycle study"
 
-    stiffness: Annotated[Axis, *parameter_axis("stiffness")]
+    stiffness: Annotated[Axis, axis_of("stiffness")]
     """Stiffness K of the wall, in N/m or with a unit."""
 
-    virtual_damping: Annotated[Axis, *parameter_axis("virtual_damping")]
+    virtual_damping: Annotated[Axis, axis_of("virtual_damping")]
     """Damping B of the wall, in N s/m or with a unit."""
 
-    resolution: Annotated[Axis, *quantity_axis("m", NOT_NEGATIVE)] | None = None
+    resolution: Annotated[Axis, AxisOf(Quantity("m", NOT_NEGATIVE))] | None = None
     """One count of the encoder, in m or with a unit."""
 
-    coulomb: Annotated[Axis, *quantity_axis("N", NOT_NEGATIVE)] | None = None
+    coulomb: Annotated[Axis, AxisOf(Quantity("N", NOT_NEGATIVE))] | None = None
     """Dry friction, in N or with a unit."""
 
     def limits(self) -> Iterable[LocatedProblem]:

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from itertools import product
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 from pydantic import WrapValidator
@@ -15,10 +14,12 @@ from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.config.fields import members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, register
+from zwidth.figures.region import Outlines
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
 from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene, share_of_device
+from zwidth.studies.passivity import find_edges
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 
@@ -88,19 +89,11 @@ class MapStudy(ComputedStudy):
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
         arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
-        return Outcome(arrays=arrays, figures={f"_{name}": partial(_draw, arrays, name, share) for name in names})
+        edges = {name: partial(_find_edge, name, share) for name in names}
+        draw = {f"_{name}": partial(figures.draw_map, arrays, name, edges=edge) for name, edge in edges.items()}
+        return Outcome(arrays=arrays, figures=draw)
 
 
-def _draw(arrays: dict[str, Any], name: str, share: float) -> Any:
-    """A figure with the exact edges of the panels that it has."""
-    from zwidth.figures.stability_map import PANELS
-    from zwidth.figures.style import pick_evenly
-    from zwidth.studies.stable_set import find_edges
-
-    delta, d = arrays["delta"], arrays["d"]
-    shown = product(delta[pick_evenly(delta.size, PANELS)], d[pick_evenly(d.size, PANELS)])
-    edges = {}
-    for delta, d in shown if name in ("stable", "passive") else ():
-        damping = float(delta) * (share if name == "passive" else 1.0)
-        edges[delta, d] = find_edges(damping, float(d)).get(name)
-    return figures.draw_map(arrays, name, outlines={place: edge for place, edge in edges.items() if edge})
+def _find_edge(name: str, share: float, delta: float, d: float) -> Outlines | None:
+    """The exact edge of what is stable or passive on a device."""
+    return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)

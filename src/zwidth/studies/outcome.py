@@ -19,6 +19,8 @@ from zwidth.config.fields import members
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
 from zwidth.figures.table import SI_COLUMNS
+from zwidth.scenes.assessment import name_kind
+from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.formatting import to_cell
 
 Table: TypeAlias = dict[str, np.ndarray]
@@ -163,6 +165,12 @@ def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Phy
 
 def _is_single(axis: Axis, value: float) -> bool:
     return axis.size == 1 and float(axis.values()[0]) == value
+
+
+def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
+    """A stiffest wall as columns of a table."""
+    found = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
+    return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 
 
 def csv_text(table: Table) -> str:

@@ -11,8 +11,10 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, register
+from zwidth.figures.region import Outlines
 from zwidth.loops.rigid.passive_area import passive_edge
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
+from zwidth.loops.rigid.region import stable_region
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.scenes.scene import Scene
@@ -45,6 +47,15 @@ class PassivityStudy(CurvesStudy):
 def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
     """alpha and beta of the passive set's edge for delta = 1, from the smallest beta to the largest."""
     return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
+
+
+def find_edges(delta: float, d: float) -> dict[str, Outlines]:
+    """Where the stable and the passive walls of a rigid device end, normalized."""
+    found = stable_region(delta, d)
+    edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
+    if delta > 0:
+        edges["passive"] = [(delta * np.stack(unit_outline(d), -1), False)]
+    return edges
 
 
 def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:

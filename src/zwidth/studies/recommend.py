@@ -11,9 +11,9 @@ from typing import Any, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.config.fields import Fraction
 from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.config.study import register
+from zwidth.config.values import Fraction
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.settling import decay_time

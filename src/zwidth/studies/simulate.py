@@ -7,16 +7,15 @@ from functools import partial
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, PlainValidator
 
 from zwidth import figures
-from zwidth.config.axes import SPELLED, Axis, axis, axis_schema
+from zwidth.config.axes import Axis, AxisOf
 from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.numbers import whole_number
 from zwidth.config.parts import NO_LINEAR_FORM, locate_refusal
 from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
 from zwidth.config.study import HeldOnly, register
+from zwidth.config.values import Quantity
 from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
@@ -27,8 +26,7 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import header, with_unit
 from zwidth.words.quantities import POSITIVE, Range
 
-_POSITIVE = {"type": "number", "exclusiveMinimum": 0}
-Fractions = Annotated[Axis, PlainValidator(axis(POSITIVE)), SPELLED, axis_schema(_POSITIVE, _POSITIVE)]
+Fractions = Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))]
 
 # What the program makes of a sample stays until the next one.
 _OF_SAMPLES = ("measured", "estimated_velocity", "command", "contact")
@@ -75,7 +73,7 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
 
     kind: Literal["simulate"]
 
-    substeps: Annotated[int, BeforeValidator(whole_number(Range(1, 10_000)))] = 1
+    substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 1
     """Points recorded per period."""
 
     stiffness_fraction: Fractions | None = None

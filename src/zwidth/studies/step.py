@@ -8,13 +8,12 @@ from functools import partial
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, WrapValidator
+from pydantic import WrapValidator
 from pydantic_core import PydanticCustomError
 
 from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Duration, Fraction, members
-from zwidth.config.numbers import whole_number
+from zwidth.config.fields import members
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import (
     AnyDevice,
@@ -28,6 +27,7 @@ from zwidth.config.scenes import (
     normalized_wall,
 )
 from zwidth.config.study import HeldOnly, refuse_parts, register
+from zwidth.config.values import Duration, Fraction, Quantity
 from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.response import step_response
@@ -48,7 +48,7 @@ class ResponseStudy(ComputedStudy):
     duration: Duration = Span(100.0, "periods")
     """Length of the response, in s or in periods."""
 
-    substeps: Annotated[int, BeforeValidator(whole_number(Range(1, 10_000)))] = 10
+    substeps: Annotated[int, Quantity(allowed=Range(1, 10_000), whole=True)] = 10
     """Points computed per period."""
 
     delay_model: HeldOnly = "held"

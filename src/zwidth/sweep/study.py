@@ -9,15 +9,14 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import Axis
+from zwidth.config.axes import Axis, axis_of
 from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
-from zwidth.config.numbers import number
-from zwidth.config.parameters import parameter_axis
 from zwidth.config.parts import list_parts, make_parts_base
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study, register
+from zwidth.config.values import Quantity
 from zwidth.sweep.part_axes import find_faults
 from zwidth.words.quantities import (
     MAX_DELAY_PERIODS,
@@ -43,15 +42,13 @@ def _check_output(name: Any) -> str:
 
 
 OutputName = Annotated[str, BeforeValidator(_check_output), WithJsonSchema({"type": "string", "enum": list(OUTPUTS)})]
-# Closer in, the rounding of the two counts that prove a radius would meet.
-_ACCURACY = Range(1e-12, 0.1)
 
 
 def _axis_field(name: str) -> tuple[Any, Any]:
     if name == "devices":
         rows = "Parameters that move together, one row a device: lists of equal length, or a CSV file."
         return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
-    axis: Any = Annotated[Axis, *parameter_axis(name)]
+    axis: Any = Annotated[Axis, axis_of(name)]
     words = describe_parameter(PARAMETERS[name]) + ("." if name in WALL else "; the scene's where left out.")
     return axis | None, Field(default=None, description=words)
 
@@ -164,9 +161,8 @@ class SweepStudy(_Parts, _Swept):
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""
 
-    accuracy: Annotated[float, BeforeValidator(number(_ACCURACY))] = Field(
-        default=1e-9, json_schema_extra={"minimum": _ACCURACY.low, "maximum": _ACCURACY.high}
-    )
+    # Closer in, the rounding of the two counts that prove a radius would meet.
+    accuracy: Annotated[float, Quantity(allowed=Range(1e-12, 0.1))] = 1e-9
     """Relative error to prove of every spectral radius.
 
     It is proved by counting the poles inside two circles; most values have nearly all digits whatever is

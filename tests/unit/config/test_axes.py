@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from zwidth.config.axes import axis
+from zwidth.config.axes import AxisOf
+from zwidth.config.values import Quantity
 
 
 @pytest.mark.parametrize(
@@ -18,34 +19,37 @@ from zwidth.config.axes import axis
     ],
 )
 def test_values(raw, form, values):
-    made = axis()(raw)
+    made = AxisOf(Quantity()).read(raw)
     assert made.form == form
     assert made.values().dtype == np.float64
     np.testing.assert_allclose(made.values(), values, rtol=1e-15)
     assert made.size == len(values)
     assert made.largest == max(values)
-    assert axis()(made.spelling()) == made
-    assert axis()(made) is made
-    assert hash(made) == hash(axis()(raw))
+    assert AxisOf(Quantity()).read(made.spelling()) == made
+    assert AxisOf(Quantity()).read(made) is made
+    assert hash(made) == hash(AxisOf(Quantity()).read(raw))
 
 
 def test_size_needs_no_memory():
-    assert axis()({"linear": {"start": 0, "stop": 1, "num": 10_000_000}}).size == 10_000_000
+    assert AxisOf(Quantity()).read({"linear": {"start": 0, "stop": 1, "num": 10_000_000}}).size == 10_000_000
 
 
 def test_ends_too_far_apart_are_refused():
     with pytest.raises(ValueError, match="must be finite"):
-        axis()({"linear": {"start": -1e308, "stop": 1e308, "num": 3}})
+        AxisOf(Quantity()).read({"linear": {"start": -1e308, "stop": 1e308, "num": 3}})
 
 
 def test_steps_below_the_resolution_are_refused():
     with pytest.raises(ValueError, match="below float64's resolution"):
-        axis()({"linear": {"start": 1.0, "stop": 1.0 + 1e-14, "num": 1000}})
+        AxisOf(Quantity()).read({"linear": {"start": 1.0, "stop": 1.0 + 1e-14, "num": 1000}})
 
 
 def test_two_neighbors_may_be_as_close_as_float64_tells_apart():
     """One step of six units in the last place is an axis, one of three is not."""
     unit = 2.0**-52
-    assert axis()({"linear": {"start": 1.0, "stop": 1.0 + 6 * unit, "num": 2}}).values()[1] == 1.0 + 6 * unit
+    assert (
+        AxisOf(Quantity()).read({"linear": {"start": 1.0, "stop": 1.0 + 6 * unit, "num": 2}}).values()[1]
+        == 1.0 + 6 * unit
+    )
     with pytest.raises(ValueError, match="below float64's resolution"):
-        axis()({"linear": {"start": 1.0, "stop": 1.0 + 3 * unit, "num": 2}})
+        AxisOf(Quantity()).read({"linear": {"start": 1.0, "stop": 1.0 + 3 * unit, "num": 2}})

@@ -181,7 +181,7 @@ def test_a_fault_without_its_field_would_be_noticed(tmp_path):
         ("version: 1\nname: a\n!x studies: []\n", "studies"),
         ("version: 1\nname: a\nstudies: [{kind: map, name: m, d: !x [1]}]\n", "studies[0].d"),
         ("version: 1\nname: " + "[" * 30 + "]" * 30, "name" + "[0]" * 19),
-        ("version: 1\nname: a\nx: &x [1]\nstudies: &s [*s]\n", "studies" + "[0]" * 20),
+        ("version: 1\nname: a\nx: &x [1]\nstudies: &s [*s]\n", "studies[0]"),
         ("version: 1\nstudies:\n" + "- [" + "1," * 60_000 + "]", "studies[0][49994]"),
     ],
     ids=["tag", "tag on a key", "tag below", "depth", "alias", "number"],

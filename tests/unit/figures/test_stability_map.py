@@ -15,13 +15,13 @@ def exact(ax):
 
 
 def test_the_outline_is_drawn_where_the_cells_agree():
-    (ax,) = figures.draw_map(grid_map(), "stable", outlines={(0.1, 1.0): [(EDGE, False)]})
+    (ax,) = figures.draw_map(grid_map(), "stable", edges=lambda delta, d: {(0.1, 1.0): [(EDGE, False)]}[delta, d])
     (line,) = exact(ax)
     np.testing.assert_array_equal(line[:-1], EDGE)
     # All is white below it.
     assert ax.collections[0].get_cmap()(0) == ax.collections[0].get_cmap()(1)
-    for outlines in ({(0.2, 1.0): [(EDGE, False)]}, {(0.1, 1.0): [(EDGE * [0.1, 1], False)]}):
-        (ax,) = figures.draw_map({**fine(), "delta": np.array([0.1])}, "stable", outlines=outlines)
+    for edge in (None, [(EDGE * [0.1, 1], False)]):
+        (ax,) = figures.draw_map({**fine(), "delta": np.array([0.1])}, "stable", edges=lambda *_, edge=edge: edge)
         assert not exact(ax)
 
 

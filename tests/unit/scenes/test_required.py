@@ -32,6 +32,12 @@ def test_both_sides_are_what_is_told(parameter, stiffness, side):
         assert beyond.max_stiffness().stiffness < stiffness
 
 
+def test_a_rate_is_the_inverse_of_a_period():
+    rate, period = (FILTERED.required(name, 8.5e3) for name in ("rate", "period"))
+    assert (rate.enough, period.enough) == ("above", "below")
+    assert rate.value * period.value == pytest.approx(1.0, rel=1e-10)
+
+
 def test_out_of_reach_and_everywhere():
     never = FILTERED.required("mass", 1e9, within=(0.05, 0.2))
     assert (never.status, never.enough, never.crossings) == (Status.UNREACHABLE, "nowhere", ())

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import along, frozen, namespace
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device
+from zwidth.loops.domain import nan_with_nan_slopes, valid_device
 from zwidth.loops.rigid.needed_damping import directions, needed_damping
 from zwidth.words.types import Array, ArrayLike
 
@@ -28,8 +28,7 @@ if TYPE_CHECKING:
 
 # Gauss-Legendre nodes for each of the three parts.
 _NODES = (64, 64, 32)
-# A point becomes 160 of them.
-_FEW, _BLOCK = 1 << 6, 1 << 7
+_WEIGHT = 64
 
 
 def passive_edge(scene: Scene, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
@@ -73,8 +72,7 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{passive_area(0.5, 0):.4f}")
         0.5000
     """
-    check_scalars(delta=delta, d=d)
-    return elementwise(_passive_area_kernel, ("delta", "d"), (delta, d), few=_FEW, block=_BLOCK)
+    return evaluate(_passive_area_kernel, {"delta": delta, "d": d}, weight=_WEIGHT)
 
 
 def _passive_area_kernel(delta: Array, d: Array) -> Array:

@@ -28,7 +28,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import processors
+from zwidth.arrays.evaluate import processors
 from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
 from zwidth.loops.rigid.pole_search import both_poles
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step

@@ -32,7 +32,7 @@ _STRIDES = ((9, 1), (15, 2), (26, 4), (42, 8))
 # Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
 _ON_EDGE = 1e-5
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
-# So few that no compiler is asked for (`arrays.batching.FEW`).
+# So few that no compiler is asked for (`arrays.evaluate.FEW`).
 _FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (72, 56), (48, 40), 12, (36, 30)
 _DIRECTIONS, _FEW_DIRECTIONS = 181, 41
 _RIDGE_POINTS, _FEW_RIDGE_POINTS, _MOST_DAMPING = 61, 9, 4.0

@@ -3,11 +3,21 @@
 import math
 
 import pytest
-from pydantic_core import PydanticCustomError
 
-from zwidth.config.units import quantity
 from zwidth.parts.span import Span
-from zwidth.words.units import ANGLE, ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPING, MASS, RATE, STIFFNESS, TIME, TORQUE
+from zwidth.words.errors import UnusableValueError
+from zwidth.words.units import (
+    ANGLE,
+    ANGULAR_DAMPING,
+    ANGULAR_STIFFNESS,
+    DAMPING,
+    MASS,
+    RATE,
+    STIFFNESS,
+    TIME,
+    TORQUE,
+    read_quantity,
+)
 
 
 @pytest.mark.parametrize(
@@ -50,7 +60,7 @@ from zwidth.words.units import ANGLE, ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPIN
     ],
 )
 def test_a_quantity_is_the_number_nearest_to_what_is_written(dimension, text, value):
-    assert quantity(dimension)(text) == value
+    assert read_quantity(text, dimension)[0] == value
 
 
 @pytest.mark.parametrize(
@@ -79,8 +89,8 @@ def test_a_quantity_is_the_number_nearest_to_what_is_written(dimension, text, va
     ],
 )
 def test_what_is_no_quantity(dimension, value):
-    with pytest.raises(PydanticCustomError):
-        quantity(dimension)(value)
+    with pytest.raises(UnusableValueError):
+        read_quantity(value, dimension)
 
 
 def test_spans():
