@@ -372,7 +372,7 @@ def follow_poles(area: Area, accuracy: float) -> tuple[MapPoles, np.ndarray]:
     first = [part.start // top for part in window]
     last = [-(-part.stop // top) for part in window]
     shape = (area.d.size, *(top * (stop - start) for start, stop in zip(first, last, strict=True)))
-    out = MapPoles(np.empty(shape), np.empty(shape))
+    out = MapPoles(np.zeros(shape), np.zeros(shape))
     held, missing = area.d != np.floor(area.d), []
     for kind in (False, True):
         pieces = np.flatnonzero(held == kind), *map(np.arange, first, last)
