@@ -28,8 +28,8 @@ from zwidth.figures.motion import draw_motion
 from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls, trace_outlines
 from zwidth.figures.step import draw_step
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.passive_area import passive_edge
 from zwidth.parts.wall import resolve_wall
+from zwidth.scenes.passive import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError

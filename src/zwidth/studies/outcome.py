@@ -158,7 +158,7 @@ def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) ->
 
 def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> PhysicalScene | PhysicalDevice | None:
     """The rigid scene or device, where delta and d are those of it alone."""
-    if not isinstance(owner, PhysicalScene | PhysicalDevice) or not owner.is_rigid:
+    if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
         return None
     return owner if _is_single(delta, owner.delta) and _is_single(d, owner.d) else None
 
