@@ -65,7 +65,7 @@ def fresh(scene: zwidth.Scene) -> zwidth.Scene:
 
 def eigenvalue_labels(scene: zwidth.Scene, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
     """Spectral radii of walls by companion eigenvalues."""
-    parts = affine_polynomial(scene.loop)
+    parts = affine_polynomial(scene.loop.roots)
     polynomials = parts.D + alpha[:, None] * parts.N1 + beta[:, None] * parts.N2
     return np.abs(np.linalg.eigvals(companion(polynomials / polynomials[:, :1]))).max(-1)
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from methods.clock import time_calls
-from zwidth.arrays import batching, xla
+from zwidth.arrays import evaluate, xla
 from zwidth.loops.rigid import (
     certified_filter,
     circle,
@@ -110,16 +110,16 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
         return radius.quick_kernel(*walls, 1e-9, True)  # pyright: ignore
 
     def point(a: Any, b: Any) -> Any:
-        return jax.vmap(lambda x, y: exact_points.kkt_kernel(x, y, "held"))(a, b)
+        return exact_points.kkt_kernel(a, b, "held")
 
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, "held", ANY)
 
-    strips = batching.compile_strips.__wrapped__
+    strips = evaluate._compile_strips.__wrapped__
     wide = xla.WIDE
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
-    yield "STRIP, verdict", lambda: strips(stable), compiled(stable, wide), columns
+    yield "STRIP, verdict", lambda: strips(stable, (), xla.STRIP), compiled(stable, wide), columns
     few = (delta[:8192], d[:8192])
     yield (
         "store_once, ridge kkt",
@@ -134,19 +134,19 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     by_rule, alone = slopes()
     yield "custom_jvp, gradient of ridge", lambda: by_rule, lambda: alone, (delta, d)
     million = tuple(np.tile(np.asarray(column), 16) for column in (delta, d))
-    ridges = batching._compile_elementwise(ridge.ridge_kernel, ("held", ANY))
+    ridges = evaluate.compile_traced(ridge.ridge_kernel, ("held", ANY))
     yield "BLOCK, ridge of a million", in_blocks(ridges, 1 << 16), in_blocks(ridges, 1 << 20), million
     yield "sine series, radius", compiled(quick, wide), compiled(quick, wide, step___half_turn=their_half_turn), columns
 
 
 def in_blocks(function: Callable[..., Any], size: int) -> Make:
     """A compiled function applied to blocks of one size, on one processor."""
-    return lambda: lambda *columns: batching.map_blocks(function, list(columns), size, 1)
+    return lambda: lambda *columns: evaluate.map_blocks(function, list(columns), size, 1)
 
 
 def slopes() -> tuple[Callable[..., Any], Callable[..., Any]]:
-    """The first gradient outside `jit`, by the rule of `batching.elementwise` and by JAX alone."""
-    by_rule = batching._compile_elementwise.__wrapped__(ridge.ridge_kernel, ("held", ANY))
+    """The first gradient outside `jit`, by the rule of `arrays.evaluate` and by JAX alone."""
+    by_rule = evaluate.compile_traced.__wrapped__(ridge.ridge_kernel, ("held", ANY))
     alone = jax.jit(lambda *columns: ridge.ridge_kernel(*columns, "held", ANY))  # pyright: ignore
     return tuple(jax.grad(lambda *c, f=f: f(*c).alpha.sum(), argnums=(0, 1)) for f in (by_rule, alone))  # type: ignore
 

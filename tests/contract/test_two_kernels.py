@@ -3,90 +3,136 @@
 A rigid scene is a linear scene; the general kernels share nothing with the closed forms but the sampled device.
 """
 
+import inspect
+
 import numpy as np
 import pytest
 
 import zwidth
-from zwidth.loops.linear.columns import stable_dampings
-from zwidth.loops.linear.margins import OpenLoop, margins_of
-from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
-from zwidth.loops.linear.poles import all_poles
-from zwidth.loops.linear.radius import spectral_radius
-from zwidth.loops.linear.ridge import find_ridge
-from zwidth.loops.linear.rows import label_walls, stable_intervals
+from zwidth.loops.loop import LinearLoop, RigidLoop
 
 DELAYS = (0.0, 0.3, 1.0, 1.6, 2.0, 4.0, 8.5)
 
 
 @pytest.fixture(scope="module", params=range(24))
-def rigid(request):
-    """A random rigid scene of T = 1 s and m = 1 kg, whose SI quantities are the normalized ones; and its ridge."""
+def loops(request):
+    """A random rigid scene of T = 1 s and m = 1 kg, whose SI quantities are the normalized ones, and walls around it.
+
+    Both of its loops, its ridge, and alpha and beta of 40 walls each.
+    """
     random = np.random.default_rng(request.param)
     delta, d = float(10.0 ** random.uniform(-3, 1.5)), DELAYS[request.param % len(DELAYS)]
     scene = zwidth.Scene(zwidth.Device(1.0, delta), zwidth.Timing(1.0, d))
-    assert scene.is_rigid
+    assert isinstance(scene.loop, RigidLoop)
     top = zwidth.alpha_max(delta, d)
     shares = random.uniform(0.02, 1.2, 40), random.uniform(-0.1, 1.8, 40)
-    return scene, top, shares[0] * top.alpha, -delta + shares[1] * (top.beta + delta)
+    beta = -delta + shares[1] * (top.beta + delta)
+    return scene.loop, LinearLoop(scene), top, shares[0] * top.alpha, beta
 
 
-def test_labels(rigid):
-    scene, _, alpha, beta = rigid
-    expected = zwidth.is_stable(alpha[:, None], beta, scene.delta, scene.d)
-    np.testing.assert_array_equal(label_walls(scene.traced_boundary, alpha[:, None], beta), expected)
+def test_both_answer_the_same_questions():
+    for name, answer in inspect.getmembers(RigidLoop, inspect.isfunction):
+        assert (
+            inspect.signature(answer).parameters.keys()
+            == inspect.signature(getattr(LinearLoop, name)).parameters.keys()
+        ), name
+
+
+def test_labels(loops):
+    rigid, linear, _, alpha, beta = loops
+    expected = rigid.labels(alpha[:, None], beta)
+    np.testing.assert_array_equal(linear.labels(alpha[:, None], beta), expected)
     assert 0.1 < np.mean(expected) < 0.9
+    for method in ("auto", "companion", "certified"):
+        decided = [loop.decide(alpha[:8], beta[:8], method, (alpha[:8], beta[:8])) for loop in (rigid, linear)]
+        for field in ("stable", "status", "method"):
+            np.testing.assert_array_equal(*(getattr(each, field) for each in decided))
 
 
-def test_rows_and_columns(rigid):
-    scene, top, alpha, beta = rigid
-    row = zwidth.boundary_point(scene.delta, scene.d, beta=beta)
-    found = stable_intervals(scene.traced_boundary, beta)
-    there = row.status == zwidth.Status.OK
-    np.testing.assert_array_equal(np.isfinite(found.high[:, 0]), there)
-    np.testing.assert_allclose(found.high[there, 0], row.alpha[there], rtol=1e-9)
-    assert np.isnan(found.high[:, 1:]).all()
-    for stiffness in alpha[:6]:
-        ends = [zwidth.boundary_point(scene.delta, scene.d, alpha=stiffness, side=side) for side in ("lower", "upper")]
-        column = stable_dampings(scene.traced_boundary, float(stiffness))
-        assert len(column) == (stiffness < top.alpha)
-        if len(column):
-            expected = [float(end.beta) for end in ends]
-            np.testing.assert_allclose(column[0], expected, rtol=1e-8, atol=1e-8 * (scene.delta + abs(expected[1])))
+def test_rows_and_columns(loops):
+    rigid, linear, top, alpha, beta = loops
+    expected, found = rigid.row(beta), linear.row(beta)
+    assert expected.shape == found.shape == (40, 1, 2)
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    for stiffness in alpha[:6].tolist():
+        expected, found = rigid.column(stiffness), linear.column(stiffness)
+        assert expected.shape == found.shape == (int(stiffness < top.alpha), 2)
+        size = rigid.scene.delta + np.abs(expected).max(initial=0.0)
+        np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8 * size)
 
 
-def test_the_stiffest_wall(rigid):
-    scene, top, _, _ = rigid
-    found = find_ridge(scene.border, True)
-    assert found is not None
-    assert found.kind == top.kind
-    np.testing.assert_allclose([found.alpha, found.omega], [top.alpha, top.omega], rtol=1e-7)
-    np.testing.assert_allclose(found.alpha, top.alpha, rtol=1e-12)
+def test_a_stable_set_of_one_piece(loops):
+    rigid, linear, top, _, _ = loops
+    assert rigid.islands(-np.inf) == linear.islands(-np.inf) == []
+    wall = 0.9 * float(top.alpha), float(top.beta)
+    assert rigid.holds_softly(*wall)
+    assert linear.holds_softly(*wall)
+    for least in (-np.inf, 0.0):
+        assert rigid.soft_column(wall[0], least) == linear.soft_column(wall[0], least)
+    assert rigid.soft_column(wall[0], -np.inf)
 
 
-def test_poles_and_radius(rigid):
-    scene, _, alpha, beta = rigid
+@pytest.mark.parametrize("negative", [True, False])
+def test_the_stiffest_wall(loops, negative):
+    rigid, linear, top, _, _ = loops
+    expected, found = rigid.stiffest(negative), linear.stiffest(negative)
+    assert (found.kind, found.status) == (expected.kind, expected.status)
+    np.testing.assert_allclose(found.omega, expected.omega, rtol=1e-7)
+    np.testing.assert_allclose(found.alpha, expected.alpha, rtol=1e-12)
+    assert negative is False or expected.alpha == top.alpha
+
+
+def test_sensitivities(loops):
+    rigid, linear, top, _, _ = loops
+    expected, found = rigid.sensitivities(True), linear.sensitivities(True)
+    for path in expected.per:
+        size = float(top.alpha) * max(1.0, 1.0 / rigid.scene.parameters()[path] if path == "damping" else 1.0)
+        np.testing.assert_allclose(found.per[path], expected.per[path], rtol=1e-6, atol=1e-9 * size)
+
+
+def test_poles_and_radius(loops):
+    rigid, linear, _, alpha, beta = loops
     alpha, beta = alpha[:8], beta[:8]
-    stable = zwidth.is_stable(alpha, beta, scene.delta, scene.d)
-    expected = zwidth.spectral_radius(alpha, beta, scene.delta, scene.d)
-    np.testing.assert_allclose(spectral_radius(scene.loop, alpha, beta, stable), expected, rtol=1e-8)
-    size = np.abs(1.0 + all_poles(scene.loop, alpha, beta)).max(-1)
-    np.testing.assert_allclose(size, expected, rtol=1e-6)
+    expected = rigid.radius(alpha, beta)
+    np.testing.assert_allclose(linear.radius(alpha, beta), expected, rtol=1e-8)
+    for loop in (rigid, linear):
+        np.testing.assert_allclose(np.nanmax(np.abs(loop.poles(alpha, beta)), -1), expected, rtol=1e-6)
 
 
-def test_margins(rigid):
-    scene, _, alpha, beta = rigid
-    for a, b in zip(alpha[:4], beta[:4], strict=True):
-        closed = zwidth.margins(a, b, scene.delta, scene.d)
-        stable = bool(zwidth.is_stable(a, b, scene.delta, scene.d))
-        found = margins_of(OpenLoop.lay_out(scene.loop, float(a), float(b), scene.traced_boundary.w), stable)
-        np.testing.assert_allclose(found.modulus_margin, closed.modulus_margin, rtol=1e-7)
-        if stable:
-            np.testing.assert_allclose(found.phase_margin, closed.phase_margin, rtol=1e-7)
+def test_the_slowest_motion(loops):
+    rigid, linear, _, alpha, beta = loops
+    for wall in zip(alpha[:4].tolist(), beta[:4].tolist(), strict=True):
+        expected, found = rigid.slowest(*wall), linear.slowest(*wall)
+        assert found.marginal == expected.marginal is False
+        np.testing.assert_allclose([found.radius, found.rate], [expected.radius, expected.rate], rtol=1e-6, atol=1e-9)
+    # Nothing pulls back, but damping slows down.
+    wall = 0.0, 0.5 * float(rigid.stiffest(True).beta)
+    assert rigid.slowest(*wall).marginal == linear.slowest(*wall).marginal
 
 
-def test_passivity(rigid):
-    scene, _, alpha, beta = rigid
-    condition = PassivityCondition.derive(scene.velocity.estimate(1.0), scene.d)
-    found = passivity_margins(condition, alpha[:6], beta[:6], scene.delta)
-    expected = zwidth.passivity_margin(alpha[:6], beta[:6], scene.delta, scene.d)
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * scene.delta)
+def test_margins(loops):
+    rigid, linear, _, alpha, beta = loops
+    expected, found = rigid.margins(alpha[:2], beta[:2]), linear.margins(alpha[:2], beta[:2])
+    stable = rigid.labels(alpha[:2], beta[:2])
+    np.testing.assert_allclose(found.modulus_margin, expected.modulus_margin, rtol=1e-7)
+    np.testing.assert_allclose(found.phase_margin[stable], expected.phase_margin[stable], rtol=1e-7)
+
+
+def test_passivity(loops):
+    rigid, linear, _, alpha, beta = loops
+    expected = rigid.passivity_margin(alpha[:6], beta[:6])
+    found = linear.passivity_margin(alpha[:6], beta[:6])
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * rigid.scene.delta)
+
+
+def test_variants_of_a_device():
+    scene = zwidth.Scene(
+        zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1.3e-3), operator=zwidth.Operator(mass=0.05, damping=1.0)
+    )
+    drawn = {"damping": np.array([2.0, 8.0, 20.0]), "delay": np.array([0.0, 1e-3, 2.5e-3])}
+    expected, found = scene.loop.vary(drawn), LinearLoop(scene).vary(drawn)
+    assert type(expected) is not type(found)
+    np.testing.assert_array_equal(expected.labels(12e3, 20.0), found.labels(12e3, 20.0))
+    dampings = np.array([0.0, 20.0, 1e5])
+    np.testing.assert_allclose(expected.row_ends(dampings), found.row_ends(dampings), rtol=1e-9)
+    np.testing.assert_allclose(expected.stiffest(), found.stiffest(), rtol=1e-9)

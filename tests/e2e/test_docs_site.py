@@ -143,7 +143,7 @@ def test_names_are_links_and_examples_are_code(site):
     pages = {page.name: page.read_text(encoding="utf-8") for page in (site / "reference").glob("*.html")}
     scene = set(re.findall(r'id="zwidth\.Scene\.(\w+)"', pages["scene.html"]))
     assert scene >= {"is_stable", "max_stiffness"}
-    assert not scene & {"border", "chain", "loop", "traced_boundary", "whole_delay"}
+    assert not scene & {"check_parts", "loop", "whole_delay"}
     # What Markdown makes of ">>>" that nobody has told it is an example.
     assert [name for name, text in pages.items() if "<blockquote" in text] == []
     assert pages["stability.html"].count('class="gp"') > 10

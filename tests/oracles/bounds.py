@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import broadcast
+from zwidth.arrays.arguments import broadcast
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.outermost_poles import prove_radii
 from zwidth.words.status import Status
@@ -21,7 +21,7 @@ class Radius(NamedTuple):
 
 def bound_radius(alpha, beta, delta, d, *, accuracy=1e-9) -> Radius:
     """What `zwidth.spectral_radius` knows of each point."""
-    arrays = broadcast(NAMES, (alpha, beta, delta, d))
+    arrays = broadcast(dict(zip(NAMES, (alpha, beta, delta, d), strict=True)))
     radius, proved, status = prove_radii(arrays, accuracy)
     certified = (status == Status.OK) & (proved <= accuracy)
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.

@@ -54,7 +54,6 @@ EDITS = {
         ),
         '"zwidth.Operator(mass=0.5)",': '"zwidth.Operator(mass=0.5)",\n    "mount": "zwidth.Mount(stiffness=100)",',
         '"operator": Operator | None}': '"operator": Operator | None, "mount": Mount | None}',
-        "self.device.coupling is None\n\n": "self.device.coupling is None and self.mount is None\n\n",
         "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
     },
     "loops/linear/chain.py": {

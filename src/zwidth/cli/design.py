@@ -72,7 +72,7 @@ def design(
     if tolerances:
         found["tolerances"], words = _tolerate(scene, dict(tolerances), distribution, samples, seed)
         lines += words
-        if scene.is_rigid and distribution == "uniform" and all(name in _BOX for name, _ in tolerances):
+        if not scene.parts_beyond and distribution == "uniform" and all(name in _BOX for name, _ in tolerances):
             found["every_device"], words = _prove(scene, dict(tolerances))
             lines += words
     if as_json:
@@ -119,7 +119,7 @@ def _tolerate(
 ) -> tuple[dict[str, Any], list[str]]:
     from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 
-    count = samples if samples is not None else 10_000 if scene.is_rigid else 200
+    count = samples if samples is not None else scene.loop.draws
     named = {name: Tolerance(share, distribution) for name, share in shares.items()}
     found = simulate_tolerances(scene, named, samples=count, seed=seed)
     result = {name: value for name, value in asdict(found).items() if name not in ("drawn", "labels")}

@@ -155,8 +155,7 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
             VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
             velocity=_velocity(part("velocity")),
         ).replace(**parts)
-        # What parts refuse only together, as a cut-off beyond half the sampling rate.
-        _ = scene.is_rigid or scene.loop
+        scene.check_parts()
         return scene
     except InputError as error:
         field, _, text = str(error).partition(": ")

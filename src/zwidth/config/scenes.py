@@ -122,8 +122,8 @@ class _PhysicalPlant(_Parts, _Mass):
             return
         try:
             scene = self.to_scene()
-            # Where it is not rigid: what the parts refuse only together, such as a cut-off beyond half the rate.
-            _ = scene.is_rigid or is_adaptive(self) or scene.loop
+            if not is_adaptive(self):
+                scene.check_parts()
         except InputError as error:
             yield locate_refusal(error)
             return
@@ -140,9 +140,9 @@ class _PhysicalPlant(_Parts, _Mass):
                 yield (field,), problem(what, allowed, "check the units and the mass")
 
     @property
-    def is_rigid(self) -> bool:
-        """Whether it is a rigid mass with the backward difference, for which every kind of study answers."""
-        return self.to_scene().is_rigid
+    def parts_beyond(self) -> tuple[str, ...]:
+        """What makes it more than a rigid mass with the difference of two samples, which every kind of study takes."""
+        return self.to_scene().parts_beyond
 
     @property
     def moving_mass(self) -> float:
@@ -261,7 +261,7 @@ class PhysicalScene(_PhysicalPlant):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        if self.delay_model != "held" and not self.is_rigid:
+        if self.delay_model not in self.to_scene().loop.delay_models:
             allowed = "velocity filters, hands and couplings are computed in the model 'held'"
             yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
 
@@ -334,7 +334,7 @@ def is_adaptive(owner: Any) -> bool:
 
 def is_with_parts(owner: AnyScene | AnyDevice) -> bool:
     """Whether a scene or a device is more than a rigid mass with the difference of two samples."""
-    return isinstance(owner, PhysicalScene | PhysicalDevice) and not owner.is_rigid
+    return isinstance(owner, PhysicalScene | PhysicalDevice) and bool(owner.parts_beyond)
 
 
 def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:

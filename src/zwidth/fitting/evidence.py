@@ -7,19 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.batching import FEW
 from zwidth.fitting.buzz import BuzzPoint
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.safe_wall import draw_devices
-from zwidth.fitting.scenes import scene_of
 from zwidth.fitting.words import LINEAR, AxisUnits, choose_wall
-from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header
-from zwidth.words.status import Status
 
 # Devices drawn around the estimate, dampings of the boundary, and how far beyond its end.
-_DRAWS, _DRAWS_WITH_PARTS, _ROWS, _BEYOND = 1000, 200, 121, 1.1
+_DRAWS, _ROWS, _BEYOND = 1000, 121, 1.1
 # Lags of the autocorrelation, at most, and at most as a share of the samples.
 _LAGS, _SHARE = 60, 0.25
 # Of a normal distribution: 95 % lie within.
@@ -83,7 +79,7 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
     damping = np.concatenate([np.linspace(0.0, end, _ROWS), np.linspace(end, _BEYOND * end, _ROWS // 10)[1:]])
     own = np.array([[fit.mass, fit.damping, fit.delay, *([fit.cutoff] if "cutoff" in fit.errors else [])]])
     low = high = np.full(damping.size, np.nan)
-    drawn = draw_devices(fit, _DRAWS if fit.scene.is_rigid else _DRAWS_WITH_PARTS, 0)
+    drawn = draw_devices(fit, min(_DRAWS, fit.scene.loop.draws), 0)
     if drawn is not None:
         low, high = np.quantile(_limit_rows(fit, drawn, damping), [0.025, 0.975], axis=0)
     return {
@@ -96,21 +92,8 @@ def trace_boundary(fit: DeviceFit, units: AxisUnits = LINEAR) -> dict[str, np.nd
 
 def _limit_rows(fit: DeviceFit, devices: np.ndarray, damping: np.ndarray) -> np.ndarray:
     """Up to which stiffness every softer wall is stable, for devices, a row each, and dampings; 0 where none is."""
-    if fit.scene.is_rigid:
-        # So few at a time that nothing is compiled.
-        few = FEW // damping.size
-        parts = [devices[k : k + few] for k in range(0, len(devices), few)]
-        return np.concatenate([_limit_rigid(part, fit.period, damping) for part in parts])
-    scenes = (scene_of(values, fit.period, fit.velocity) for values in devices)
-    first = np.array([scene.stable_stiffness(damping)[:, 0] for scene in scenes])
-    return np.where(first[..., 0] == 0, first[..., 1], 0.0)
-
-
-def _limit_rigid(devices: np.ndarray, period: float, damping: np.ndarray) -> np.ndarray:
-    mass, own, delay = devices.T[:3, :, None]
-    rate = mass / period
-    row = boundary_point(own / rate, delay / period, beta=damping / rate)
-    return np.where(row.status == Status.OK, row.alpha * rate / period, 0.0)
+    paths = ("mass", "damping", "delay", "velocity.cutoff")
+    return fit.scene.loop.vary(dict(zip(paths, devices.T, strict=False))).row_ends(damping)
 
 
 def tabulate_walls(

@@ -11,21 +11,19 @@ a grid of frequencies; eigenvalues then judge the wall on every device.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import FEW
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.scenes import scene_of
 from zwidth.loops.domain import device_status
 from zwidth.loops.linear.polynomial import affine_polynomial
-from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.poles import companion
-from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.verdict import is_stable
+from zwidth.loops.variants import RigidVariants
 from zwidth.parts.checks import check_whole
+from zwidth.parts.velocity import BackwardDifference
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.tolerances import borne_by
 from zwidth.words.errors import InputError
@@ -36,7 +34,7 @@ from zwidth.words.types import Array
 if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
 
-_SAMPLES, _FILTERED_SAMPLES, _MOST_SAMPLES = 8000, 1000, 100_000
+_SAMPLES, _MOST_SAMPLES = 8000, 100_000
 # Rounds of draws; where most are impossible, the estimate says nothing.
 _ROUNDS = 50
 # In parts of the sampling rate.
@@ -67,17 +65,17 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     if isinstance(reliability, bool | str) or not 0.5 <= reliability < 1:
         raise InputError(f"reliability: got {reliability!r}; a share from 0.5 to below 1 is needed, as 0.99")
     scene = fit.scene
-    usual = _SAMPLES if scene.is_rigid else _FILTERED_SAMPLES
-    count = usual if samples is None else check_whole("samples", samples, 100, _MOST_SAMPLES)
+    count = (
+        min(_SAMPLES, 5 * scene.loop.draws) if samples is None else check_whole("samples", samples, 100, _MOST_SAMPLES)
+    )
     seed = check_whole("seed", seed, 0, 2**63 - 1)
     if fit.is_doubted:
         return SafeWall(np.nan, np.nan, np.nan, fit.status if fit.status != Status.OK else int(Status.UNDECIDED))
     drawn = draw_devices(fit, count, seed)
     if drawn is None:
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
-    devices = (
-        _RigidDevices(drawn, fit.period) if scene.is_rigid else _FilteredDevices(drawn, scene, "cutoff" in fit.errors)
-    )
+    filtered = scene.velocity != BackwardDifference()
+    devices = _FilteredDevices(drawn, scene, "cutoff" in fit.errors) if filtered else _RigidDevices(drawn, scene)
     stiffness, virtual_damping = devices.find(reliability)
     if stiffness == 0:
         return SafeWall(0.0, 0.0, 1.0, int(Status.OK))
@@ -126,49 +124,26 @@ def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
 class _RigidDevices:
     """Devices with the backward difference, by closed forms."""
 
-    def __init__(self, drawn: np.ndarray, period: float) -> None:
-        with np.errstate(all="ignore"):
-            self.rate, self.period = drawn[:, 0] / period, period
-            self.delta, self.d = drawn[:, 1] / self.rate, drawn[:, 2] / period
+    def __init__(self, drawn: np.ndarray, scene: Scene) -> None:
+        self.devices = RigidVariants(scene, dict(zip(("mass", "damping", "delay"), drawn.T, strict=True)))
 
     def find(self, reliability: float) -> tuple[float, float]:
         """K and B, both 0 where there is none."""
-        best = _in_pieces(lambda delta, d: alpha_max(delta, d).alpha, self.delta, self.d)
-        low, high, damping = 0.0, borne_by(best * self.rate / self.period, reliability), 0.0
+        low, high, damping = 0.0, borne_by(self.devices.stiffest()[0], reliability), 0.0
         least = _NOTHING * high
         while high > max((1.0 + _CLOSE) * low, least):
             stiffness = 0.5 * (low + high)
             tried = self._most_borne(stiffness)
-            borne = borne_by(self._row_ends(tried), reliability)
+            borne = borne_by(self.devices.row_ends(np.array([tried]))[:, 0], reliability)
             if borne > low:
                 low, damping = borne, tried
             if borne < stiffness:
                 high = stiffness
         return (low, damping) if low > least else (0.0, 0.0)
 
-    def _row_ends(self, damping: float) -> np.ndarray:
-        ends = _in_pieces(lambda delta, d, beta: boundary_point(delta, d, beta=beta).alpha, *self._with(damping))
-        return ends * self.rate / self.period
-
-    def _with(self, damping: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        with np.errstate(all="ignore"):
-            return self.delta, self.d, damping / self.rate
-
-    def _normalize(self, stiffness: float) -> np.ndarray:
-        # Where records allow nearly any mass, some are drawn that are 0.
-        with np.errstate(all="ignore"):
-            return stiffness * self.period / self.rate
-
     def _most_borne(self, stiffness: float) -> float:
         """The middle of the dampings at which most devices bear this stiffness."""
-        alpha = self._normalize(stiffness)
-        sides = []
-        for side in ("lower", "upper"):
-            ends = _in_pieces(
-                lambda delta, d, alpha, side=side: boundary_point(delta, d, alpha=alpha, side=side).beta,
-                *(self.delta, self.d, alpha),
-            )
-            sides.append(ends * self.rate)
+        sides = [self.devices.column_ends(stiffness, side) for side in ("lower", "upper")]
         real = np.isfinite(sides[0]) & np.isfinite(sides[1])
         places = np.concatenate([side[real] for side in sides])
         if not places.size:
@@ -180,16 +155,7 @@ class _RigidDevices:
 
     def share(self, stiffness: float, virtual_damping: float) -> float:
         """Of the devices on which the wall is stable; softer ones are so with it."""
-        delta, d, beta = self._with(virtual_damping)
-        return float(_in_pieces(is_stable, self._normalize(stiffness), beta, delta, d).mean())
-
-
-def _in_pieces(function: Any, *arrays: np.ndarray) -> np.ndarray:
-    """A function of arrays that is computed at once for few points and would be compiled for many."""
-    count = -(-arrays[0].size // FEW)
-    with np.errstate(all="ignore"):
-        pieces = zip(*(np.array_split(array, count) for array in arrays), strict=True)
-        return np.concatenate([np.asarray(function(*piece)) for piece in pieces])
+        return float(self.devices.labels(stiffness, virtual_damping).mean())
 
 
 class _FilteredDevices:
@@ -259,7 +225,7 @@ class _FilteredDevices:
 
 
 def _bears(scene: Scene, stiffness: float, virtual_damping: float) -> bool:
-    D, N1, N2 = affine_polynomial(scene.loop)
+    D, N1, N2 = affine_polynomial(scene.loop.roots)
     alpha, beta = scene.normalize_walls(stiffness * np.array(_SOFTER), virtual_damping)
     monic = (D + alpha[:, None] * N1 + beta * N2) / D[0]
     return bool(np.all(np.abs(np.linalg.eigvals(companion(monic))) < 1.0))

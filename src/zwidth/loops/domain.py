@@ -6,14 +6,10 @@ infinite or negative where it must not be is INVALID_INPUT, one beyond the range
 
 from __future__ import annotations
 
-import math
-from typing import Any
-
 import numpy as np
 
 from zwidth.arrays.xp import namespace
-from zwidth.words.errors import InputError
-from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, SIZES, WALL_RANGE
+from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
 
@@ -27,27 +23,6 @@ def within(value: Array, limits: tuple[float, float]) -> Array:
     return (size == 0) | ((size >= limits[0]) & (size <= most))
 
 
-def device_status(delta: Array, d: Array) -> Array:
-    """The `Status` of a device and its delay."""
-    xp = namespace(delta, d)
-    valid = xp.isfinite(delta) & xp.isfinite(d) & (delta >= 0) & (d >= 0)
-    inside = (delta <= LARGEST_DAMPING) & (d <= LONGEST_DELAY)
-    return _status(valid, inside, xp)
-
-
-def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """The `Status` of a wall on a device."""
-    xp = namespace(alpha, beta, delta, d)
-    valid = xp.isfinite(alpha) & xp.isfinite(beta) & xp.isfinite(delta) & xp.isfinite(d) & (delta >= 0) & (d >= 0)
-    inside = (delta <= LARGEST_DAMPING) & (d <= LONGEST_DELAY) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
-    return _status(valid, inside, xp)
-
-
-def _status(valid: Array, inside: Array, xp: Any) -> Array:
-    status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
-    return status.astype(np.int32)
-
-
 def valid_device(delta: Array, d: Array) -> Array:
     """Whether a device and its delay lie where the model is computed."""
     # What is NaN or infinite compares as outside.
@@ -57,6 +32,25 @@ def valid_device(delta: Array, d: Array) -> Array:
 def valid_wall(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     """Whether a wall on a device lies where the model is computed."""
     return valid_device(delta, d) & within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
+
+
+def device_status(delta: Array, d: Array) -> Array:
+    """The `Status` of a device and its delay."""
+    return _status(valid_device(delta, d), delta, d)
+
+
+def wall_status(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
+    """The `Status` of a wall on a device."""
+    return _status(valid_wall(alpha, beta, delta, d), delta, d, alpha, beta)
+
+
+def _status(inside: Array, delta: Array, d: Array, *others: Array) -> Array:
+    xp = namespace(delta, d, *others)
+    valid = (delta >= 0) & (d >= 0)
+    for value in (delta, d, *others):
+        valid = valid & xp.isfinite(value)
+    status = xp.where(valid, xp.where(inside, int(Status.OK), int(Status.OUT_OF_RANGE)), int(Status.INVALID_INPUT))
+    return status.astype(np.int32)
 
 
 # A bad point is NaN, and so are its derivatives: `where(ok, value, nan)` alone would give it the derivative 0, a finite
@@ -77,19 +71,3 @@ def nan_with_nan_slopes(ok: Array, *inputs: Array) -> Array:
     # Chosen twice: an input so large that its square overflows must not turn 0 into NaN where all is well.
     total = sum(xp.where(ok, 0.0, value) for value in inputs)
     return xp.where(ok, 0.0, np.nan) * total * (1.0 + total)
-
-
-_NUMBERS = (int, float, np.floating, np.integer)
-
-
-def check_scalars(**values: Any) -> None:
-    """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
-    for name, value in values.items():
-        if not isinstance(value, _NUMBERS):
-            continue
-        # Every other name is one of a wall's numbers. What is infinite gets a status, as what is negative.
-        least, most = SIZES.get(name, WALL_RANGE)
-        size = abs(value) if least else value
-        if 0 < size < least or most < size < math.inf:
-            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"0 to {most:g}"
-            raise InputError(f"{name}: got {value!r}; it must be {allowed}")

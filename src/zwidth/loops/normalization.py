@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import join_shapes, refuse_masked
+from zwidth.arrays.arguments import join_shapes, refuse_masked
 from zwidth.arrays.xp import is_jax, is_traced, namespace
 from zwidth.loops.domain import nan_unless, within
 from zwidth.parts.span import accept_units, in_periods
@@ -88,9 +88,9 @@ def _convert_quantities(formula: Callable[..., tuple[Array, ...]], **values: Arr
     checked = {name: _check_quantity(name, value) for name, value in values.items()}
     join_shapes((name, np.shape(value)) for name, value in checked.items())
     if any(map(is_jax, values.values())):
-        from zwidth.arrays.batching import elementwise
+        from zwidth.arrays.evaluate import evaluate
 
-        return elementwise(_formula_at, tuple(values), tuple(values.values()), (formula, tuple(values)))
+        return evaluate(_formula_at, values, formula, tuple(values))
     with np.errstate(all="ignore"):
         result = _formula_at(*checked.values(), formula, tuple(values))
     return tuple(part[()] for part in result)

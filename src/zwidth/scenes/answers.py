@@ -2,32 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, join_shapes
+from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.arrays.circle import circle
-from zwidth.loops.linear import state_space
-from zwidth.loops.linear.chain import Chain
-from zwidth.loops.linear.columns import stable_dampings
-from zwidth.loops.linear.delay_margin import linear_margins
-from zwidth.loops.linear.loop import LinearLoop
 from zwidth.loops.linear.margins import open_loop_response
-from zwidth.loops.linear.passivity import PassivityCondition, check_has_condition, passivity_margins
+from zwidth.loops.linear.passivity import check_has_condition
 from zwidth.loops.linear.pieces import Island
-from zwidth.loops.linear.poles import all_poles, log_size
-from zwidth.loops.linear.radius import spectral_radius as linear_radius
-from zwidth.loops.linear.rows import label_walls, stable_intervals
-from zwidth.loops.rigid.margins import Margins, margins
-from zwidth.loops.rigid.passivity import passivity_margin
-from zwidth.loops.rigid.poles import poles
-from zwidth.loops.rigid.spectral_radius import spectral_radius
-from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod, decide_stability, is_stable
+from zwidth.loops.linear.poles import log_size, poles_less_one
+from zwidth.loops.linear.state_space import Matrices, closed_loop, delayed_device, open_loop
+from zwidth.loops.rigid.margins import Margins
+from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.stiffest import list_islands
+from zwidth.scenes.stiffest import allows_negative
 from zwidth.words.errors import InputError, check_choice
-from zwidth.words.status import Method, Status
 from zwidth.words.types import Array, ArrayLike
 
 if TYPE_CHECKING:
@@ -62,56 +53,6 @@ class PoleTable(NamedTuple):
     time_constant: np.ndarray  # -1/Re s in s; negative for a growing one, infinite on the unit circle
 
 
-def tabulate_poles(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, period: float) -> PoleTable:
-    """The poles of walls of one shape."""
-    zeta: Array = all_poles(loop, alpha, beta)
-    size = log_size(zeta)
-    order = np.argsort(-size, axis=-1, kind="stable")
-    zeta, size = (np.take_along_axis(values, order, -1) for values in (zeta, size))
-    turn = np.abs(np.arctan2(zeta.imag, 1.0 + zeta.real))
-    with np.errstate(all="ignore"):
-        # A pole at z = 0 is gone after one period.
-        ratio = np.where(np.isinf(size), 1.0, -size / np.hypot(size, turn))
-        ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
-        return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
-
-
-def respond(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, frequency: ArrayLike, period: float) -> Array:
-    """``L = (alpha + beta F) G`` at frequencies in Hz up to half the sampling rate; NaN for others."""
-    hertz = as_float64("frequency", frequency)
-    join_shapes([("frequency", hertz.shape), ("stiffness", alpha.shape), ("virtual_damping", beta.shape)])
-    hertz, a, b = np.broadcast_arrays(hertz, alpha, beta)
-    w = 2.0 * np.pi * hertz * period
-    # Half the sampling rate is half a turn, whatever the rounding of the quotient.
-    w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
-    inside = (w > 0) & (w <= np.pi)
-    value = open_loop_response(loop, a, b, circle(np.where(inside, w, 1.0))).value
-    return np.where(inside, value, complex(np.nan, np.nan))[()]
-
-
-def closed_loop_si(chain: Chain, alpha: float, beta: float, mass: float, period: float) -> StateSpace:
-    """From a force in N held on the device to the sensed position in m."""
-    return _in_si(chain, state_space.closed_loop(chain, alpha, beta), period, mass, period * period / mass)
-
-
-def open_loop_si(chain: Chain, alpha: float, beta: float, mass: float, period: float) -> StateSpace:
-    """From the position that the wall is given to the one that its force answers, both in m."""
-    return _in_si(chain, state_space.open_loop(chain, alpha, beta), period, mass, 1.0)
-
-
-def _in_si(chain: Chain, loop: state_space.Matrices, period: float, mass: float, unit: float) -> StateSpace:
-    """States in m, m/s and N in place of units of the period and the mass."""
-    count = len(chain.bodies)
-    waiting = state_space.delayed_device(chain).A.shape[0] - 2 * count
-    filtered = loop.A.shape[0] - 2 * count - waiting
-    scale = np.concatenate(
-        [np.ones(filtered + count), np.full(count, 1.0 / period), np.full(waiting, mass / period**2)]
-    )
-    return StateSpace(
-        loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit, loop.C / scale, loop.D * unit, period
-    )
-
-
 class SceneAnswers:
     """The questions of `zwidth.Scene` about walls; of the scene they need its parts, loop and boundary.
 
@@ -124,17 +65,23 @@ class SceneAnswers:
         Eigenvalues of the companion matrix, then Aberth's steps on the factored polynomial around z = 1: a simple pole
         is right to about 1e-15 times its condition, a k-fold one to about 1e-16^(1/k). O(degree^3) a wall.
         """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return poles(alpha, beta, self.delta, self.d)
-        return 1.0 + all_poles(self.loop, alpha, beta)
+        return self.loop.poles(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
 
     def pole_table(
         self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
     ) -> PoleTable:
         """Each pole, the slowest first, with its frequency in Hz, its damping ratio and its time constant in s."""
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        return tabulate_poles(self.loop, alpha, beta, self.timing.period)
+        zeta: Array = poles_less_one(self.loop.roots, alpha, beta)
+        size, period = log_size(zeta), self.timing.period
+        order = np.argsort(-size, axis=-1, kind="stable")
+        zeta, size = (np.take_along_axis(values, order, -1) for values in (zeta, size))
+        turn = np.abs(np.arctan2(zeta.imag, 1.0 + zeta.real))
+        with np.errstate(all="ignore"):
+            # A pole at z = 0 is gone after one period.
+            ratio = np.where(np.isinf(size), 1.0, -size / np.hypot(size, turn))
+            ratio = np.where((size == 0) & (turn == 0), 0.0, ratio)
+            return PoleTable(1.0 + zeta, turn / (2.0 * np.pi * period), ratio, -period / size)
 
     def spectral_radius(
         self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
@@ -143,12 +90,7 @@ class SceneAnswers:
 
         From all poles; beyond 150 of them by counting poles in circles, at a cost that does not grow with the delay.
         """
-        alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return spectral_radius(alpha, beta, self.delta, self.d)
-        stable = label_walls(self.traced_boundary, alpha, beta).reshape(-1)
-        found = linear_radius(self.loop, alpha.reshape(-1), beta.reshape(-1), stable)
-        return found.reshape(alpha.shape)[()]
+        return self.loop.radius(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
 
     def islands(self: Any, *, negative_damping: bool | None = None) -> list[Island]:
         """The islands: pieces of the stable set that no path of stable walls leads to from soft ones.
@@ -170,20 +112,21 @@ class SceneAnswers:
             >>> print("{:.0f} to {:.0f} N/m".format(*island.stiffness))
             7537 to 9037 N/m
         """
-        return list_islands(self, negative_damping)
+        units = np.array([self.units.stiffness, self.units.virtual_damping])[:, None]
+        found = self.loop.islands(-np.inf if allows_negative(self, negative_damping) else 0.0)
+        return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in found]
 
     def state_space(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
         """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
 
         Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
         """
-        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
-        return closed_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+        compliance = self.timing.period**2 / float(self.mass)
+        return _realize(self, closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
     def open_loop(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
         """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
-        wall = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping)))
-        return open_loop_si(self.chain, *wall, float(self.mass), self.timing.period)
+        return _realize(self, open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
     def frequency_response(
         self: Any,
@@ -198,7 +141,15 @@ class SceneAnswers:
         if frequency is None:
             raise InputError("frequency: none is given; give frequencies in Hz, up to half the sampling rate")
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        return respond(self.loop, alpha, beta, frequency, self.timing.period)
+        hertz = as_float64("frequency", frequency)
+        join_shapes([("frequency", hertz.shape), ("stiffness", alpha.shape), ("virtual_damping", beta.shape)])
+        hertz, alpha, beta = np.broadcast_arrays(hertz, alpha, beta)
+        w = 2.0 * np.pi * hertz * self.timing.period
+        # Half the sampling rate is half a turn, whatever the rounding of the quotient.
+        w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
+        inside = (w > 0) & (w <= np.pi)
+        value = open_loop_response(self.loop.roots, alpha, beta, circle(np.where(inside, w, 1.0))).value
+        return np.where(inside, value, complex(np.nan, np.nan))[()]
 
     def is_stable(
         self: Any,
@@ -227,10 +178,7 @@ class SceneAnswers:
         """
         if method != "auto":
             return self.decide_stability(stiffness, virtual_damping, method=method).stable
-        alpha, beta = self.normalize_walls(stiffness, virtual_damping)
-        if self.is_rigid:
-            return is_stable(alpha, beta, self.delta, self.d)
-        return label_walls(self.traced_boundary, alpha, beta)[()]
+        return self.loop.labels(*self.normalize_walls(stiffness, virtual_damping))
 
     def stable_stiffness(self: Any, virtual_damping: ArrayLike | None = None) -> np.ndarray:
         """The stable intervals of the stiffness at a damping, several where there are several.
@@ -244,8 +192,7 @@ class SceneAnswers:
         """
         damping = self.wall.virtual_damping if virtual_damping is None else virtual_damping
         beta = as_float64("virtual_damping", damping) / self.units.virtual_damping
-        found = stable_intervals(self.traced_boundary, beta.reshape(-1))
-        both = np.stack(found, -1) * self.units.stiffness
+        both = self.loop.row(beta.reshape(-1)) * self.units.stiffness
         return both.reshape(*beta.shape, *both.shape[1:])
 
     def stable_damping(self: Any, stiffness: float | None = None) -> np.ndarray:
@@ -259,7 +206,7 @@ class SceneAnswers:
         """
         stiffness = resolve_wall(self.wall, None, None)[0] if stiffness is None else stiffness
         alpha, _ = one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, 0.0)))
-        return stable_dampings(self.traced_boundary, alpha) * self.units.virtual_damping
+        return self.loop.column(alpha) * self.units.virtual_damping
 
     def decide_stability(
         self: Any,
@@ -275,22 +222,8 @@ class SceneAnswers:
         """
         check_choice("method", method, STABILITY_METHODS)
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return decide_stability(alpha, beta, self.delta, self.d, method=method)
-        known = np.isfinite(alpha) & np.isfinite(beta)
-        status = np.where(known, np.int32(Status.OK), np.int32(Status.INVALID_INPUT))
-        if method == "certified":
-            from zwidth.scenes.certified import decide_walls
-
-            walls = [np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping)]
-            stable, status = decide_walls(self, *np.broadcast_arrays(*walls))
-            used = Method.CERTIFIED
-        elif method == "companion":
-            with np.errstate(invalid="ignore"):
-                stable, used = log_size(all_poles(self.loop, alpha, beta)).max(-1) < 0, Method.COMPANION
-        else:
-            stable, used = label_walls(self.traced_boundary, alpha, beta), Method.CROSSOVER
-        return Stability(stable[()], status[()], np.full(alpha.shape, used, np.int32)[()])
+        walls = [np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping)]
+        return self.loop.decide(alpha, beta, method, tuple(np.broadcast_arrays(*walls)))
 
     def passivity_margin(
         self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
@@ -304,10 +237,7 @@ class SceneAnswers:
         """
         check_has_condition(self.device)
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        if self.is_rigid:
-            return passivity_margin(alpha, beta, self.own_delta, self.d) * self.units.virtual_damping
-        condition = PassivityCondition.derive(self.chain.estimate, self.d)
-        return (passivity_margins(condition, alpha, beta, self.own_delta) * self.units.virtual_damping)[()]
+        return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
 
     def is_passive(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> Array:
         """Whether walls are passive by their `passivity_margin`: then no passive hand makes them unstable."""
@@ -327,16 +257,25 @@ class SceneAnswers:
         """
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
-        if self.is_rigid:
-            found = margins(alpha, beta, self.delta, self.d)
-        else:
-            found = linear_margins(self.chain, self.traced_boundary, alpha, beta)
+        found = self.loop.margins(alpha, beta)
         return found._replace(
             delay_margin=found.delay_margin * self.timing.period,
             phase_crossover=found.phase_crossover * hertz,
             gain_crossover=found.gain_crossover * hertz,
             modulus_frequency=found.modulus_frequency * hertz,
         )
+
+
+def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any, beta: Any) -> StateSpace:
+    """A loop with one wall, its states in m, m/s and N in place of units of the period and the mass."""
+    chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
+    loop, count = build(chain, *one_wall(*np.broadcast_arrays(alpha, beta))), len(chain.bodies)
+    waiting = delayed_device(chain).A.shape[0] - 2 * count
+    filtered = loop.A.shape[0] - 2 * count - waiting
+    parts = np.ones(filtered + count), np.full(count, 1.0 / period), np.full(waiting, mass / period**2)
+    scale = np.concatenate(parts)
+    A, B = loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit
+    return StateSpace(A, B, loop.C / scale, loop.D * unit, period)
 
 
 def to_control(scene: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> control.StateSpace:

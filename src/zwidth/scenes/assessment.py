@@ -10,18 +10,12 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from zwidth.loops.linear.passivity import has_condition
-from zwidth.loops.linear.poles import is_marginal
-from zwidth.loops.rigid.boundary import boundary_point
-from zwidth.loops.rigid.decay import decay_rate
-from zwidth.loops.rigid.outermost_poles import outermost_poles
-from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import to_json
 from zwidth.words.status import RidgeKind, Status
 
-_POLE_ACCURACY = 1e-9
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
@@ -96,12 +90,17 @@ def assess(scene: Scene) -> Assessment:
     stands, best, known = scene.margins(), scene.max_stiffness(), has_condition(scene.device)
     margin = float(scene.passivity_margin()) if known else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
-    found = _judge_rigid(scene) if scene.is_rigid else _judge_parts(scene)
-    row, column = found["stable_stiffness"], found["stable_damping"]
+    row, column = (_list_intervals(ends) for ends in (scene.stable_stiffness(), scene.stable_damping()))
     lower, upper = nearest_interval(column, scene.wall.virtual_damping)
+    slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
     return Assessment(
         **{name: float(value) for name, value in scene.normalized._asdict().items()},
         stable=bool(scene.is_stable()),
+        marginal=slowest.marginal,
+        spectral_radius=slowest.radius,
+        decay_rate=slowest.rate / period,
+        stable_stiffness=row,
+        stable_damping=column,
         stiffness_limit=nearest_interval(row, scene.wall.stiffness)[1],
         virtual_damping_lower=lower,
         virtual_damping_upper=upper,
@@ -113,9 +112,14 @@ def assess(scene: Scene) -> Assessment:
         virtual_damping_at_max=float(best.virtual_damping),
         ridge_kind=name_kind(best),
         ridge_frequency=float(best.frequency),
+        time_constant=math.inf if slowest.rate == 0 else period / slowest.rate,
+        frequency=slowest.angle / (2.0 * math.pi * period),
         **{name: float(getattr(stands, name)) for name in _MARGINS},
-        **found,
     )
+
+
+def _list_intervals(ends: np.ndarray) -> Intervals:
+    return tuple((low, high) for low, high in ends.tolist())
 
 
 def name_kind(wall: StiffestWall) -> str:
@@ -169,44 +173,3 @@ def _record(name: str | int, scene: Scene) -> dict[str, Any]:
         verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
     own = scene.parameters() if isinstance(scene, Scene) else {}
     return head | own | verdict
-
-
-def _judge_rigid(scene: Scene) -> dict[str, Any]:
-    """By closed forms: at most one interval of each kind, and the slowest pole with all its digits."""
-    alpha, beta, delta, d = (float(value) for value in scene.normalized)
-    units, period = scene.units, scene.timing.period
-    rate = float(decay_rate(alpha, beta, delta, d))
-    with np.errstate(all="ignore"):
-        slowest = outermost_poles([np.array([value]) for value in (alpha, beta, delta, d)], _POLE_ACCURACY)
-    row = 0.0, float(boundary_point(delta, d, beta=beta).alpha) * units.stiffness
-    column = math.nan, math.nan
-    if alpha > 0:
-        lower, upper = (float(boundary_point(delta, d, alpha=alpha, side=side).beta) for side in ("lower", "upper"))
-        column = lower * units.virtual_damping, upper * units.virtual_damping
-    return {
-        # The row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
-        "marginal": alpha == 0 and row[1] > 0,
-        "spectral_radius": float(spectral_radius(alpha, beta, delta, d)),
-        "decay_rate": rate / period,
-        "stable_stiffness": (row,) if row[1] > 0 else (),
-        "stable_damping": (column,) if column[0] < column[1] else (),
-        "time_constant": math.inf if rate == 0 else period / rate,
-        "frequency": abs(float(slowest.im[0])) / (2.0 * math.pi * period),
-    }
-
-
-def _judge_parts(scene: Scene) -> dict[str, Any]:
-    """The same of a scene with parts: every stable interval, and the slowest of all poles."""
-    alpha, beta = (float(value) for value in scene.normalize_walls())
-    slowest = scene.pole_table()
-    marginal = is_marginal(scene.loop, alpha, beta)
-    constant = math.inf if marginal else float(slowest.time_constant[0])
-    return {
-        "marginal": marginal,
-        "spectral_radius": 1.0 if marginal else float(scene.spectral_radius()),
-        "decay_rate": 1.0 / constant if constant else math.inf,
-        "stable_stiffness": tuple((low, high) for low, high in scene.stable_stiffness().tolist()),
-        "stable_damping": tuple((low, high) for low, high in scene.stable_damping().tolist()),
-        "time_constant": constant,
-        "frequency": 0.0 if marginal else float(slowest.frequency[0]),
-    }

@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth.loops.linear.margins import OpenLoop
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.stiffest import allows_negative, soft_dampings
+from zwidth.scenes.stiffest import soft_dampings
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.status import Status
 
@@ -46,11 +46,12 @@ def find_best_damping(
 
     @np.vectorize
     def margin(beta: float) -> float:
-        loop = OpenLoop.lay_out(scene.loop, stiffness / units.stiffness, beta, scene.traced_boundary.w)
-        return loop.least_distance()[0]
+        loop = scene.loop
+        wall = OpenLoop.lay_out(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
+        return wall.least_distance()[0]
 
     cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
-    columns = soft_dampings(scene, stiffness, allows_negative(scene, negative_damping))
+    columns = soft_dampings(scene, stiffness, negative_damping)
     if not columns:
         return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
     best = min((_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))

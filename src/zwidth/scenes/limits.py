@@ -11,9 +11,8 @@ from zwidth.words.errors import InputError
 from zwidth.words.formatting import tell_apart
 from zwidth.words.status import Status
 
-# "Ideal" sampling is so many times faster, or as much less as keeps window and delay within these many periods: the
-# cost of a search grows with their square.
-_FASTER, _MOST_PERIODS = 64, 128
+# "Ideal" sampling is so many times faster, or as much less as keeps window and delay within what a search affords.
+_FASTER = 64
 
 
 class Limit(NamedTuple):
@@ -103,7 +102,7 @@ def _affordable_rate(scene: Scene) -> int:
     if isinstance(scene.velocity, VelocityFilter):
         return 1
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
-    return _FASTER if scene.is_rigid else min(_FASTER, int(_MOST_PERIODS / (window + scene.d)))
+    return int(min(_FASTER, scene.loop.most_periods / (window + scene.d)))
 
 
 def _sample_faster(scene: Scene, faster: int) -> Scene:

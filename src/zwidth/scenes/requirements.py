@@ -16,13 +16,13 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.arguments import check_scalars
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.roots import last_cell, newton
 from zwidth.arrays.xp import frozen, namespace
 from zwidth.loops.domain import (
     LARGEST_DAMPING,
     LONGEST_DELAY,
-    check_scalars,
     device_status,
     nan_with_nan_slopes,
     within,
@@ -44,8 +44,8 @@ _RISES = ("mass", "damping")
 _LEAST, _MOST = 0.2, 6.0
 # Enough for two zeros that all but meet; in NumPy a few steps end it.
 _STEPS = 24
-# A hundred samples of a point at a time: what a block needs stays in the cache.
-_BLOCK, _FEW = 1 << 6, 1 << 9
+# For the samples of a point.
+_WEIGHT = 8
 
 
 class Requirement(NamedTuple):
@@ -118,11 +118,11 @@ def required(
     device = normalize(**dict(zip(named, physical, strict=False)))
     denormalize(mass=1.0, period=1.0, d=turns)
     known = parameter in _RISES
-    check_scalars(delta=device.delta if parameter == "delay" else 0.0, d=device.d if known else 0.0)
+    check_scalars({"delta": device.delta if parameter == "delay" else 0.0, "d": device.d if known else 0.0})
     fixed = delay_periods if delay_periods is not None else device.d if known else None
     kind = ANY if fixed is None else classify_delays(fixed)
-    values = (stiffness, *physical, turns)
-    return elementwise(_kernel, ("stiffness", *named), values, (parameter, kind), few=_FEW, block=_BLOCK)
+    arguments = dict(zip(("stiffness", *named), (stiffness, *physical, turns), strict=True))
+    return evaluate(_kernel, arguments, parameter, kind, weight=_WEIGHT)
 
 
 class _Request(NamedTuple):

@@ -12,7 +12,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, join_shapes
+from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.arrays.roots import bisect
 from zwidth.arrays.xp import is_traced
 from zwidth.loops.domain import within

@@ -8,25 +8,22 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, join_shapes
-from zwidth.arrays.xp import is_traced
-from zwidth.loops.linear.border import Border, Outline, outlines
-from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import Chain, chain_of, linear_loop
+from zwidth.arrays.arguments import are_numbers, as_float64, join_shapes
+from zwidth.loops.linear.border import Outline, outlines
 from zwidth.loops.linear.curve import curve_at
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.slopes import SceneSensitivities
+from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
-from zwidth.parts.paths import list_parameters, replace_parameters
+from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import NoWall, VirtualWall, resolve_wall
 from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.best_damping import BestDamping, Goal, find_best_damping
 from zwidth.scenes.required import RequiredValue, require
-from zwidth.scenes.slopes import SceneSensitivities, differentiate
-from zwidth.scenes.stiffest import StiffestWall, stiffest_wall
+from zwidth.scenes.stiffest import StiffestWall, allows_negative, stiffest_wall
 from zwidth.simulation.result import Motion
 from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
@@ -95,12 +92,27 @@ class Scene(SceneAnswers):
             object.__setattr__(self, name, part)
 
     @cached_property
+    def parts_beyond(self) -> tuple[str, ...]:
+        """What makes it more than a rigid mass with the difference of two samples: names of its parts."""
+        hand = self.operator
+        grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
+        plain = isinstance(self.velocity, BackwardDifference) and self.velocity.coded_period is None
+        within = {"velocity": plain, "operator": grasp}
+        return tuple(name for name in find_parts(self) if not within.get(name))
+
+    @property
     def is_rigid(self) -> bool:
         """Whether it is a rigid mass with the backward difference, for which the closed forms hold."""
-        hand = self.operator
-        bare = isinstance(self.velocity, BackwardDifference) and self.velocity.coded_period is None
-        free = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
-        return bare and free and self.device.coupling is None
+        return not self.parts_beyond
+
+    @cached_property
+    def loop(self) -> LinearLoop:
+        """Its loop, normalized, that answers every question about its walls."""
+        return LinearLoop(make_plain(self)) if self.parts_beyond else RigidLoop(self)
+
+    def check_parts(self) -> None:
+        """Raise `InputError` for what its parts refuse only together, such as a cut-off beyond half the rate."""
+        _ = self.loop.roots
 
     @cached_property
     def mass(self) -> Any:
@@ -136,7 +148,7 @@ class Scene(SceneAnswers):
         """Normalized damping of the wall."""
         return self.normalized.beta
 
-    @property
+    @cached_property
     def delta(self) -> float:
         """Normalized damping of the device, with that of a hand held rigidly."""
         return self.normalized.delta
@@ -168,34 +180,16 @@ class Scene(SceneAnswers):
         rate = self.mass / self.timing.period
         return WallSI(rate / self.timing.period, rate)
 
-    @cached_property
-    def chain(self) -> Chain:
-        """Its masses, springs and dampers, normalized."""
-        return chain_of(self)
-
-    @cached_property
-    def loop(self) -> LinearLoop:
-        """Its loop without the wall, by roots, normalized."""
-        return linear_loop(self.chain)
-
-    @cached_property
-    def traced_boundary(self) -> Boundary:
-        """The boundary of its walls, normalized, laid out once."""
-        return Boundary.trace(self.loop)
-
-    @cached_property
-    def border(self) -> Border:
-        """The edge of its stable set, normalized."""
-        return Border(self.traced_boundary)
-
     def normalize_walls(
         self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
-        units = self.units
-        stiffness, virtual_damping = resolve_wall(self.wall, stiffness, virtual_damping)
-        both = as_float64("stiffness", stiffness), as_float64("virtual_damping", virtual_damping)
-        join_shapes(zip(("stiffness", "virtual_damping"), (part.shape for part in both), strict=True))
+        units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping)
+        if are_numbers(*both):
+            both = np.float64(both[0]), np.float64(both[1])
+        else:
+            both = as_float64("stiffness", both[0]), as_float64("virtual_damping", both[1])
+            join_shapes([("stiffness", both[0].shape), ("virtual_damping", both[1].shape)])
         with np.errstate(all="ignore"):
             return both[0] / units.stiffness, both[1] / units.virtual_damping
 
@@ -210,7 +204,7 @@ class Scene(SceneAnswers):
         """
         w = as_float64("omega", omega) * self.timing.period
         inside = (w > 0) & (w < np.pi)
-        curve = curve_at(self.loop, np.where(inside, w, 1.0))
+        curve = curve_at(self.loop.roots, np.where(inside, w, 1.0))
         units = self.units
         numbers = (curve.alpha * units.stiffness, curve.beta * units.virtual_damping)
         return WallSI(*(np.where(inside, part, np.nan)[()] for part in numbers))
@@ -225,7 +219,7 @@ class Scene(SceneAnswers):
         units = self.units
         return [
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
-            for piece in outlines(self.border)
+            for piece in outlines(self.loop.border)
         ]
 
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
@@ -257,10 +251,6 @@ class Scene(SceneAnswers):
             >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
             11942 N/m
         """
-        if not self.is_rigid and is_traced(*self.parameters().values()):
-            from zwidth.scenes.ridge_kkt import traced_wall
-
-            return traced_wall(self, negative_damping)
         return stiffest_wall(self, negative_damping)
 
     def sensitivities(self, *, negative_damping: bool | None = None) -> SceneSensitivities:
@@ -285,7 +275,7 @@ class Scene(SceneAnswers):
             >>> print(f"{scene.sensitivities().per['damping']:.0f} N/m per N s/m")
             572 N/m per N s/m
         """
-        return differentiate(self, negative_damping)
+        return self.loop.sensitivities(allows_negative(self, negative_damping))
 
     def required(
         self,
@@ -375,7 +365,8 @@ class Scene(SceneAnswers):
 
         Returns:
             For example ``{"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": 0.0, "velocity.cutoff": 100.0, ...}``;
-            the wall's ``stiffness`` and ``virtual_damping`` come last. What is left out (None) is not listed.
+            the wall's ``stiffness`` and ``virtual_damping`` come last. What is left out (None) is not listed, nor what
+            is chosen by a word, as ``coupling.sensor``, and the coefficients of a filter.
         """
         return list_parameters(self)
 

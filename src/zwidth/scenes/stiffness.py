@@ -6,9 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.arguments import check_scalars
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import is_traced, namespace
-from zwidth.loops.domain import check_scalars
 from zwidth.loops.normalization import Normalized, normalize, quantity_status
 from zwidth.loops.rigid.delay_classes import DelayClasses, classify_delays
 from zwidth.loops.rigid.polynomial import check_delay_model
@@ -18,13 +18,13 @@ from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
-_NAMES = ("mass", "damping", "period", "delay", "delta", "d")
+_NAMES: tuple[str, ...] = ("mass", "damping", "period", "delay", "delta", "d")
 
 
 def checked_device(**quantities: ArrayLike) -> Normalized:
     """The normalized device; raises `InputError` also where a scalar delta or d is beyond the range of the model."""
     device = normalize(**quantities)
-    check_scalars(delta=device.delta, d=device.d)
+    check_scalars({"delta": device.delta, "d": device.d})
     return device
 
 
@@ -65,8 +65,8 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
         19865 N/m
     """
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
-    values = (mass, period, device.delta, device.d)
-    return elementwise(max_stiffness_kernel, ("mass", "period", "delta", "d"), values, (classify_delays(device.d),))
+    arguments = {"mass": mass, "period": period, "delta": device.delta, "d": device.d}
+    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d))
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
@@ -124,8 +124,8 @@ def sensitivities(
     """
     check_delay_model(delay_model)
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
-    values = (mass, damping, period, delay, device.delta, device.d)
-    return elementwise(_sensitivities_kernel, _NAMES, values, (delay_model, classify_delays(device.d)))
+    arguments = dict(zip(_NAMES, (mass, damping, period, delay, device.delta, device.d), strict=True))
+    return evaluate(_sensitivities_kernel, arguments, delay_model, classify_delays(device.d))
 
 
 def _sensitivities_kernel(

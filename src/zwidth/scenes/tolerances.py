@@ -11,18 +11,13 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.rigid.boundary import boundary_point
-from zwidth.loops.rigid.verdict import is_stable
 from zwidth.parts.checks import check_whole
 from zwidth.scenes.scene import Scene
-from zwidth.scenes.stiffness import max_stiffness
 from zwidth.words.errors import InputError, check_choice, describe_choice
-from zwidth.words.types import Array
 
 # Of the interval in which the share of all devices lies.
 _CONFIDENCE = 0.95
 _MOST_SAMPLES = 1_000_000
-_RIGID = ("mass", "damping", "period", "delay")
 
 
 class Tolerance(NamedTuple):
@@ -92,8 +87,9 @@ def simulate_tolerances(
     if not 0 < reliability < 1:
         raise InputError(f"reliability: got {reliability!r}; a share between 0 and 1 is needed, as 0.99")
     drawn = _draw(scene, tolerances, count, check_whole("seed", seed, 0, 2**63 - 1))
-    known = scene.is_rigid and set(drawn) <= set(_RIGID)
-    labels, limits, highest = _judge_rigid(scene, drawn, count) if known else _judge_each(scene, drawn, count)
+    wall, variants = scene.wall, scene.loop.vary(drawn)
+    labels = variants.labels(wall.stiffness, wall.virtual_damping)
+    limits = variants.row_ends(np.array([wall.virtual_damping]))[:, 0]
     stable = int(np.count_nonzero(labels))
     low, high = _interval(stable, count)
     return ToleranceEstimate(
@@ -103,7 +99,7 @@ def simulate_tolerances(
         high,
         reliability,
         borne_by(limits, reliability),
-        borne_by(highest, reliability) if highest is not None else np.nan,
+        np.nan if variants.searched else borne_by(variants.stiffest()[0], reliability),
         drawn,
         labels,
     )
@@ -138,38 +134,6 @@ def _factors(generator: np.random.Generator, share: float, distribution: str, co
         # No mass is negative: what three standard deviations or more would make so is drawn again.
         factors[bad] = generator.normal(1.0, share, np.count_nonzero(bad))
     return factors
-
-
-def _judge_rigid(scene: Scene, drawn: dict[str, np.ndarray], count: int) -> tuple[Array, Array, Array]:
-    """Labels, and the stiffest wall at the scene's damping and at the best one, of devices as arrays."""
-    timing, wall = scene.timing, scene.wall
-    nominal = {"mass": scene.mass, "damping": scene.damping, "period": timing.period, "delay": timing.delay}
-    values: dict[str, Any] = {name: drawn.get(name, np.full(count, value)) for name, value in nominal.items()}
-    # The hand of a rigid grasp does not vary with the device.
-    if "mass" in drawn:
-        values["mass"] = values["mass"] + (scene.mass - scene.device.mass)
-    if "damping" in drawn:
-        values["damping"] = values["damping"] + (scene.damping - scene.device.damping)
-    mass, damping, period, delay = (values[name] for name in _RIGID)
-    rate = mass / period
-    d = delay / period if {"delay", "period"} & set(drawn) else np.full(count, float(scene.d))
-    delta, beta = damping / rate, wall.virtual_damping / rate
-    labels = np.asarray(is_stable(wall.stiffness / rate * period, beta, delta, d))
-    limits = np.asarray(boundary_point(delta, d, beta=beta).alpha) * rate / period
-    return labels, limits, np.asarray(max_stiffness(**values))
-
-
-def _judge_each(scene: Scene, drawn: dict[str, np.ndarray], count: int) -> tuple[Array, Array, None]:
-    """The same one scene after another; its rows may be several intervals, of which the lowest counts."""
-    wall = scene.wall
-    labels, limits = np.zeros(count, bool), np.full(count, np.nan)
-    for k in range(count):
-        varied = scene.replace(**{name: float(values[k]) for name, values in drawn.items()})
-        labels[k] = bool(varied.is_stable(wall.stiffness, wall.virtual_damping))
-        row = varied.stable_stiffness(wall.virtual_damping)
-        first = row[(row[:, 0] <= 1e-9 * row[:, 1]) & (row[:, 1] > 0)]
-        limits[k] = first[0, 1] if len(first) else np.nan
-    return labels, limits, None
 
 
 def borne_by(limits: np.ndarray, share: float) -> float:

@@ -98,7 +98,7 @@ def worst_motion(
     margin = float(scene.passivity_margin(*wall))
     if not margin < 0:
         return _no_motion(Status.UNREACHABLE if margin >= 0 else Status.OUT_OF_RANGE)
-    condition = PassivityCondition.derive(scene.chain.estimate, scene.d)
+    condition = PassivityCondition.derive(scene.loop.chain.estimate, scene.d)
     stiff = alpha + beta * condition.spring
     needed = needed_damping(condition, alpha, beta)
     unit = scene.units.virtual_damping
@@ -187,7 +187,7 @@ def _move(scene: Any, wall: tuple[float, float], x: np.ndarray, damping: float) 
     Between them it bends, where a force arrives, as takes least energy under this damping.
     """
     period, b = scene.timing.period, scene.device.damping
-    estimate = scene.chain.estimate
+    estimate = scene.loop.chain.estimate
     estimated = _estimate_velocity(estimate, x)
     answer = wall[0] * x + wall[1] / period * estimated
     now, f = _delay(answer, scene.whole_delay), float(scene.d - scene.whole_delay)

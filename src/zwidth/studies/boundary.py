@@ -11,7 +11,6 @@ import numpy as np
 
 from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
@@ -98,11 +97,11 @@ class BoundaryStudy(CurvesStudy):
             if getattr(self, name).values().tolist() != [getattr(self.device, name)]:
                 what = f"got {name!r} beside a device"
                 yield (name,), problem(what, "a device has its own", "remove one", on_key=True)
-        if self.device.is_rigid:
+        if not self.device.parts_beyond:
             return
         asked = {"plane": "alpha_beta", "delay_models": ("held",), "ridge_path": False, "passivity": False}
         for name in [name for name, known in asked.items() if getattr(self, name) != known]:
-            parts = " and ".join(list_parts(self.device))
+            parts = " and ".join(self.device.parts_beyond)
             allowed = f"it is known for a rigid mass with the difference of two samples, not for one with {parts}"
             yield (name,), problem(f"got {name!r}", allowed, "remove it", on_key=True)
 
@@ -113,7 +112,7 @@ class BoundaryStudy(CurvesStudy):
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """One boundary for every delta, d and delay model, or that of a device with parts, as a table and a figure."""
-        if self.device is not None and not self.device.is_rigid:
+        if self.device is not None and self.device.parts_beyond:
             return outline_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
         models = needed_models(self.delay_models, delays)

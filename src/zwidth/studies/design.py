@@ -151,7 +151,7 @@ class DesignStudy(ComputedStudy):
         """Devices drawn for each stiffness."""
         if self.tolerances is None:
             return 0
-        return self.samples or (10_000 if self.device.is_rigid else 200)
+        return self.samples or self.device.to_scene().loop.draws
 
     @property
     def points(self) -> int:

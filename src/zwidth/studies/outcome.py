@@ -158,7 +158,7 @@ def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) ->
 
 def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> PhysicalScene | PhysicalDevice | None:
     """The rigid scene or device, where delta and d are those of it alone."""
-    if not isinstance(owner, PhysicalScene | PhysicalDevice) or not owner.is_rigid:
+    if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
         return None
     alone = [axis.values().tolist() for axis in (delta, d)] == [[owner.delta], [owner.d]]
     return owner if alone else None

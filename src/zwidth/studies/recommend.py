@@ -82,7 +82,7 @@ class RecommendStudy(ResponseStudy):
         elif wall.virtual_damping != top.virtual_damping:
             notes.append(_OTHER_DAMPING)
         found = _summarize(bare, top, wall, verdict, share)
-        if bare.is_rigid and verdict is not None:
+        if not bare.parts_beyond and verdict is not None:
             # The wall as it was judged: from SI units and back, a last digit may be another.
             columns, note = self.respond(self.device, verdict.alpha, verdict.beta, label=label, physical=True)
             found["recommended"]["settling_time"] = to_json(float(columns["settling_time_s"]))
@@ -203,7 +203,7 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
         f"Device: m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, sampled every "
         f"{with_unit(scene.timing.period, 's')}, force delayed by",
         f"{with_unit(scene.timing.delay, 's')} (normalized: delta = {plain(scene.delta)}, d = {plain(scene.d)}).",
-        *([] if scene.is_rigid and scene.operator is None else [f"Its parts, in SI units: {', '.join(parts)}."]),
+        *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
         "",
         "| | stiffness K | virtual damping B | alpha | beta |",
         "|---|---|---|---|---|",
@@ -218,6 +218,6 @@ def _describe(scene: Scene, found: dict[str, Any]) -> str:
         f"- is passive: {passive}.",
         "",
     ]
-    if scene.is_rigid:
+    if not scene.parts_beyond:
         lines += ["No virtual damping makes a stiffness above the maximum stable.", ""]
     return "\n".join(lines)

@@ -78,7 +78,6 @@ def _find_refusals(study: SweepStudy) -> Iterator[InputError]:
     ends = [{name: study.axes.end(name, largest=True)} for name in study.axes.given_of_parts]
     for changed in ({}, *ends):
         try:
-            scene = make_scene(study, {**least, **changed})
-            _ = scene.is_rigid or scene.loop
+            make_scene(study, {**least, **changed}).check_parts()
         except InputError as error:
             yield error

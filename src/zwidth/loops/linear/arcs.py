@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.curve import CurvePoints, curve_at
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 
 # How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
 _ROOM, _ROUNDING = 0.02, 1e-6
@@ -31,7 +31,7 @@ class Arc(NamedTuple):
 
 
 def cut_arcs(
-    loop: LinearLoop,
+    loop: LoopRoots,
     w: np.ndarray,
     here: CurvePoints,
     poles: np.ndarray,
@@ -94,7 +94,7 @@ def _bands(
         return straight, np.where(straight, close, 1.5 * rise + _ROOM * largest)
 
 
-def _end_value(loop: LinearLoop, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
+def _end_value(loop: LoopRoots, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
     if w in at_pole:
         return side * np.inf
     if w in limits:

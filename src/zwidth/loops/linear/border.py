@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -45,11 +45,6 @@ class Border:
     """The edge of the stable set of one loop."""
 
     boundary: Boundary
-
-    @cached_property
-    def ridges(self) -> dict[bool, Any]:
-        """The stiffest walls that were found, by whether negative dampings count: a scene is asked for them often."""
-        return {}
 
     @cached_property
     def curved(self) -> list[Edge]:

@@ -22,7 +22,7 @@ from zwidth.arrays.circle import ON_CIRCLE, circle, depths
 from zwidth.loops.linear.arcs import Arc, cut_arcs
 from zwidth.loops.linear.crossing_lines import CrossingLine, circle_zeros, end_lines, interior_line
 from zwidth.loops.linear.curve import curve_at, find_dips, nodes_of, zeros_of
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.
 _MOST_STEPS, _ARRIVED = 120, 1e-10
@@ -43,14 +43,14 @@ class Crossings(NamedTuple):
 class Boundary:
     """The boundary of one loop, laid out for rows."""
 
-    loop: LinearLoop
+    loop: LoopRoots
     w: np.ndarray
     arcs: tuple[Arc, ...]
     lines: tuple[CrossingLine, ...]
     infinite: np.ndarray  # angles at which the curve runs to infinity
 
     @classmethod
-    def trace(cls, loop: LinearLoop) -> Boundary:
+    def trace(cls, loop: LoopRoots) -> Boundary:
         """Lay out the curve."""
         w = nodes_of(loop)
         here = curve_at(loop, w)
@@ -207,7 +207,7 @@ def _cells(arc: Arc, beta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _solve_rows(
-    loop: LinearLoop, fixed: list[float], beta: np.ndarray, low: np.ndarray, high: np.ndarray, leaving: np.ndarray
+    loop: LoopRoots, fixed: list[float], beta: np.ndarray, low: np.ndarray, high: np.ndarray, leaving: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The angle between two nodes at which each row crosses, and its alpha.
 
@@ -245,7 +245,7 @@ def _solve_rows(
     return found, _residual(loop, fixed, beta, found)[2]
 
 
-def _residual(loop: LinearLoop, fixed: list[float], beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
+def _residual(loop: LoopRoots, fixed: list[float], beta: np.ndarray, w: np.ndarray) -> tuple[np.ndarray, ...]:
     """``Im(q - beta F)`` over ``sin w prod(cos w - cos fixed)``, its derivative; and ``Re(q - beta F)``."""
     at = circle(w)
     with np.errstate(all="ignore"):

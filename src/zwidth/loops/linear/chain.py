@@ -22,7 +22,7 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.xp import namespace
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.rigid.plant import Plant, held_plant, undelayed_plant
 from zwidth.parts.estimate import Estimate
 from zwidth.parts.paths import Parts
@@ -266,7 +266,7 @@ def _continuous_roots(polynomial: np.ndarray) -> np.ndarray:
     return np.concatenate([np.zeros(still, complex), roots])
 
 
-def linear_loop(chain: Chain) -> LinearLoop:
+def find_roots(chain: Chain) -> LoopRoots:
     """The loop of a chain by its roots."""
     if chain.rigid:
         return _rigid_loop(chain)
@@ -293,7 +293,7 @@ def linear_loop(chain: Chain) -> LinearLoop:
     slow = slow[np.abs(slow) < _SLOW]
     zeros = np.roots(top).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
-    return LinearLoop(float(top[0]), lag, -_polished_zeros(parts, zeros), poles, chain.estimate)
+    return LoopRoots(float(top[0]), lag, -_polished_zeros(parts, zeros), poles, chain.estimate)
 
 
 def _numerator(parts: Sampled, push: np.ndarray, den: np.ndarray) -> np.ndarray:
@@ -332,15 +332,15 @@ def _relative_slope(matrix: np.ndarray, growing: np.ndarray) -> complex:
         return complex(np.inf)
 
 
-def _rigid_loop(chain: Chain) -> LinearLoop:
+def _rigid_loop(chain: Chain) -> LoopRoots:
     delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.whole)
     if fraction == 0:
         plant = undelayed_plant(delta)
         # At delta = 0 the zero is at -1 exactly.
         zeros = np.array([2.0 + plant.gap * -1.0 / plant.a2 + 0j])
-        return LinearLoop(float(plant.a2), chain.whole, zeros, np.array([0.0, plant.em], complex), chain.estimate)
+        return LoopRoots(float(plant.a2), chain.whole, zeros, np.array([0.0, plant.em], complex), chain.estimate)
     plant = held_plant(delta, fraction)
     root = np.sqrt(max(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0))
     far = -0.5 * (plant.a1 + root)
     zeros = np.array([1.0 - far / plant.a2, 1.0 - plant.a0 / far], complex)
-    return LinearLoop(float(plant.a2), chain.whole + 1, zeros, np.array([0.0, plant.em], complex), chain.estimate)
+    return LoopRoots(float(plant.a2), chain.whole + 1, zeros, np.array([0.0, plant.em], complex), chain.estimate)

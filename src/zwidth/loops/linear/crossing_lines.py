@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import ON_CIRCLE, circle, depths
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 
 # Of |q|: less of an imaginary part than that where Im F vanishes is none.
 _NONE = 1e-11
@@ -40,7 +40,7 @@ class CrossingLine(NamedTuple):
         return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
 
 
-def interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
+def interior_line(loop: LoopRoots, w: float) -> CrossingLine | None:
     """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
     at = circle(np.array([w]))
     if np.min(np.abs(at.before + loop.zeros), initial=1.0) < 1e-9:
@@ -53,14 +53,14 @@ def interior_line(loop: LinearLoop, w: float) -> CrossingLine | None:
     return CrossingLine(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
 
 
-def circle_zeros(loop: LinearLoop) -> np.ndarray:
+def circle_zeros(loop: LoopRoots) -> np.ndarray:
     """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
     zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
     angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
     return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
 
 
-def end_lines(loop: LinearLoop) -> list[CrossingLine]:
+def end_lines(loop: LoopRoots) -> list[CrossingLine]:
     """The lines of real poles at z = 1 and z = -1; where the device does not move there is none."""
     lines = []
     for w in (0.0, np.pi):

@@ -11,7 +11,7 @@ import numpy as np
 
 from zwidth.arrays.circle import circle
 from zwidth.arrays.roots import false_position
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 
 # How far one node lies from the next, as a share of the distance over which the loop changes by its own size.
 _STEP = 0.08
@@ -34,7 +34,7 @@ class CurvePoints(NamedTuple):
     size: np.ndarray  # |q| + |beta F|, of which alpha is a difference
 
 
-def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
+def curve_at(loop: LoopRoots, w: np.ndarray) -> CurvePoints:
     """The boundary curve at angles in (0, pi)."""
     at = circle(w)
     with np.errstate(all="ignore"):
@@ -48,7 +48,7 @@ def curve_at(loop: LinearLoop, w: np.ndarray) -> CurvePoints:
         return CurvePoints(alpha, beta, alpha_slope, turn, f.value.imag, size)
 
 
-def nodes_of(loop: LinearLoop) -> np.ndarray:
+def nodes_of(loop: LoopRoots) -> np.ndarray:
     """Angles from nearly 0 to nearly pi, so close that the loop hardly changes from one to the next."""
     roots = np.concatenate([loop.poles, loop.zeros, loop.estimate.poles, loop.estimate.zeros])
     sizes, far = np.abs(roots), np.abs(roots - 2.0)
@@ -68,7 +68,7 @@ def nodes_of(loop: LinearLoop) -> np.ndarray:
     return w
 
 
-def zeros_of(loop: LinearLoop, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
+def zeros_of(loop: LoopRoots, w: np.ndarray, values: np.ndarray, field: str) -> np.ndarray:
     """Zeros of a field of the curve between nodes where its sign changes."""
     k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
     low, high, sign = w[k], w[k + 1], np.sign(values[k])

@@ -16,11 +16,11 @@ import numpy as np
 
 from zwidth.loops.domain import WALL_RANGE, within
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import Chain, linear_loop
+from zwidth.loops.linear.chain import Chain, find_roots
 from zwidth.loops.linear.curve import nodes_of
-from zwidth.loops.linear.loop import LinearLoop
 from zwidth.loops.linear.margins import OpenLoop, margins_of
 from zwidth.loops.linear.radius import log_radius
+from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import label_walls
 from zwidth.loops.rigid.margins import Margins
 from zwidth.words.types import Array
@@ -55,7 +55,7 @@ class DelayedLoops:
 
     chain: Chain
     delays: np.ndarray
-    loops: list[LinearLoop]
+    loops: list[LoopRoots]
     nodes: list[np.ndarray]
 
     @classmethod
@@ -68,12 +68,12 @@ class DelayedLoops:
         return cls(chain, delays, loops, [nodes_of(loop) for loop in loops])
 
 
-def loop_at(chain: Chain, delay: float) -> LinearLoop:
+def loop_at(chain: Chain, delay: float) -> LoopRoots:
     """The loop of a chain at another delay."""
-    return linear_loop(replace(chain, d=float(delay), whole=int(np.floor(delay))))
+    return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
 
 
-def _cross(loop: LinearLoop, alpha: float, beta: float, nodes: np.ndarray) -> Crossovers:
+def _cross(loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> Crossovers:
     wall = OpenLoop.lay_out(loop, alpha, beta, nodes)
     w = wall.gain_crossovers()
     return Crossovers(w, np.angle(-wall.at(w).value), float(wall.L.value[-1].real))
@@ -150,7 +150,7 @@ def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: fl
     return 0.5 * (low + high) + at.periods
 
 
-def _last(loop: LinearLoop, alpha: float, beta: float) -> float:
+def _last(loop: LoopRoots, alpha: float, beta: float) -> float:
     return float(OpenLoop.lay_out(loop, alpha, beta, np.array([3.0])).L.value[-1].real)
 
 

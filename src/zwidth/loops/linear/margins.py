@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle
 from zwidth.arrays.roots import bisect
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.rigid.margins import Margins
 from zwidth.words.types import Array
 
@@ -28,14 +28,14 @@ _ARRIVED = 1e-10
 class OpenLoop(NamedTuple):
     """One wall in one loop, on angles that resolve it."""
 
-    loop: LinearLoop
+    loop: LoopRoots
     alpha: float
     beta: float
     w: np.ndarray
     L: Jet
 
     @classmethod
-    def lay_out(cls, loop: LinearLoop, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
+    def lay_out(cls, loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> OpenLoop:
         """Refine the nodes of a loop for a wall."""
         w = np.append(nodes[nodes < np.pi], np.pi)
         for _ in range(_HALVINGS):
@@ -123,7 +123,7 @@ class OpenLoop(NamedTuple):
         return float(distances[best]), float(places[best])
 
 
-def open_loop_response(loop: LinearLoop, alpha: Array, beta: Array, at: CirclePoints) -> Jet:
+def open_loop_response(loop: LoopRoots, alpha: Array, beta: Array, at: CirclePoints) -> Jet:
     """L and its derivative in w."""
     with np.errstate(all="ignore"):
         f = loop.estimate.jet(at)

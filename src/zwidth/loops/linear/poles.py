@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.loop import LinearLoop
 from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.rigid.poles import companion
 from zwidth.parts.estimate import Estimate
 from zwidth.words.errors import InputError
@@ -65,12 +65,6 @@ def _difference(zeta: Array, window: int) -> tuple[Array, Array]:
     return np.where(near, np.expm1(small), power - 1.0) / window, slope / window
 
 
-def degree_of(loop: LinearLoop) -> int:
-    """How many poles a wall with damping has."""
-    f = loop.estimate
-    return loop.poles.size + loop.lag + f.poles.size + max(f.window + f.lag, 0)
-
-
 def abs2(z: Array) -> Array:
     """``|z|^2``."""
     return z.real * z.real + z.imag * z.imag
@@ -82,7 +76,7 @@ def log_size(zeta: Array) -> Array:
         return 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -1.0))
 
 
-def evaluate(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
+def evaluate(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> PolynomialValue:
     """The factored polynomial; arrays that broadcast with zeta."""
     f = loop.estimate
     turns = f.window + f.lag
@@ -99,14 +93,14 @@ def evaluate(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> Polyno
     return PolynomialValue(own[0] + pushed[0], own[1] + pushed[1], largest)
 
 
-def _start(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
+def _start(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
     """Eigenvalues of the companion matrices, less 1."""
     D, N1, N2 = affine_polynomial(loop)
     monic = (D + alpha[:, None] * N1 + beta[:, None] * N2) / D[0]
     return np.linalg.eigvals(companion(monic)) - 1.0 + 0j
 
 
-def _polish(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> Array:
+def _polish(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Array:
     """Aberth's steps: Newton's, from which each pole keeps off the others."""
     here = np.arange(len(zeta))
     same = np.eye(zeta.shape[1], dtype=bool)
@@ -128,14 +122,15 @@ def _polish(loop: LinearLoop, alpha: Array, beta: Array, zeta: Array) -> Array:
     return zeta
 
 
-def poles_less_one(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
-    """``z - 1`` for all poles of walls of shape (walls,): shape (walls, order); NaN where a wall is not finite."""
-    order = degree_of(loop)
+def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
+    """``z - 1`` for all poles of walls of one shape, along a new last axis; NaN where a wall is not finite."""
+    order, shape = loop.order, alpha.shape
     if order > MOST_POLES:
         raise InputError(
             f"scene: its {order} poles would take minutes a wall, and at most {MOST_POLES} are computed; "
             "spectral_radius and is_stable answer for every delay at once"
         )
+    alpha, beta = alpha.reshape(-1), beta.reshape(-1)
     out = np.full((alpha.size, order), complex(np.nan, np.nan))
     known = np.flatnonzero(np.isfinite(alpha) & np.isfinite(beta))
     block = max(1, _NUMBERS // order**2)
@@ -148,13 +143,13 @@ def poles_less_one(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
                 out[some] = _polish(loop, a, b, _start(loop, a, b))
             else:
                 out[some] = _springs(loop, a)
-    return out
+    return out.reshape(*shape, order)
 
 
-def _springs(loop: LinearLoop, alpha: Array) -> Array:
+def _springs(loop: LoopRoots, alpha: Array) -> Array:
     """Walls without damping: the poles of the estimate are in nobody's loop, and known."""
     f = loop.estimate
-    alone = LinearLoop(loop.gain, loop.lag, loop.zeros, loop.poles, Estimate(0))
+    alone = LoopRoots(loop.gain, loop.lag, loop.zeros, loop.poles, Estimate(0))
     none = np.zeros_like(alpha)
     idle = np.concatenate([-f.poles, -np.ones(max(f.window + f.lag, 0))])
     return np.concatenate(
@@ -162,17 +157,11 @@ def _springs(loop: LinearLoop, alpha: Array) -> Array:
     )
 
 
-def all_poles(loop: LinearLoop, alpha: Array, beta: Array) -> Array:
-    """`poles_less_one` of arrays of one shape, along a new last axis."""
-    found = poles_less_one(loop, alpha.reshape(-1), beta.reshape(-1))
-    return found.reshape(*alpha.shape, found.shape[-1])
-
-
 # In a difference of two numbers: what the rounding of either may leave of it.
 _CANCELLED = 1e-14
 
 
-def is_marginal(loop: LinearLoop, alpha: float, beta: float) -> bool:
+def is_marginal(loop: LoopRoots, alpha: float, beta: float) -> bool:
     """Whether a wall has one pole exactly at z = 1 and all others strictly inside: it neither pulls back nor grows."""
     wall = np.array([alpha]), np.array([beta])
     at = evaluate(loop, *wall, np.zeros(1, complex))
@@ -181,5 +170,5 @@ def is_marginal(loop: LinearLoop, alpha: float, beta: float) -> bool:
     parts = np.abs(undamped.slope[0]) + np.abs(at.slope[0] - undamped.slope[0])
     if at.value[0] != 0 or np.abs(at.slope[0]) <= _CANCELLED * parts:
         return False
-    found = all_poles(loop, *wall)[0]
+    found = poles_less_one(loop, *wall)[0]
     return bool(np.all(log_size(np.delete(found, np.argmin(np.abs(found)))) < 0))

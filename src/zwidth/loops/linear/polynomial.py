@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.rigid.polynomial import Affine
 
 
@@ -13,7 +13,7 @@ def _product(*offsets: np.ndarray) -> np.ndarray:
     return np.atleast_1d(np.poly(1.0 - np.concatenate(offsets))).real
 
 
-def estimate_polynomials(loop: LinearLoop) -> tuple[np.ndarray, np.ndarray]:
+def estimate_polynomials(loop: LoopRoots) -> tuple[np.ndarray, np.ndarray]:
     """Numerator and denominator of the velocity estimate."""
     f = loop.estimate
     top, bottom = f.gain * _product(f.zeros), _product(f.poles)
@@ -29,7 +29,7 @@ def _raised(polynomial: np.ndarray, power: int) -> np.ndarray:
     return np.concatenate([polynomial, np.zeros(power)])
 
 
-def affine_polynomial(loop: LinearLoop) -> Affine:
+def affine_polynomial(loop: LoopRoots) -> Affine:
     """D, N1 and N2 of the closed loop."""
     top, bottom = estimate_polynomials(loop)
     device, answer = _product(loop.poles), loop.gain * _product(loop.zeros)
@@ -42,7 +42,7 @@ def affine_polynomial(loop: LinearLoop) -> Affine:
     return Affine(*(np.concatenate([np.zeros(length - part.size), part]) for part in parts))
 
 
-def closed_loop_roots(loop: LinearLoop, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray, float, int]:
+def closed_loop_roots(loop: LoopRoots, alpha: float, beta: float) -> tuple[np.ndarray, np.ndarray, float, int]:
     """Zeros, poles, gain and lag of ``P = z^lag prod(z - poles) + gain prod(z - zeros)`` for one wall."""
     top, bottom = estimate_polynomials(loop)
     length = max(top.size, bottom.size)

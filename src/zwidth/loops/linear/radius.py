@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.loops.linear.loop import LinearLoop
-from zwidth.loops.linear.poles import abs2, degree_of, evaluate, log_size, poles_less_one
+from zwidth.loops.linear.poles import abs2, evaluate, log_size, poles_less_one
 from zwidth.loops.linear.polynomial import closed_loop_roots
+from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.rigid.counting import count_poles
 
 # Beyond so many poles a count, whose cost no delay changes, is faster than all of them; but the window's zeros count.
@@ -19,14 +19,14 @@ _UNKNOWN = 1e-6
 _CONTRADICTION = 1e-7
 
 
-def log_radius(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
+def log_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray) -> np.ndarray:
     """``log max|z|`` of walls of shape (walls,); NaN where it is not known."""
-    if degree_of(loop) <= _MOST_POLES or loop.estimate.window > _LONGEST_WINDOW:
+    if loop.order <= _MOST_POLES or loop.estimate.window > _LONGEST_WINDOW:
         return log_size(poles_less_one(loop, alpha, beta)).max(-1)
     return np.array([_by_circles(loop, a, b) for a, b in zip(alpha.tolist(), beta.tolist(), strict=True)])
 
 
-def spectral_radius(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
+def spectral_radius(loop: LoopRoots, alpha: np.ndarray, beta: np.ndarray, stable: np.ndarray) -> np.ndarray:
     """``max|z|`` on the verdict's side of 1: within rounding of the boundary the two would contradict each other."""
     log = log_radius(loop, alpha, beta)
     log = np.where((log < 0) != stable, np.where(np.abs(log) < _CONTRADICTION, 0.0, np.nan), log)
@@ -34,7 +34,7 @@ def spectral_radius(loop: LinearLoop, alpha: np.ndarray, beta: np.ndarray, stabl
     return np.where(stable, np.minimum(radius, np.nextafter(1.0, 0.0)), radius)
 
 
-def _by_circles(loop: LinearLoop, alpha: float, beta: float) -> float:
+def _by_circles(loop: LoopRoots, alpha: float, beta: float) -> float:
     if not (np.isfinite(alpha) and np.isfinite(beta)):
         return np.nan
     zeros, poles, gain, lag = closed_loop_roots(loop, alpha, beta)
@@ -61,10 +61,10 @@ def _by_circles(loop: LinearLoop, alpha: float, beta: float) -> float:
     return _polish(loop, alpha, beta, low, high)
 
 
-def _polish(loop: LinearLoop, alpha: float, beta: float, low: float, high: float) -> float:
+def _polish(loop: LoopRoots, alpha: float, beta: float, low: float, high: float) -> float:
     """Newton's method from where P is smallest on the circle; the pole counts if it lies within the bracket."""
     middle = 0.5 * (low + high)
-    w = np.concatenate([np.geomspace(1e-9, 1e-2, 200), np.linspace(1e-2, np.pi, 16 * degree_of(loop))])
+    w = np.concatenate([np.geomspace(1e-9, 1e-2, 200), np.linspace(1e-2, np.pi, 16 * loop.order)])
     # e^(middle + jw) - 1
     zeta = np.expm1(middle) * np.cos(w) - 2.0 * np.sin(0.5 * w) ** 2 + 1j * np.exp(middle) * np.sin(w)
     a, b = np.float64(alpha), np.float64(beta)

@@ -18,7 +18,7 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.loop import LinearLoop
+from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import bound_intervals
 from zwidth.words.status import RidgeKind
 
@@ -157,7 +157,7 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
     return BoundRidge(top, damping, np.pi, np.pi, Condition.MINUS_ONE, Condition.STATIONARY)
 
 
-def _polish(loop: LinearLoop, start: BoundRidge) -> BoundRidge | None:
+def _polish(loop: LoopRoots, start: BoundRidge) -> BoundRidge | None:
     """Newton's method on a corner of two different angles; None where it does not hold near the start."""
     x = np.array([start.alpha, start.beta, start.w1, start.w2])
     moves = np.array([start.first == Condition.PAIR, start.second == Condition.PAIR])

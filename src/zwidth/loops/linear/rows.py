@@ -18,25 +18,16 @@ _ROWS = 1 << 12
 _FEW_WALLS = 4
 
 
-class Intervals(NamedTuple):
-    """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer."""
-
-    low: np.ndarray
-    high: np.ndarray
-
-
 class BoundIntervals(NamedTuple):
-    """The same with the column of the crossings that ends each, -1 where there is none."""
+    """Stable intervals of alpha: shape (rows, most intervals of a row), NaN where a row has fewer.
+
+    With each stands the column of the crossings that ends it, -1 where there is none.
+    """
 
     low: np.ndarray
     high: np.ndarray
     below: np.ndarray
     above: np.ndarray
-
-
-def stable_intervals(boundary: Boundary, beta: np.ndarray) -> Intervals:
-    """Where the rows of these dampings, shape (rows,), are stable."""
-    return Intervals(*bound_intervals(boundary, beta)[:2])
 
 
 def bound_intervals(boundary: Boundary, beta: np.ndarray) -> BoundIntervals:
@@ -85,7 +76,7 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
     sound = boundary.is_sound(np.where(np.isfinite(rows), rows, 0.0))
     if rows.size * _FEW_WALLS > np.prod(shape) or not sound.all():
         return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
-    ends = stable_intervals(boundary, rows)
+    ends = bound_intervals(boundary, rows)
     place = place.reshape(beta.shape)
     steps = np.diff(alpha.reshape(-1)) if alpha.size > 1 else np.ones(1)
     in_rows = bool(shape) and alpha.size == shape[-1] and beta.shape == (*shape[:-1], 1)
@@ -114,7 +105,7 @@ def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
     return stable.reshape(shape)
 
 
-def _mark_rows(alpha: np.ndarray, ends: Intervals, place: np.ndarray) -> np.ndarray:
+def _mark_rows(alpha: np.ndarray, ends: BoundIntervals, place: np.ndarray) -> np.ndarray:
     """The same for ascending alpha along the last axis, at the speed at which rows are copied."""
     stable = np.zeros((place.size, alpha.size), bool)
     for k in range(ends.low.shape[1]):

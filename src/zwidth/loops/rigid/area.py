@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import along, frozen, namespace
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device
+from zwidth.loops.domain import nan_with_nan_slopes, valid_device
 from zwidth.loops.rigid.curve import lobe, spread, wall
 from zwidth.loops.rigid.delay_classes import DelayClasses, classify_delays
 from zwidth.words.types import Array, ArrayLike
 
 # Gauss-Legendre nodes along the lobe, where alpha d(beta) is analytic.
 _NODES = 48
-_NODE, _WEIGHT = np.polynomial.legendre.leggauss(_NODES)
-# Each point holds as many values as there are nodes.
-_FEW, _BLOCK = 1 << 8, 1 << 10
+_NODE, _SHARE = np.polynomial.legendre.leggauss(_NODES)
+_WEIGHT = 16
 
 
 def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
@@ -44,16 +43,14 @@ def stable_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{stable_area(0.0, 0):.4f}")
         0.9096
     """
-    check_scalars(delta=delta, d=d)
-    kind = classify_delays(d)
-    return elementwise(_area_kernel, ("delta", "d"), (delta, d), (kind,), few=_FEW, block=_BLOCK)
+    return evaluate(_area_kernel, {"delta": delta, "d": d}, classify_delays(d), weight=_WEIGHT)
 
 
 def _area_kernel(delta: Array, d: Array, kind: DelayClasses) -> Array:
     xp = namespace(delta, d)
     curve = lobe(delta, d, "held", kind)
     end = frozen(curve.end, xp)
-    node, weight = (along(part, end) for part in (0.5 + 0.5 * _NODE, 0.5 * _WEIGHT))
+    node, weight = (along(part, end) for part in (0.5 + 0.5 * _NODE, 0.5 * _SHARE))
     at = wall(end[..., None] * node, spread(curve))
     under_lobe = xp.sum(at.alpha * at.d_b * weight, axis=-1) * end
     # From a corner back to alpha = 0 along alpha + 2 beta = const.

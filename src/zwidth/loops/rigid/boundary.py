@@ -7,9 +7,9 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise, pointwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import frozen, namespace, repeat
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device, wall_status
+from zwidth.loops.domain import nan_with_nan_slopes, valid_device, wall_status
 from zwidth.loops.rigid.curve import Lobe, LobePoint, column_end, creeps, frequency, lobe, on_line, peak, row_end, wall
 from zwidth.loops.rigid.delay_classes import classify_delays
 from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
@@ -59,8 +59,7 @@ def boundary(omega: ArrayLike, delta: ArrayLike, d: ArrayLike, *, delay: DelayMo
         -0.25
     """
     check_delay_model(delay)
-    check_scalars(delta=delta, d=d)
-    return elementwise(_boundary_kernel, ("omega", "delta", "d"), (omega, delta, d), (delay,))
+    return evaluate(_boundary_kernel, {"omega": omega, "delta": delta, "d": d}, delay)
 
 
 def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> Wall:
@@ -135,15 +134,14 @@ def boundary_point(
     if len(given) != 1:
         raise InputError(f"beta, alpha: got {'both' if given else 'none'}; give exactly one of the two")
     ((name, value),) = given
-    check_scalars(**{"delta": delta, "d": d, name: value})
     line = side if beta is None else "row"
-    names, values = ("delta", "d", name), (delta, d, value)
+    arguments = {"delta": delta, "d": d, name: value}
     if method == "optimistix":
         # Its solvers take a second to import.
         from zwidth.loops.rigid.exact_points import point_kernel
 
-        return BoundaryPoint(*pointwise(point_kernel, names, values, (line, delay, ridge_kernel)))
-    return elementwise(_point_kernel, names, values, (line, delay, classify_delays(d)))
+        return BoundaryPoint(*evaluate(point_kernel, arguments, line, delay, ridge_kernel, route="jax"))
+    return evaluate(_point_kernel, arguments, line, delay, classify_delays(d))
 
 
 def _point_kernel(delta: Array, d: Array, number: Array, line: str, delay_model: str, kind: Any) -> BoundaryPoint:

@@ -11,7 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.batching import BLOCK, compile_strips, compute_concretely, map_blocks
+from zwidth.arrays.arguments import compute_concretely
+from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.loops.domain import WALL_RANGE, within
 from zwidth.loops.rigid.delay_classes import device
 from zwidth.loops.rigid.folding import Points, assemble_groups, group_by
@@ -68,7 +69,7 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0)
             with np.errstate(all="ignore"):
                 return np.asarray(kernel(points[0], *np.broadcast_arrays(*points[1:])))
         whole = np.broadcast_arrays(*points)
-        limits = map_blocks(compile_strips(kernel), [array.reshape(-1) for array in whole], BLOCK)
+        limits = evaluate_columns(kernel, [array.reshape(-1) for array in whole], route="jax")
         return limits.reshape(whole[0].shape)
 
     return assemble_groups(group_by((beta, delta, d), d >= 1), shape, np.float64, of)

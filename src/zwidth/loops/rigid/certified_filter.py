@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.batching import BLOCK, FEW, compile_strips, map_blocks
+from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.arrays.phi import phi_functions
 from zwidth.arrays.xla import COSINE, SINE, fit_arcsine, store_once
 from zwidth.arrays.xp import horner, namespace
@@ -155,13 +155,7 @@ def wall_codes(alpha: Array, beta: Array, delta: Array, d: Array, kind: DelayCla
 
 def each_code(points: Points) -> np.ndarray:
     """The code of every point, point by point."""
-    shape, kind = points.shape, classify_delays(points.d)
-    if points.size <= FEW:
-        # NumPy is several times faster with scalars than with arrays without axes.
-        with np.errstate(all="ignore"):
-            alpha, beta, delta, d = (array[()] for array in points)
-            return np.broadcast_to(wall_codes(alpha, beta, delta, d, kind), shape).copy()
-    code = map_blocks(compile_strips(wall_codes, (kind,)), points.columns(), BLOCK).reshape(shape)
+    code = evaluate_columns(wall_codes, points.columns(), classify_delays(points.d)).reshape(points.shape)
     if np.signbit(points.delta).any() or np.signbit(points.d).any():
         code |= np.where((points.delta < 0) | (points.d < 0), SPECIAL, 0).astype(np.uint8)
     return code

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import tree_map
+from zwidth.arrays.arguments import tree_map
 from zwidth.arrays.roots import bisect
 from zwidth.arrays.xp import frozen, horner, namespace, repeat
 from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, device

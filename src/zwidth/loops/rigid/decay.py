@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.arrays.batching import broadcast, elementwise, to_caller
+from zwidth.arrays.arguments import broadcast, check_scalars, to_caller
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import check_scalars
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.outermost_poles import OutermostPoles, outermost_poles, usable
@@ -57,11 +57,12 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
         9.999993e-10
     """
     values = (alpha, beta, delta, d)
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
     if is_traced(*values):
         fraction = is_traced(d) or bool(np.any(np.asarray(d, float) % 1.0))
-        return -elementwise(traced_kernel, NAMES, values, (fraction,))
-    arrays = broadcast(NAMES, values)
+        return -evaluate(traced_kernel, arguments, fraction)
+    arrays = broadcast(arguments)
     columns, status = usable([array.reshape(-1) for array in arrays])
     rate = rates(outermost_poles(columns, _ACCURACY), columns)
     rate[status != Status.OK] = np.nan

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays import phi
-from zwidth.arrays.batching import as_float64
+from zwidth.arrays.arguments import as_float64
 from zwidth.arrays.xp import is_traced
 from zwidth.loops.domain import nan_unless, valid_device
 from zwidth.loops.rigid.plant import Functions, discretize, split_delay

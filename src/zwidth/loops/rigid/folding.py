@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, join_shapes
+from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.loops.rigid.degrees import NAMES
 
 # Below this many values an argument is too small for looking for repetition to pay.

@@ -10,18 +10,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.roots import false_position, follow_root
 from zwidth.arrays.xp import along, epsilon, frozen, namespace
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_wall
+from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.crossover import gain_crossover, stable_at
 from zwidth.loops.rigid.delay_classes import ANY, DeviceTerms, device
-from zwidth.loops.rigid.modulus import modulus
+from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, modulus
 from zwidth.loops.rigid.open_loop import find_angle, size_and_phase
 from zwidth.loops.rigid.plant import split_delay
 from zwidth.words.types import Array, ArrayLike
 
-_NAMES = ("alpha", "beta", "delta", "d")
 # Steps of false position at most; every sixth one halves the bracket.
 _STEPS = 240
 # Samples of the fraction of a delay, between which the verdict is taken to change once at most.
@@ -87,9 +86,8 @@ def margins(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -
         >>> print(f"{found.gain_margin:.3f} {found.phase_margin:.2f} {found.delay_margin:.3f}")
         1.593 22.78 0.837
     """
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
-    values = (alpha, beta, delta, d)
-    return elementwise(margins_kernel, _NAMES, values, samples=True)
+    arguments = {"alpha": alpha, "beta": beta, "delta": delta, "d": d}
+    return evaluate(margins_kernel, arguments, weight=SAMPLES_WEIGHT, route="numpy")
 
 
 def margins_kernel(

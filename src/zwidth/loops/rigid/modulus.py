@@ -12,14 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import along, frozen, namespace, repeat
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_wall
+from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.crossover import gain_crossover
 from zwidth.loops.rigid.delay_classes import DeviceTerms, device
 from zwidth.loops.rigid.open_loop import find_angle, size_and_phase
 from zwidth.words.types import Array, ArrayLike
 
+# For the samples of a point. Compiled they would take many seconds and then win nothing over NumPy.
+SAMPLES_WEIGHT = 8
 # Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
 _TURN, _DECADES, _DIPS, _ZOOMS, _TRIALS = 100, 50, 5, 5, 13
 
@@ -51,8 +53,8 @@ def modulus_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Array
         >>> print(f"{modulus_margin(0.1, 0.2, 0.1, 0):.4f}")
         0.5898
     """
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
-    return elementwise(margin_kernel, ("alpha", "beta", "delta", "d"), (alpha, beta, delta, d), samples=True)
+    arguments = {"alpha": alpha, "beta": beta, "delta": delta, "d": d}
+    return evaluate(margin_kernel, arguments, weight=SAMPLES_WEIGHT, route="numpy")
 
 
 def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:

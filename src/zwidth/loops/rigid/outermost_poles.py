@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import BLOCK, FEW, map_blocks
+from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks
 from zwidth.arrays.xla import WIDE
 from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.circle import factor_loop

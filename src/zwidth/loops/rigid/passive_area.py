@@ -1,4 +1,4 @@
-"""Z-width: the edge of the passive walls of any scene, and their area in the (alpha, beta) plane (rigid loop).
+"""Z-width: the area of the passive walls in the (alpha, beta) plane (rigid loop).
 
 In the direction ``alpha = cos(theta)/(d + 1/2)``, ``beta = sin(theta)`` the damping that a wall needs is decided
 
@@ -13,38 +13,18 @@ them it is analytic in theta.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import along, frozen, namespace
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_device
+from zwidth.loops.domain import nan_with_nan_slopes, valid_device
 from zwidth.loops.rigid.needed_damping import directions, needed_damping
 from zwidth.words.types import Array, ArrayLike
 
-if TYPE_CHECKING:
-    from zwidth.scenes.scene import Scene
-
 # Gauss-Legendre nodes for each of the three parts.
 _NODES = (64, 64, 32)
-# A point becomes 160 of them.
-_FEW, _BLOCK = 1 << 6, 1 << 7
-
-
-def passive_edge(scene: Scene, directions: int = 721) -> tuple[np.ndarray, np.ndarray]:
-    """K and B of the edge of the passive walls with K >= 0, from the least B to the largest; empty without damping.
-
-    The condition is homogeneous: a wall needs damping in proportion to its distance from the origin.
-    """
-    own, units = float(scene.device.damping), scene.units
-    turn = np.linspace(-0.5 * np.pi, 0.5 * np.pi, directions)
-    # The smallest cosines are rounded zeros.
-    stiffness, damping = np.maximum(np.cos(turn), 0.0) * units.stiffness, np.sin(turn) * units.virtual_damping
-    needed = own - np.asarray(scene.passivity_margin(stiffness, damping))
-    if own == 0:
-        return np.empty(0), np.empty(0)
-    return stiffness / needed * own, damping / needed * own
+_WEIGHT = 64
 
 
 def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
@@ -73,8 +53,7 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
         >>> print(f"{passive_area(0.5, 0):.4f}")
         0.5000
     """
-    check_scalars(delta=delta, d=d)
-    return elementwise(_passive_area_kernel, ("delta", "d"), (delta, d), few=_FEW, block=_BLOCK)
+    return evaluate(_passive_area_kernel, {"delta": delta, "d": d}, weight=_WEIGHT)
 
 
 def _passive_area_kernel(delta: Array, d: Array) -> Array:

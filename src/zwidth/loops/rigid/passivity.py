@@ -15,14 +15,15 @@ highest: `loops.rigid.needed_damping`. On a map of one delay it is a polynomial 
 
 from __future__ import annotations
 
-from functools import cache, lru_cache
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import FEW, as_float64, elementwise, map_blocks, to_caller
+from zwidth.arrays.arguments import as_float64, check_scalars, to_caller
+from zwidth.arrays.evaluate import FEW, evaluate, evaluate_columns
 from zwidth.arrays.xp import horner, is_traced, namespace
-from zwidth.loops.domain import LONGEST_DELAY, check_scalars, nan_with_nan_slopes, valid_wall
+from zwidth.loops.domain import LONGEST_DELAY, nan_with_nan_slopes, valid_wall
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
 from zwidth.loops.rigid.folding import fold_arguments, group_by
@@ -32,7 +33,6 @@ from zwidth.words.types import Array, ArrayLike
 
 # Chebyshev terms: the last one is below 1e-16 for every delay.
 _TERMS = 30
-_MAP_BLOCK = 1 << 15
 # Each narrows the bracket of a direction eightfold.
 _ROUNDS = 17
 _NO_DELAY = DelayClasses(True, False, False)
@@ -62,6 +62,10 @@ class PassiveTable(NamedTuple):
     last: float  # in the variable of the polynomial
     limit: float  # the same, infinite where there is none
     powers: list[float]
+
+    def numbers(self) -> list[float]:
+        """All of them in a row."""
+        return [*self[:-1], *self.powers]
 
 
 @lru_cache(maxsize=256)
@@ -93,10 +97,10 @@ def table(d: float) -> PassiveTable:
     return PassiveTable(d - np.floor(d), d + 0.5, float(turn.first), width, float(last), limit, powers.tolist())
 
 
-def _map_kernel(alpha: Array, beta: Array, delta: Array, known: PassiveTable) -> Array:
-    """`passivity_margin` at one delay."""
+def _map_kernel(alpha: Array, beta: Array, delta: Array, *known: Any) -> Array:
+    """`passivity_margin` at one delay, given the numbers of its `PassiveTable`."""
     xp = namespace(alpha)
-    f, at_zero, first, width, last, limit, powers = known
+    f, at_zero, first, width, last, limit, *powers = known
     ok = valid_wall(alpha, beta, delta, 0.0 * delta)
     stiff = xp.maximum(alpha, 0.0)
     beyond = beta - first * stiff
@@ -110,19 +114,12 @@ def _map_kernel(alpha: Array, beta: Array, delta: Array, known: PassiveTable) ->
     return xp.where(ok, _limit_margin(delta - needed, alpha), xp.nan)
 
 
-@cache
-def _compiled_map() -> Any:
-    import jax
-
-    return jax.jit(_map_kernel)
-
-
 def margin_at_one_delay(alpha: np.ndarray, beta: np.ndarray, delta: np.ndarray, d: float) -> np.ndarray:
     """`passivity_margin` of arrays of one shape by NumPy; a point's value does not depend on the others."""
     if not 0 <= d <= LONGEST_DELAY:
         return np.full(alpha.shape, np.nan)
     with np.errstate(all="ignore"):
-        return _map_kernel(alpha, beta, delta, table(d))
+        return _map_kernel(alpha, beta, delta, *table(d).numbers())
 
 
 def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
@@ -135,12 +132,10 @@ def _on_maps(values: tuple[ArrayLike, ...]) -> Array | None:
     for delay, arrays, place in group_by((alpha, beta, delta), d):
         if not 0 <= delay <= LONGEST_DELAY:
             continue
-        columns = np.broadcast_arrays(*arrays)
-        known = table(float(delay))
-        flat = map_blocks(
-            lambda *part, known=known: _compiled_map()(*part, known), [c.reshape(-1) for c in columns], _MAP_BLOCK
-        )
-        out[place] = flat.reshape(columns[0].shape)
+        whole = np.broadcast_shapes(*(array.shape for array in arrays))
+        columns = (a.reshape(1) if a.size == 1 else np.broadcast_to(a, whole).reshape(-1) for a in arrays)
+        known = map(np.atleast_1d, table(float(delay)).numbers())
+        out[place] = evaluate_columns(_map_kernel, [*columns, *known], route="jax").reshape(whole)
     return to_caller(laid.spread(out), values)
 
 
@@ -173,18 +168,18 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         >>> print(f"{zwidth.passivity_margin(0.2, 0.3, 1.0, 0):.2f}")
         0.60
     """
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
     values = (alpha, beta, delta, d)
+    arguments = dict(zip(NAMES, values, strict=True))
     if is_traced(*values):
-        return elementwise(_margin_kernel, NAMES, values, (ANY,))
+        return evaluate(_margin_kernel, arguments, ANY)
     if not all(isinstance(value, int | float | np.number) for value in values):
+        check_scalars(arguments)
         found = _on_maps(values)
         if found is not None:
             return found
-    delay = as_float64("d", d)
-    kind = classify_delays(delay)
+    kind = classify_delays(d)
     # Compiled, one text serves every delay.
-    return elementwise(_margin_kernel, NAMES, values, (kind if kind == _NO_DELAY or delay.size <= FEW else ANY,))
+    return evaluate(_margin_kernel, arguments, kind if kind == _NO_DELAY or np.size(d) <= FEW else ANY)
 
 
 def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -222,7 +217,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     whole d the damping has no effect on the peak where cos((d + 1) w) = 0: ``slope = 2 tan(pi/(4 (d + 1)))``. For a
     held delay the direction is searched: the passive set is convex, so that it has one tip.
     """
-    check_scalars(d=d)
+    check_scalars({"d": d})
     delay = as_float64("d", d)
     if delay.ndim or not (np.isfinite(delay) and delay >= 0):
         raise InputError(f"d: got {d!r}; a single finite number of at least 0 is needed")

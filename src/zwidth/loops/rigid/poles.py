@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from functools import cache
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64, map_blocks
+from zwidth.arrays.arguments import as_float64
+from zwidth.arrays.evaluate import map_blocks
 from zwidth.arrays.xp import is_traced, namespace, repeat
-from zwidth.loops.domain import LONGEST_DELAY, check_scalars, wall_status
+from zwidth.loops.domain import LONGEST_DELAY, wall_status
 from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, join, product_form, replace_invalid, split, with_zero
-from zwidth.loops.rigid.degrees import NAMES, Degree, few_poles, find_degree, map_by_degree
+from zwidth.loops.rigid.degrees import Degree, few_poles, find_degree, map_by_degree
 from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import MOST_POLES
@@ -121,7 +121,6 @@ def check_degree(d: ArrayLike) -> None:
 def _check(values: tuple[ArrayLike, ...], delay_model: str = "held", method: str = "companion") -> None:
     check_has_poles(delay_model)
     check_choice("method", method, get_args(PoleMethod))
-    check_scalars(**dict(zip(NAMES, values, strict=True)))
     check_degree(values[3])
 
 
@@ -130,8 +129,8 @@ def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ...]) -> 
     _check(values)
     static = (is_spring(values[1]),)
     if is_traced(*values):
-        return map_by_degree(_inside_jax(kernel), values, static=(*static, pole_kernel))
-    return map_by_degree(_by_companion, values, static=(*static, kernel), few=lambda degree: sys.maxsize)
+        return map_by_degree(_inside_jax(kernel), values, *static, pole_kernel)
+    return map_by_degree(_by_companion, values, *static, kernel, route="numpy")
 
 
 @cache
@@ -234,8 +233,7 @@ def poles(
         )
     if method == "companion" or is_traced(*values):
         return _of_all_poles(_found_poles, values)
-    static = (is_spring(values[1]), method)
-    return map_by_degree(_found_on_host, values, static=static, few=lambda degree: sys.maxsize)
+    return map_by_degree(_found_on_host, values, is_spring(values[1]), method, route="numpy")
 
 
 def _found_on_host(*arguments: Any) -> Roots:

@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.xp import horner, namespace
-from zwidth.loops.domain import check_scalars, nan_with_nan_slopes, valid_wall
-from zwidth.loops.rigid.degrees import Degree, few_poles, map_by_degree
+from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
+from zwidth.loops.rigid.degrees import Degree, map_by_degree
 from zwidth.loops.rigid.plant import Plant, held_plant, split_delay, undelayed_plant
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
@@ -166,17 +166,6 @@ def tilt_at_minus_one(plant: Plant, whole: Array) -> Array:
     return (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
 
 
-def line_at_minus_one(delta: Array, d: Array) -> Array:
-    """``alpha + 2 beta`` on the line where a real pole crosses at z = -1 (held delay), for one point.
-
-    ``alpha + 2 beta = (-1)^n 2 (1 + c)/N(-1)``; infinite where N(-1) = 0.
-    """
-    whole, fraction = split_delay(d)
-    plant = held_plant(delta, fraction)
-    sign = 1.0 - 2.0 * namespace(whole).mod(whole, 2.0)
-    return sign * 2.0 * (1.0 + plant.c) / plant.gap
-
-
 def check_delay_model(delay_model: str) -> None:
     """Raise `InputError` unless the name of a delay model is known."""
     check_choice("delay", delay_model, DELAY_MODELS)
@@ -229,8 +218,7 @@ def char_poly(
         [ 1.   -1.5   1.25 -0.25]
     """
     check_has_poles(delay)
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
-    return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True, few=few_poles)
+    return map_by_degree(_char_poly_kernel, (alpha, beta, delta, d), lead=True)
 
 
 def _char_poly_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree) -> Coefficients:

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import compute_concretely, processors
+from zwidth.arrays.arguments import compute_concretely
+from zwidth.arrays.evaluate import processors
 from zwidth.arrays.xla import WIDE
 from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.circle import Loop, factor_loop

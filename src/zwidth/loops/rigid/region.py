@@ -7,8 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import as_float64
-from zwidth.loops.domain import check_scalars
+from zwidth.arrays.arguments import as_float64, check_scalars
 from zwidth.loops.rigid import curve
 from zwidth.loops.rigid.boundary import boundary
 from zwidth.loops.rigid.delay_classes import classify_delays
@@ -49,7 +48,7 @@ def lobe(
         number = as_float64(name, value)
         if number.ndim or not (np.isfinite(number) and number >= 0):
             raise InputError(f"{name}: got {value!r}; a single finite number of at least 0 is needed")
-    check_scalars(delta=float(delta), d=float(d))
+    check_scalars({"delta": float(delta), "d": float(d)})
     if not isinstance(points, int | np.integer) or isinstance(points, bool) or points < 8:
         raise InputError(f"points: got {points!r}; a whole number of at least 8 is needed")
     kind = classify_delays(d)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays import phi
-from zwidth.arrays.batching import as_float64
+from zwidth.arrays.arguments import as_float64
 from zwidth.loops.rigid.degrees import find_degree
 from zwidth.loops.rigid.settling import advance, settling_time
 from zwidth.words.errors import InputError

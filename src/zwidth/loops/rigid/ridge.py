@@ -6,9 +6,9 @@ from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise, pointwise
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import epsilon, namespace
-from zwidth.loops.domain import check_scalars, device_status, nan_unless
+from zwidth.loops.domain import device_status, nan_unless
 from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
 from zwidth.loops.rigid.plant import Plant, split_delay, undelayed_plant
 from zwidth.loops.rigid.polynomial import check_delay_model
@@ -26,8 +26,6 @@ from zwidth.words.types import Array, ArrayLike, DelayModel
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
-# What fits the second-level cache, for the general route and for this one.
-_CHUNK, _BLOCK = 1 << 13, 1 << 15
 
 
 class RidgePoint(NamedTuple):
@@ -78,13 +76,13 @@ def alpha_max(
     """
     check_delay_model(delay)
     check_choice("method", method, _METHODS)
-    check_scalars(delta=delta, d=d)
+    arguments = {"delta": delta, "d": d}
     if method == "kkt":
         # The general route iterates over long formulas; its solvers take a second to import.
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
-        return RidgePoint(*pointwise(kkt_kernel, ("delta", "d"), (delta, d), (delay,), _CHUNK))
-    return elementwise(ridge_kernel, ("delta", "d"), (delta, d), (delay, classify_delays(d)), block=_BLOCK)
+        return RidgePoint(*evaluate(kkt_kernel, arguments, delay, route="jax"))
+    return evaluate(ridge_kernel, arguments, delay, classify_delays(d))
 
 
 def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgePoint:

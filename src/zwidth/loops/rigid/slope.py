@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from zwidth.arrays.batching import elementwise
-from zwidth.loops.domain import check_scalars, nan_unless, valid_device
+from zwidth.arrays.evaluate import evaluate
+from zwidth.loops.domain import nan_unless, valid_device
 from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
 from zwidth.loops.rigid.plant import Plant, split_delay
 from zwidth.loops.rigid.polynomial import check_delay_model
@@ -48,8 +48,7 @@ def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
         0.631130
     """
     check_delay_model(delay)
-    check_scalars(d=d)
-    return elementwise(slope_kernel, ("d",), (d,), (delay, classify_delays(d)))
+    return evaluate(slope_kernel, {"d": d}, delay, classify_delays(d))
 
 
 def slope_kernel(d: Array, delay_model: str, kind: DelayClasses = ANY) -> Array:

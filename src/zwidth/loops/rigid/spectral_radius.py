@@ -6,9 +6,9 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.batching import broadcast, elementwise, to_caller
+from zwidth.arrays.arguments import broadcast, check_scalars, to_caller
+from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import check_scalars
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.outermost_poles import prove_radii
 from zwidth.loops.rigid.pole_search import traced_kernel
@@ -76,12 +76,13 @@ def spectral_radius(
     """
     values = (alpha, beta, delta, d)
     wanted = _check_radius(method, accuracy, delay)
-    check_scalars(alpha=alpha, beta=beta, delta=delta, d=d)
+    arguments = dict(zip(NAMES, values, strict=True))
+    check_scalars(arguments)
     if method == "companion":
         return radius_by_companion(*values)
     if is_traced(*values):
-        return _exp(elementwise(traced_kernel, NAMES, values, (_has_fraction(d),)))
-    arrays = broadcast(NAMES, values)
+        return _exp(evaluate(traced_kernel, arguments, _has_fraction(d)))
+    arrays = broadcast(arguments)
     return to_caller(prove_radii(arrays, wanted)[0].reshape(arrays[0].shape), values)
 
 

@@ -6,9 +6,10 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.batching import BLOCK, FEW, are_numbers, compile_strips, elementwise, map_blocks, to_caller
+from zwidth.arrays.arguments import are_numbers, check_scalars, to_caller
+from zwidth.arrays.evaluate import evaluate, evaluate_columns
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import check_scalars, wall_status
+from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.boundary_map import boundary_map
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.degrees import NAMES
@@ -78,10 +79,13 @@ def is_stable(
         array([ True,  True, False])
     """
     values = (alpha, beta, delta, d)
-    _check(method, delay, values)
-    if method in ("auto", "crossover") and are_numbers(*values):
-        return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
-    if is_traced(*values):
+    _check(method, delay)
+    arguments = dict(zip(NAMES, values, strict=True))
+    traced = is_traced(*values)
+    if method in ("auto", "crossover") and (traced or are_numbers(*values)):
+        return evaluate(stable_kernel, arguments, classify_delays(d))
+    check_scalars(arguments)
+    if traced:
         return _traced(values, method)
     laid = fold_arguments(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
@@ -118,7 +122,8 @@ def decide_stability(
         array([0, 1], dtype=int32)
     """
     values = (alpha, beta, delta, d)
-    _check(method, delay, values)
+    _check(method, delay)
+    check_scalars(dict(zip(NAMES, values, strict=True)))
     if is_traced(*values):
         raise InputError("decide_stability: got traced values; inside a JAX transformation use `zwidth.is_stable`")
     laid = fold_arguments(values)
@@ -133,12 +138,11 @@ def decide_stability(
 stability_of = decide_stability
 
 
-def _check(method: str, delay_model: str, values: tuple[ArrayLike, ...]) -> None:
+def _check(method: str, delay_model: str) -> None:
     if delay_model != "held":
         check_has_poles(delay_model)
     if method != "auto":
         check_choice("method", method, STABILITY_METHODS)
-    check_scalars(**dict(zip(NAMES, values, strict=True)))
 
 
 def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
@@ -147,10 +151,7 @@ def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
             "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
             "'auto', 'crossover' or 'companion'"
         )
-    if method == "companion":
-        return unstable_poles(*values) == 0
-    d = values[3]
-    return elementwise(stable_kernel, NAMES, values, (classify_delays(d),))
+    return unstable_poles(*values) == 0
 
 
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
@@ -169,8 +170,4 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
 def _by_crossover(points: Points) -> np.ndarray:
     if points.is_dense:
         return boundary_map(points)
-    shape, kind = points.shape, classify_delays(points.d)
-    if points.size <= FEW:
-        with np.errstate(all="ignore"):
-            return np.broadcast_to(stable_kernel(*points, kind), shape)
-    return map_blocks(compile_strips(stable_kernel, (kind,)), points.columns(), BLOCK).reshape(shape)
+    return evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d)).reshape(points.shape)

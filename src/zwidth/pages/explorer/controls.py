@@ -126,9 +126,10 @@ class Controls:
             InputError: the loop has too many poles.
         """
         # Where parts refuse only together, as a cut-off beyond half the sampling rate, the loop does.
-        if self.scene.loop.order > _MOST_POLES:
+        order = self.scene.loop.roots.order
+        if order > _MOST_POLES:
             raise InputError(
-                f"delay: the loop has {self.scene.loop.order} poles, by its delay and its window; the page follows "
+                f"delay: the loop has {order} poles, by its delay and its window; the page follows "
                 f"{_MOST_POLES}, zwidth check judges any wall"
             )
         return self

@@ -43,8 +43,8 @@ class Wish:
 
 def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
     """The parts in the order in which they are wanted; whoever asks may stop after each."""
-    scene, rigid = wish.scene, wish.scene.is_rigid
-    if wish.outline and not rigid:
+    scene, quick = wish.scene, wish.scene.loop.outline() is not None
+    if wish.outline and not quick:
         yield show_outlines(model.outlines(scene))
     verdict = assess(scene)
     own = model.normalized_lines(verdict) if wish.normalized else None
@@ -56,10 +56,10 @@ def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
         yield {"passive": {"x": x, "y": y}, "contours": model.contours(scene, wish.across, wish.up)}
     if not own:
         yield {"verdict": "\n".join(words.check(scene, verdict, limits_of(scene)))}
-    if wish.contact or (wish.costly and not rigid):
+    if wish.contact or (wish.costly and not quick):
         with IMPORTING:
             import jax  # noqa: F401
-    if rigid or wish.costly:
+    if quick or wish.costly:
         x, y = model.ridge_path(scene)
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if wish.normalized else words.slopes(scene))}

@@ -5,7 +5,7 @@ K and B stand for alpha and beta where the scene is normalized (m = 1, T = 1).
 
 from __future__ import annotations
 
-from math import ceil, floor, isfinite, log10
+from math import ceil, floor, inf, isfinite, log10
 from typing import Any
 
 import numpy as np
@@ -13,11 +13,9 @@ import numpy as np
 from zwidth.loops.linear.crossing_lines import end_lines
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.loops.linear.polynomial import affine_polynomial
-from zwidth.loops.rigid.passive_area import passive_edge
 from zwidth.loops.rigid.poles import companion
-from zwidth.loops.rigid.region import stable_region
-from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.scenes.assessment import Assessment
+from zwidth.scenes.passive import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain
@@ -32,19 +30,18 @@ _STRIDES = ((9, 1), (15, 2), (26, 4), (42, 8))
 # Poles of a point on the edge lie in the unit circle but for rounding, of eigenvalues that lie close together.
 _ON_EDGE = 1e-5
 LEVELS = (0.7, 0.8, 0.9, 0.95, 0.98, 0.99)
-# So few that no compiler is asked for (`arrays.batching.FEW`).
-_FINE_GRID, _GRID, _LARGE_LOOP, _COARSE_GRID = (72, 56), (48, 40), 12, (36, 30)
-_DIRECTIONS, _FEW_DIRECTIONS = 181, 41
-_RIDGE_POINTS, _FEW_RIDGE_POINTS, _MOST_DAMPING = 61, 9, 4.0
+# By how many poles a radius takes; so few points that no compiler is asked for (`arrays.evaluate.FEW`).
+_GRIDS = ((1, (72, 56)), (12, (48, 40)), (inf, (36, 30)))
+_DIRECTIONS, _RIDGE_POINTS, _MOST_DAMPING = 181, 61, 4.0
 _SHORTEST, _LONGEST = 30, 3000
 _IMPACT, _APPROACH = 0.1, 5.0
 
 
 def outlines(scene: Scene) -> list[Curve]:
     """The closed outlines of the stable set, holes and islands among them, as `zwidth` finds them."""
-    if scene.is_rigid:
-        region, units = stable_region(float(scene.delta), float(scene.d)), scene.units
-        return [(region.alpha * units.stiffness, region.beta * units.virtual_damping)]
+    outline, units = scene.loop.outline(), scene.units
+    if outline is not None:
+        return [(outline[0] * units.stiffness, outline[1] * units.virtual_damping)]
     return [(piece.stiffness, piece.virtual_damping) for piece in scene.stable_region()]
 
 
@@ -54,7 +51,7 @@ def quick_edge(scene: Scene) -> Curve:
     On the boundary curve and on the lines of real poles, those at which no pole lies outside of the unit circle. A
     part through which the curve runs in a few of its places, as behind a long window, comes with the `outlines` only.
     """
-    if scene.is_rigid:
+    if scene.loop.outline() is not None:
         return outlines(scene)[0]
     # Closer together at low frequencies, where loops with a hand have their resonance.
     w = np.pi * ((np.arange(_QUICK_CURVE) + 0.5) / _QUICK_CURVE) ** 2
@@ -63,7 +60,7 @@ def quick_edge(scene: Scene) -> Curve:
     low, high = (float(known.min()), float(known.max())) if known.size else (-1.0, 1.0)
     damping = np.linspace(low - 0.5 * (high - low), high + 0.5 * (high - low), _QUICK_LINE)
     units = scene.units
-    for line in end_lines(scene.loop):
+    for line in end_lines(scene.loop.roots):
         stiffness = (line.q - damping / units.virtual_damping * line.f) * units.stiffness
         parts.append(_on_edge(scene, stiffness, damping))
     x, y = (np.concatenate([np.append(part[k], np.nan) for part in parts]) for k in (0, 1))
@@ -72,7 +69,7 @@ def quick_edge(scene: Scene) -> Curve:
 
 def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
     """Points of a curve that border the stable set, the others NaN: some are asked, then those between two answers."""
-    D, N1, N2 = affine_polynomial(scene.loop)
+    D, N1, N2 = affine_polynomial(scene.loop.roots)
     alpha, beta = scene.normalize_walls(stiffness, damping)
     finite = np.isfinite(alpha) & np.isfinite(beta)
     edge = np.zeros(alpha.size, bool)
@@ -144,28 +141,21 @@ def passive_set(scene: Scene) -> Curve | None:
     """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
     if not has_condition(scene.device):
         return None
-    return passive_edge(scene, _DIRECTIONS if scene.is_rigid else _FEW_DIRECTIONS)
+    return passive_edge(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 
 
 def radius_map(scene: Scene, across: Range, up: Range) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Stiffness and damping over a frame, and the spectral radius of the walls there."""
-    small = scene.poles(1.0, 1.0).size <= _LARGE_LOOP
-    grid = _FINE_GRID if scene.is_rigid else _GRID if small else _COARSE_GRID
+    grid = next(grid for most, grid in _GRIDS if scene.loop.poles_sought <= most)
     stiffness, damping = np.linspace(*across, grid[0]), np.linspace(*up, grid[1])
     return stiffness, damping, np.asarray(scene.spectral_radius(stiffness, damping[:, None]))
 
 
 def ridge_path(scene: Scene) -> Curve:
     """The stiffest stable wall as the device's damping grows from none to four times what it is."""
-    units = scene.units
-    own = float(scene.damping) if scene.is_rigid else float(scene.device.damping)
-    most = _MOST_DAMPING * (own or 0.25 * units.virtual_damping)
-    if scene.is_rigid:
-        path = alpha_max(np.linspace(0.0, most, _RIDGE_POINTS) / units.virtual_damping, float(scene.d))
-        return np.asarray(path.alpha) * units.stiffness, np.asarray(path.beta) * units.virtual_damping
-    dampings = np.linspace(0.0, most, _FEW_RIDGE_POINTS)
-    walls = [scene.replace(damping=float(damping)).max_stiffness() for damping in dampings]
-    return np.array([float(w.stiffness) for w in walls]), np.array([float(w.virtual_damping) for w in walls])
+    most = _MOST_DAMPING * (float(scene.device.damping) or 0.25 * scene.units.virtual_damping)
+    dampings = np.linspace(0.0, most, min(_RIDGE_POINTS, 1 + scene.loop.draws // 25))
+    return scene.loop.vary({"damping": dampings}).stiffest()
 
 
 def contact_motion(scene: Scene, periods: int) -> tuple[Any, Any, Any, str]:

@@ -220,9 +220,9 @@ class Page:
         device = replace(scene, wall=VirtualWall(0.0)), controls.normalized
         if device != self.device:
             self.device, self.drawn = device, False
-            # Of a scene with parts, what is quick has no inside; its outlines come when the slider rests.
+            # What has gaps has no inside; the outlines come when the slider rests.
             moving = {"area": {"xs": [], "ys": []}, "edge": {"x": edge[0], "y": edge[1]}}
-            self._fill(show_outlines([edge]) if scene.is_rigid else moving)
+            self._fill(show_outlines([edge]) if np.isfinite(edge).all() else moving)
             self._fill({name: {column: [] for column in _COLUMNS[name]} for name in _OF_DEVICE})
             self.tell({"slopes": ""})
         self.controls = controls

@@ -30,7 +30,7 @@ def to_yaml(controls: Controls) -> str:
     """A configuration: the scene, its stable walls and, of a rigid device, the passive ones and the response."""
     scene = controls.scene
     studies: list[dict[str, Any]] = [{"kind": "boundary", "name": "stable_walls"}]
-    if scene.is_rigid:
+    if not scene.parts_beyond:
         studies[0] |= {"passivity": True} if scene.operator is None else {}
         studies.append({"kind": "step", "name": "response"})
     # JSON is YAML of one line.

@@ -29,7 +29,7 @@ def scenes(kind: str, seed: int, count: int = SCENES) -> list[zwidth.Scene]:
 
 def walls_of(scene: zwidth.Scene, generator: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """Normalized walls anywhere, and beside the curve at a relative distance of 1e-9 to 1e-2."""
-    curve = curve_at(scene.loop, generator.choice(scene.traced_boundary.w, 15))
+    curve = curve_at(scene.loop.roots, generator.choice(scene.loop.boundary.w, 15))
     side = 10 ** generator.uniform(-9, -2, 15) * generator.choice([-1.0, 1.0], 15)
     fine = (np.abs(curve.alpha) < 1e6) & (np.abs(curve.beta) < 1e6) & (np.abs(curve.alpha) > 1e-6)
     alpha = 10 ** generator.uniform(-4, 1, 10) * generator.choice([1.0, 1.0, -0.1], 10)
@@ -43,7 +43,7 @@ def test_poles_outside_are_those_of_the_matrix(kind):
     for scene in scenes(kind, 10):
         units = scene.units
         walls = walls_of(scene, generator)
-        for alpha, beta, outside in zip(*walls, scene.traced_boundary.outside(*walls), strict=True):
+        for alpha, beta, outside in zip(*walls, scene.loop.boundary.outside(*walls), strict=True):
             wall = alpha * units.stiffness, beta * units.virtual_damping
             sizes = np.abs(np.linalg.eigvals(any_loop.closed_loop_matrix(scene, *wall)))
             expected: int | None = int(np.sum(sizes > 1))
@@ -62,7 +62,7 @@ def test_poles_are_proved_ones(kind):
     for scene in scenes(kind, 20, 40):
         alpha, beta = 10 ** generator.uniform(-3, 0), 10 ** generator.uniform(-2, 0) * generator.choice([0.0, 1.0, 1.0])
         wall = alpha * scene.units.stiffness, beta * scene.units.virtual_damping
-        found = poles_less_one(scene.loop, np.array([alpha]), np.array([beta]))[0]
+        found = poles_less_one(scene.loop.roots, np.array([alpha]), np.array([beta]))[0]
         try:
             expected, missed = any_loop.proved_poles(scene, *wall, found)
         except ValueError:
@@ -93,9 +93,9 @@ def test_zeros_beside_soft_modes_keep_their_digits(sensor, stiffness):
         hand = held if generator.random() < 0.5 else None
         scene = zwidth.Scene(device, zwidth.Timing(period, generator.choice([0, 1, 0.4]) * period), operator=hand)
         expected = any_loop.proved_zeros(scene)
-        distance = np.abs(-scene.loop.zeros[:, None] - expected) / np.abs(expected)
+        distance = np.abs(-scene.loop.roots.zeros[:, None] - expected) / np.abs(expected)
         own, other = linear_sum_assignment(distance)
-        assert own.size == expected.size == scene.loop.zeros.size
+        assert own.size == expected.size == scene.loop.roots.zeros.size
         assert distance[own, other].max() < ZERO, scene
 
 

@@ -16,7 +16,7 @@ def test_columns_agree_with_eigenvalues(seed):
     K, B = random_walls(scene, rng, 4)
     unit = scene.units.virtual_damping
     for stiffness in K[:2]:
-        found = stable_dampings(scene.traced_boundary, stiffness / scene.units.stiffness) * unit
+        found = stable_dampings(scene.loop.boundary, stiffness / scene.units.stiffness) * unit
         shares = np.array([-0.01, 0.003, 0.5, 0.997, 1.01])
         tried = np.concatenate([B, *(low + (high - low) * shares for low, high in found)])
         inside = ((tried[:, None] > found[:, 0]) & (tried[:, None] < found[:, 1])).any(1)
@@ -31,7 +31,7 @@ def test_a_rigid_column_is_the_closed_form_s():
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(10e3, 40))
     verdict = zwidth.assess(scene)
     assert isinstance(verdict, zwidth.Assessment)
-    ((low, high),) = stable_dampings(scene.traced_boundary, scene.alpha) * scene.units.virtual_damping
+    ((low, high),) = stable_dampings(scene.loop.boundary, scene.alpha) * scene.units.virtual_damping
     assert low == pytest.approx(verdict.virtual_damping_lower, rel=1e-9)
     assert high == pytest.approx(verdict.virtual_damping_upper, rel=1e-9)
 
@@ -39,7 +39,7 @@ def test_a_rigid_column_is_the_closed_form_s():
 @pytest.mark.parametrize("alpha", [0.3, 5.0, np.nan, np.inf])
 def test_a_column_beyond_the_stable_set_is_empty(alpha):
     scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
-    assert stable_dampings(scene.traced_boundary, alpha).shape == (0, 2)
+    assert stable_dampings(scene.loop.boundary, alpha).shape == (0, 2)
 
 
 # Columns that a curve crosses next to its ends, beyond its first or last node, or between two narrow turns.
@@ -83,7 +83,7 @@ def check_column(scene, stiffness):
     exact = any_loop.proved_column(scene, stiffness)
     if exact is None:
         return None
-    found = stable_dampings(scene.traced_boundary, stiffness / scene.units.stiffness) * scene.units.virtual_damping
+    found = stable_dampings(scene.loop.boundary, stiffness / scene.units.stiffness) * scene.units.virtual_damping
     assert found.shape == exact.shape, (scene, stiffness, found, exact)
     if exact.size:
         np.testing.assert_allclose(found, exact, rtol=1e-9, atol=1e-12 * np.abs(exact).max())

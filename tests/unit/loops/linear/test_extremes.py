@@ -69,8 +69,8 @@ SCENES = {
 @pytest.mark.parametrize("name", SCENES)
 def test_counts_are_those_of_proved_poles(name):
     loop, generator = SCENES[name], np.random.default_rng(5)
-    boundary, units = loop.traced_boundary, loop.units
-    curve = curve_at(loop.loop, generator.choice(boundary.w, 10))
+    boundary, units = loop.loop.boundary, loop.units
+    curve = curve_at(loop.loop.roots, generator.choice(boundary.w, 10))
     side = 10 ** generator.uniform(-7, -2, 10) * generator.choice([-1.0, 1.0], 10)
     # Next to w = 0 and to undamped modes, alpha is what rounding leaves of larger numbers.
     fine = (np.abs(curve.alpha) < 1e5) & (np.abs(curve.alpha) > 1e-7) & (np.abs(curve.beta) < 1e5)
@@ -89,7 +89,7 @@ def test_counts_are_those_of_proved_poles(name):
 
 @pytest.mark.parametrize("name", SCENES)
 def test_every_row_s_crossings_lead_from_the_count_below_to_the_one_above(name):
-    boundary, generator = SCENES[name].traced_boundary, np.random.default_rng(6)
+    boundary, generator = SCENES[name].loop.boundary, np.random.default_rng(6)
     through_nodes = generator.choice(np.concatenate([arc.beta for arc in boundary.arcs]), 300)
     rows = np.concatenate([generator.uniform(-1, 1.5, 300) * 10 ** generator.uniform(-6, 1, 300), through_nodes, [0.0]])
     rows = rows[np.isfinite(rows)]
@@ -118,5 +118,5 @@ def test_walls_of_a_row_that_contradicts_itself_are_told_by_their_poles(monkeypa
     stiffness, damping = np.linspace(1e3, 3e5, 12), np.array([[0.0], [50.0], [300.0]])
     expected = loop.is_stable(stiffness, damping)
     assert 0 < expected.sum() < expected.size
-    monkeypatch.setattr(type(loop.traced_boundary), "_settle", lambda self, beta: (beta, np.zeros(beta.shape, bool)))
+    monkeypatch.setattr(type(loop.loop.boundary), "_settle", lambda self, beta: (beta, np.zeros(beta.shape, bool)))
     np.testing.assert_array_equal(loop.is_stable(stiffness, damping), expected)

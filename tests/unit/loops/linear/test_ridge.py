@@ -11,7 +11,7 @@ from waiting import LONGEST
 import zwidth
 from zwidth import Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
 from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge
-from zwidth.scenes.ridge_kkt import moving_paths
+from zwidth.loops.linear.slopes import moving_paths
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind
 
@@ -32,7 +32,7 @@ WINDOW = PAPER.replace(velocity=WindowedDifference(15))
 
 
 def wanted(scene: Scene, negative: bool) -> BoundRidge:
-    found = find_ridge(scene.border, negative)
+    found = find_ridge(scene.loop.border, negative)
     assert found is not None
     return found
 

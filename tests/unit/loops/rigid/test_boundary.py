@@ -16,8 +16,7 @@ from mpmath import mpf
 
 import oracles
 import zwidth
-from zwidth.arrays.batching import map_flat
-from zwidth.loops.rigid.polynomial import line_at_minus_one
+from zwidth.loops.rigid.delay_classes import device
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -105,7 +104,7 @@ def test_undelayed_explicit_formula():
 
 def test_the_line_of_a_pole_at_minus_one():
     points = np.array(list(itertools.product([0.1, 2.0, 2.31, 4.0, 1e3], [0.0, 0.125, 0.5, 0.9, 1.0, 2.0, 3.3])))
-    for limit, (delta, d) in zip(map_flat(_line, list(points.T)), points, strict=True):
+    for limit, (delta, d) in zip(1.0 / device(*points.T).tilt, points, strict=True):
         with mp.workdps(60):
             # P(-1) is affine in alpha + 2 beta, which is put into alpha alone.
             at_zero, at_one = (oracles.evaluate(oracles.polynomial(a, 0, delta, d), -1) for a in (0, 1))
@@ -114,10 +113,6 @@ def test_the_line_of_a_pole_at_minus_one():
             numerator = oracles.numerator(delta, d - int(d))
             condition = sum(numerator) / abs(numerator[0] - numerator[1] + numerator[2])
             assert oracles.relative_error(limit, exact) <= tol.BOUNDARY.float64 * float(condition)
-
-
-def _line(delta, d):
-    return jnp.asarray(line_at_minus_one(delta, d))
 
 
 def test_remark_3_in_all_digits():

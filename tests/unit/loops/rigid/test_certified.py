@@ -11,7 +11,7 @@ from mpmath import mpf
 from waiting import LONGEST
 
 import zwidth
-from zwidth.arrays.batching import FEW
+from zwidth.arrays.evaluate import FEW
 from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid import balls
 from zwidth.loops.rigid.certified import certified_stable

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from zwidth.arrays.xp import namespace
 from zwidth.loops.rigid.degrees import Degree, find_degree, groups, map_by_degree
-from zwidth.words.errors import InputError
+from zwidth.words.errors import TracedDelayError
 
 DELAYS = np.array([2.0, 0.0, 0.5, 2.0, np.nan, 1e-300, 7.25, 0.0, -1.0, np.inf])
 DEGREES = [(2, False), (0, False), (0, True), (2, False), (0, False), (0, True), (7, True), (0, False)]
@@ -14,7 +15,8 @@ DEGREES = [(2, False), (0, False), (0, True), (2, False), (0, False), (0, True),
 
 def numbers(alpha, beta, delta, d, degree):
     """The degree as a scalar, and a vector as long as there are poles."""
-    return alpha + 0.0 * d, jnp.full(degree.poles, float(degree.poles))
+    xp = namespace(alpha, d)
+    return alpha + 0.0 * d, xp.full((*alpha.shape, degree.poles), float(degree.poles))
 
 
 @pytest.mark.parametrize("d, expected", list(zip(DELAYS[:8], DEGREES, strict=True)))
@@ -71,6 +73,11 @@ def test_traced_points_are_grouped_too():
     np.testing.assert_array_equal(np.isfinite(vectors).sum(-1), [5, 3, 4])
 
 
-def test_no_traced_points_are_refused():
-    with pytest.raises(InputError, match="no point at all"):
-        jax.jit(lambda alpha: map_by_degree(numbers, (alpha, 0.0, 0.0, 1.0)))(jnp.ones(0))
+def test_no_traced_points_have_the_fewest_poles():
+    _, vectors = jax.jit(lambda alpha: map_by_degree(numbers, (alpha, 0.0, 0.0, 1.0)))(jnp.ones(0))
+    assert vectors.shape == (0, 3)
+
+
+def test_a_traced_delay_is_refused_with_the_remedy():
+    with pytest.raises(TracedDelayError, match="pass d as a plain number, for example through jit's static_argnums"):
+        jax.jit(lambda d: map_by_degree(numbers, (1.0, 0.0, 0.0, d)))(1.0)

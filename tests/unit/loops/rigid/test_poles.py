@@ -1,6 +1,5 @@
 """Poles and spectral radius against labels from 60-digit arithmetic, exact roots, and double poles made on purpose."""
 
-import sys
 from pathlib import Path
 
 import jax
@@ -186,7 +185,7 @@ def many_walls(count=600):
 
 def by_aberth(*walls, spring=False):
     """Poles, the discs in which they lie, and whether these are proved."""
-    return map_by_degree(aberth_kernel, walls, static=(spring,), few=lambda degree: sys.maxsize)
+    return map_by_degree(aberth_kernel, walls, spring, route="numpy")
 
 
 def test_the_iteration_is_right_to_the_last_digits_wherever_eigenvalues_are():

@@ -1,4 +1,4 @@
-"""Batching: shapes, types, pieces, and a caller's own transformations, with kernels whose answers are known."""
+"""From a kernel to arrays: shapes, types, routes, and a caller's own transformations, with answers that are known."""
 
 import sys
 import threading
@@ -11,80 +11,91 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zwidth.arrays import batching
-from zwidth.arrays.batching import (
-    FEW,
-    as_float64,
-    broadcast,
-    concrete_delay,
-    elementwise,
-    is_traced,
-    map_flat,
-    pointwise,
-)
-from zwidth.arrays.xp import is_jax, namespace
-from zwidth.words.errors import InputError, PrecisionWarning, TracedDelayError
+from zwidth.arrays import arguments
+from zwidth.arrays.arguments import as_float64, broadcast, check_scalars
+from zwidth.arrays.evaluate import FEW, evaluate, evaluate_columns, map_blocks
+from zwidth.arrays.xp import is_jax, is_traced, namespace
+from zwidth.words.errors import InputError, PrecisionWarning
+
+ROUTES = ("auto", "numpy", "jax")
 
 
 class Weighted(NamedTuple):
     total: object
-    pair: object
+    whole: object
 
 
 def weighted(x, y, factor=1.0):
-    return Weighted(x + factor * y, jnp.stack([x, y]))
+    return Weighted(x + factor * y, (x > y).astype(np.int32))
 
 
 def fragile(x):
-    return jnp.where(x < 0, jnp.nan, jnp.sqrt(jnp.abs(x)))
+    xp = namespace(x)
+    return xp.where(x < 0, xp.nan, xp.sqrt(xp.abs(x)))
 
 
-NAMES = ("x", "y")
+def powers(x, y, highest):
+    """A vector a point, along a last axis."""
+    xp = namespace(x, y)
+    return xp.stack([y * x**k for k in range(highest)], axis=-1)
 
 
-def test_arguments_broadcast_and_vectors_come_last():
+@pytest.mark.parametrize("route", ROUTES)
+def test_arguments_broadcast(route):
     x, y = np.arange(3.0)[:, None], np.arange(4.0)
-    got = pointwise(weighted, NAMES, (x, y), (10.0,))
+    got = evaluate(weighted, {"x": x, "y": y}, 10.0, route=route)
     np.testing.assert_array_equal(got.total, x + 10 * y)
-    assert got.pair.shape == (3, 4, 2)
-    np.testing.assert_array_equal(got.pair[..., 1], np.broadcast_to(y, (3, 4)))
+    np.testing.assert_array_equal(got.whole, x > y)
+    assert got.whole.dtype == np.int32
 
 
 @pytest.mark.parametrize("count", [1, 2, 7, 8, 9, 25])
-@pytest.mark.parametrize("chunk", [1, 8])
-def test_pieces_join_to_the_whole(count, chunk):
+@pytest.mark.parametrize("block", [1, 8])
+def test_blocks_join_to_the_whole(count, block):
     x = np.arange(float(count))
-    np.testing.assert_array_equal(map_flat(fragile, [x], chunk=chunk), np.sqrt(x))
+    np.testing.assert_array_equal(map_blocks(np.sqrt, [x], block), np.sqrt(x))
 
 
-def test_nothing_in_nothing_out():
-    got = pointwise(weighted, NAMES, (np.ones((0, 3)), 1.0))
-    assert got.total.shape == (0, 3)
-    assert got.pair.shape == (0, 3, 2)
+@pytest.mark.parametrize("route", ROUTES)
+@pytest.mark.parametrize("weight", [1, 64])
+@pytest.mark.parametrize("count", [1, 3, 100, 5000])
+def test_vectors_come_last_and_one_value_serves_all_points(route, weight, count):
+    x = np.linspace(0.0, 1.0, count)
+    got = evaluate_columns(powers, [x, np.array([2.0])], 3, weight=weight, route=route)
+    np.testing.assert_allclose(got, np.stack([2.0 + 0.0 * x, 2.0 * x, 2.0 * x * x], axis=-1), rtol=1e-15)
+
+
+@pytest.mark.parametrize("route", ROUTES)
+def test_nothing_in_nothing_out(route):
+    got = evaluate(weighted, {"x": np.ones((0, 3)), "y": 1.0}, route=route)
+    assert got.total.shape == got.whole.shape == (0, 3)
     assert got.total.dtype == np.float64
 
 
-def test_a_bad_point_leaves_its_neighbors_alone():
+@pytest.mark.parametrize("route", ROUTES)
+def test_a_bad_point_leaves_its_neighbors_alone(route):
     x = np.linspace(0.1, 5.0, 9)
     spoiled = x.copy()
     spoiled[4] = -1.0
-    clean, got = pointwise(fragile, ("x",), (x,)), pointwise(fragile, ("x",), (spoiled,))
+    clean, got = (evaluate(fragile, {"x": value}, route=route) for value in (x, spoiled))
     assert np.isnan(got[4])
     np.testing.assert_array_equal(np.delete(got, 4), np.delete(clean, 4))
 
 
-def test_types_follow_the_caller():
-    assert isinstance(pointwise(fragile, ("x",), (2.0,)), np.float64)
-    assert isinstance(pointwise(fragile, ("x",), (np.ones(2),)), np.ndarray)
-    assert isinstance(pointwise(fragile, ("x",), ([1, 2],)), np.ndarray)
-    from_jax = pointwise(fragile, ("x",), (jnp.ones(2),))
+@pytest.mark.parametrize("route", ROUTES)
+def test_types_follow_the_caller(route):
+    assert isinstance(evaluate(fragile, {"x": 2.0}, route=route), np.float64)
+    assert isinstance(evaluate(fragile, {"x": np.ones(2)}, route=route), np.ndarray)
+    assert isinstance(evaluate(fragile, {"x": [1, 2]}, route=route), np.ndarray)
+    from_jax = evaluate(fragile, {"x": jnp.ones(2)}, route=route)
     assert isinstance(from_jax, jax.Array)
     assert from_jax.dtype == np.float64
 
 
-def test_float64_without_touching_the_configuration():
+@pytest.mark.parametrize("route", ROUTES)
+def test_float64_without_touching_the_configuration(route):
     before = jax.enable_x64.value
-    assert pointwise(fragile, ("x",), (1 + 2.0**-40,)) == np.sqrt(1 + 2.0**-40)
+    assert evaluate(fragile, {"x": 1 + 2.0**-40}, route=route) == np.sqrt(1 + 2.0**-40)
     assert jnp.ones(1).dtype == jnp.float32
     assert jax.enable_x64.value == before
 
@@ -92,7 +103,7 @@ def test_float64_without_touching_the_configuration():
 def test_inside_a_transformation_the_ambient_precision_holds():
     def function(x):
         assert is_traced(x)
-        return pointwise(fragile, ("x",), (x,))
+        return evaluate(fragile, {"x": x})
 
     assert jax.jit(function)(jnp.ones(3)).dtype == jnp.float32
     assert jax.vmap(function)(jnp.ones(3)).shape == (3,)
@@ -102,9 +113,17 @@ def test_inside_a_transformation_the_ambient_precision_holds():
 
 
 def test_traced_arguments_broadcast_too():
-    got = jax.jit(lambda x: pointwise(weighted, NAMES, (x, np.arange(4.0))))(jnp.ones((3, 1)))
-    assert got.total.shape == (3, 4)
-    assert got.pair.shape == (3, 4, 2)
+    got = jax.jit(lambda x: evaluate(weighted, {"x": x, "y": np.arange(4.0)}))(jnp.ones((3, 1)))
+    assert got.total.shape == got.whole.shape == (3, 4)
+
+
+def test_a_number_beyond_the_range_of_its_name_is_refused():
+    with pytest.raises(InputError, match=r"delta: got 10000000000000.0; it must be 0 to 1e"):
+        evaluate(fragile, {"delta": 1e13})
+    with pytest.raises(InputError, match="alpha: got 1e-70; it must be 0 or 1e-60 to 1e"):
+        check_scalars({"alpha": 1e-70})
+    # Arrays get a status, and other names have no range.
+    check_scalars({"delta": np.array([1e13]), "omega": 1e-70, "alpha": np.inf, "beta": -1.0})
 
 
 def rooted(x, y, factor):
@@ -115,26 +134,26 @@ def rooted(x, y, factor):
 def test_one_kernel_is_numpy_for_few_points_and_compiled_for_many():
     y = np.linspace(0.5, 2.0, FEW + 1)
     x = y - 1.0
-    many, few = (elementwise(rooted, NAMES, (x[:count], y[:count]), (3.0,)) for count in (FEW + 1, FEW))
+    many, few = (evaluate(rooted, {"x": x[:count], "y": y[:count]}, 3.0) for count in (FEW + 1, FEW))
     assert many.total.shape == (FEW + 1,)
     np.testing.assert_allclose(few.total, many.total[:FEW], rtol=1e-15)
-    np.testing.assert_allclose(few.pair, 3.0 * (x * y)[:FEW], rtol=1e-15)
+    np.testing.assert_allclose(few.whole, 3.0 * (x * y)[:FEW], rtol=1e-15)
     assert np.isnan(many.total[0])
 
 
 def test_an_elementwise_kernel_follows_its_caller_too():
-    number = elementwise(rooted, NAMES, (2.0, 1), (3.0,))
+    number = evaluate(rooted, {"x": 2.0, "y": 1}, 3.0)
     assert isinstance(number.total, np.float64)
-    assert number.pair == 6.0
-    spread = elementwise(rooted, NAMES, (np.ones((3, 1)), np.ones(4)), (3.0,))
-    assert spread.total.shape == spread.pair.shape == (3, 4)
-    from_jax = elementwise(rooted, NAMES, (jnp.ones(2), 1.0), (3.0,))
+    assert number.whole == 6.0
+    spread = evaluate(rooted, {"x": np.ones((3, 1)), "y": np.ones(4)}, 3.0)
+    assert spread.total.shape == spread.whole.shape == (3, 4)
+    from_jax = evaluate(rooted, {"x": jnp.ones(2), "y": 1.0}, 3.0)
     assert isinstance(from_jax.total, jax.Array)
     assert from_jax.total.dtype == np.float64
     with jax.enable_x64(True):
-        assert float(jax.grad(lambda x: elementwise(rooted, NAMES, (x, 1.0), (3.0,)).pair)(2.0)) == 3.0
+        assert float(jax.grad(lambda x: evaluate(rooted, {"x": x, "y": 1.0}, 3.0).whole)(2.0)) == 3.0
     with pytest.raises(InputError, match="shapes do not broadcast"):
-        elementwise(rooted, NAMES, (np.ones(2), np.ones(3)), (3.0,))
+        evaluate(rooted, {"x": np.ones(2), "y": np.ones(3)}, 3.0)
 
 
 def test_a_mask_is_not_ignored():
@@ -158,12 +177,7 @@ def test_what_is_a_real_number(value):
 def test_shapes_that_do_not_fit_are_all_named():
     message = r"shapes do not broadcast: x \(2,\), y \(3,\); make each axis equal or 1"
     with pytest.raises(InputError, match=message):
-        broadcast(NAMES, (np.ones(2), np.ones(3)))
-
-
-def test_a_traced_delay_is_refused_with_the_remedy():
-    with pytest.raises(TracedDelayError, match="pass d as a plain number, for example through jit's static_argnums"):
-        jax.jit(lambda d: concrete_delay(d).sum())(1.0)
+        broadcast({"x": np.ones(2), "y": np.ones(3)})
 
 
 @pytest.mark.parametrize("x", [2.0, np.array([2.0, 3.0])])
@@ -171,27 +185,27 @@ def test_plain_numbers_inside_somebody_elses_transformation_are_computed_at_once
     seen = []
 
     def traced(factor):
-        seen.append(pointwise(fragile, ("x",), (x,)))
+        seen.append(evaluate(fragile, {"x": x}))
         return factor * 2.0
 
     jax.jit(jax.vmap(jax.grad(traced)))(np.ones(2, np.float32))
     assert isinstance(seen[0], np.ndarray | np.float64)
-    np.testing.assert_array_equal(seen[0], pointwise(fragile, ("x",), (x,)))
+    np.testing.assert_array_equal(seen[0], evaluate(fragile, {"x": x}))
     assert not jax.enable_x64.value
 
 
 def test_float32_inside_a_transformation_is_said_once(monkeypatch):
-    monkeypatch.setattr(batching, "_warned", threading.Event())
+    monkeypatch.setattr(arguments, "_warned", threading.Event())
     with jax.enable_x64(True), warnings.catch_warnings():
         warnings.simplefilter("error")
-        jax.jit(lambda x: pointwise(fragile, ("x",), (x,)))(1.0)
+        jax.jit(lambda x: evaluate(fragile, {"x": x}))(1.0)
     with pytest.warns(PrecisionWarning, match="call jax.config.update.'jax_enable_x64', True. first") as caught:
-        jax.grad(lambda x: elementwise(jnp.square, ("x",), (x,)))(1.0)
+        jax.grad(lambda x: evaluate(jnp.square, {"x": x}))(1.0)
     # The line named is the caller's.
     assert caught[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        jax.jit(lambda x: pointwise(fragile, ("x",), (x,)))(2.0)
+        jax.jit(lambda x: evaluate(fragile, {"x": x}))(2.0)
 
 
 def _product(x, y):
@@ -201,7 +215,7 @@ def _product(x, y):
 
 def test_derivatives_of_an_elementwise_kernel_are_those_of_its_points(x64):
     def first(x, y):
-        return elementwise(_product, ("x", "y"), (x, y))[0]
+        return evaluate(_product, {"x": x, "y": y})[0]
 
     x, y = np.array([1.0, np.nan, 3.0]), np.array([2.0, 1.0, 0.5])
     by_x, by_y = (jax.vmap(jax.grad(first, k))(x, y) for k in (0, 1))
@@ -211,7 +225,7 @@ def test_derivatives_of_an_elementwise_kernel_are_those_of_its_points(x64):
     assert jax.grad(lambda x: first(x, 2.0))(3.0) == 12
     assert jax.jvp(first, (3.0, 2.0), (1.0, 10.0)) == (18.0, 12 + 90)
     np.testing.assert_array_equal(jax.jit(jax.hessian(lambda v: first(*v)))(np.array([3.0, 2.0])), [[4, 6], [6, 0]])
-    value, count = jax.jit(lambda x: elementwise(_product, ("x", "y"), (x, 1.0)))(2.0)
+    value, count = jax.jit(lambda x: evaluate(_product, {"x": x, "y": 1.0}))(2.0)
     assert (value, count, count.dtype) == (4.0, 1, np.int32)
 
 
@@ -222,7 +236,7 @@ def test_the_first_gradient_hands_out_no_intermediate_results(x64):
         return x
 
     # Outside `jit`, what goes from the value to the gradient: one number an argument.
-    _, pullback = jax.vjp(lambda x, y: elementwise(long, ("x", "y"), (x, y)), 0.5, 0.25)
+    _, pullback = jax.vjp(lambda x, y: evaluate(long, {"x": x, "y": y}), 0.5, 0.25)
     assert len(jax.tree.leaves(pullback)) <= 4
 
 

@@ -20,7 +20,7 @@ from zwidth.words.types import Array
 
 
 @dataclass(frozen=True)
-class LinearLoop:
+class LoopRoots:
     """A loop without its wall: ``G(z) = gain prod(z - zeros)/(z^lag prod(z - poles))`` and the velocity estimate F."""
 
     gain: float
@@ -41,9 +41,9 @@ class LinearLoop:
 
     @property
     def order(self) -> int:
-        """How many poles the closed loop has."""
-        filtered = self.estimate
-        return self.poles.size + max(self.lag, 0) + filtered.poles.size + filtered.window + max(filtered.lag, 0)
+        """How many poles the loop with a wall that has damping has."""
+        f = self.estimate
+        return self.poles.size + self.lag + f.poles.size + max(f.window + f.lag, 0)
 
     def turning(self, w: np.ndarray, reach: np.ndarray) -> np.ndarray:
         """How fast q and F vary at most within ``reach`` of w, relative to themselves."""

@@ -8,14 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.batching import elementwise
-from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
-from zwidth.arrays.xp import is_jax
+from zwidth.arrays.circle import CirclePoints, circle, lag_jet
+from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.chain import chain_of, flow, rates
 from zwidth.loops.linear.ridge import BoundRidge, Condition
 from zwidth.loops.rigid.delay_classes import classify_delays
 from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
-from zwidth.scenes.stiffest import allows_negative, refuse_fractional_power, search
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 from zwidth.words.types import Array
@@ -37,18 +35,9 @@ class SceneSensitivities(NamedTuple):
     status: Array
 
 
-def differentiate(scene: Any, negative_damping: bool | None = None) -> SceneSensitivities:
-    """See `zwidth.Scene.sensitivities`."""
-    negative = allows_negative(scene, negative_damping)
-    held = {path: float(value) for path, value in scene.parameters().items() if is_jax(value)}
-    scene = scene.replace(**held) if held else scene
-    if scene.is_rigid:
-        closed = _by_closed_form(scene, negative)
-        if closed is not None:
-            return closed
-    refuse_fractional_power(scene)
+def differentiate(scene: Any, found: BoundRidge | None, status: Status) -> SceneSensitivities:
+    """The derivatives of a ridge by the conditions that bind it."""
     paths = moving_paths(scene)
-    found, status = search(scene, negative)
     if found is None:
         return SceneSensitivities(np.float64(math.nan), dict.fromkeys(paths, math.nan), np.int32(status))
     per = {path: _slope(scene, found, path) for path in paths}
@@ -65,11 +54,10 @@ def moving_paths(scene: Any) -> tuple[str, ...]:
     return tuple(path for path in paths if path not in without)
 
 
-def _by_closed_form(scene: Any, negative: bool) -> SceneSensitivities | None:
-    """Those of a rigid device; None where its ridge lies at a damping that does not count."""
-    device, model = scene.normalized, scene.timing.delay_model
-    values = device.delta, device.d
-    found = elementwise(slopes_kernel, ("delta", "d"), values, (model, classify_delays(device.d)))
+def differentiate_rigid(scene: Any, negative: bool) -> SceneSensitivities | None:
+    """Those of a rigid device by closed forms; None where its ridge lies at a damping that does not count."""
+    values, model = (scene.delta, scene.d), scene.timing.delay_model
+    found = evaluate(slopes_kernel, {"delta": scene.delta, "d": scene.d}, model, classify_delays(scene.d))
     if not negative and found.point.beta < 0:
         return None
     with np.errstate(invalid="ignore"):
@@ -77,15 +65,11 @@ def _by_closed_form(scene: Any, negative: bool) -> SceneSensitivities | None:
     per = dict(zip(("mass", "damping", "period", "delay"), slopes, strict=True))
     if scene.operator is not None:
         per |= {"operator.mass": per["mass"], "operator.damping": per["damping"]}
-        per["operator.stiffness"] = _by_spring(scene, negative)
+        # A spring to ground that is not there yet has no closed form.
+        ridge = scene.loop.ridge(negative)[0] if model == "held" else None
+        per["operator.stiffness"] = math.nan if ridge is None else _slope(scene, ridge, "operator.stiffness")
     per = {path: float(slope) for path, slope in per.items()}
     return SceneSensitivities(np.float64(stiffness), per, found.point.status)
-
-
-def _by_spring(scene: Any, negative: bool) -> float:
-    """The derivative in a spring to ground that is not there yet."""
-    found = search(scene, negative)[0] if scene.timing.delay_model == "held" else None
-    return math.nan if found is None else _slope(scene, found, "operator.stiffness")
 
 
 def _slope(scene: Any, found: BoundRidge, path: str) -> float:
@@ -133,14 +117,14 @@ def _needed_slopes(
 
     NaN where G by the matrices of the chain is not G by its roots: then rounding has eaten what they tell.
     """
-    chain = scene.chain
+    chain = scene.loop.chain
     # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
     rate, push = (value + 1j * _TINY * by for value, by in zip(rates(chain), (by_rate, by_push), strict=True))
     fraction = chain.d - chain.whole + 1j * _TINY * by_delay
     steps = (*flow(rate, push, 1.0), flow(rate, push, 1.0 - fraction)[1])
     (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))
     turns, slopes = chain.whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
-    exact, lag = scene.loop.required_wall(at).value, lag_jet(at, turns)
+    exact, lag = scene.loop.roots.required_wall(at).value, lag_jet(at, turns)
     for k, (zeta, turn) in enumerate(zip(at.before, 1j * at.z, strict=True)):
         with np.errstate(all="ignore"):
             try:
@@ -158,20 +142,16 @@ def _needed_slopes(
     return slopes[0], slopes[1]
 
 
-def _residual(scene: Any, found: BoundRidge) -> tuple[np.ndarray, Jet]:
-    """``dr/dw`` of ``r = alpha + beta F - q`` at both angles, and F."""
-    at = circle(np.array([found.w1, found.w2]))
-    with np.errstate(all="ignore"):
-        q, f = scene.loop.required_wall(at), scene.loop.estimate.jet(at)
-        return found.beta * f.slope - q.slope, f
-
-
 def _conditions(scene: Any, found: BoundRidge) -> tuple[np.ndarray, list[int]]:
     """The derivatives of the binding conditions in alpha and what moves with it; their rows of `_state`.
 
     At a smooth optimum the angle may stay where it is: to first order it does not matter.
     """
-    slope, f = _residual(scene, found)
+    at, loop = circle(np.array([found.w1, found.w2])), scene.loop.roots
+    with np.errstate(all="ignore"):
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
+        # Of r = alpha + beta F - q.
+        slope = found.beta * f.slope - q.slope
     by_alpha = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
     by_beta = np.array([f.value[0].real, f.value[0].imag, f.value[1].real, f.value[1].imag, f.slope[0].imag])
     columns = [by_alpha]

@@ -33,7 +33,7 @@ class BallPolynomials(NamedTuple):
     D: flint.arb_poly
     N1: flint.arb_poly
     N2: flint.arb_poly
-    rest: bool  # whether F answers a position at rest with exactly 0, so that K = 0 leaves a pole at z = 1 exactly
+    rest: bool  # whether K = 0 leaves a pole at z = 1 exactly: nothing pulls a device at rest back
 
 
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -59,7 +59,7 @@ def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, BallP
                 known[bits] = _polynomials(scene)
             D, N1, N2, rest = known[bits]
             p = D + N1 * flint.arb(stiffness) + N2 * flint.arb(damping)
-            at_one = stiffness == 0 and rest and _is_free(scene)
+            at_one = stiffness == 0 and rest
             if at_one:
                 # z = 1 is a pole; the others decide whether it is the only one not inside.
                 p = _without_one(p)
@@ -68,11 +68,6 @@ def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, BallP
             return (False, Status.ON_BOUNDARY if verdict else Status.OK) if at_one else (verdict, Status.OK)
         bits *= 2
     return False, Status.UNDECIDED
-
-
-def _is_free(scene: Any) -> bool:
-    """Whether no spring ties the device to the ground."""
-    return not any(body.stiffness for body in scene.chain.bodies)
 
 
 def all_inside(p: flint.arb_poly) -> bool | None:
@@ -109,16 +104,16 @@ def _polynomials(scene: Any) -> BallPolynomials:
     import flint
 
     period = flint.arb(float(scene.timing.period))
-    chain = chain_of(_exact(scene, period), (scene.d, scene.whole_delay))
+    chain = chain_of(_exact(scene, period), (scene.d, int(scene.d)))
     answer, device = _device(chain)
     top, bottom = _estimate(scene.velocity, period)
     mass: Any = chain.estimate
     unit = period * period / mass
     whole = chain.whole + (1 if chain.d > chain.whole else 0)
     waiting = flint.arb_poly([0] * whole + device.coeffs())
-    # Exactly 0 is what a sum of exact fractions is; all other estimates are differences.
-    own = isinstance(scene.velocity, VelocityFilter)
-    rest = not own or sum(map(Fraction, scene.velocity.numerator)) == 0
+    # F(1) is exactly 0 where a sum of exact fractions is; all other estimates are differences.
+    own, free = isinstance(scene.velocity, VelocityFilter), all(body.stiffness == 0 for body in chain.bodies)
+    rest = free and (not own or sum(map(Fraction, scene.velocity.numerator)) == 0)
     return BallPolynomials(waiting * bottom, answer * bottom * unit, answer * top * unit, rest)
 
 

@@ -16,18 +16,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth.arrays.batching import traced_columns
+from zwidth.arrays.arguments import broadcast_traced
 from zwidth.arrays.circle import circle
-from zwidth.arrays.xp import is_traced, namespace
+from zwidth.arrays.xp import is_traced
 from zwidth.loops.domain import nan_with_nan_slopes
 from zwidth.loops.linear.chain import Chain, chain_of, required_wall, respond
 from zwidth.loops.linear.ridge import Condition
+from zwidth.loops.linear.slopes import moving_paths
 from zwidth.loops.rigid.exact_points import polish
+from zwidth.loops.rigid.ridge import RidgePoint
 from zwidth.parts.paths import replace_parameters
 from zwidth.parts.span import in_periods
 from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.slopes import moving_paths
-from zwidth.scenes.stiffest import StiffestWall, allows_negative, refuse_fractional_power, search
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
@@ -81,21 +81,19 @@ def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structur
     return Structure(template, paths, whole, held, negative)
 
 
-def traced_wall(scene: Any, negative_damping: bool | None) -> StiffestWall:
-    """`zwidth.Scene.max_stiffness` inside a transformation."""
-    refuse_fractional_power(scene)
-    negative = allows_negative(scene, negative_damping)
+def trace_stiffest(scene: Any, negative: bool) -> RidgePoint:
+    """The stiffest wall of a scene with traced parameters."""
     values = scene.parameters()
     paths = tuple(path for path in moving_paths(scene) if is_traced(values[path]))
     if not paths:
         # Only the wall is traced, on which nothing depends.
         paths = ("mass",)
     structure = structure_of(scene, paths, negative)
-    return compiled_wall(structure, *traced_columns(tuple(values[path] for path in paths)))
+    return compiled_ridge(structure, *broadcast_traced(values[path] for path in paths))
 
 
 @partial(jax.jit, static_argnums=0)
-def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
+def compiled_ridge(structure: Structure, *values: Array) -> RidgePoint:
     """The stiffest wall for values of the moving parameters."""
     dtype = values[0].dtype
     # As bits: the thread of a callback may have JAX's default precision, which would halve the digits on the way.
@@ -107,38 +105,23 @@ def compiled_wall(structure: Structure, *values: Array) -> StiffestWall:
     status = told[-1].astype(jnp.int32)
     found = status == Status.OK
     told = jnp.where(found, told[:-1], jnp.asarray(_NOWHERE, dtype))
-    scene = _fill(structure, values)
-    alpha, beta, w1, w2, close = _solve(_chain(structure, scene), told[:4], told[4:6].astype(jnp.int32))
+    alpha, beta, w1, w2, close = _solve(structure, _fill(structure, values), told[:4], told[4:6].astype(jnp.int32))
     status = jnp.where(found & ~close, int(Status.NOT_CONVERGED), status)
     spoiled = nan_with_nan_slopes(status == Status.OK, *values)
     omega = jnp.where(told[5] <= Condition.PLUS_ONE, jnp.maximum(w1, w2), w1)
-    units = scene.units
-    return StiffestWall(
-        alpha * units.stiffness + spoiled,
-        beta * units.virtual_damping + spoiled,
-        omega / (2.0 * math.pi * scene.timing.period) + spoiled,
-        told[6].astype(jnp.int32),
-        status,
-    )
-
-
-def _delay(scene: Any) -> tuple[Any, Any]:
-    return scene.timing.delay, scene.timing.period
+    return RidgePoint(alpha + spoiled, beta + spoiled, omega + spoiled, told[6].astype(jnp.int32), status)
 
 
 def _search(structure: Structure, dtype: np.dtype, bits: np.ndarray) -> np.ndarray:
-    """`_find` for a callback: numbers come and go as their bits."""
-    told = np.array(_find(structure, np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()), dtype)
-    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
-
-
-def _find(structure: Structure, values: list[float]) -> tuple[float, ...]:
-    """The ridge on the host, and its status behind it."""
+    """The ridge on the host, and its status behind it; numbers come and go as their bits."""
+    values = np.ascontiguousarray(bits).view(dtype).reshape(-1).tolist()
     try:
-        found, status = search(_fill(structure, values), structure.negative)
+        found, status = _fill(structure, values).loop.ridge(structure.negative)
     except InputError:
         found, status = None, Status.INVALID_INPUT
-    return *((math.nan,) * len(_NOWHERE) if found is None else (*found, found.kind)), status
+    ridge = (math.nan,) * len(_NOWHERE) if found is None else (*found, found.kind)
+    told = np.array([*ridge, status], dtype)
+    return told.view(np.int32).reshape(told.size, *np.shape(bits)[1:])
 
 
 def _fill(structure: Structure, values: Iterable[Any]) -> Any:
@@ -146,41 +129,28 @@ def _fill(structure: Structure, values: Iterable[Any]) -> Any:
     return replace_parameters(structure.template, dict(zip(structure.paths, values, strict=True)))
 
 
-def _chain(structure: Structure, scene: Any) -> Chain:
-    d = float(structure.whole) if structure.held else in_periods(*map(jnp.asarray, _delay(scene)))
-    return chain_of(scene, (d, structure.whole))
-
-
-def _solve(chain: Chain, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
+def _solve(structure: Structure, scene: Any, start: Array, codes: Array) -> tuple[Array, Array, Array, Array, Array]:
     """alpha, beta, w1, w2 at the conditions of ``codes``, and whether they lie where the search found them."""
-    args = _prepare(chain, start, codes)
-    begin = start / args.scales
-    found = polish(partial(_residual, chain), begin, args)
-    # Newton must stay where the search put it; a double root is met to half of the digits.
-    close = jnp.all(jnp.abs(found - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
-    return *(found * args.scales), close
-
-
-def _prepare(chain: Chain, start: Array, codes: Array) -> _Arguments:
-    """What `_residual` needs beside the unknowns."""
-    estimate = chain.estimate
-    complexes = jnp.result_type(start.dtype, jnp.complex64)
-    return _Arguments(
+    delay, period = scene.timing.delay, scene.timing.period
+    d = float(structure.whole) if structure.held else in_periods(jnp.asarray(delay), jnp.asarray(period))
+    chain = chain_of(scene, (d, structure.whole))
+    estimate, complexes = chain.estimate, jnp.result_type(start.dtype, jnp.complex64)
+    # The size of the unknowns.
+    scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
+    args = _Arguments(
         jax.tree.map(jnp.asarray, respond(chain)),
         jnp.asarray(estimate.gain, start.dtype),
         jnp.asarray(estimate.zeros, complexes),
         jnp.asarray(estimate.poles, complexes),
         start,
         codes,
-        _scales(start),
+        jnp.where(scales > 0, scales, 1.0),
     )
-
-
-def _scales(start: Array) -> Array:
-    """The size of the unknowns."""
-    xp = namespace(start)
-    scales = xp.stack([start[0], xp.abs(start[0]) + xp.abs(start[1]), start[2], start[3]])
-    return xp.where(scales > 0, scales, 1.0)
+    begin = start / args.scales
+    found = polish(partial(_residual, chain), begin, args)
+    # Newton must stay where the search put it; a double root is met to half of the digits.
+    close = jnp.all(jnp.abs(found - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
+    return *(found * args.scales), close
 
 
 def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:

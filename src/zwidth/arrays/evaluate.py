@@ -1,0 +1,233 @@
+"""The one way from a kernel to arrays.
+
+A kernel is a formula for one point whose text serves NumPy and JAX, elementwise. Few concrete points, and plain
+numbers above all, go through NumPy at once, in float64, whatever JAX's configuration says and without importing it;
+many are compiled by JAX, in pieces of one size; inside somebody's own transformation (`jit`, `grad`, ...) the compiled
+kernel is called and the ambient precision holds.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+
+from zwidth.arrays.arguments import (
+    are_numbers,
+    broadcast,
+    broadcast_traced,
+    check_scalars,
+    compute_concretely,
+    to_caller,
+    tree_map,
+)
+from zwidth.arrays.xla import STRIP, WIDE
+from zwidth.arrays.xp import is_traced
+from zwidth.words.types import ArrayLike
+
+# "auto": NumPy for few points; "numpy": for all of them; "jax": compiled, however few they are, so that a point's value
+# does not depend on how many others came with it (the two routes may differ in the last place), or for lack of a text
+# for NumPy.
+Route: TypeAlias = Literal["auto", "numpy", "jax"]
+
+# Up to so many points NumPy is done before a compiler has begun.
+FEW = 1 << 12
+# A compiled call gets so many points at most: one compilation, bounded memory, work for every processor.
+BLOCK = 1 << 16
+# The compiler treats shorter arrays differently, to the last place.
+_LEAST = 1 << 4
+
+
+def evaluate(
+    kernel: Callable[..., Any],
+    arguments: Mapping[str, ArrayLike],
+    *static: Any,
+    weight: int = 1,
+    route: Route = "auto",
+) -> Any:
+    """Apply ``kernel(*arrays, *static)`` to arguments that broadcast, and give results of their shape and type.
+
+    Plain numbers beyond the range of their name are refused. ``weight`` says how many plain points one point counts
+    for, in time and memory: a kernel that makes samples of each point weighs more.
+    """
+    values = tuple(arguments.values())
+    check_scalars(arguments)
+    if route != "jax" and are_numbers(*values):
+        try:
+            numbers = list(map(np.float64, values))
+        except OverflowError:
+            pass  # An integer beyond float64: the long way names it.
+        else:
+            with np.errstate(all="ignore"):
+                return tree_map(_plain, kernel(*numbers, *static))
+    if is_traced(*values):
+        return compile_traced(kernel, static)(*broadcast_traced(values))
+    arrays = broadcast(arguments)
+    shape = arrays[0].shape
+    flat = evaluate_columns(kernel, [array.reshape(-1) for array in arrays], *static, weight=weight, route=route)
+    return to_caller(tree_map(lambda leaf: leaf.reshape(shape), flat), values)
+
+
+def evaluate_columns(
+    kernel: Callable[..., Any], columns: Sequence[np.ndarray], *static: Any, weight: int = 1, route: Route = "auto"
+) -> Any:
+    """`evaluate` of concrete columns of one length; one of a single value goes to the kernel as a number."""
+    count, few = _length(columns), max(1, FEW // weight)
+    if route == "jax" or (route == "auto" and count > few):
+        return map_blocks(_compile_strips(kernel, static, STRIP // weight), columns, BLOCK // weight)
+
+    def at_once(*parts: np.ndarray) -> Any:
+        with np.errstate(all="ignore"):
+            result = kernel(*(part[0] if part.size == 1 < count else part for part in parts), *static)
+        # A copy: a view of an argument, or of one value, could not be written to.
+        shape = (_length(parts),)
+        return tree_map(lambda leaf: leaf if np.ndim(leaf) > 1 else np.array(np.broadcast_to(leaf, shape)), result)
+
+    return at_once(*columns) if count <= few else map_blocks(at_once, columns, few)
+
+
+def _plain(leaf: Any) -> Any:
+    """A NumPy scalar for the result at a single point."""
+    return leaf if isinstance(leaf, np.generic) else np.asarray(leaf)[()]
+
+
+@cache
+def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+    """A kernel compiled for traced values, with its derivatives as one product for each argument.
+
+    A point depends on itself alone, so that all there is to differentiate is a few numbers a point. Left to itself,
+    `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge
+    1.2 to 1.5 times as long (benchmarks/bench_xla.py).
+    """
+    import jax
+
+    def plain(*arrays: Any) -> Any:
+        return kernel(*arrays, *static)
+
+    def by_argument(active: tuple[bool, ...], *arrays: Any) -> tuple[Any, Any]:
+        """The values, and along a new first axis the derivatives in the arguments that move."""
+        moving = [k for k, moves in enumerate(active) if moves]
+
+        def of_moving(*values: Any) -> Any:
+            known = dict(zip(moving, values, strict=True))
+            return plain(*(known.get(k, array) for k, array in enumerate(arrays)))
+
+        points = tuple(arrays[k] for k in moving)
+        ones = jax.numpy.ones_like(points[0])
+        if len(moving) == 1:
+            value, slopes = jax.jvp(of_moving, points, (ones,))
+            return value, tree_map(lambda leaf: leaf[None], slopes)
+        sides = tuple(side.reshape(-1, *(1,) * ones.ndim) * ones for side in np.eye(len(moving), dtype=ones.dtype))
+        # The values are computed once for all sides.
+        return jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
+
+    function = jax.custom_jvp(jax.jit(plain))
+    sloped = jax.jit(by_argument, static_argnums=0)
+
+    def rule(primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[Any, Any]:
+        active = tuple(not isinstance(tangent, jax.custom_derivatives.SymbolicZero) for tangent in tangents)
+        if not any(active):
+            return function(*primals), tree_map(_no_change, function(*primals))
+        value, slopes = sloped(active, *primals)
+        moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
+
+        def change(leaf: Any, by: Any) -> Any:
+            if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
+                return _no_change(leaf)
+            return sum((by[k] * tangent for k, tangent in enumerate(moving[1:], 1)), by[0] * moving[0])
+
+        return value, tree_map(change, value, slopes)
+
+    function.defjvp(rule, symbolic_zeros=True)
+    return function
+
+
+def _no_change(leaf: Any) -> Any:
+    """The tangent of what is constant or no real number."""
+    import jax
+
+    if jax.numpy.issubdtype(leaf.dtype, np.inexact):
+        return jax.numpy.zeros_like(leaf)
+    return np.zeros(leaf.shape, jax.dtypes.float0)
+
+
+@cache
+def _compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...], strip: int) -> Callable[..., Any]:
+    """A kernel compiled for blocks of columns, which it goes through strip by strip."""
+    import jax
+
+    def strips(*columns: Any) -> Any:
+        size = max(column.size for column in columns)
+        shared = [column.size == 1 < size for column in columns]
+        long = tuple(column for column, same in zip(columns, shared, strict=True) if not same)
+
+        def run(parts: tuple[Any, ...]) -> Any:
+            rest = iter(parts)
+            return kernel(*(c[0] if same else next(rest) for c, same in zip(columns, shared, strict=True)), *static)
+
+        if size <= strip:
+            return run(long)
+        found = jax.lax.map(run, tuple(column.reshape(-1, strip) for column in long))
+        return tree_map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
+
+    return jax.jit(strips, compiler_options=WIDE)
+
+
+def map_blocks(
+    function: Callable[..., Any], columns: Sequence[np.ndarray], block: int, threads: int | None = None
+) -> Any:
+    """Apply a function of columns to equally long ones, block by block on every processor; NumPy arrays come back.
+
+    One array of a million points is 2.5 times slower for the ridge (benchmarks/bench_xla.py):
+    what the function holds meanwhile leaves the cache.
+    Columns of one value are handed over as they are.
+    """
+    count = _length(columns)
+    # A power of two, so that batches of many sizes share a few compilations.
+    size = min(block, 1 << max(count - 1, _LEAST - 1).bit_length())
+    flagged = [(column, column.size == 1 < count) for column in columns]
+
+    def run(start: int) -> Any:
+        with compute_concretely():
+            parts = (column if shared else _piece(column, start, size) for column, shared in flagged)
+            return tree_map(np.asarray, function(*parts))
+
+    first = run(0)
+    # A copy, because JAX's own memory is read-only.
+    whole = tree_map(lambda leaf: np.empty((count, *leaf.shape[1:]), leaf.dtype), first)
+
+    def store(start: int, result: Any) -> None:
+        stop = min(start + size, count)
+        tree_map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
+
+    store(0, first)
+    if count > size:
+        # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
+        with ThreadPoolExecutor(threads or processors()) as pool:
+            list(pool.map(lambda start: store(start, run(start)), range(size, count, size)))
+    return whole
+
+
+def _length(columns: Sequence[np.ndarray]) -> int:
+    return np.broadcast_shapes(*(column.shape for column in columns))[0]
+
+
+def _piece(column: np.ndarray, start: int, size: int) -> np.ndarray:
+    part = column[start : start + size]
+    missing = size - part.size
+    if not missing:
+        return part
+    # The last point is repeated: a neutral filler would need to be known to be good for every kernel.
+    return np.concatenate([part, np.full(missing, part[-1] if part.size else 0.0)])
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS
+        return os.cpu_count() or 1
