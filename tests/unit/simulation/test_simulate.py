@@ -194,6 +194,17 @@ def test_contact_is_what_its_name_says():
     np.testing.assert_array_equal(one.penetration, np.maximum(one.position.max(1), 0))
 
 
+def test_the_energy_that_the_wall_gives_is_its_held_force_times_the_way():
+    """At rest in the wall it has taken all of it, beyond the stable ones it gives more and more."""
+    scene = SCENE.replace(delay=1e-3)
+    motion = run(scene, stiffness=[300.0, 1200.0, 4000.0], start_velocity=0.1, start_position=0.0, contact="unilateral")
+    work = np.cumsum(motion.wall_force[:, :-1] * np.diff(motion.position), axis=1)
+    np.testing.assert_allclose(motion.wall_work[:, 1:], work, rtol=0, atol=1e-12 * np.abs(work).max())
+    np.testing.assert_allclose(motion.energy_given[:2], np.maximum(work[:2].max(1), 0.0), rtol=1e-9, atol=1e-15)
+    assert motion.energy_given[1] > 1e-6
+    assert motion.energy_given[2] >= work[2].max() > 1e-4
+
+
 @pytest.mark.parametrize("periods", [17, 128, 129, 300])
 def test_what_is_said_of_a_motion_is_the_same_unrecorded(periods):
     options = {"stiffness": [300.0, 4000.0], "contact": "unilateral", "start_velocity": 0.1, "periods": periods}
