@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.rigid import balls
+from zwidth.loops.rigid import certified_balls
 from zwidth.loops.rigid.boundary import boundary
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.outermost_poles import outermost_poles
@@ -128,7 +128,7 @@ def exact_radius(alpha: float, beta: float, delta: float, d: float) -> float:
     import flint
 
     with flint.ctx.workprec(_ROOT_BITS):
-        coefficients = balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
+        coefficients = certified_balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
         roots = flint.acb_poly([flint.acb(value) for value in coefficients]).roots(tol=_ROOT_WIDTH)
         return max(float(abs(root).mid()) for root in roots)
 
@@ -145,7 +145,7 @@ def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
     if not pole.error[0] <= 1e-9:
         raise ArithmeticError(f"no proof of the outermost pole at {(alpha, beta, delta, d)}")
     with flint.ctx.workprec(_ROOT_BITS):
-        coefficients = balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
+        coefficients = certified_balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
         terms = [(k, value.mid()) for k, value in enumerate(coefficients) if value != 0]
         start = z = flint.acb(float(pole.re[0]), float(pole.im[0])).exp()
         step = z

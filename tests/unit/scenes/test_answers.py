@@ -8,7 +8,9 @@ import scipy.linalg
 from independent_scenes import KINDS, closed_loop_matrix, continuous, flow, random_scene, random_walls
 
 import zwidth
+from zwidth.loops.linear.radius import spectral_radius
 from zwidth.words.errors import InputError
+from zwidth.words.status import Method, Status
 
 FILTERED = zwidth.Scene(
     zwidth.Device(mass=0.1, damping=3.0), zwidth.Timing(period=1e-3, delay=1e-3), velocity=zwidth.LowPass(cutoff=100.0)
@@ -65,6 +67,20 @@ def test_on_both_sides_of_the_boundary_radius_and_verdict_agree():
     assert np.abs(radius - 1).max() < 1e-5
     assert np.all(radius[[0, 1]] < 1)
     assert np.all(radius[[-2, -1]] > 1)
+
+
+def test_a_radius_within_rounding_takes_the_side_of_the_label_and_one_that_contradicts_it_is_not_given():
+    edge = FILTERED.stable_stiffness(5.0)[0, 1] / FILTERED.units.stiffness
+    beta, labels = np.full(2, 5.0 / FILTERED.units.virtual_damping), np.array([True, False])
+    on, inside, outside = (
+        spectral_radius(FILTERED.loop.roots, np.full(2, alpha), beta, labels)
+        for alpha in (edge, 0.5 * edge, 2.0 * edge)
+    )
+    np.testing.assert_allclose(on, 1.0, rtol=1e-12)
+    assert on[0] < 1 <= on[1]
+    assert inside[0] < 0.999
+    assert outside[1] > 1.001
+    assert np.isnan([inside[1], outside[0]]).all()
 
 
 def test_slow_poles_keep_their_digits():
@@ -131,6 +147,14 @@ def test_shapes_and_what_is_not_finite():
     assert FILTERED.frequency_response(1e3, 0.0, 500.0).imag == pytest.approx(0.0, abs=1e-15)
     with pytest.raises(InputError, match="one wall of finite numbers"):
         FILTERED.state_space(K)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("method, used", [("auto", Method.CROSSOVER), ("companion", Method.COMPANION)])
+def test_a_decision_says_what_decided_and_where_it_could_not(method, used):
+    found = FILTERED.decide_stability([1e3, 60e3, np.nan, np.inf], 4.0, method=method)
+    np.testing.assert_array_equal(found.stable, [True, False, False, False])
+    np.testing.assert_array_equal(found.status, [Status.OK, Status.OK, *[Status.INVALID_INPUT] * 2])
+    np.testing.assert_array_equal(found.method, [used] * 4)
 
 
 def test_rigid_scenes_take_the_closed_functions():

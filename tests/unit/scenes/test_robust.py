@@ -139,6 +139,18 @@ def test_arrays_hold_a_box_each_and_a_bad_one_spoils_no_other():
     assert robust_wall(mass=np.empty(0), period=1e-3).stiffness.shape == (0,)
 
 
+def test_undamped_devices_without_delay_have_a_closed_form():
+    """K_max is (12 - 8 sqrt 2) m/T^2, least for the lightest; b = 0 and t_d = 0 are what is left out."""
+    box = {"mass": Interval(0.08, 0.12), "period": Interval(0.5e-3, 1e-3)}
+    found, wall = robust_max_stiffness(**box), robust_wall(**box)
+    expected = (12 - 8 * np.sqrt(2)) * 0.08 / 1e-3**2
+    assert found.status == wall.status == Status.OK
+    assert found.attained == pytest.approx(expected, rel=1e-12)
+    assert expected * (1 - 2e-6) <= found.stiffness <= expected
+    assert wall.stiffness <= found.stiffness * (1 + 1e-12)
+    assert (found.mass, found.damping, found.period, found.delay) == (0.08, 0.0, 1e-3, 0.0)
+
+
 def test_wrong_boxes_are_named():
     with pytest.raises(zwidth.InputError, match=r"mass: got .*0.2.*; the first number must not be greater"):
         robust_max_stiffness(mass=Interval(0.2, 0.1), period=1e-3)

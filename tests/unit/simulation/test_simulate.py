@@ -194,6 +194,17 @@ def test_contact_is_what_its_name_says():
     np.testing.assert_array_equal(one.penetration, np.maximum(one.position.max(1), 0))
 
 
+def test_the_energy_that_the_wall_gives_is_its_held_force_times_the_way():
+    """At rest in the wall it has taken all of it, beyond the stable ones it gives more and more."""
+    scene = SCENE.replace(delay=1e-3)
+    motion = run(scene, stiffness=[300.0, 1200.0, 4000.0], start_velocity=0.1, start_position=0.0, contact="unilateral")
+    work = np.cumsum(motion.wall_force[:, :-1] * np.diff(motion.position), axis=1)
+    np.testing.assert_allclose(motion.wall_work[:, 1:], work, rtol=0, atol=1e-12 * np.abs(work).max())
+    np.testing.assert_allclose(motion.energy_given[:2], np.maximum(work[:2].max(1), 0.0), rtol=1e-9, atol=1e-15)
+    assert motion.energy_given[1] > 1e-6
+    assert motion.energy_given[2] >= work[2].max() > 1e-4
+
+
 @pytest.mark.parametrize("periods", [17, 128, 129, 300])
 def test_what_is_said_of_a_motion_is_the_same_unrecorded(periods):
     options = {"stiffness": [300.0, 4000.0], "contact": "unilateral", "start_velocity": 0.1, "periods": periods}
@@ -202,6 +213,17 @@ def test_what_is_said_of_a_motion_is_the_same_unrecorded(periods):
     for name in FIGURES:
         assert_again(getattr(kept, name), getattr(told, name), name)
     assert_again(kept.position, run(**{**options, "periods": 300}).position[:, :periods], "position")
+
+
+def test_the_frequency_is_that_of_the_slowest_pole_also_if_the_end_is_where_the_velocity_turns():
+    scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(1e-4, 0.0))
+    poles = scene.poles(5e4, 1.0)
+    expected = np.abs(np.angle(poles[np.argmax(np.abs(poles))])) / (2 * np.pi * 1e-4)
+    velocity = run(scene, stiffness=5e4, virtual_damping=1.0, periods=2000).velocity
+    turns = np.flatnonzero((velocity[:-1] <= 0) & (velocity[1:] > 0))
+    for periods in (turns[-1], turns[-1] + 1):
+        motion = run(scene, stiffness=5e4, virtual_damping=1.0, periods=int(periods), record=False)
+        assert motion.frequency == pytest.approx(expected, rel=1e-6)
 
 
 def test_jitter_is_late_by_less_than_asked_and_none_is_the_limit_of_little():

@@ -15,8 +15,8 @@ from zwidth.arrays.arguments import compute_concretely
 from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.loops.domain import WALL_RANGE, within
 from zwidth.loops.rigid.delay_classes import device
-from zwidth.loops.rigid.folding import Points, assemble_groups, group_by
-from zwidth.loops.rigid.row_limit import long_device, long_row, short_row
+from zwidth.loops.rigid.folding import Points, group_by
+from zwidth.loops.rigid.row_limit import long_lobe, long_row, short_row
 from zwidth.words.types import Array
 
 # Smaller maps are compared by NumPy, with nothing to compile.
@@ -60,19 +60,18 @@ def row_limits(beta: np.ndarray, delta: np.ndarray, d: np.ndarray, few: int = 0)
     depend on how it was cut into pieces.
     """
     shape = np.broadcast_shapes(beta.shape, delta.shape, d.shape)
-    here = int(np.prod(shape)) <= few
-
-    def of(long: bool, *points: np.ndarray) -> np.ndarray:
+    out = np.empty(shape)
+    for long, points, place in group_by((beta, delta, d), d >= 1):
         kernel = _long_limit if long else _short_limit
-        if here:
+        if out.size <= few:
             # Each device is computed once.
             with np.errstate(all="ignore"):
-                return np.asarray(kernel(points[0], *np.broadcast_arrays(*points[1:])))
-        whole = np.broadcast_arrays(*points)
-        limits = evaluate_columns(kernel, [array.reshape(-1) for array in whole], route="jax")
-        return limits.reshape(whole[0].shape)
-
-    return assemble_groups(group_by((beta, delta, d), d >= 1), shape, np.float64, of)
+                out[place] = kernel(points[0], *np.broadcast_arrays(*points[1:]))
+        else:
+            whole = np.broadcast_arrays(*points)
+            limits = evaluate_columns(kernel, [array.reshape(-1) for array in whole], route="jax")
+            out[place] = limits.reshape(whole[0].shape)
+    return out
 
 
 def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
@@ -80,7 +79,7 @@ def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
 
 
 def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
-    return long_row(beta, long_device(device(delta, d)))
+    return long_row(beta, long_lobe(device(delta, d)))
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.loops.domain import wall_status
-from zwidth.loops.rigid import balls
+from zwidth.loops.rigid import certified_balls
 from zwidth.loops.rigid.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
 from zwidth.loops.rigid.folding import Points, fold_arguments
 from zwidth.words.errors import InputError
@@ -99,6 +99,8 @@ def _settle_points(points: Points, verdict: np.ndarray, max_bits: int) -> tuple[
     status[inside & (verdict == STABLE) & (alpha == 0)] = Status.ON_BOUNDARY
     rest = np.flatnonzero(inside & (verdict == OPEN))
     status[rest] = Status.UNDECIDED
-    if rest.size and balls.available():
-        stable[rest], status[rest], bits[rest] = balls.decide_all([column[rest] for column in points], max_bits)
+    if rest.size and certified_balls.available():
+        stable[rest], status[rest], bits[rest] = certified_balls.decide_all(
+            [column[rest] for column in points], max_bits
+        )
     return stable, status, bits

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.arrays.balls import TINY, UNIT, Ball
 from zwidth.arrays.evaluate import evaluate_columns
 from zwidth.arrays.phi import phi_functions
 from zwidth.arrays.xla import COSINE, SINE, fit_arcsine, store_once
@@ -28,7 +29,6 @@ from zwidth.loops.domain import WALL_RANGE, wall_status
 from zwidth.loops.rigid.boundary_map import row_limits
 from zwidth.loops.rigid.crossover import Lag, first_zero, long_verdict, short_verdict
 from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, classify_delays, device
-from zwidth.loops.rigid.enclosure import TINY, UNIT, Ball
 from zwidth.loops.rigid.folding import Points, pick_points
 from zwidth.words.status import Status
 from zwidth.words.types import Array

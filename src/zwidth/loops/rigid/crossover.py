@@ -11,7 +11,7 @@ of the boundary curve at this w, and the wall is stable exactly if its argument 
 ``beta alpha_w > alpha beta_w``, or ``beta > beta_w``, where (alpha_w, beta_w) is the curve in the form of
 `loops.rigid.row_limit`. Below one period the crossover is eliminated: the end of each row is in closed form.
 
-One text serves arrays of NumPy and JAX, float64 balls (`loops.rigid.enclosure`), affine forms and python-flint's
+One text serves arrays of NumPy and JAX, float64 balls (`arrays.balls`), affine forms and python-flint's
 balls. Where a number stands for all in a set, a comparison is true if it is so for all.
 """
 

@@ -22,12 +22,12 @@ from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, device
 from zwidth.loops.rigid.plant import Plant
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
-    LONG_FIELDS,
     Angles,
-    long_device,
-    long_fields,
+    LongLobe,
+    long_lobe,
     long_row_point,
     offset,
+    open_lobe,
     short_curve,
     short_place,
     short_row,
@@ -39,7 +39,6 @@ from zwidth.words.types import Array
 _CUBIC_STEPS, _COLUMN_STEPS = 4, 3
 # Where the logarithm of a place begins to be halved, in parts of the lobe.
 _SMALLEST = 1e-32
-_END, _TOP = LONG_FIELDS.index("end"), LONG_FIELDS.index("top")
 
 
 class Lobe(NamedTuple):
@@ -49,7 +48,7 @@ class Lobe(NamedTuple):
     d: Array
     is_short: Array | None  # where both forms occur
     short: Any  # `short_curve`
-    long: Any  # `LONG_FIELDS`
+    long: Any  # `LongLobe`
     end: Array  # the last x
     to_corner: Array  # whether it ends at omega = pi with alpha > 0
 
@@ -99,13 +98,13 @@ def lobe(delta: Array, d: Array, delay_model: str, kind: DelayClasses) -> Lobe:
         ends.append(root)
     if kind.long or creeping:
         # The end and what follows it only start solvers: no derivative passes through them.
-        fields = list(long_device(frozen(here, xp)))
-        long = fields if xp is np else [*long_fields(here), *fields[_END:]]
+        still = long_lobe(frozen(here, xp))
+        long = still if xp is np else LongLobe(*open_lobe(here)[:-5], *still[-5:])
         if creeping:
             limit = np.pi / xp.maximum(1.0, d + 0.5)
-            crept = bisect(lambda x: _long_wall(x, fields).alpha > 0, _SMALLEST * limit, limit, geometric=True)
-            long[_END] = xp.where(d < 1, crept, long[_END])
-        ends.append(long[_END])
+            crept = bisect(lambda x: _long_wall(x, still).alpha > 0, _SMALLEST * limit, limit, geometric=True)
+            long = long._replace(end=xp.where(d < 1, crept, long.end))
+        ends.append(long.end)
     if len(ends) < 2:
         return Lobe(here, d, None, short, long, ends[0], to_corner)
     return Lobe(here, d, is_short, short, long, xp.where(is_short, *ends), to_corner & is_short)
@@ -130,7 +129,7 @@ def wall(x: Array, lobe: Lobe) -> LobePoint:
     xp = namespace(x, lobe.d)
     # Each form gets a place that is harmless where the other one holds.
     low = _short_wall(xp.where(lobe.is_short, x, 0.25), lobe.short)
-    high = _long_wall(xp.where(lobe.is_short, xp.minimum(1.0, 1.0 / lobe.long[1]), x), lobe.long)
+    high = _long_wall(xp.where(lobe.is_short, xp.minimum(1.0, 1.0 / lobe.long.k), x), lobe.long)
     return LobePoint(*(xp.where(lobe.is_short, mine, other) for mine, other in zip(low, high, strict=True)))
 
 
@@ -142,10 +141,10 @@ def _short_wall(y: Array, short: Any) -> LobePoint:
     return LobePoint(alpha, b, d_alpha, (u0 + 2.0 * y * u1 - b * dV) * over)
 
 
-def _long_wall(omega: Array, fields: Any) -> LobePoint:
-    at = Angles(omega, fields)
-    turn = turn_angles(at, fields[1] + 0.5)
-    total, d_total, scale, d_scale = offset(at, fields)
+def _long_wall(omega: Array, long: LongLobe) -> LobePoint:
+    at = Angles(omega, long)
+    turn = turn_angles(at)
+    total, d_total, scale, d_scale = offset(at)
     over = 1.0 / scale
     alpha, b = 2.0 * at.s * turn.across * over, total * over
     d_alpha = (at.c * turn.across + 2.0 * at.s * turn.d_across - alpha * d_scale) * over
@@ -166,8 +165,7 @@ def frequency(x: Array, lobe: Lobe) -> Array:
 
 def spread(lobe: Lobe) -> Lobe:
     """The same with a new last axis, for many places of each lobe."""
-    parts = lobe._replace(long=None if lobe.long is None else tuple(lobe.long))
-    return tree_map(lambda value: None if value is None else value[..., None], parts)
+    return tree_map(lambda value: None if value is None else value[..., None], lobe)
 
 
 def on_line(lobe: Lobe) -> Array:
@@ -194,7 +192,7 @@ def row_end(beta: Array, lobe: Lobe, delay_model: str, kind: DelayClasses) -> Ro
         ends.append(RowEnd(y, real & (y <= lobe.end), lobe.to_corner, short_row(beta, lobe.here)))
     if lobe.long is not None:
         alpha, x = long_row_point(beta, lobe.long)
-        top = lobe.long[_TOP]
+        top = lobe.long.top
         if creeps(delay_model, kind):
             x = bisect(lambda x: wall(x, lobe).b < b, _SMALLEST * lobe.end, lobe.end, geometric=True)
             top = wall(lobe.end, lobe).b
@@ -281,8 +279,8 @@ def _long_end_of_column(alpha: Array, top: Peak, lobe: Lobe, upper: bool) -> Arr
 
         return repeat(_COLUMN_STEPS, outwards, x, xp)
     # alpha = rate omega^2 + ... at the start; of the ridge nothing is used but its place.
-    _, k, g0, _, _, h0, _, v0, *_ = lobe.long
-    rate = ((k + 0.5) * g0 + h0) / v0
+    long = lobe.long
+    rate = ((long.k + 0.5) * long.g0 + long.h0) / long.v0
     begin = 2.0 * top.alpha / (rate * top.x * top.x)
     part = share / (1.0 + S)
     x = top.x * xp.sqrt(part) * xp.sqrt(begin + (1.0 - begin) * part)

@@ -7,7 +7,7 @@ an argument only repeats itself (broadcast views, `numpy.meshgrid`) are folded b
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -95,47 +95,24 @@ def pick_points(points: Points, mask: np.ndarray) -> Points:
     return Points(*(a.reshape(1) if a.size == 1 and shape else np.broadcast_to(a, shape)[mask] for a in points))
 
 
-class Group(NamedTuple):
-    """The arguments of all points with one value of a key, and the places of their results in the whole array."""
-
-    value: Any
-    arrays: tuple[np.ndarray, ...]
-    place: tuple[Any, ...]
-
-
-def group_by(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> list[Group]:
-    """Group arguments by the values of a key that broadcasts with them.
+def group_by(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> Iterator[tuple[Any, tuple[np.ndarray, ...], Any]]:
+    """The values of a key that broadcasts with arguments, the arguments of each, and the place of what they give.
 
     Where the key varies along one axis the parts keep their layout; where it varies along several, the points are
     listed one by one.
     """
     key = fold(key)
     values = np.unique(key)
-    if values.size <= 1:
-        return [Group(values[0] if values.size else 0, arrays, (...,))]
     varying = [axis for axis, length in enumerate(key.shape) if length > 1]
-    parts = []
-    if len(varying) == 1:
-        axis, along = varying[0], key.reshape(-1)
+    if values.size == 1:
+        yield values[0], arrays, ...
+        return
+    if len(varying) > 1:
+        key, *everywhere = np.broadcast_arrays(key, *arrays)
         for value in values:
-            index = np.flatnonzero(along == value)
-            taken = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
-            parts.append(Group(value, taken, ((slice(None),) * axis + (index,))))
-        return parts
-    everywhere = np.broadcast_arrays(key, *arrays)
+            yield value, tuple(array[key == value] for array in everywhere), key == value
+        return
     for value in values:
-        mine = everywhere[0] == value
-        parts.append(Group(value, tuple(array[mine] for array in everywhere[1:]), (mine,)))
-    return parts
-
-
-def assemble_groups(
-    parts: list[Group], shape: tuple[int, ...], dtype: Any, work: Callable[..., np.ndarray]
-) -> np.ndarray:
-    """Put the results of ``work(value, *arrays)`` where they belong."""
-    if len(parts) == 1:
-        return work(parts[0].value, *parts[0].arrays)
-    out = np.empty(shape, dtype)
-    for value, arrays, place in parts:
-        out[place] = work(value, *arrays)
-    return out
+        axis, index = varying[0], np.flatnonzero(key.reshape(-1) == value)
+        taken = tuple(array if array.shape[axis] == 1 else array.take(index, axis) for array in arrays)
+        yield value, taken, (slice(None),) * axis + (index,)

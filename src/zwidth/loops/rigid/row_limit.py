@@ -36,10 +36,28 @@ _ROW_STEPS = 2
 
 # Abramowitz, Stegun 1964, eq. (4.4.47): arctan t on [0, 1] within 1e-5.
 _ARCTAN = [0.9998660, -0.3302995, 0.1801410, -0.0851330, 0.0208351]
-LONG_FIELDS = (
-    *("delta", "k", "g0", "g1", "g2", "h0", "h1", "v0", "v1", "v2", "b1", "b2"),
-    *("end", "top", "bow", "sin_bow", "bend"),
-)
+
+
+class LongLobe(NamedTuple):
+    """The lobe of a device with d >= 1: E, H, V and ``(delta V - E)/y`` by powers of y, and what rows start from."""
+
+    delta: Array
+    k: Array
+    g0: Array
+    g1: Array
+    g2: Array
+    h0: Array
+    h1: Array
+    v0: Array
+    v1: Array
+    v2: Array
+    b1: Array
+    b2: Array
+    end: Any = None  # the lobe's last w
+    top: Any = None  # b there
+    bow: Any = None  # how the start of a row bends
+    sin_bow: Any = None
+    bend: Any = None
 
 
 def _sin_cos(x: Array) -> tuple[Array, Array]:
@@ -109,20 +127,19 @@ def long_curve(here: Any) -> tuple[tuple, tuple, tuple, tuple]:
     return g, (p1 * (p1 + here.f * em), a0 * -4.0), (p1 * p1, (a1 * sigma + corner) * -4.0, corner * 4.0), (b1, b2)
 
 
-def long_fields(device: DeviceTerms) -> list[Array]:
-    """The curve alone: the first of `LONG_FIELDS`, up to the lobe's end."""
+def open_lobe(device: DeviceTerms) -> LongLobe:
+    """The curve alone, whose end is not known yet."""
     g, h, v, base = long_curve(device)
-    return [device.delta, device.whole + 0.5, *g, *h, *v, *base]
+    return LongLobe(device.delta, device.whole + 0.5, *g, *h, *v, *base)
 
 
-def long_device(device: DeviceTerms) -> Array:
-    """What rows with d >= 1 need of a device, its lobe's end included: `LONG_FIELDS` along a new first axis."""
-    fields = long_fields(device)
-    delta, k, g0, _, _, h0, _, v0, _, _, b1, _ = fields
+def long_lobe(device: DeviceTerms) -> LongLobe:
+    """What rows with d >= 1 need of a device, its lobe's end included."""
+    lobe = open_lobe(device)
     em, p1, whole, f = device.em, device.p1, device.whole, device.f
-    xp = namespace(delta)
-    end = _lobe_end(fields, em / (p1 + f * em), whole + f)
-    total, d_total, scale, d_scale = offset(Angles(end, fields), fields)
+    xp = namespace(lobe.delta)
+    end = _lobe_end(lobe, em / (p1 + f * em), whole + f)
+    total, d_total, scale, d_scale = offset(Angles(end, lobe))
     top = total / scale
     # Rows start from sqrt(b/top) = sin(bow w/end)/sin(bow), with the slope of the curve at the lobe's end, where
     # strong damping makes it nearly flat; `bend` adds the slope at w = 0. Right to 0.4 %. The relative slope at the
@@ -133,16 +150,18 @@ def long_device(device: DeviceTerms) -> Array:
     # As the rows compute it, so that they start exact at the lobe's end, where strong damping and a long delay leave b
     # no slope and Newton's steps would only halve an error.
     bow = _arcsine(sin_bow)
-    slope = (0.25 * b1 + 0.5 * g0 * (k * k - 0.25) + k * h0) / v0
+    slope = (0.25 * lobe.b1 + 0.5 * lobe.g0 * (lobe.k * lobe.k - 0.25) + lobe.k * lobe.h0) / lobe.v0
     bend = xp.sqrt(top / slope) / end - sin_bow / bow
-    return xp.stack([*fields, end, top, bow, sin_bow, bend])
+    # As one array: the compiler computes a device once, and not again for every row.
+    return LongLobe(*xp.stack([*lobe[:-5], end, top, bow, sin_bow, bend]))
 
 
 class Angles:
     """The trigonometric terms of one frequency, from two short series."""
 
-    def __init__(self, omega: Array, fields: list[Array] | Array):
-        _, k, g0, g1, g2, h0, h1, v0, v1, v2, b1, b2, *_ = fields
+    def __init__(self, omega: Array, lobe: LongLobe):
+        _, k, g0, g1, g2, h0, h1, v0, v1, v2, b1, b2, *_ = lobe
+        self.k = k
         s4, c4 = _sin_cos(0.25 * omega)
         sk4, ck4 = _sin_cos(0.25 * k * omega)
         # Differences of cosines are formed from half angles, which keeps their relative accuracy at small w.
@@ -160,9 +179,9 @@ class Angles:
         self.base, self.dbase = y * (b1 + y * b2), dy * (b1 + 2.0 * y * b2)
 
 
-def offset(at: Angles, fields: list[Array] | Array) -> tuple[Array, Array, Array, Array]:
+def offset(at: Angles) -> tuple[Array, Array, Array, Array]:
     """``b = beta + delta`` on the curve as T/Q, accurate relative to b itself, with the derivatives of T and Q."""
-    k, s, c = fields[1], at.s, at.c
+    k, s, c = at.k, at.s, at.c
     total = c * at.base + at.E * at.drop + s * c * 2.0 * at.sin_k * at.H
     d_total = c * at.dbase - 0.5 * s * at.base + at.dE * at.drop + at.E * (k * at.sin_k - 0.5 * s)
     d_total += at.H * (at.sin_k * (1.0 - 2.0 * s * s) + 2.0 * k * s * c * at.cos_k) + 2.0 * s * c * at.sin_k * at.dH
@@ -179,8 +198,9 @@ class _Turned(NamedTuple):
     dF: Array
 
 
-def turn_angles(at: Angles, turns: Array) -> _Turned:
+def turn_angles(at: Angles) -> _Turned:
     # (n + 1) w = k w + w/2
+    turns = at.k + 0.5
     sine = at.sin_k * at.c + at.cos_k * at.s
     cosine = at.cos_k * at.c - at.sin_k * at.s
     sin_w, cos_w = 2.0 * at.s * at.c, 1.0 - 2.0 * at.s * at.s
@@ -189,19 +209,19 @@ def turn_angles(at: Angles, turns: Array) -> _Turned:
     return _Turned(sine * at.E + cosine * F, along, turns * along + sine * at.dE + cosine * dF, F, dF)
 
 
-def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
+def _lobe_end(lobe: LongLobe, ratio: Array, d: Array) -> Array:
     """The first w at which alpha returns to 0: the phase of ``e^(j (n+1) w) (E + j sin w H)`` reaches pi there.
 
     Newton's method on that phase, nearly linear in w; ``ratio`` is E/H at w = 0 and places the start between
     pi/(2 (n+1)), for no damping, and pi/(n+1).
     """
-    turns = fields[1] + 0.5
+    turns = lobe.k + 0.5
     xp = namespace(turns)
     limit = np.pi / (d + 0.5)
 
     def step(omega: Array) -> Array:
-        at = Angles(omega, fields)
-        x = turn_angles(at, turns)
+        at = Angles(omega, lobe)
+        x = turn_angles(at)
         size = at.E * at.E + x.F * x.F
         # Less than a quarter turn away sin cos is a safe stand-in for the phase left; farther off, creep up.
         left = xp.where(x.along < 0, x.across * x.along, -0.2 * size)
@@ -212,18 +232,18 @@ def _lobe_end(fields: list[Array], ratio: Array, d: Array) -> Array:
     return repeat(_END_STEPS, step, start, xp)
 
 
-def long_row(beta: Array, fields: Array) -> Array:
+def long_row(beta: Array, lobe: LongLobe) -> Array:
     """The limit for d >= 1; 0 where no alpha is stable, NaN for bad input."""
-    return long_row_point(beta, fields)[0]
+    return long_row_point(beta, lobe)[0]
 
 
-def long_row_point(beta: Array, fields: Array) -> tuple[Array, Array]:
+def long_row_point(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
     """The limit for d >= 1 and the frequency w there, of no meaning where no alpha is stable.
 
     b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
     lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
     """
-    delta, end, top, bow, sin_bow, bend = fields[0], *fields[-5:]
+    delta, end, top, bow, sin_bow, bend = lobe.delta, *lobe[-5:]
     xp = namespace(beta, delta)
     b = beta + delta
     inside = (b > 0) & (b < top)
@@ -232,12 +252,12 @@ def long_row_point(beta: Array, fields: Array) -> tuple[Array, Array]:
     r = xp.sqrt(share)
     omega = xp.minimum(end * (_arcsine(r * sin_bow) / bow + bend * r * (1.0 - share)), end)
     for _ in range(_ROW_STEPS):
-        omega = xp.clip(omega - _newton_step(goal, Angles(omega, fields), fields), 0.0, end)
-    at = Angles(omega, fields)
-    x = turn_angles(at, fields[1] + 0.5)
+        omega = xp.clip(omega - _newton_step(goal, Angles(omega, lobe)), 0.0, end)
+    at = Angles(omega, lobe)
+    x = turn_angles(at)
     numerator, denominator = 2.0 * at.s * x.across, at.c * at.V
     # The last step is taken in alpha itself.
-    step = _newton_step(goal, at, fields)
+    step = _newton_step(goal, at)
     numerator -= step * (at.c * x.across + 2.0 * at.s * x.d_across)
     denominator -= step * (at.c * at.dV - 0.5 * at.s * at.V)
     return _finish(xp.where(inside, numerator / denominator, 0.0), b), omega - step
@@ -250,11 +270,11 @@ def _arcsine(x: Array) -> Array:
     return 2.0 * t * horner(t * t, _ARCTAN)
 
 
-def _newton_step(goal: Array, at: Angles, fields: list[Array] | Array) -> Array:
+def _newton_step(goal: Array, at: Angles) -> Array:
     """``2 (b - sqrt(goal b))/b'`` with sqrt(goal/b) as (1 + 3 goal/b)/(3 + goal/b): one division in all.
 
     XLA fuses a chain of such steps into one loop over the rows only while no quotient is used twice.
     """
-    total, d_total, scale, d_scale = offset(at, fields)
+    total, d_total, scale, d_scale = offset(at)
     part = goal * scale
     return 4.0 * total * scale * (total - part) / ((d_total * scale - total * d_scale) * (3.0 * total + part))

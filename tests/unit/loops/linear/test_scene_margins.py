@@ -4,6 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import scipy.optimize
 from independent_scenes import KINDS, closed_loop_matrix, random_scene, random_walls
 
 import zwidth
@@ -73,6 +74,18 @@ def test_margins_by_a_fine_grid_and_by_other_delays(kind):
                 assert radius_at(scene, K, B, scene.timing.delay + share * found.delay_margin) < 1
 
 
+@pytest.mark.parametrize("stiffness, damping", [(500.0, 1.0), (2e3, 4.0), (4e3, 10.0)])
+def test_the_delay_margin_ends_where_an_eigenvalue_first_leaves_the_circle(stiffness, damping):
+    def excess(delay):
+        return radius_at(FILTERED, stiffness, damping, delay) - 1.0
+
+    delays = np.arange(1.0, 10.0, 0.05) * 1e-3
+    first = next(k for k, delay in enumerate(delays) if excess(delay) > 0)
+    end = scipy.optimize.brentq(excess, *delays[first - 1 : first + 1], xtol=1e-14)
+    expected = end - FILTERED.timing.delay
+    assert FILTERED.margins(stiffness, damping).delay_margin == pytest.approx(expected, rel=1e-9)
+
+
 def test_python_control_agrees():
     control = pytest.importorskip("control")
     # Its polynomials lose their digits in discrete time: it is given the frequency response.
@@ -106,6 +119,16 @@ def test_a_wall_whose_loop_is_zero_at_half_the_rate():
     assert found.gain_margin == pytest.approx(factors[np.argmin(np.abs(np.log(factors)))], rel=1e-3)
     assert abs(found.phase_margin) == pytest.approx(phases.min(), rel=1e-3)
     assert 0.98 * distance <= found.modulus_margin <= distance * (1 + 1e-9)
+
+
+def test_a_loop_that_a_stiffer_wall_drives_at_half_the_rate():
+    """Behind strong damping the pole that leaves first is real: at z = -1, where L is real in any case."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 800.0), zwidth.Timing(1e-3), velocity=zwidth.LowPass(cutoff=400.0))
+    found = scene.margins(20e3, 20.0)
+    assert found.phase_crossover == pytest.approx(500.0, rel=1e-12)
+    assert found.gain_margin == pytest.approx(-1.0 / scene.frequency_response(20e3, 20.0, 500.0).real, rel=1e-12)
+    edge = closed_loop_matrix(scene, 20e3 * found.gain_margin, 20.0 * found.gain_margin)
+    assert np.abs(np.linalg.eigvals(edge) + 1).min() < 1e-12
 
 
 def test_an_unstable_wall():

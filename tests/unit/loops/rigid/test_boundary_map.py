@@ -6,7 +6,7 @@ import pytest
 from zwidth.loops.rigid import boundary_map as maps
 from zwidth.loops.rigid.boundary_map import row_limits
 from zwidth.loops.rigid.delay_classes import device
-from zwidth.loops.rigid.row_limit import LONG_FIELDS, long_device, long_row
+from zwidth.loops.rigid.row_limit import long_lobe, long_row
 from zwidth.loops.rigid.verdict import is_stable
 
 ROWS, COLUMNS = 331, 400
@@ -80,8 +80,8 @@ def test_a_map_and_its_points_one_by_one_agree(d):
 @pytest.mark.parametrize("d", [1.0, 2.5, 8.0, 60.0, 500.0])
 @pytest.mark.parametrize("delta", [0.0, 1e-8, 0.3, 4.0, 1e3, 1e6])
 def test_rows_are_solved_to_the_last_digits(d, delta, monkeypatch):
-    fields = long_device(device(np.float64(delta), np.float64(d)))
-    beta = np.linspace(0.0, 0.999, 500)[1:] * fields[LONG_FIELDS.index("top")] - delta
+    fields = long_lobe(device(np.float64(delta), np.float64(d)))
+    beta = np.linspace(0.0, 0.999, 500)[1:] * fields.top - delta
     limit = row_limits(beta, np.array([delta]), np.array([d]))
     monkeypatch.setattr("zwidth.loops.rigid.row_limit._ROW_STEPS", 6)
     more = long_row(beta, fields)

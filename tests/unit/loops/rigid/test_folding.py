@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from zwidth.loops.rigid.folding import assemble_groups, fold, group_by
+from zwidth.loops.rigid.folding import fold, group_by
 
 SHAPE = (3, 4, 5)
 
@@ -14,9 +14,11 @@ def test_parts_of_a_key_join_to_the_whole(axes):
     random = np.random.default_rng(15)
     key = random.integers(3, size=tuple(length if axis in axes else 1 for axis, length in enumerate(SHAPE)))
     arrays = random.random(SHAPE), random.random((1, 4, 1)), random.random((3, 1, 5))
-    parts = group_by(arrays, key)
-    assert sorted(part.value for part in parts) == np.unique(key).tolist()
-    joined = assemble_groups(parts, SHAPE, np.float64, lambda value, a, b, c: value + a - 2.0 * b * c)
+    joined, values = np.full(SHAPE, np.nan), []
+    for value, (a, b, c), place in group_by(arrays, key):
+        joined[place] = value + a - 2.0 * b * c
+        values.append(value)
+    assert values == np.unique(key).tolist()
     np.testing.assert_array_equal(joined, key + arrays[0] - 2.0 * arrays[1] * arrays[2])
 
 

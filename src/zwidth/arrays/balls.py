@@ -20,7 +20,7 @@ from zwidth.words.types import Array
 UNIT = 2.0**-53
 TINY = 2.0**-1000
 # What the rounding of radii may have lost.
-_INFLATED = 1.0 + 2.0**-30
+INFLATED = 1.0 + 2.0**-30
 _ROOT_ERROR = 2.0 * UNIT
 
 
@@ -38,7 +38,7 @@ class Ball:
     @property
     def radius(self) -> Any:
         """The distance from ``mid`` that no number of the ball exceeds."""
-        return 0.0 if self.rad is None else _INFLATED * self.rad
+        return 0.0 if self.rad is None else INFLATED * self.rad
 
     def lower(self) -> Any:
         """A float64 number below or at every number of the ball."""

@@ -9,15 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zwidth.loops.rigid import enclosure
-from zwidth.loops.rigid.enclosure import Ball, as_ball
+from zwidth.arrays import balls
+from zwidth.arrays.balls import Ball, as_ball
 
 flint = pytest.importorskip("flint")
 OPERATIONS: tuple[Callable[[Any, Any], Ball], ...] = (operator.add, operator.sub, operator.mul, operator.truediv)
 COUNT = 600
 
 
-def balls(rng, exact):
+def random_balls(rng, exact):
     """Numbers of sixty decades, exact or with radii from a rounding error to ten times themselves."""
     mid = rng.choice([-1, 1], COUNT) * 10.0 ** rng.uniform(-30, 30, COUNT)
     return Ball(mid) if exact else Ball(mid, np.abs(mid) * 10.0 ** rng.uniform(-17, 1, COUNT))
@@ -52,7 +52,7 @@ def escaped(operation, left, right, result):
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_operations_enclose(operation, exact):
     rng = np.random.default_rng(3)
-    left, right = balls(rng, exact[0]), balls(rng, exact[1])
+    left, right = random_balls(rng, exact[0]), random_balls(rng, exact[1])
     with np.errstate(all="ignore"):
         result = operation(left, right)
     assert escaped(operation, left, right, result) == 0
@@ -63,15 +63,15 @@ def test_operations_enclose(operation, exact):
 
 @pytest.mark.parametrize("operation", OPERATIONS)
 def test_a_rounding_bound_too_small_is_noticed(monkeypatch, operation):
-    monkeypatch.setattr(enclosure, "UNIT", 2.0**-55)
+    monkeypatch.setattr(balls, "UNIT", 2.0**-55)
     rng = np.random.default_rng(3)
-    left, right = balls(rng, True), balls(rng, True)
+    left, right = random_balls(rng, True), random_balls(rng, True)
     assert escaped(operation, left, right, operation(left, right)) > 0
 
 
 def test_compiled_operations_enclose():
     rng = np.random.default_rng(5)
-    left, right = balls(rng, False), balls(rng, False)
+    left, right = random_balls(rng, False), random_balls(rng, False)
 
     def everything(a, ra, b, rb):
         results = [operation(Ball(a, ra), Ball(b, rb)) for operation in OPERATIONS]
@@ -125,7 +125,7 @@ def test_comparisons_are_certain_or_false():
 
 def test_lower_ends_lie_below():
     rng = np.random.default_rng(9)
-    ball = balls(rng, False)
+    ball = random_balls(rng, False)
     low = ball.lower()
     with flint.ctx.workprec(400):
         assert all(members(ball, index)[0] >= float(low[index]) for index in range(COUNT))

@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
+from zwidth.arrays import affine
 from zwidth.arrays.phi import phi_functions
-from zwidth.loops.rigid import affine
+from zwidth.loops.rigid import boxes
 from zwidth.loops.rigid.certified import certified_stable
 
 COUNT = 400
 
 
-def boxes(seed, width):
+def random_boxes(seed, width):
     """Random boxes of four quantities, and points in them as shares from -1 to 1."""
     random = np.random.default_rng(seed)
     middle = 10.0 ** random.uniform(-2, 1, (COUNT, 4))
@@ -29,7 +30,7 @@ def assert_contains(form, shares, exact):
 
 @pytest.mark.parametrize("width", [1e-9, 0.01, 0.3])
 def test_every_operation_contains_its_result(width):
-    (x, y, z, w), (a, b, c, d), shares = boxes(1, width)
+    (x, y, z, w), (a, b, c, d), shares = random_boxes(1, width)
     for form, exact in (
         (x + y, a + b),
         (x - 2.0 * y, a - 2 * b),
@@ -45,7 +46,7 @@ def test_every_operation_contains_its_result(width):
 
 @pytest.mark.parametrize("width", [1e-9, 0.01, 0.3])
 def test_the_plant_contains_those_of_its_devices(width):
-    (x, y, _, _), (a, b, _, _), shares = boxes(2, width)
+    (x, y, _, _), (a, b, _, _), shares = random_boxes(2, width)
     f = y / (y + 1.0)
     # mpmath is too slow for so many points; the phi-functions themselves are held to it elsewhere.
     t, fraction = 1 / (b + 1), b / (b + 1)
@@ -53,7 +54,7 @@ def test_the_plant_contains_those_of_its_devices(width):
     _, _, phi2_t, psi_t, _ = phi_functions(a * t)
     _, _, phi2_f, psi_f, _ = phi_functions(a * fraction)
     e_t = np.exp(-a * t)
-    found = affine.plant(x, f)
+    found = boxes.plant(x, f)
     assert_contains(found.c, shares, c)
     assert_contains(found.p1, shares, phi2 + psi)
     assert_contains(found.a2, shares, t * t * phi2_t)
@@ -73,7 +74,7 @@ def test_what_is_proved_for_a_box_holds_at_its_points(width):
     low, high = middle * (1 - width), middle * (1 + width)
     forms = affine.quantities(low, high)
     damping = affine.Form(beta, np.zeros((3, count)), np.zeros(count))
-    proved = affine.stable_everywhere(forms[0], damping, forms[1], forms[2])
+    proved = boxes.stable_everywhere(forms[0], damping, forms[1], forms[2])
     assert np.mean(proved) > 0.05
     for corner in range(8):
         chosen = np.where([(corner >> k) & 1 for k in range(3)], high, low)
@@ -89,7 +90,7 @@ def test_nothing_is_proved_of_unstable_walls_and_nearly_all_of_stable_points():
     beta = random.uniform(-1, 1, count) * (0.5 + delta) / (d + 1)
     points = np.stack([alpha, beta, delta, d], axis=1)
     forms = affine.quantities(points, points)
-    proved = affine.stable_everywhere(*forms)
+    proved = boxes.stable_everywhere(*forms)
     truth = certified_stable(*points.T).stable
     assert not np.any(proved & ~truth)
     assert np.mean(proved[truth]) > 0.999
