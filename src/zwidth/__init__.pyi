@@ -19,7 +19,6 @@ from .loops.rigid.boundary import BoundaryPoint as BoundaryPoint
 from .loops.rigid.boundary import boundary as boundary
 from .loops.rigid.boundary import boundary_point as boundary_point
 from .loops.rigid.counting import count_poles as count_poles
-from .loops.rigid.decay import decay_rate as decay_rate
 from .loops.rigid.margins import Margins as Margins
 from .loops.rigid.margins import margins as margins
 from .loops.rigid.modulus import modulus_margin as modulus_margin
@@ -34,6 +33,7 @@ from .loops.rigid.response import step_response as step_response
 from .loops.rigid.ridge import RidgePoint as RidgePoint
 from .loops.rigid.ridge import alpha_max as alpha_max
 from .loops.rigid.slope import stiffness_slope as stiffness_slope
+from .loops.rigid.spectral_radius import decay_rate as decay_rate
 from .loops.rigid.spectral_radius import spectral_radius as spectral_radius
 from .loops.rigid.verdict import decide_stability as decide_stability
 from .loops.rigid.verdict import is_stable as is_stable

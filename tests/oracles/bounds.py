@@ -5,6 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.arguments import broadcast
+from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.degrees import NAMES
 from zwidth.loops.rigid.outermost_poles import prove_radii
 from zwidth.words.status import Status
@@ -22,7 +23,8 @@ class Radius(NamedTuple):
 def bound_radius(alpha, beta, delta, d, *, accuracy=1e-9) -> Radius:
     """What `zwidth.spectral_radius` knows of each point."""
     arrays = broadcast(dict(zip(NAMES, (alpha, beta, delta, d), strict=True)))
-    radius, proved, status = prove_radii(arrays, accuracy)
+    radius, proved = prove_radii(arrays, accuracy)
+    status = np.asarray(wall_status(*arrays))
     certified = (status == Status.OK) & (proved <= accuracy)
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
     error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)

@@ -55,8 +55,6 @@ def draw_curves(
     colors = style.ordered_colors(len(picked))
     few = data.sizes[x] <= 12
     whole = np.concatenate([part[name].values.ravel() for part in parts])
-    positive = whole[np.isfinite(whole) & (whole > 0)]
-    positive = positive if positive.size else np.ones(1)
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
         shown = [np.where(np.isfinite(curve[name].values), curve[name].values, np.nan) for curve in curves]
@@ -67,7 +65,7 @@ def draw_curves(
         ax.margins(y=0.06)
         if output.look in ("logarithmic", "steep"):
             # Panels share the axis: ticks that fit all of them.
-            style.use_logarithmic(ax, "y", float(positive.min()), float(positive.max()))
+            style.use_logarithmic(ax, "y", whole)
         if output.look == "diverging":
             ax.axhline(output.center, color=style.GRAY, linewidth=0.7, linestyle=style.DASHED, zorder=0.5)
     values = data[x].values

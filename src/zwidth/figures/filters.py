@@ -11,8 +11,6 @@ from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, select
 
 _STIFFNESS, _NOISE = SI_COLUMNS[0], "velocity_noise_m_per_s"
-# From so many times its least value on, an axis has powers of ten only.
-_WIDE = 3000.0
 _OVER = {
     "low_pass": ("cutoff_Hz", "cut-off of the low-pass  $f_c$  in Hz"),
     "windowed_difference": ("samples", "length of the window  $n$  in periods"),
@@ -47,9 +45,9 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
             ax.axhline(bare * factor, color=color, **look)
         ax.set_xlabel(label)
         values = select(table, estimate=kind)[over]
-        _use_logarithmic(ax, "y", table[_STIFFNESS])
+        style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
         if kind == "low_pass" or grid.logarithmic(np.unique(values)):
-            _use_logarithmic(ax, "x", values)
+            style.use_logarithmic(ax, "x", values, style.DECADES)
     panels[0].set_ylabel(words)
     handles = [style.line(rf"$b = {damping:g}$ N s/m", color=color) for damping, color in colors.items()]
     handles.append(style.line("one-sample difference", style.DASHED, 0.9))
@@ -80,8 +78,8 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
         handles.append(style.line(rf"$b = {damping:g}$ N s/m{best}", color=color))
     if np.isfinite(limit):
         ax.axvline(limit * 1e3, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
-    _use_logarithmic(ax, "x", table[_NOISE])
-    _use_logarithmic(ax, "y", table[_STIFFNESS])
+    style.use_logarithmic(ax, "x", table[_NOISE], style.DECADES)
+    style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
     ax.set(xlabel=r"noise of the velocity  $\sigma_v$  in mm/s", ylabel=words)
     handles += [style.line(words, dash, marker=marker, markersize=4.5) for dash, marker, words in kinds.values()]
     style.legend(panels, handles, outside=axes is None, ncols=2)
@@ -110,7 +108,3 @@ def _mark_best(ax: Axes, rows: Table, color: Any, factor: float, words: str) -> 
 def _dots(rows: Table) -> dict[str, Any]:
     """Few values are dots on their line."""
     return {"marker": "o", "markersize": 3.5} if len(rows[_STIFFNESS]) <= 24 else {}
-
-
-def _use_logarithmic(ax: Axes, which: str, values: Any) -> None:
-    style.use_logarithmic(ax, which, float(np.nanmin(values)), float(np.nanmax(values)), _WIDE)

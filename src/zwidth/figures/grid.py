@@ -159,9 +159,8 @@ def find_edges(values: np.ndarray) -> np.ndarray:
 
 def scale_axis(ax: Axes, which: str, values: Any) -> None:
     """The range of an axis, and its spacing."""
-    values = np.asarray(values)
-    low, high = float(values.min()), float(values.max())
+    low, high = float(np.min(values)), float(np.max(values))
     if logarithmic(values):
-        style.use_logarithmic(ax, which, low, high, _FEW_DECADES)
+        style.use_logarithmic(ax, which, values, _FEW_DECADES)
     if low < high:
         getattr(ax, f"set_{which}lim")(low, high)

@@ -118,8 +118,7 @@ def draw_limit_cycle_curves(
     buzzes = ~_find_beyond(cycles, bounds) & (cycles["amplitude_m"] >= bounds[0])
     factor, meter = style.si_unit(cycles["amplitude_m"][buzzes], "m")
     # Panels of a row share the axis: ticks that fit all of them.
-    shown_amplitudes = cycles["amplitude_m"][buzzes] * factor
-    amplitudes = (float(shown_amplitudes.min(initial=np.inf)), float(shown_amplitudes.max(initial=0.0)))
+    amplitudes = cycles["amplitude_m"][buzzes] * factor
     quantities = (("amplitude_m", factor, f"amplitude  in {meter}"), ("frequency_Hz", 1.0, "frequency  in Hz"))
     looks = _list_looks(arrays, family, cycles["linearly_stable"])
     for row, (name, times, words) in enumerate(quantities):
@@ -131,7 +130,7 @@ def draw_limit_cycle_curves(
             for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
-                style.use_logarithmic(ax, "y", *amplitudes)
+                style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
                 ax.set_xlabel(f"{_AXES[over][0]}  ${_AXES[over][1]}$  in {unit}")

@@ -14,8 +14,6 @@ from zwidth.words.formatting import header
 from zwidth.words.quantities import PARAMETERS
 
 _WORDS = {"above": "or more", "below": "or less"}
-# From so many times its least value on, an axis has powers of ten only.
-_WIDE = 3000.0
 
 
 @style.house_style()
@@ -48,7 +46,7 @@ def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None =
         for target, value, enough in rows
     ]
     for name, scaled in (("x", values * scale), ("y", stiffness * factor)):
-        style.use_logarithmic(ax, name, float(np.nanmin(scaled)), float(np.nanmax(scaled)), _WIDE)
+        style.use_logarithmic(ax, name, scaled, style.DECADES)
     ax.set(
         xlim=(values[0] * scale, values[-1] * scale),
         xlabel=f"{parameter.words}  ${parameter.symbol}$  in {spelled}",

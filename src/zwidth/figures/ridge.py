@@ -49,8 +49,8 @@ def _draw_panel(ax: Axes, table: Table, share: float) -> None:
     ax.set_ylim(0.0, 1.04 * highest)
     if grid.logarithmic(shown[0].delta):
         # The stiffest wall grows with the damping, over as many decades.
-        style.use_logarithmic(ax, "x", float(columns["delta"].min()), end)
-        style.use_logarithmic(ax, "y", float(np.nanmin(columns["alpha_max"])), highest)
+        style.use_logarithmic(ax, "x", columns["delta"])
+        style.use_logarithmic(ax, "y", columns["alpha_max"])
         ax.set_ylim(float(np.nanmin(columns["alpha_max"])), 1.2 * highest)
     style.label_ends(ax, shown, [path.alpha_max[-1] for path in shown], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=style.ALPHA_MAX_LABEL)

@@ -46,9 +46,10 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
         ax.plot(delta, path.alpha_max[shown] / delta, color=color, linestyle=dash, label=label, zorder=3)
         ax.axhline(path.limit, color=color, linestyle=style.DOTTED, linewidth=0.9, label=f"g, d = {path.d:g}", zorder=2)
     limits = [path.limit for path in paths]
-    style.use_logarithmic(ax, "x", _LEAST_DELTA, max(float(path.delta.max()) for path in paths))
-    style.use_logarithmic(ax, "y", min(limits), max(limits))
-    ax.set_xlim(_LEAST_DELTA, max(float(path.delta.max()) for path in paths))
+    ends = _LEAST_DELTA, max(float(path.delta.max()) for path in paths)
+    style.use_logarithmic(ax, "x", ends)
+    style.use_logarithmic(ax, "y", limits)
+    ax.set_xlim(*ends)
     ax.set_ylim(0.7 * min(limits), 3.0 * max(limits))
     style.label_ends(ax, paths, [path.limit for path in paths], colors)
     ax.set(xlabel=style.DELTA_LABEL, ylabel=r"$\alpha_{\max}/\delta = K_{\max}T/b$")

@@ -44,6 +44,7 @@ ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
 AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 
 WIDTH = 7.0  # inches: both columns of a journal page
+DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesses has powers of ten only
 PNG_DPI = 180
 
 # Dates and versions out of the files, for the same figure is to give the same bytes.
@@ -143,11 +144,13 @@ def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: An
             text.set_text(literal(fill(plain, max(int(0.9 * len(plain) / share), 12))))
 
 
-def use_logarithmic(ax: Axes, which: str, low: float, high: float, wide: float = 100.0) -> None:
-    """A logarithmic axis with plain numbers, which has 2 and 5 as well unless it is as wide as that."""
+def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> None:
+    """A logarithmic axis with plain numbers, which has 2 and 5 as well unless positive values are as far apart."""
     getattr(ax, f"set_{which}scale")("log")
-    axis = getattr(ax, f"{which}axis")
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < wide * low else (1.0,)))
+    axis, known = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known) & (known > 0)]
+    near = not known.size or known.max() < wide * known.min()
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 

@@ -29,14 +29,13 @@ from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import bound_intervals, label_walls
 from zwidth.loops.linear.slopes import SceneSensitivities, differentiate, differentiate_rigid
 from zwidth.loops.rigid.boundary import boundary_point
-from zwidth.loops.rigid.decay import decay_rate
 from zwidth.loops.rigid.margins import Margins, margins
 from zwidth.loops.rigid.outermost_poles import outermost_poles
 from zwidth.loops.rigid.passivity import passivity_margin
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.region import stable_region
 from zwidth.loops.rigid.ridge import RidgePoint, alpha_max
-from zwidth.loops.rigid.spectral_radius import spectral_radius
+from zwidth.loops.rigid.spectral_radius import decay_rate, spectral_radius
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod, decide_stability, is_stable
 from zwidth.loops.variants import RIGID_PARAMETERS, RigidVariants, Variants
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters

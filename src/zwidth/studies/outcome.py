@@ -160,11 +160,8 @@ def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Phy
     """The rigid scene or device, where delta and d are those of it alone."""
     if not isinstance(owner, PhysicalScene | PhysicalDevice) or owner.parts_beyond:
         return None
-    return owner if _is_single(delta, owner.delta) and _is_single(d, owner.d) else None
-
-
-def _is_single(axis: Axis, value: float) -> bool:
-    return axis.size == 1 and float(axis.values()[0]) == value
+    alone = [axis.values().tolist() for axis in (delta, d)] == [[owner.delta], [owner.d]]
+    return owner if alone else None
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:

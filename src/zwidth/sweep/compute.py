@@ -15,10 +15,10 @@ from typing import TypeAlias
 import numpy as np
 
 from zwidth.loops.rigid.boundary_map import row_limits
-from zwidth.loops.rigid.decay import rates
 from zwidth.loops.rigid.margins import margins_kernel
-from zwidth.loops.rigid.outermost_poles import outermost_poles, radius_at, usable
+from zwidth.loops.rigid.outermost_poles import area_poles, list_poles, radius_at
 from zwidth.loops.rigid.passivity import margin_at_one_delay
+from zwidth.loops.rigid.pole_map import Area
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.settling import decay_time
 from zwidth.sweep.grid import Block
@@ -35,6 +35,8 @@ _WALL_PIECE = 1 << 12
 _LAID_OUT = 1 << 20
 # From here on it is cheaper to treat the betas of each device together than to list every pair.
 _MANY_ROWS = 256
+# Walls of one device that are worth a map.
+_SMALLEST_PLANE = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
 
 
@@ -80,7 +82,10 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
     found: dict[str, np.ndarray] = {}
     unproved = False
     if RADIUS_OUTPUTS & set(outputs):
-        radius, proved, rate = _by_device(partial(_radius_columns, accuracy), block, shape, _all_devices, leaves=3)
+        if block.plane.alpha.shape[1] * block.plane.beta.shape[1] >= _SMALLEST_PLANE:
+            radius, proved, rate = _radius_planes(accuracy, block)
+        else:
+            radius, proved, rate = _by_device(partial(_radius_columns, accuracy), block, shape, _all_devices, leaves=3)
         found["spectral_radius"], unproved = radius, proved == 0
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
         found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
@@ -133,8 +138,8 @@ def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
 
 def _limits(block: Block) -> np.ndarray:
     """The stiffest stable alpha of every device and beta, shape (D, B)."""
-    if block.rows >= _MANY_ROWS:
-        size = min(_ROW_PIECE, 1 << (block.rows - 1).bit_length())
+    if block.plane.beta.shape[1] >= _MANY_ROWS:
+        size = min(_ROW_PIECE, 1 << (block.plane.beta.shape[1] - 1).bit_length())
         devices = zip(block.beta, block.delta, block.d, strict=True)
         return np.stack([_limits_of_one(beta, delta, d, size) for beta, delta, d in devices])
     columns = tuple(
@@ -181,14 +186,21 @@ def _by_device(
     return results
 
 
+def _radius_planes(accuracy: float, block: Block) -> Columns:
+    """The spectral radii of maps, whether they are proved to an accuracy, and the rates of decay."""
+    alpha, beta, alphas, betas = block.plane
+    found = area_poles(Area(alpha, beta, block.delta, block.d, (betas, alphas)), accuracy, with_rate=True)
+    walls = (block.alpha[:, None, :], block.beta[:, :, None], block.delta[:, None, None], block.d[:, None, None])
+    radius = radius_at(found.re, found.error, list(np.broadcast_arrays(*walls)))
+    return tuple(leaf.transpose(0, 2, 1) for leaf in (radius, found.error <= accuracy, found.rate))
+
+
 def _radius_columns(accuracy: float, columns: Columns) -> Columns:
-    """The spectral radius, whether it is proved to an accuracy (NaN where no error bound is), and the rate of decay."""
-    walls, status = usable(list(columns))
+    """The same of listed walls."""
+    walls = list(columns)
     # Always compiled, however few they are: a value must not depend on the size of its chunk.
-    found = outermost_poles(walls, accuracy, few=0)
-    rate, error = rates(found, walls), np.where(status == Status.OK, found.error, np.inf)
-    rate[status != Status.OK] = np.nan
-    return radius_at(found.re, error, walls), (error <= accuracy).astype(np.float64), rate
+    found = list_poles(walls, accuracy, with_rate=True, few=0)
+    return radius_at(found.re, found.error, walls), found.error <= accuracy, found.rate
 
 
 def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Columns:

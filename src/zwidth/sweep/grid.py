@@ -14,6 +14,15 @@ from zwidth.sweep.study import SweepStudy
 from zwidth.words.quantities import PARAMETERS, WALL, Family
 
 
+class Plane(NamedTuple):
+    """All alphas (D, ..) and betas (D, ..) of the devices of a block, and which of them are the block's."""
+
+    alpha: np.ndarray
+    beta: np.ndarray
+    alphas: slice
+    betas: slice
+
+
 class Block(NamedTuple):
     """A block of the grid, normalized: D devices with A x B walls each, every alpha with every beta."""
 
@@ -23,7 +32,7 @@ class Block(NamedTuple):
     beta: np.ndarray  # shape (D, B)
     mass: np.ndarray  # in SI units, shape (D,); empty in a normalized sweep, likewise the period
     period: np.ndarray
-    rows: int  # how many betas the whole grid has, of which the block may hold a part only
+    plane: Plane  # the whole grid's walls, of which the block may hold a part only
 
 
 class SceneBlock(NamedTuple):
@@ -84,13 +93,20 @@ class Grid:
     def block(self, place: tuple[slice, ...]) -> Block:
         """The normalized parameters of a block, given one slice for every dimension, or for those of devices."""
         slices, shape = self._cut(place)
-        if not self.physical:
+        cut = [slice(0, 1), slice(0, 1)]
+        if len(place) == len(self.dims):
+            names = ("stiffness", "virtual_damping") if self.physical else ("alpha", "beta")
+            cut = [slice(*slices.get(name, slice(0, 1)).indices(self.sizes.get(name, 1))[:2]) for name in names]
+            slices |= dict.fromkeys(self.wall_dims, slice(None))
+        if self.physical:
+            delta, d, alpha, beta, mass, period = self._physical_block(slices, shape)
+        else:
             delta, d = (self._device(name, slices, shape) for name in ("delta", "d"))
             alpha, beta = (self._wall(name, slices, shape) for name in ("alpha", "beta"))
-            return Block(
-                delta, d, *self._broadcast_walls(alpha, beta, delta.size), np.empty(0), np.empty(0), self._rows
-            )
-        return self._physical_block(slices, shape)
+            mass, period = np.empty(0), np.empty(0)
+        alpha, beta = self._broadcast_walls(alpha, beta, delta.size)
+        plane = Plane(alpha, beta, *cut)
+        return Block(delta, d, alpha[:, plane.alphas], beta[:, plane.betas], mass, period, plane)
 
     def scene_block(self, place: tuple[slice, ...]) -> SceneBlock:
         """The same in SI units, of a sweep whose devices have parts."""
@@ -107,11 +123,7 @@ class Grid:
             slices.setdefault(name, slice(0, 1))
         return slices, tuple(len(range(*slices[name].indices(self.sizes[name]))) for name in self.device_dims)
 
-    @property
-    def _rows(self) -> int:
-        return self.sizes.get("virtual_damping" if self.physical else "beta", 1)
-
-    def _physical_block(self, slices: dict[str, slice], shape: tuple[int, ...]) -> Block:
+    def _physical_block(self, slices: dict[str, slice], shape: tuple[int, ...]) -> tuple[np.ndarray, ...]:
         mass, damping, delay = (self._device(name, slices, shape) for name in ("mass", "damping", "delay"))
         period = (
             1.0 / self._device("rate", slices, shape)
@@ -128,8 +140,7 @@ class Grid:
             )
             damped = normalize(mass=mass[:, None], period=period[:, None], virtual_damping=virtual_damping)
         d = delay if in_periods else device.d
-        alpha, beta = self._broadcast_walls(walls.alpha, damped.beta, mass.size)
-        return Block(device.delta, np.broadcast_to(d, mass.shape), alpha, beta, mass, period, self._rows)
+        return device.delta, np.broadcast_to(d, mass.shape), walls.alpha, damped.beta, mass, period
 
     def _device(self, name: str, slices: dict[str, slice], shape: tuple[int, ...]) -> np.ndarray:
         """A parameter of the devices of a block, flat; 0 where it is not given."""

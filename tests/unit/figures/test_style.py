@@ -50,7 +50,7 @@ def test_the_look_is_a_style_of_matplotlib():
 @pytest.mark.parametrize("low, high", [(2.1, 4.9), (1.1, 1.9), (2.0, 8.0), (2.1, 10.4), (0.3, 40.0), (1e-3, 1e4)])
 def test_a_logarithmic_axis_has_plain_numbers(low, high):
     (ax,) = style.panels(None, 1, 5.0, 3.0)
-    style.use_logarithmic(ax, "x", low, high)
+    style.use_logarithmic(ax, "x", (low, high))
     ax.set_xlim(low, high)
     style.figure_of(ax).draw_without_rendering()
     ticks = [tick for minor in (False, True) for tick in ax.xaxis.get_ticklabels(minor=minor) if tick.get_text()]

@@ -215,6 +215,17 @@ def test_what_is_said_of_a_motion_is_the_same_unrecorded(periods):
     assert_again(kept.position, run(**{**options, "periods": 300}).position[:, :periods], "position")
 
 
+def test_the_frequency_is_that_of_the_slowest_pole_also_if_the_end_is_where_the_velocity_turns():
+    scene = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(1e-4, 0.0))
+    poles = scene.poles(5e4, 1.0)
+    expected = np.abs(np.angle(poles[np.argmax(np.abs(poles))])) / (2 * np.pi * 1e-4)
+    velocity = run(scene, stiffness=5e4, virtual_damping=1.0, periods=2000).velocity
+    turns = np.flatnonzero((velocity[:-1] <= 0) & (velocity[1:] > 0))
+    for periods in (turns[-1], turns[-1] + 1):
+        motion = run(scene, stiffness=5e4, virtual_damping=1.0, periods=int(periods), record=False)
+        assert motion.frequency == pytest.approx(expected, rel=1e-6)
+
+
 def test_jitter_is_late_by_less_than_asked_and_none_is_the_limit_of_little():
     exact, little, much = (run(jitter=late) for late in (0.0, 1e-15, 9e-4))
     assert little.position == pytest.approx(exact.position, rel=0, abs=1e-12)

@@ -28,6 +28,8 @@ from zwidth.words.types import Array
 
 # Steps of the bracketed Newton iteration for the zeros of the cubic.
 _CUBIC_STEPS = 6
+# Cells are taken a little wider than they are, for rounding errors.
+_WIDER = 1.0 + 1e-12
 
 
 class Loop(NamedTuple):
@@ -237,14 +239,7 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
         sure = sure & xp.where(outer != ends_outer, alone, monotone)
     else:
         zeros = _cubic_zeros(at, xp) if fractional else _quadratic_zeros(*at.h[:3], xp)
-    half = xp.where(loop.s < 0, -1.0, 1.0)
-    # The argument of P over pi at both ends, that of its larger part.
-    start = xp.where(
-        outer, xp.where(at.near < 0, 1.0, 0.0) + xp.where(at.off < 0, 1.0, 0.0), xp.where(at.front < 0, half, 0.0)
-    )
-    body, wall = loop.h - loop.a2 * at.r, -(at.front + 2.0 * loop.beta)
-    stop = xp.where(body < 0, 1.0, 0.0) - xp.where(loop.q > at.r, 1.0, 0.0) + xp.where(wall < 0, half, 0.0)
-    stop = xp.where(ends_outer, loop.turns + 2.0, stop)
+    start, stop, _ = _ends(at, loop, outer, ends_outer)
     turn, crossings = 0.0 * start, []
     for x in zeros:
         valid = (x >= 0) & (x < 1.0)
@@ -261,6 +256,76 @@ def count(log_r: Array, loop: Loop, fractional: bool, single: bool = False) -> C
     # Rounding must not have changed the number of crossovers.
     sure = sure & (outer == ends_outer)
     return Count(loop.turns + 2.0 - (stop - start + 2.0 * turn), sure, crossings)
+
+
+def count_in_cell(
+    log_r: Array, loop: Loop, half: tuple[Array, Array], fractional: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """How many poles are outside ``|z| = e^log_r``, and whether that is so for every wall of a cell.
+
+    The walls are those whose alpha and beta differ by at most ``half`` from the loop's. A pole is on the circle only
+    where |T| is within what |B| is for these walls, between the crossovers with the least and with the largest |B|. It
+    is there only if arg T - arg B, which moves by a bounded amount in that interval and in the cell, can be pi.
+    """
+    at = _circle(log_r, loop, fractional, np)
+    a, b = half
+    r, near, power = at.r, np.abs(at.near), loop.turns * log_r
+    # How far W = alpha z + beta (z - 1) moves at x = 0, and |W|^2 = w0 + w1 x by its two coefficients.
+    moved, w1 = a * r + b * near, 4.0 * r * loop.s * loop.beta
+    e0 = (2.0 * np.abs(at.front) * moved + moved * moved) * _WIDER + 1e-14 * at.front**2
+    e1 = 4.0 * r * (np.abs(loop.s) * b + (np.abs(loop.beta) + b) * (a + b)) * _WIDER + 1e-14 * np.abs(w1)
+    down = np.where(power < 0, 1.0, np.exp(-np.abs(power)))
+    m0, m1 = (down * at.body) ** 2, -4.0 * r * loop.a2 * loop.h * down * down
+    by = [m0 * e0, m0 * e1 + m1 * e0, m1 * e1, 0.0 * m0]
+    if fractional:
+        ratio = loop.q / r
+        g0, g1 = (1.0 + ratio) ** 2, -4.0 * ratio
+        by = [by[0] * g0, by[1] * g0 + by[0] * g1, by[2] * g0 + by[1] * g1, by[2] * g1]
+    ends = []
+    for side in (-1.0, 1.0):
+        h = tuple(part + side * change for part, change in zip(at.h, by, strict=True))
+        zeros = _cubic_zeros(at._replace(h=h), np) if fractional else _quadratic_zeros(h[0], h[1], h[2], np)
+        zeros = np.sort([np.where((x >= 0) & (x < 1.0), x, np.nan) for x in zeros], axis=0)
+        ends.append((h[0] > 0, h[0] + h[1] + h[2] + h[3] > 0, zeros))
+    (outer, ends_outer, low), (other, ends_other, high) = ends
+    sure = (outer == other) & (ends_outer == ends_other)
+    start, stop, last = _ends(at, loop, outer, ends_outer)
+    # Where the wall's part is the larger at an end, its sign is that of every wall.
+    sure &= (outer | (np.abs(at.front) > moved)) & (ends_outer | (np.abs(last) > a * r + b * (1.0 + r)))
+    turn = 0.0 * start
+    for first, second in zip(low, high, strict=True):
+        valid = ~np.isnan(first)
+        sure &= valid == ~np.isnan(second)
+        first, second = np.where(valid, np.fmin(first, second), 0.5), np.where(valid, np.fmax(first, second), 0.5)
+        w_first, w_second = find_turn(first, 1.0 - first, np), find_turn(second, 1.0 - second, np)
+        x = np.sin(0.25 * (w_first + w_second)) ** 2
+        part = _phase(x, at, loop, fractional, np)[0] / (2.0 * np.pi)
+        whole = np.round(part)
+        turn = turn + np.where(valid, np.where(outer, whole, -whole), 0.0)
+        outer = outer != valid
+        # z/(z - a) = 1 + a/(z - a) of every factor, where z is nearest to its zero.
+        wall = np.sqrt(np.maximum(at.front**2 + np.minimum(w1 * first, w1 * second), 0.0))
+        rate = loop.turns + 1.0 / np.sqrt(near**2 + 4.0 * r * first) + np.abs(loop.beta) / wall
+        rate = rate + loop.c / np.sqrt(at.off**2 + 4.0 * r * loop.c * first)
+        rate = rate + loop.h / np.sqrt(np.maximum(at.body**2 - 4.0 * r * loop.a2 * loop.h * second, 0.0))
+        if fractional:
+            rate = rate + loop.q / np.sqrt(np.maximum((r + loop.q) ** 2 - 4.0 * r * loop.q * second, 0.0))
+        reach = (a * r + b * np.sqrt(near**2 + 4.0 * r * second)) / wall
+        moves = 0.5 * (w_second - w_first) * rate + np.where(reach < 1.0, 0.5 * np.pi * reach, np.inf)
+        sure &= ~valid | (2.0 * np.pi * np.abs(part - whole) + moves < np.pi - 1e-9)
+    return loop.turns + 2.0 - (stop - start + 2.0 * turn), sure
+
+
+def _ends(at: _Circle, loop: Loop, outer: Array, ends_outer: Array) -> tuple[Array, Array, Array]:
+    """The argument of P over pi at both ends, that of its larger part; and the wall's part at the last one."""
+    xp = namespace(at.r)
+    half = xp.where(loop.s < 0, -1.0, 1.0)
+    start = xp.where(
+        outer, xp.where(at.near < 0, 1.0, 0.0) + xp.where(at.off < 0, 1.0, 0.0), xp.where(at.front < 0, half, 0.0)
+    )
+    body, wall = loop.h - loop.a2 * at.r, -(at.front + 2.0 * loop.beta)
+    stop = xp.where(body < 0, 1.0, 0.0) - xp.where(loop.q > at.r, 1.0, 0.0) + xp.where(wall < 0, half, 0.0)
+    return start, xp.where(ends_outer, loop.turns + 2.0, stop), wall
 
 
 def _may_cancel(sizes: tuple[Array, Array], blur: Array) -> Array:

@@ -1,24 +1,26 @@
 """Outermost poles of arrays, each proved: most of them compiled, the rest by more patient means in NumPy.
 
-On maps of alpha and beta the poles of neighboring points are followed (`loops.rigid.radius_map`).
+On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks
+from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks, processors
 from zwidth.arrays.xla import WIDE
 from zwidth.loops.domain import wall_status
-from zwidth.loops.rigid.circle import factor_loop
+from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.delay_classes import classify_delays
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.pole_search import Found, certify_pole, has_bound, quick_kernel, search
-from zwidth.loops.rigid.radius_map import SMALLEST_MAP, Map, as_map, followed_poles, lay_nodes
+from zwidth.loops.rigid.pole_map import Area, follow_poles
+from zwidth.loops.rigid.pole_search import Found, certification_width, certify_pole, has_bound, quick_kernel, search
 from zwidth.words.status import Status
 
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
@@ -28,8 +30,17 @@ _LARGEST_ERROR = 0.1
 # radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
 _DOUBTFUL = 1e-8
 _BELOW_ONE = 1.0 - 2.0**-53
+# A rate of which no more is proved than this share of it is no answer; on maps a smaller one is looked at wall by wall.
+_LARGEST_SHARE, _KNOWN = 1e-3, 1e-6
+# Poles so near to the real axis are taken for single ones.
+_REAL = 1e-6
+# Smaller maps are not worth their cells.
+SMALLEST_MAP = 1 << 11
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
+
+
+_NONE = np.empty(0)
 
 
 class OutermostPoles(NamedTuple):
@@ -122,43 +133,117 @@ def _store_poles(
     return left[~new.proved], type(loop)(*(part[~new.proved] for part in loop))
 
 
-def _by_map(area: Map, accuracy: float) -> tuple[np.ndarray, np.ndarray]:
-    """The logarithms of radii and their errors in the order of the axes that the caller gave."""
-    fractional = area.d != np.floor(area.d)
-    if fractional.all() or not fractional.any():
-        found = _map_poles(area, accuracy, bool(fractional.any()))
-    else:
-        found = tuple(np.empty((area.d.size, area.beta.size, area.alpha.size)) for _ in range(2))
+def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
+    """The points as a map of one or several devices, where they are one that is large enough.
+
+    With it the caller's axes in the map's order, those of the devices, then beta's, then alpha's; and its shape.
+    """
+    shape, alone = points.shape, []
+    for name in ("beta", "alpha"):
+        varying = [axis for axis, length in enumerate(getattr(points, name).shape) if length > 1]
+        # By name: one and the same array may be given twice.
+        others = [array for other, array in points._asdict().items() if other != name]
+        if len(varying) != 1 or any(other.shape[varying[0]] > 1 for other in others):
+            return None
+        alone.append(varying[0])
+    if points.alpha.size * points.beta.size < SMALLEST_MAP:
+        return None
+    others = tuple(axis for axis in range(len(shape)) if axis not in alone)
+    order = (*others, *alone)
+    delta, d = (
+        np.broadcast_to(array, shape).transpose(order)[..., 0, 0].reshape(-1) for array in (points.delta, points.d)
+    )
+    area = Area.whole(points.alpha.reshape(1, -1), points.beta.reshape(1, -1), delta, d)
+    return area, order, tuple(shape[axis] for axis in order)
+
+
+class WallPoles(NamedTuple):
+    """Logarithms of the radii of walls, their errors, infinite where none is proved, and rates of decay if wanted."""
+
+    re: np.ndarray
+    error: np.ndarray
+    rate: np.ndarray  # NaN where less than three digits are known
+
+    def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
+        """The same in another layout."""
+        return WallPoles(*(function(leaf) if leaf.size else leaf for leaf in self))
+
+
+def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
+    """The outermost poles of a map (devices, betas, alphas): by series, and where these fail wall by wall.
+
+    Nothing is compiled, and a wall's value does not depend on the others of its window.
+    """
+    (re, error), missing = follow_poles(area, accuracy)
+    if with_rate:
+        left = error > _KNOWN * np.abs(re)
+        left[tuple(missing)] = True
+        missing = np.stack(np.nonzero(left))
+    found = WallPoles(re, error, -re if with_rate else _NONE)
+    held = (area.d % 1.0 != 0.0)[missing[0]]
+    kinds = [missing[:, held == kind] for kind in (False, True)]
+    pieces = [part[:, start : start + FEW] for part in kinds for start in range(0, part.shape[1], FEW)]
+
+    def solve(places: np.ndarray) -> None:
+        # A multiple of 16: NumPy rounds odd ones at the end of a list otherwise.
+        walls = area.walls(np.pad(places, ((0, 0), (0, -places.shape[1] % 16)), mode="edge"))
+        for whole, leaf in zip(found, list_poles(walls, accuracy, with_rate), strict=True):
+            if leaf.size:
+                whole[tuple(places)] = leaf[: places.shape[1]]
+
+    with ThreadPoolExecutor(processors()) as pool:
+        list(pool.map(solve, pieces))
+    return found
+
+
+def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, few: int = FEW) -> WallPoles:
+    """The outermost poles of equally long columns; as for `outermost_poles`, bad walls among them."""
+    columns, status = usable(columns)
+    found, bad = outermost_poles(columns, accuracy, few), status != Status.OK
+    rate = rates(found, columns, accuracy) if with_rate else _NONE
+    found.error[bad] = np.inf
+    rate[bad[: rate.size]] = np.nan
+    return WallPoles(found.re, found.error, rate)
+
+
+def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
+    """The outermost poles of arrays of one shape, as a map where they are one."""
+    shape = arrays[0].shape
+    laid = as_area(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
+    if laid is None:
+        columns = [array.reshape(-1) for array in arrays]
+        return list_poles(columns, accuracy, with_rate).map(lambda leaf: leaf.reshape(shape))
+    area, order, sizes = laid
+    back = np.argsort(order)
+    return area_poles(area, accuracy, with_rate).map(
+        lambda leaf: np.broadcast_to(np.ascontiguousarray(leaf.reshape(sizes).transpose(back)), shape)
+    )
+
+
+def prove_radii(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray]:
+    """Radii and relative errors (infinite where none is proved) of arrays of one shape."""
+    shape, arrays = arrays[0].shape, [np.atleast_1d(array) for array in arrays]
+    found = find_poles(arrays, accuracy)
+    return radius_at(found.re, found.error, arrays).reshape(shape), found.error.reshape(shape)
+
+
+def rates(found: OutermostPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:
+    """The rates of decay of outermost poles; NaN where their relative errors are not proved to be small."""
+    rate, allowed, beyond = 0.0 - found.re, _LARGEST_SHARE * np.abs(found.re), certification_width(found.re, accuracy)
+    # Other poles may be larger by what the count allows.
+    error = np.minimum(found.error, found.doubt + beyond)
+    # Without stiffness and damping both poles next to 1 are at 1.
+    error[(found.re == 0) & (columns[0] == 0) & (columns[1] == -columns[2])] = 0.0
+    held = columns[3] % 1.0 != 0.0
+    with np.errstate(all="ignore"):
         for kind in (False, True):
-            part = np.flatnonzero(fractional == kind)
-            found[0][part], found[1][part] = _map_poles(area.of(part), accuracy, kind)
-    back = np.argsort(area.order)
-    re, error = (leaf.reshape(area.shape).transpose(back).reshape(-1) for leaf in found)
-    return re, error
-
-
-def _map_poles(area: Map, accuracy: float, kind: bool) -> tuple[np.ndarray, np.ndarray]:
-    """The same of devices whose delays are all whole, or none; axes as in the map."""
-    nodes = lay_nodes(area)
-    start = outermost_poles(nodes, accuracy, patient=False)
-    re, proved = followed_poles(area, nodes, start.re, start.im, accuracy, kind)
-    error = np.where(proved, accuracy, np.inf)
-    left = np.nonzero(~proved)
-    late = outermost_poles([area.alpha[left[2]], area.beta[left[1]], area.delta[left[0]], area.d[left[0]]], accuracy)
-    re[left], error[left] = late.re, late.error
-    return re, error
-
-
-def prove_radii(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Radii, relative errors (infinite where none is proved) and status of arrays of one shape, flat."""
-    area = as_map(Points(*map(fold, arrays))) if arrays[0].size >= SMALLEST_MAP else None
-    if area is not None and area.good():
-        (re, error), status = _by_map(area, accuracy), np.zeros(arrays[0].size, np.int32)
-    else:
-        columns, status = usable([array.reshape(-1) for array in arrays])
-        found = outermost_poles(columns, accuracy)
-        re, error = found.re, np.where(status == Status.OK, found.error, np.inf)
-    return radius_at(re, error, arrays), error, status
+            part = np.flatnonzero((error > allowed) & (found.doubt <= allowed) & (held == kind))
+            loop = factor_loop(*(column[part] for column in columns), fractional=kind)
+            # Whether a count proves that no other pole is nearly as large.
+            seen = count(found.re[part] - beyond[part], loop, kind)
+            alone = seen.sure & (seen.missing == np.where(np.sin(found.im[part]) < _REAL, 1, 2))
+            error[part] = np.where(alone, found.doubt[part], error[part])
+    return np.where(error <= allowed, rate, np.nan)
 
 
 def usable(columns: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
@@ -174,11 +259,12 @@ def radius_at(re: np.ndarray, error: np.ndarray, arrays: list[np.ndarray]) -> np
     """Radii on the verdict's side of the circle, which the proved error alone may not tell."""
     radius = np.exp(re)
     radius[np.isinf(error)] = np.nan
-    near = np.flatnonzero(np.abs(re) <= _DOUBTFUL)
-    if near.size:
-        alpha, beta, delta, d = (array.reshape(-1)[near] for array in arrays)
+    near = np.nonzero(np.abs(re) <= _DOUBTFUL)
+    if near[0].size:
+        alpha, beta, delta, d = (array[near] for array in arrays)
         with np.errstate(all="ignore"):
             stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
-        # The largest number below 1 is as near to the truth as 1 itself.
-        radius[near] = np.where(stable, np.minimum(radius[near], _BELOW_ONE), np.maximum(radius[near], 1.0))
+        # The largest number below 1 is as near to the truth as 1 itself. A wall without stiffness has a pole at 1.
+        known = np.where((alpha == 0) & (radius[near] <= 1.0 + error[near]), 1.0, np.maximum(radius[near], 1.0))
+        radius[near] = np.where(stable, np.minimum(radius[near], _BELOW_ONE), known)
     return radius

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.figures.grid import choose_axes
+from zwidth.figures.style import pick_evenly
 from zwidth.words.quantities import OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
@@ -35,7 +36,7 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
     others = [str(dim) for dim in values.dims if dim not in (x, y)]
     along = min(_ALONG, int(np.sqrt(_MOST / max(1, np.prod([min(values.sizes[dim], _OTHERS) for dim in others])))))
     most = {dim: along if dim in (x, y) else _OTHERS for dim in map(str, values.dims)}
-    thin = values.isel({dim: _spread(values.sizes[dim], count) for dim, count in most.items()})
+    thin = values.isel({dim: pick_evenly(values.sizes[dim], count) for dim, count in most.items()})
     thin = thin.transpose(*others, y, x).load()
     numbers = thin.values.astype(np.float32)
     finite = numbers[np.isfinite(numbers)]
@@ -72,10 +73,6 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
         f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
         f'</output><script type="application/json">{_embed(content)}</script></div>'
     )
-
-
-def _spread(size: int, most: int) -> np.ndarray:
-    return np.unique(np.linspace(0, size - 1, min(size, most)).round().astype(int))
 
 
 def _axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:

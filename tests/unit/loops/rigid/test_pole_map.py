@@ -1,4 +1,4 @@
-"""Radii of maps by following poles from the nodes of cells: held against the same points one by one."""
+"""Outermost poles of maps from series: held against the same walls one by one."""
 
 import numpy as np
 import pytest
@@ -6,15 +6,15 @@ from bounds import bound_radius
 
 import zwidth
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.outermost_poles import outermost_poles
-from zwidth.loops.rigid.radius_map import SMALLEST_MAP, as_map, followed_poles, lay_nodes
+from zwidth.loops.rigid.outermost_poles import SMALLEST_MAP, as_area, outermost_poles
+from zwidth.loops.rigid.pole_map import Area, follow_poles
 from zwidth.words.status import Status
 
 ALPHA, BETA = np.linspace(-0.1, 1.5, 203), np.linspace(-0.3, 1.5, 157)
 
 
-def as_area(*values):
-    return as_map(Points(*map(fold, np.broadcast_arrays(*map(np.asarray, values)))))
+def laid_out(*values):
+    return as_area(Points(*map(fold, np.broadcast_arrays(*map(np.asarray, values)))))
 
 
 def check_against_points(found, walls, seed, count=1500):
@@ -24,7 +24,7 @@ def check_against_points(found, walls, seed, count=1500):
     alone = bound_radius(*(np.broadcast_to(wall, found.radius.shape)[places] for wall in walls))
     differ = np.abs(found.radius[places] - alone.radius)
     assert (differ <= found.error[places] + alone.error).all()
-    # Where both are proved nearly all digits agree: Newton's method ends at the same pole.
+    # The series' terms fall much faster than their bound says.
     both = found.certified[places] & alone.certified
     assert np.median(differ[both]) < 1e-15
     assert both.mean() > 0.99
@@ -51,16 +51,35 @@ def test_axes_in_any_order_and_delays_of_both_kinds():
 
 
 @pytest.mark.parametrize("d", [0.0, 4.0, 60.0, 1.5])
-def test_nearly_all_points_need_no_search(d):
-    # As many points a cell as in maps that people draw: finer than the one above.
-    alpha, beta = np.linspace(0.001, 1.5 / (1.0 + d), 320), np.linspace(0.0, 1.5 / (1.0 + d), 320)[:, None]
-    area = as_area(alpha, beta, 0.1, d)
-    assert area is not None
-    nodes = lay_nodes(area)
-    found = outermost_poles(nodes, 1e-9)
-    _, ok = followed_poles(area, nodes, found.re, found.im, 1e-9, d % 1.0 != 0.0)
-    assert ok.shape == (1, 320, 320)
-    assert ok.mean() > 0.95
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-4, 1e-6, 1e-9])
+def test_every_accuracy_is_kept(d, accuracy):
+    """Against walls found one by one; nearly all come from series, and coarser ones are not as right by chance."""
+    rng = np.random.default_rng(3)
+    alpha, beta = np.linspace(0.001, 1.5 / (1.0 + d), 320), np.linspace(0.0, 1.5 / (1.0 + d), 320)
+    found, missing = follow_poles(Area.whole(alpha[None], beta[None], np.array([0.1]), np.array([d])), accuracy)
+    left = np.zeros((320, 320), bool)
+    left[missing[1], missing[2]] = True
+    assert left.mean() < 0.1
+    row, column = rng.integers(0, 320, (2, 2000))
+    row, column = row[~left[row, column]], column[~left[row, column]]
+    exact = outermost_poles([alpha[column], beta[row], np.full(row.size, 0.1), np.full(row.size, d)], 1e-9)
+    error, bound = np.abs(found.re[0, row, column] - exact.re), found.error[0, row, column]
+    assert (bound <= accuracy * (1 + 1e-9)).all()
+    assert (error <= bound + exact.error).all()
+
+
+def test_an_axis_in_any_order_has_the_same_walls():
+    rng = np.random.default_rng(4)
+    alpha, beta = np.geomspace(1e-12, 1.0, 64), np.linspace(-0.05, 1.0, 64)
+    mixed = rng.permutation(64)
+    found = zwidth.spectral_radius(alpha, beta[:, None], 0.1, 1.0)
+    np.testing.assert_allclose(
+        zwidth.spectral_radius(alpha[mixed], beta[:, None], 0.1, 1.0), found[:, mixed], rtol=2e-9
+    )
+    rate = zwidth.decay_rate(alpha, beta[:, None], 0.1, 1.0)
+    alone = zwidth.decay_rate(np.tile(alpha, 2), np.repeat(beta[[9, 50]], 64), 0.1, 1.0).reshape(2, 64)
+    np.testing.assert_allclose(rate[[9, 50]], alone, rtol=1e-6)
+    assert np.isfinite(alone).mean() > 0.95
 
 
 def test_bad_values_on_an_axis_leave_the_others_alone():
@@ -76,10 +95,10 @@ def test_bad_values_on_an_axis_leave_the_others_alone():
 
 
 def test_what_is_no_map_is_left_to_the_points():
-    assert as_area(ALPHA, ALPHA, 0.1, 0.0) is None
-    assert as_area(ALPHA, BETA[:3, None], 0.1, 0.0) is None
-    assert as_area(ALPHA, BETA[:, None], np.linspace(0.1, 0.2, ALPHA.size), 0.0) is None
-    area = as_area(ALPHA, BETA[:, None], np.array([0.1, 0.2])[:, None, None], 1.0)
-    assert area is not None
-    assert area.shape == (2, BETA.size, ALPHA.size)
+    assert laid_out(ALPHA, ALPHA, 0.1, 0.0) is None
+    assert laid_out(ALPHA, BETA[:3, None], 0.1, 0.0) is None
+    assert laid_out(ALPHA, BETA[:, None], np.linspace(0.1, 0.2, ALPHA.size), 0.0) is None
+    found = laid_out(ALPHA, BETA[:, None], np.array([0.1, 0.2])[:, None, None], 1.0)
+    assert found is not None
+    assert found[2] == (2, BETA.size, ALPHA.size)
     assert ALPHA.size * BETA.size >= SMALLEST_MAP
