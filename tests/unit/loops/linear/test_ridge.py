@@ -291,3 +291,12 @@ scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), velocity
 assert scene.max_stiffness().status == 0 and "jax" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=LONGEST)
+
+
+def test_slopes_next_to_a_parameter_of_0_are_those_at_0():
+    scene = Scene(Device(1.5, 0.0, Coupling(1.0, 300.0, 0.0)), Timing(period=2e-4))
+    tiny = scene.replace(**{"damping": 1e-7, "coupling.damping": 1e-7, "delay": 1e-13})
+    at_zero, beside = scene.sensitivities().per, tiny.sensitivities().per
+    # In steps of a thousandth of themselves, rounding moved those in both dampings by 4e-3, that in the delay by 7e-6.
+    for path in ("damping", "coupling.damping", "delay", "coupling.stiffness"):
+        assert beside[path] == pytest.approx(at_zero[path], rel=1e-7)
