@@ -5,20 +5,28 @@ a sweep, python-control and the time domain; the stiffest wall, passivity and de
 may contradict another, in value or in status. Where two roads differ on a wall, the certified verdict (balls of
 python-flint) a little to all sides of it tells whether rounding explains it.
 
-As a program: ``python tests/properties/test_one_answer.py COUNT SEED [SLOW]`` prints the contradictions; SLOW of them
-go through the command line, a sweep, the time domain and JAX as well.
+As a program, ``python tests/properties/test_one_answer.py COUNT SEED`` prints the contradictions, and how many answers
+to each question were compared. Every scene takes the quick roads; `EVERY` says how many take which of the slow ones.
+A scene that the library refuses is passed over and counted.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
-import sys
+import math
 import tempfile
+import time
+import traceback
+import warnings
+from collections import Counter, defaultdict
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import any_loop
+import control
 import jax
 import numpy as np
 from click.testing import CliRunner
@@ -26,6 +34,7 @@ from click.testing import CliRunner
 import zwidth
 from zwidth.cli import cli
 from zwidth.loops.linear.passivity import has_condition
+from zwidth.simulation.result import MotionKind
 from zwidth.words.status import Status
 
 SEED = 20
@@ -35,10 +44,34 @@ BAND = 1e-8
 SAME = 1e-9
 # Derivatives: implicit ones by JAX beside those of the host.
 SAME_SLOPE = 1e-6
+# Numbers that two roads pass on alike.
+ALIKE = 1e-12
+# Slower motions tell no growth within so many periods.
+LONGEST = 30_000
+
+
+class Every(NamedTuple):
+    """One scene in how many takes the roads that cost more than the quick ones."""
+
+    highest: int = 4  # the stiffest wall, around which the wall then lies
+    assessed: int = 16  # assess, margins, check
+    run: int = 48  # ridge, limits, a sweep, the time domain
+    traced: int = 48  # jax.grad, compiled for every scene with parts
+
+
+EVERY = Every()
+
+
+class Question(NamedTuple):
+    """One question, what each road answers, and within which share numbers are alike; verdicts have none."""
+
+    name: str
+    answers: dict[str, Any]
+    within: float | None = None
 
 
 class Wall(NamedTuple):
-    """A wall on a scene, in N/m and N s/m."""
+    """A wall on a scene that has none of its own, in N/m and N s/m."""
 
     scene: zwidth.Scene
     stiffness: float
@@ -69,22 +102,27 @@ def draw_scene(random: np.random.Generator) -> zwidth.Scene:
 
 def draw_wall(scene: zwidth.Scene, random: np.random.Generator) -> Wall:
     """A wall inside, outside or next to an end of a row."""
-    top = scene.max_stiffness()
-    high = float(top.stiffness) if top.status == Status.OK else float(scene.units.stiffness)
-    best = float(top.virtual_damping) if top.status == Status.OK else 0.0
-    size = abs(best) + scene.units.virtual_damping * 10 ** random.uniform(-3, -1)
-    damping = random.choice([best, 0.0, best + size * random.uniform(-1, 1), abs(best) * random.uniform(0, 1.5)])
+    damping = scene.units.virtual_damping * 10 ** random.uniform(-3, 0) * random.choice([1.0, 1.0, 0.0, -0.1])
+    ends = scene.stable_stiffness(damping).reshape(-1)
+    ends = ends[np.isfinite(ends) & (ends > 0)]
+    high = ends.max() if ends.size else float(scene.units.stiffness)
     stiffness = high * random.choice([random.uniform(0, 1.3), 10 ** random.uniform(-6, 0)])
-    if random.random() < 0.2:
-        ends = scene.stable_stiffness(damping).reshape(-1)
-        ends = ends[np.isfinite(ends) & (ends > 0)]
-        if ends.size:
-            stiffness = random.choice(ends) * (1 + random.choice([-1, 1]) * 10 ** random.uniform(-7, -2))
-    wall = zwidth.VirtualWall(float(stiffness), float(damping))
-    return Wall(scene.replace(wall=wall), float(stiffness), float(damping))
+    if random.random() < 0.2 and ends.size:
+        stiffness = random.choice(ends) * (1 + random.choice([-1, 1]) * 10 ** random.uniform(-7, -2))
+    return Wall(scene, float(stiffness), float(damping))
 
 
-def verdicts(wall: Wall, found: Any) -> dict[str, bool | None]:
+def draw_high_wall(scene: zwidth.Scene, random: np.random.Generator) -> Wall:
+    """A wall around the stiffest stable one."""
+    top = scene.max_stiffness()
+    if top.status != Status.OK:
+        return draw_wall(scene, random)
+    size = abs(float(top.virtual_damping)) + scene.units.virtual_damping * 10 ** random.uniform(-3, -1)
+    damping = float(top.virtual_damping) + size * random.choice([0.0, random.uniform(-1, 1)])
+    return Wall(scene, float(top.stiffness) * random.uniform(0, 1.3), float(damping))
+
+
+def verdicts(wall: Wall) -> dict[str, bool | None]:
     """What each road says of the wall's stability; None where it says that it does not know."""
     scene, K, B = wall
     decided = {name: scene.decide_stability(K, B, method=name) for name in ("auto", "crossover", "companion")}
@@ -100,18 +138,12 @@ def verdicts(wall: Wall, found: Any) -> dict[str, bool | None]:
         "poles": bool(poles.max() < 1),
         "pole_table": bool(np.abs(table.z).max() < 1),
         "stable_stiffness": bool(np.any((rows[:, 0] < K) & (rows[:, 1] > K))),
-        "phase_margin": None if np.isnan(found.phase_margin) else found.phase_margin > 0,
-        "delay_margin": None if np.isnan(found.delay_margin) else found.delay_margin > 0,
-        "assess.stable": found.stable,
-        "assess.spectral_radius": None if np.isnan(found.spectral_radius) else found.spectral_radius < 1,
-        "assess.decay_rate": None if np.isnan(found.decay_rate) else found.decay_rate > 0,
-        "assess, stable K": any(low < K < high for low, high in found.stable_stiffness),
-        "assess, stable B": any(low < B < high for low, high in found.stable_damping),
+        "state_space": bool(np.abs(np.linalg.eigvals(scene.state_space(K, B).A)).max() < 1),
+        "to_control": bool(np.abs(control.poles(zwidth.to_control(scene, K, B))).max() < 1),
     }
     if scene.is_rigid:
         alpha, beta = (float(part) for part in scene.normalize_walls(K, B))
         said["zwidth.is_stable"] = bool(zwidth.is_stable(alpha, beta, scene.delta, scene.d))
-    said["state_space"] = bool(np.abs(np.linalg.eigvals(scene.state_space(K, B).A)).max() < 1)
     return said
 
 
@@ -128,48 +160,71 @@ def near_the_edge(wall: Wall) -> bool:
     return bool(np.any(np.asarray(told.stable) != told.stable[0]) or np.any(~np.isin(told.status, (Status.OK,))))
 
 
-def differing(values: dict[str, Any]) -> str:
-    """The roads and their answers, where two that know differ."""
-    known = {road: value for road, value in values.items() if value is not None}
-    return "" if len(set(known.values())) < 2 else str(known)
-
-
-def spread(values: dict[str, Any], within: float) -> str:
-    """The roads and their numbers, where they differ by more than rounding, or only some know."""
-    numbers = np.array([np.nan if value is None else float(value) for value in values.values()])
-    if np.isnan(numbers).all():
-        return ""
-    if np.isnan(numbers).any() or np.ptp(numbers) > within * np.abs(numbers).max():
-        return str(values)
-    return ""
-
-
-def contradictions(wall: Wall) -> Iterator[tuple[str, str]]:
-    """The questions to which two roads give different answers."""
+def quick_questions(wall: Wall) -> Iterator[Question]:
+    """Those that are answered in some hundredths of a second."""
     scene, K, B = wall
-    found = zwidth.assess(scene)
-    text = differing(verdicts(wall, found))
-    if text and not near_the_edge(wall):
-        proved = scene.decide_stability(K, B, method="certified")
-        yield "stable", f"{text}, proved {bool(proved.stable)}"
-    top = scene.max_stiffness()
-    known = top.status == Status.OK
-    tops = {"max_stiffness": top.stiffness, "assess": found.stiffness_max}
-    if scene.is_rigid:
-        tops["alpha_max"] = zwidth.alpha_max(scene.delta, scene.d).alpha * scene.units.stiffness
-    if known and (text := spread(tops, SAME)):
-        yield "K_max", text
-    if known and not scene.is_stable(top.stiffness * (1 - 1e-7), top.virtual_damping) and found.ridge_kind == "smooth":
-        # A smooth top is inside for any softer wall of its damping only on a row that is one interval.
-        yield "the stiffest wall stands on stable ones", f"{top}"
+    yield Question("stable", verdicts(wall))
     if has_condition(scene.device):
         margin = float(scene.passivity_margin(K, B))
-        if text := differing(
-            {"is_passive": bool(scene.is_passive(K, B)), "margin": margin > 0, "assess": found.passive}
-        ):
-            yield "passive", text
-        if text := spread({"scene": margin, "assess": found.passivity_margin}, 1e-12):
-            yield "passivity margin", text
+        yield Question("passive", {"is_passive": bool(scene.is_passive(K, B)), "margin": margin > 0})
+
+
+def highest_questions(wall: Wall) -> Iterator[Question]:
+    """Those about the stiffest wall of the device."""
+    scene = wall.scene
+    top = scene.max_stiffness()
+    tops = {"max_stiffness": top.stiffness}
+    if scene.is_rigid:
+        tops["alpha_max"] = zwidth.alpha_max(scene.delta, scene.d).alpha * scene.units.stiffness
+    yield Question("K_max", tops, SAME)
+    if top.status == Status.OK:
+        ends = scene.stable_stiffness(top.virtual_damping).reshape(-1, 2)
+        # A corner may be the tip of a wedge, with nothing stable on its row.
+        if len(ends) == 1 and ends[0, 0] == 0:
+            answers = {"max_stiffness": top.stiffness, "stable_stiffness": ends[0, 1]}
+            yield Question("K_max ends its row", answers, SAME)
+            below = bool(scene.is_stable(top.stiffness * (1 - 1e-7), top.virtual_damping))
+            yield Question("stable below K_max", {"max_stiffness": True, "is_stable": below})
+
+
+def assessed_questions(wall: Wall) -> Iterator[Question]:
+    """Those to which `assess` and ``zwidth check`` have all answers together."""
+    scene, K, B = wall
+    found = zwidth.assess(scene.replace(wall=zwidth.VirtualWall(K, B)))
+    top, stands = scene.max_stiffness(), scene.margins(K, B)
+    options = options_of(scene)
+    said = None
+    if options is not None:
+        said = ask_command("check", *options, f"--stiffness={K!r}", f"--virtual-damping={B!r}")
+    yield Question(
+        "stable",
+        {
+            "is_stable": bool(scene.is_stable(K, B)),
+            "margins, phase": None if np.isnan(stands.phase_margin) else bool(stands.phase_margin > 0),
+            "margins, delay": None if np.isnan(stands.delay_margin) else bool(stands.delay_margin > 0),
+            "assess.stable": found.stable,
+            "assess.spectral_radius": None if np.isnan(found.spectral_radius) else found.spectral_radius < 1,
+            "assess.decay_rate": None if np.isnan(found.decay_rate) else found.decay_rate > 0,
+            "assess, stable K": any(low < K < high for low, high in found.stable_stiffness),
+            "assess, stable B": any(low < B < high for low, high in found.stable_damping),
+            "check": said and said["stable"],
+        },
+    )
+    tops = {"max_stiffness": top.stiffness, "assess": found.stiffness_max}
+    yield Question("K_max", tops | ({"check": said["stiffness_max"]} if said else {}), SAME)
+    for name in ("gain_margin", "phase_margin", "modulus_margin", "delay_margin"):
+        values = {"scene": float(getattr(stands, name)), "assess": float(getattr(found, name))}
+        # JSON has no infinity.
+        if said and math.isfinite(values["assess"]):
+            values["check"] = said[name]
+        yield Question(name, values, ALIKE)
+    if has_condition(scene.device):
+        yield Question(
+            "passive",
+            {"scene": bool(scene.is_passive(K, B)), "assess": found.passive, "check": said and said["passive"]},
+        )
+        margins = {"scene": float(scene.passivity_margin(K, B)), "assess": found.passivity_margin}
+        yield Question("passivity margin", margins, ALIKE)
 
 
 def options_of(scene: zwidth.Scene) -> list[str] | None:
@@ -223,60 +278,47 @@ def sweep_of(wall: Wall) -> dict[str, Any]:
             return {str(name): np.asarray(data[name]).reshape(-1) for name in data.data_vars}
 
 
-def slow_contradictions(wall: Wall) -> Iterator[tuple[str, str]]:
-    """Those between the scene's answers and the roads that start a program, a run, a compiler or a simulation."""
+def run_questions(wall: Wall) -> Iterator[Question]:
+    """Those asked of a run, a command or a simulation."""
     scene, K, B = wall
-    found, top = zwidth.assess(scene), scene.max_stiffness()
-    stands = scene.margins(K, B)
-    for name in ("gain_margin", "phase_margin", "modulus_margin", "delay_margin"):
-        pair = {"scene": float(getattr(stands, name)), "assess": float(getattr(found, name))}
-        if np.isfinite(list(pair.values())).any() and (text := spread(pair, 1e-12)):
-            yield name, text
-    stable = {"scene": bool(scene.is_stable(K, B))}
+    top = scene.max_stiffness()
+    stable: dict[str, Any] = {"scene": bool(scene.is_stable(K, B))}
     tops: dict[str, Any] = {"scene": float(top.stiffness)}
     shares = [limit.stiffness / limit.gain for limit in zwidth.limits_of(scene)]
     tops |= {f"limits_of, {k}": share for k, share in enumerate(shares) if not np.isnan(share)}
-    passive = {"scene": bool(scene.is_passive(K, B)) if has_condition(scene.device) else None}
-    options = options_of(scene)
-    if options is not None:
-        said = ask_command("check", *options, f"--stiffness={K!r}", f"--virtual-damping={B!r}")
-        stable["check"], passive["check"], tops["check"] = said["stable"], said["passive"], said["stiffness_max"]
+    if (options := options_of(scene)) is not None:
         said = ask_command("ridge", *options)
         tops["ridge"] = said.get("stiffness_max")
-        slopes = scene.sensitivities()
+        slopes = scene.sensitivities().per
         for name, entry in said.get("sensitivities", {}).items():
             value = next((entry[key] for key in entry if key in ("value", "derivative", "slope")), None)
-            path = {"delay": "delay"}.get(name, name)
-            if value is None or path not in slopes.per:
-                continue
-            if text := spread({"ridge": value, "sensitivities": float(slopes.per[path])}, 1e-9):
-                yield f"slope in {name}", text
+            if value is not None and name in slopes:
+                yield Question(
+                    f"slope of K_max in {name}", {"ridge": value, "sensitivities": float(slopes[name])}, SAME
+                )
     swept = sweep_of(wall)
     stable["sweep"], tops["sweep"] = bool(swept["stable"][0]), float(swept["stiffness_max"][0])
     if "passive" in swept:
-        passive["sweep"] = bool(swept["passive"][0])
-    import control
-
-    stable["to_control"] = bool(np.abs(control.poles(zwidth.to_control(scene, K, B))).max() < 1)
-    rate = np.log(float(scene.spectral_radius(K, B)))
-    if abs(rate) > 3e-4:
-        periods = int(min(30 / abs(rate) + 50, 1e5))
+        yield Question("passive", {"scene": bool(scene.is_passive(K, B)), "sweep": bool(swept["passive"][0])})
+    radius = float(scene.spectral_radius(K, B))
+    yield Question("spectral radius", {"scene": radius, "sweep": float(swept["spectral_radius"][0])}, SAME)
+    rate = abs(np.log(radius))
+    periods = int(30 / rate + 50) if rate > 0 else LONGEST
+    if periods < LONGEST:
         motion = scene.simulate(K, B, start_velocity=1e-3, periods=periods, record=True)
         size = np.abs(np.asarray(motion.position))
         stable["simulate"] = bool(size[-periods // 8 :].max() < size[periods // 4 : periods // 2].max())
-    for question, values in (("stable", stable), ("passive", passive)):
-        if (text := differing(values)) and not near_the_edge(wall):
-            yield question, text
-    if text := spread(tops, SAME):
-        yield "K_max", text
-    assert found.stable == stable["scene"] or near_the_edge(wall)
-    if top.status == Status.OK:
-        yield from slope_contradictions(scene)
+        label = MotionKind(int(motion.outcome))
+        stable["simulate, label"] = {MotionKind.DECAYING: True, MotionKind.GROWING: False}.get(label)
+    yield Question("stable", stable)
+    yield Question("K_max", tops, SAME)
 
 
-def slope_contradictions(scene: zwidth.Scene) -> Iterator[tuple[str, str]]:
-    """Sensitivities beside JAX's gradient, in the numbers that can be traced."""
-    per = scene.sensitivities().per
+def traced_questions(wall: Wall) -> Iterator[Question]:
+    """The sensitivities beside JAX's gradient, in a number that can be traced."""
+    scene = wall.scene
+    if scene.max_stiffness().status != Status.OK:
+        return
     path = "damping" if scene.device.damping > 0 else "mass"
 
     def stiffness(value: Any) -> Any:
@@ -284,45 +326,123 @@ def slope_contradictions(scene: zwidth.Scene) -> Iterator[tuple[str, str]]:
 
     with jax.enable_x64(True):
         slope = float(jax.grad(stiffness)(float(scene.parameters()[path])))
-    if text := spread({"sensitivities": float(per[path]), "jax.grad": slope}, SAME_SLOPE):
-        yield f"slope in {path}", text
+    yield Question(
+        f"slope of K_max in {path}",
+        {"sensitivities": float(scene.sensitivities().per[path]), "jax.grad": slope},
+        SAME_SLOPE,
+    )
 
 
-def found_in(count: int, seed: int, slow: int = 0) -> list[tuple[str, str, Wall]]:
-    """The contradictions on so many walls, one a scene."""
-    random = np.random.default_rng(seed)
-    found = []
+def differing(values: dict[str, Any]) -> str:
+    """The roads and their answers, where two that know differ."""
+    known = {road: value for road, value in values.items() if value is not None}
+    return "" if len(set(known.values())) < 2 else str(known)
+
+
+def spread(values: dict[str, Any], within: float) -> str:
+    """The roads and their numbers, where they differ by more than rounding, or only some know."""
+    numbers = np.array([np.nan if value is None else float(value) for value in values.values()])
+    if np.isnan(numbers).all() or np.all(numbers == numbers[0]):
+        return ""
+    if not np.isfinite(numbers).all() or np.ptp(numbers) > within * np.abs(numbers).max():
+        return str(values)
+    return ""
+
+
+def contradiction(question: Question, wall: Wall) -> str:
+    """The answers, where roads contradict each other beyond rounding."""
+    if question.within is not None:
+        return spread(question.answers, question.within)
+    text = differing(question.answers)
+    return "" if text and near_the_edge(wall) else text
+
+
+@dataclass
+class Tally:
+    """What was asked, and what was found."""
+
+    scenes: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    asked: Counter[str] = field(default_factory=Counter)
+    compared: Counter[str] = field(default_factory=Counter)
+    unknown: Counter[str] = field(default_factory=Counter)
+    roads: dict[str, set[str]] = field(default_factory=lambda: defaultdict(set))
+    found: list[tuple[int, str, str, Wall]] = field(default_factory=list)
+
+    def ask(self, k: int, wall: Wall, every: Every) -> None:
+        """All questions to scene k."""
+        slow = highest_questions, assessed_questions, run_questions, traced_questions
+        for nth, questions in ((1, quick_questions), *zip(every, slow, strict=True)):
+            if k % nth:
+                continue
+            try:
+                for question in questions(wall):
+                    self._compare(k, question, wall)
+            except Exception:
+                self.found.append((k, "error", traceback.format_exc(limit=-4), wall))
+
+    def _compare(self, k: int, question: Question, wall: Wall) -> None:
+        # One line for the slopes in all numbers.
+        (name, *_), values = question.name.split(" in "), question.answers
+        known = sum(not (value is None or np.isnan(value)) for value in values.values())
+        self.asked[name] += 1
+        self.compared[name] += known
+        self.unknown[name] += len(values) - known
+        self.roads[name] |= values.keys()
+        if text := contradiction(question, wall):
+            self.found.append((k, question.name, text, wall))
+
+    def table(self) -> Iterator[str]:
+        """How often each question was asked and answered, in Markdown."""
+        yield "| question | roads | asked | answers compared | unknown | contradictions |"
+        yield "|---|--:|--:|--:|--:|--:|"
+        bad = Counter(name.split(" in ")[0] for _, name, *_ in self.found)
+        for name in (*self.asked, *(bad.keys() - self.asked.keys())):
+            counts = len(self.roads[name]), self.asked[name], self.compared[name], self.unknown[name], bad[name]
+            yield f"| {name} | {' | '.join(f'{count:,}' for count in counts)} |"
+
+
+def ask_scenes(count: int, seed: int, every: Every = EVERY) -> Tally:
+    """So many scenes, each of its own seed."""
+    tally = Tally()
     for k in range(count):
-        wall = draw_wall(draw_scene(random), random)
-        told = list(contradictions(wall))
-        if slow and k % max(1, count // slow) == 0:
-            told += slow_contradictions(wall)
-        found += [(question, text, wall) for question, text in told]
-    return found
+        random = np.random.default_rng([seed, k])
+        tally.scenes += 1
+        try:
+            scene = draw_scene(random)
+            wall = draw_wall(scene, random) if k % every.highest else draw_high_wall(scene, random)
+        except zwidth.InputError as error:
+            tally.refused[str(error).split(":")[0]] += 1
+            continue
+        tally.ask(k, wall, every)
+    return tally
 
 
 def test_every_road_gives_the_same_answer():
-    assert found_in(60, SEED, slow=6) == []
+    tally = ask_scenes(64, SEED, Every(2, 8, 16, 32))
+    assert tally.found == []
+    assert sum(tally.refused.values()) <= 2, "a link that rings thousands of times a period"
+    roads = {"check", "sweep", "simulate", "simulate, label", "to_control", "zwidth.is_stable", "assess.stable"}
+    assert roads <= tally.roads["stable"]
+    assert {"check", "ridge", "sweep", "alpha_max", "limits_of, 0"} <= tally.roads["K_max"]
+    assert {"ridge", "jax.grad", "sensitivities"} <= tally.roads["slope of K_max"]
 
 
 if __name__ == "__main__":
-    import time
-    import traceback
-    import warnings
-
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("count", type=int)
+    parser.add_argument("seed", type=int)
+    for name, nth in EVERY._asdict().items():
+        parser.add_argument(f"--{name}", type=int, default=nth, help=f"one in so many scenes, {nth} if left out")
+    given = parser.parse_args()
     warnings.simplefilter("ignore", zwidth.PrecisionWarning)
-    total, first, share = (int(text) for text in (*sys.argv[1:3], *(sys.argv[3:] or ["0"])))
-    start, bad = time.process_time(), 0
-    random = np.random.default_rng(first)
-    for k in range(total):
-        wall = draw_wall(draw_scene(random), random)
-        try:
-            told = list(contradictions(wall))
-            if share and k % max(1, total // share) == 0:
-                told += slow_contradictions(wall)
-        except Exception:
-            told = [("error", traceback.format_exc(limit=-4))]
-        for question, text in told:
-            bad += 1
-            print(f"{k}: {question}: {text}\n    {wall}", flush=True)
-    print(f"{total} scenes, {bad} contradictions, {time.process_time() - start:.0f} s of CPU")
+    start, every = time.process_time(), Every(*(getattr(given, name) for name in Every._fields))
+    told = ask_scenes(given.count, given.seed, every)
+    for k, question, text, wall in told.found:
+        print(f"{k}: {question}: {text}\n    {wall}")
+    print("\n".join(told.table()))
+    shares = ", ".join(f"{name} one in {nth}" for name, nth in every._asdict().items())
+    print(
+        f"{told.scenes} scenes ({shares}), {sum(told.refused.values())} refused {dict(told.refused)}, "
+        f"{len(told.found)} contradictions, {time.process_time() - start:.0f} s of CPU"
+    )

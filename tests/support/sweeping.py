@@ -18,7 +18,8 @@ from zwidth.cli import main
 from zwidth.studies.document import Config
 from zwidth.sweep import plan
 from zwidth.sweep.chunks import perform
-from zwidth.sweep.store import find_stores, open_dataset
+from zwidth.sweep.dataset import open_dataset
+from zwidth.sweep.store import find_stores
 from zwidth.sweep.study import SweepStudy
 
 AXES = {

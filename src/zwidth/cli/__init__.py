@@ -8,12 +8,18 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from importlib import import_module
+from pkgutil import iter_modules
 
 import click
 
 from zwidth.arrays.kernel_cache import use_compilation_cache
 from zwidth.cli.commands import cli
 from zwidth.words.errors import ZwidthError
+
+# Every file of this room adds its commands.
+for _module in iter_modules(__path__, f"{__name__}."):
+    import_module(_module.name)
 
 _EXIT_FAILED, _EXIT_INPUT = 1, 2
 _STOPPED = (128 + signal.SIGINT, 128 + signal.SIGTERM)

@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
+from zwidth.cli.commands import cli
 from zwidth.cli.options import json_option
 
 
-@click.command()
+@cli.command()
 @click.option("--quick", is_flag=True, help="Few delays and small maps: less than a minute instead of some.")
 @click.option(
     "--out",

@@ -1,4 +1,4 @@
-"""The commands: thin shells over the library, which they import only when they run."""
+"""The group of commands, and those for one wall: thin shells over the library, which they import only when they run."""
 
 from __future__ import annotations
 
@@ -9,15 +9,8 @@ from typing import Any
 import click
 
 from zwidth import __version__
-from zwidth.cli import runs, words
-from zwidth.cli.bench import bench
-from zwidth.cli.design import design
-from zwidth.cli.devices import devices
-from zwidth.cli.explore import explore
-from zwidth.cli.fit import fit
-from zwidth.cli.init import init
+from zwidth.cli import words
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
-from zwidth.cli.report import report
 from zwidth.words.formatting import plain, with_unit
 
 
@@ -142,7 +135,3 @@ def schema() -> None:
     from zwidth.studies.document import config_json_schema
 
     words.print_json(config_json_schema())
-
-
-for command in (init, *runs.COMMANDS, report, design, devices, explore, fit, bench):
-    cli.add_command(command)

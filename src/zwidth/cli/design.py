@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.cli.words import print_json, row
 from zwidth.words.formatting import plain, with_unit
@@ -33,7 +34,7 @@ _TOLERANCE = Parsed(
 )
 
 
-@click.command()
+@cli.command()
 @scene_options(wall=True, required=True)
 @click.option("--find", type=click.Choice(tuple(_FINDS)), help="What to choose such that K_max reaches the stiffness.")
 @click.option("--tolerance", "tolerances", type=_TOLERANCE, multiple=True, help="As mass=10%; may be repeated.")

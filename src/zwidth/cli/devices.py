@@ -6,6 +6,7 @@ import json
 
 import click
 
+from zwidth.cli.commands import cli
 from zwidth.cli.options import json_option
 from zwidth.cli.words import row
 from zwidth.words.formatting import with_unit
@@ -13,7 +14,7 @@ from zwidth.words.formatting import with_unit
 _COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
 
 
-@click.command()
+@cli.command()
 @click.argument("name", required=False)
 @json_option
 def devices(name: str | None, as_json: bool) -> None:

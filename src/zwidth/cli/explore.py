@@ -8,9 +8,10 @@ from typing import Any
 import click
 
 from zwidth.cli import words
+from zwidth.cli.commands import cli
 
 
-@click.command()
+@cli.command()
 @click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(exists=True, path_type=Path))
 @click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
 @click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")

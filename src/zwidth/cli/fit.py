@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, json_option, number_or_text, quantity_type, read_share, velocity_options
 from zwidth.cli.words import print_json, row
 from zwidth.words.errors import InputError, UnusableValueError
@@ -65,7 +66,7 @@ _WALL = Parsed("WALL", _read_wall)
 _SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 
 
-@click.command()
+@cli.command()
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
     "--buzz",

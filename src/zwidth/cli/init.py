@@ -8,6 +8,7 @@ from pathlib import Path
 
 import click
 
+from zwidth.cli.commands import cli
 from zwidth.words.errors import InputError, ZwidthError, check_choice
 
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -19,7 +20,7 @@ def _complete(context: click.Context, parameter: click.Parameter, begun: str) ->
     return [name for name in find_examples() if name.startswith(begun)]
 
 
-@click.command()
+@cli.command()
 @click.argument("name", required=False, shell_complete=_complete)
 @click.option(
     "--example",

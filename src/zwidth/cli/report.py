@@ -7,10 +7,11 @@ from pathlib import Path
 
 import click
 
+from zwidth.cli.commands import cli
 from zwidth.cli.options import json_option
 
 
-@click.command()
+@cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="The file.  [default: DIR/report.html]")
 @json_option

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, json_option
 from zwidth.cli.words import print_json
 
@@ -57,7 +58,7 @@ _SLICE = Parsed("name=value", _read_slice, "write NAME=VALUE, as in delta=0.1")
 _FIGURE_SIZE = Parsed("WxH", _read_figure_size, "write width x height from 1 to 100 inches, as in 7x4.5")
 
 
-@click.command()
+@cli.command()
 @click.argument("path", metavar="CONFIG", type=click.Path(path_type=Path))
 @click.option("--out", type=click.Path(path_type=Path), help="Folder for the results.  [default: runs/NAME]")
 @click.option("--overwrite", is_flag=True, help="Replace a run that the folder already holds.")
@@ -176,7 +177,7 @@ def _report_end(result: RunResult, command: str) -> None:
         click.echo(f"zwidth: try again what failed with: {command}", err=True)
 
 
-@click.command()
+@cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @json_option
 def verify(folder: Path, as_json: bool) -> None:
@@ -199,7 +200,7 @@ def verify(folder: Path, as_json: bool) -> None:
         raise SystemExit(_EXIT_FAILED)
 
 
-@click.command()
+@cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--netcdf", type=click.Path(path_type=Path), help="Write a netCDF-4 file.")
 @click.option("--csv", "table", type=click.Path(path_type=Path), help="Write a table, of a million points at most.")
@@ -220,7 +221,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
         click.echo(f"zwidth: {folder}: {missing} {text}", err=True)
 
 
-@click.command()
+@cli.command()
 @click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
 @click.option("--at", multiple=True, type=_SLICE, help="Draw this slice, as in --at delta=0.1 --at d=1.")
 @click.option("--x", metavar="NAME", help="The parameter from left to right.")
@@ -256,7 +257,3 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
         print_json({"files": [str(file) for file in files]})
     if not files:
         raise SystemExit(_EXIT_FAILED)
-
-
-COMMANDS = (run, verify, export, figures)
-"""What the command line gets from this module."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Annotated, Any
 
-from pydantic import ConfigDict
-
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict
 from zwidth.config.parts import SimulatedVelocityField
@@ -26,9 +24,6 @@ LONGEST = 1_000_000
 
 class Circumstances(Strict):
     """How a device meets a wall: start, push, contact, and what motor, encoder, bearings and clock add."""
-
-    # A study has the same fields of its own, with what is said of them here.
-    model_config = ConfigDict(use_attribute_docstrings=True)
 
     duration: Duration = Span(1000.0, "periods")
     """Length of the motion, in s or in periods."""

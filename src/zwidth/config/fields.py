@@ -6,9 +6,9 @@ import ast
 import inspect
 import re
 import textwrap
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeVar
 
 from pydantic import (
     BaseModel,
@@ -26,6 +26,8 @@ from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, 
 from zwidth.words.formatting import describe, resembling, suggestion
 from zwidth.words.quantities import Parameter
 
+Kind = TypeVar("Kind")
+
 
 class Strict(BaseModel):
     """A frozen mapping that knows all its keys and reports all its faults at once."""
@@ -34,6 +36,9 @@ class Strict(BaseModel):
 
     what: ClassVar[str] = "a mapping"
     """What the mapping describes, for messages."""
+
+    described_by: ClassVar[tuple[type[Strict], ...]] = ()
+    """Other models, which say what the fields of their names are."""
 
     @classmethod
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
@@ -67,7 +72,7 @@ class Strict(BaseModel):
         """Describe every field as the source does below it; pydantic would look there for every run."""
         found = handler(schema)
         properties = handler.resolve_ref_schema(found)["properties"]
-        for model in reversed(cls.__mro__):
+        for model in (*cls.described_by, *reversed(cls.__mro__)):
             for name, words in _find_docstrings(model) if issubclass(model, Strict) else ():
                 properties[name]["description"] = words
         return found
@@ -162,6 +167,23 @@ def members(what: str) -> Callable[[Any, Callable[[Any], Any]], Any]:
         return value
 
     return validate
+
+
+def find_kind(
+    raw: Any, known: Mapping[str, Kind], what: str, example: str, refused: Mapping[str, tuple[str, str]] | None = None
+) -> Kind:
+    """What a mapping is read as, by its key ``kind``; some names are refused with what is allowed and a remedy."""
+    kinds = f"{what} is a mapping with one of the kinds {listing(known)}"
+    if not isinstance(raw, dict):
+        raise problem(f"got {describe(raw)}", kinds, f"write {example}")
+    if "kind" not in raw:
+        found = problem("missing", kinds, f"add 'kind: {next(iter(known))}'")
+    elif isinstance(kind := raw["kind"], str) and kind in known:
+        return known[kind]
+    else:
+        parts = f"the kinds are {listing(known)}", suggestion(kind, known, "write one of these")
+        found = problem(f"got {describe(kind)}", *(refused or {}).get(str(kind), parts))
+    raise validation_error(what, [(("kind",), found)])
 
 
 def repeated(raw: Iterable[Any], remedy: str) -> Iterable[LocatedProblem]:

@@ -22,14 +22,14 @@ from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_wrap_validator_function
 
 from zwidth.config.axes import read_entries
-from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Strict, describe_parameter
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import Strict, describe_parameter, find_kind
 from zwidth.config.values import Quantity
 from zwidth.parts.checks import find_range
 from zwidth.parts.paths import PARTS
 from zwidth.parts.velocity import ESTIMATES, FOAW
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, suggestion
+from zwidth.words.formatting import describe
 from zwidth.words.quantities import CHOICES, FIELDS
 
 PART_NAMES = ("velocity", *PARTS)
@@ -119,20 +119,11 @@ def read_velocity(raw: Any, known: dict[str, type[PartSection]] = _LINEAR) -> An
     """A velocity estimate, read as what its kind names."""
     if isinstance(raw, tuple(known.values())):
         return raw
-    if isinstance(raw, _ESTIMATES["foaw"]):
+    if isinstance(raw, PartSection):
         raise problem("got a velocity estimate of kind 'foaw'", NO_LINEAR_FORM, SIMULATED)
-    kinds = f"a velocity estimate is a mapping with one of the kinds {listing(known)}"
-    if not isinstance(raw, dict):
-        raise problem(f"got {describe(raw)}", kinds, "write {kind: low_pass, cutoff: 100 Hz}")
-    if "kind" not in raw:
-        raise validation_error("velocity", [(("kind",), problem("missing", kinds, "add 'kind: low_pass'"))])
-    kind = raw["kind"]
-    if not isinstance(kind, str) or kind not in known:
-        allowed, remedy = f"the kinds are {listing(known)}", suggestion(kind, known, "write one of these")
-        if kind == "foaw":
-            allowed, remedy = NO_LINEAR_FORM, SIMULATED
-        raise validation_error("velocity", [(("kind",), problem(f"got {describe(kind)}", allowed, remedy))])
-    return known[kind].model_validate(raw)
+    refused = {"foaw": (NO_LINEAR_FORM, SIMULATED)}
+    section = find_kind(raw, known, "a velocity estimate", "{kind: low_pass, cutoff: 100 Hz}", refused)
+    return section.model_validate(raw)
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,13 @@ def _period(value: Any, info: ValidationInfo) -> float:
     return 1.0 / rate
 
 
+def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
+    """A problem where the sampling period is given twice."""
+    for second in [key for key in keys if key in ("period", "rate")][1:]:
+        allowed = "the sampling period and its rate say the same"
+        yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+
+
 class _Mass(_OneKind):
     """A mass with damping, sampled, in SI units."""
 
@@ -102,10 +109,7 @@ class _Mass(_OneKind):
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        if "period" in raw and "rate" in raw:
-            second = [key for key in raw if key in ("period", "rate")][1]
-            allowed = "the sampling period and its rate say the same"
-            yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+        return find_second_period(raw)
 
 
 _Parts: Any = make_parts_base("the difference of two samples", "none")

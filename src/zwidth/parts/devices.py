@@ -6,7 +6,9 @@ A rotary device is the same mathematics as a linear one with other units: its ``
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+import json
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from zwidth.parts.device import Device
@@ -132,106 +134,24 @@ class KnownHand:
         )
 
 
-_PAPER = "Hulin, Preusche, Hirzinger 2006, section VIII"
-_WHEEL = "github.com/eastskykang/embedded-control-systems, lab6/Lab6.pdf"
-_PADDLE = "github.com/HannesRovina/HapticHumanRobotInterfaces-Lab, HHRI_Lab4_Report_HR_MSH.pdf"
-_WRIST = "github.com/mahilab/OpenWrist, matlab/OpenWristInit.m"
-_RIG = "github.com/raeedcho/hapticore, docs/adr/010-impedance-device-virtual-coupling.md"
-_WOOD = "github.com/WoodenHaptics/woody-experimental, woodenhaptics_2016ed.json"
-_FALCON = "github.com/libnifalcon/libnifalcon, include/falcon/core/FalconGeometry.h"
-_CHAI_DELTA = "github.com/chai3d/chai3d, src/devices/CDeltaDevices.cpp"
-_CHAI_PHANTOM = "github.com/chai3d/chai3d, src/devices/CPhantomDevices.cpp"
-_HAND = "Sci. Rep. 5:18004 (2015), Fig. 3"
-_SET = "a limit that the library sets, not measured"
+def _read_published() -> tuple[tuple[KnownDevice, ...], KnownHand]:
+    """The devices and the hand in the file beside this one."""
+    known = json.loads(Path(__file__).with_name("published.json").read_text(encoding="utf-8"))
+
+    def spell_out(entry: dict[str, Any]) -> dict[str, Any]:
+        """Its numbers as `Published`, which name their sources by their keys in the file."""
+        return {
+            name: Published(value[0], value[1], known["sources"][value[2]], *value[3:])
+            if isinstance(value, list)
+            else value
+            for name, value in entry.items()
+        }
+
+    return tuple(KnownDevice(**spell_out(entry)) for entry in known["devices"]), KnownHand(**spell_out(known["hand"]))
 
 
-def _limited(source: str, name: str, title: str, force: float, stiffness: float, damping: float) -> KnownDevice:
-    """A device of which only the limits are known that a library sets."""
-    return KnownDevice(
-        name,
-        title,
-        force=Published(force, "N", source, _SET),
-        stiffness_limit=Published(stiffness, "N/m", source, _SET),
-        damping_limit=Published(damping, "N s/m", source, _SET),
-    )
-
-
-def _wrist(axis: str, words: str, damping: float, friction: float) -> KnownDevice:
-    return KnownDevice(
-        f"openwrist_{axis}",
-        f"OpenWrist, {words}",
-        "rotary",
-        damping=Published(damping, "N m s/rad", _WRIST),
-        friction=Published(friction, "N m", _WRIST, "kinetic"),
-        counts=Published(500, "counts", _WRIST),
-        period=Published(1e-3, "s", _WRIST),
-    )
-
-
-DEVICES = (
-    KnownDevice(
-        "phantom_2006",
-        "PHANToM, as in the paper's example",
-        mass=Published(0.1, "kg", _PAPER),
-        period=Published(1e-3, "s", _PAPER),
-    ),
-    KnownDevice(
-        "haptic_wheel",
-        "haptic wheel of a course",
-        "rotary",
-        mass=Published(4.5e-4, "kg m^2", _WHEEL),
-        damping=Published(0.0013, "N m s/rad", _WHEEL),
-        period=Published(1e-3, "s", _WHEEL, "and 0.1 ms; a spring of 50 N mm/deg grows at 1 ms and decays at 0.1 ms"),
-    ),
-    KnownDevice(
-        "epfl_paddle",
-        "EPFL haptic paddle, at the handle",
-        damping=Published(0.033, "N s/m", _PADDLE, "from 8.33e-7 N m s/rad at the motor; handle at 75 mm"),
-        friction=Published(0.24, "N", _PADDLE, "from 1.2 to 1.65 mN m of static friction at the motor"),
-        resolution=Published(15.7e-6, "m", _PADDLE, "from 2000 counts x 15"),
-        counts=Published(2000, "counts", _PADDLE),
-        period=Published(350e-6, "s", _PADDLE),
-    ),
-    _wrist("ps", "pronation and supination", 0.0252, 0.1891),
-    _wrist("fe", "flexion and extension", 0.0019, 0.0541),
-    _wrist("ru", "radial and ulnar deviation", 0.0029, 0.1339),
-    KnownDevice(
-        "delta_3_rig",
-        "delta.3 in a laboratory rig",
-        mass=Published(0.35, "kg", _RIG, "0.3 to 0.5 kg; design notes"),
-        period=Published(0.25e-3, "s", _RIG, "4 kHz"),
-        force=Published(20.0, "N", _RIG),
-        stiffness_limit=Published(800.0, "N/m", _RIG, "about, without virtual damping; design notes"),
-    ),
-    KnownDevice(
-        "woodenhaptics",
-        "WoodenHaptics",
-        counts=Published(2000, "counts", _WOOD),
-        force=Published(5.0, "N", _WOOD),
-    ),
-    replace(
-        _limited(_CHAI_DELTA, "falcon", "Novint Falcon", 8.0, 3000.0, 20.0),
-        resolution=Published(38e-6, "m", _FALCON, "about"),
-        counts=Published(1280, "counts", _FALCON),
-    ),
-    _limited(_CHAI_DELTA, "delta_3", "delta.3", 20.0, 5000.0, 30.0),
-    _limited(_CHAI_DELTA, "omega", "omega.x", 12.0, 5000.0, 30.0),
-    _limited(_CHAI_DELTA, "sigma_7", "sigma.7", 12.0, 4000.0, 30.0),
-    _limited(_CHAI_PHANTOM, "touch", "Touch", 3.3, 400.0, 4.0),
-    _limited(_CHAI_PHANTOM, "omni", "PHANToM Omni", 3.3, 700.0, 5.0),
-    _limited(_CHAI_PHANTOM, "desktop", "PHANToM Desktop", 7.9, 1000.0, 5.0),
-    _limited(_CHAI_PHANTOM, "premium_1_5_6dof", "PHANToM Premium 1.5 6DOF", 8.5, 800.0, 5.0),
-)
-"""Every device, those with measured numbers first."""
-
-HAND = KnownHand(
-    "hand_2015",
-    "a hand, one trial",
-    Published(0.554, "kg", _HAND, "one trial"),
-    Published(6.45, "N s/m", _HAND, "one trial"),
-    Published(135.0, "N/m", _HAND, "one trial"),
-)
-"""A hand for `zwidth.Scene(..., operator=...)`."""
+DEVICES, HAND = _read_published()
+"""Every device, those with measured numbers first; and a hand for `zwidth.Scene(..., operator=...)`."""
 
 
 def find_device(name: str) -> KnownDevice:

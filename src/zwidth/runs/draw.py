@@ -16,7 +16,8 @@ from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
 from zwidth.figures.style import save, style_sheet
 from zwidth.runs.edges import Edges, make_edges
-from zwidth.sweep.store import SUFFIX, Store, find_stores, open_dataset
+from zwidth.sweep.dataset import open_dataset
+from zwidth.sweep.store import SUFFIX, Store, find_stores
 from zwidth.words.errors import InputError, StoreError
 from zwidth.words.formatting import short
 from zwidth.words.quantities import OUTPUTS, VARIABLES

@@ -10,7 +10,6 @@ import numpy as np
 
 from zwidth.figures.region import Outlines
 from zwidth.studies.passivity import find_edges
-from zwidth.sweep.part_axes import make_scene
 from zwidth.sweep.store import Store
 from zwidth.words.errors import InputError
 
@@ -60,7 +59,7 @@ def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
     try:
         if store.study.with_parts:
             parameters = store.grid.scene_block(slices).parameters
-            scene = make_scene(store.study, {name: float(values[0]) for name, values in parameters.items()})
+            scene = store.study.make_scene({name: float(values[0]) for name, values in parameters.items()})
             pieces = scene.stable_region()
             return {"stable": [(np.stack([one.stiffness, one.virtual_damping], -1), one.hole) for one in pieces]}
         block = store.grid.block(slices)

@@ -80,10 +80,14 @@ def _find_rest(loop: LoopMap, constant: np.ndarray, state: np.ndarray, kept: np.
     return _Rest(found > 0, rest, state - rest, moves, P, drift, left)
 
 
+@np.errstate(all="ignore")
 def foresee(
     lanes: Lanes, options: Options, state: Any, push: np.ndarray, known: np.ndarray, sensed: np.ndarray, periods: int
 ) -> Outlook:
-    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, what was last read."""
+    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, what was last read.
+
+    A motion near the end of the range of floats overflows, and nothing is proved of it.
+    """
     count = push.size
     no = np.zeros(count, bool)
     outlook = Outlook(no, no.copy(), no.copy(), no.copy(), np.full(count, np.inf))
@@ -154,10 +158,9 @@ def _settles(
         own, at = take(group, which), np.flatnonzero(which)
         part = LoopMap(*(piece[at] for piece in loop))
         keeps = None if keeps is None else keeps[at]
-        with np.errstate(all="ignore"):
-            settled[at] = _stays(
-                own, part, constant[at], keeps, (seen, wall, held), bilateral[at], pulling[at], reading[at], periods
-            )
+        settled[at] = _stays(
+            own, part, constant[at], keeps, (seen, wall, held), bilateral[at], pulling[at], reading[at], periods
+        )
     return settled
 
 
@@ -207,6 +210,10 @@ def _stays(
         good &= far <= 1e-9 * scale if kept is not None else True
     if not wall:
         side = high[:, 0] + far <= np.where(quantum > 0, 0.5 * quantum * (1 - 1e-9), 0.0)
+        if m == 2 and kept is not None:
+            # Nothing stops one body on no spring that is outside and moves on, and is pushed, away from the wall.
+            away = np.concatenate([group.state[:, :2], group.push[:, None], group.state[:, sent:]], 1)
+            side |= np.all(away <= 0, axis=1)
     elif seen:
         side = low[:, 0] > 0
     else:
@@ -230,11 +237,10 @@ def _is_restless(group: LaneGroup, unstable: np.ndarray, bilateral: np.ndarray, 
     force = group.plant[..., m] + group.plant[..., m + 1]
     way = np.eye(m) - group.plant[..., :m]
     way[loose] = np.eye(m)
-    with np.errstate(all="ignore"):
-        spring = np.where(loose, 0.0, 1.0 / solve_lanes(way, force[..., None])[:, 0, 0])
-        place = push / (alpha + spring)
-        count = np.round(push / (np.where(quantum > 0, quantum, 1.0) * (alpha + spring)))
-        off = np.abs(push - (alpha + spring) * count * quantum)
+    spring = np.where(loose, 0.0, 1.0 / solve_lanes(way, force[..., None])[:, 0, 0])
+    place = push / (alpha + spring)
+    count = np.round(push / (np.where(quantum > 0, quantum, 1.0) * (alpha + spring)))
+    off = np.abs(push - (alpha + spring) * count * quantum)
     # In the wall it is the loop's own rest, or one within a step of the encoder.
     inside = np.where(quantum > 0, off > 0.5 * spring * quantum + 1e-9 * np.abs(push), unstable)
     inside &= (quantum == 0) | (count != 0) | (off > 0)
@@ -251,14 +257,13 @@ def _outgrows(group: LaneGroup, loop: LoopMap, periods: int) -> np.ndarray:
     lane = np.arange(len(which))
     value, left = values[lane, which], vectors[lane, :, which]
     n = loop.A.shape[1]
-    with np.errstate(all="ignore"):
-        pushed = loop.pushed * group.push[:, None]
-        rest = solve_lanes(np.eye(n) - loop.A, pushed[..., None])[..., 0]
-        part = np.abs(np.einsum("ln,ln->l", left, group.state - rest))
-        shoved = np.abs(np.einsum("ln,ln->l", left, loop.misread)) * 0.5 * group.lanes.resolution
-        shoved += _ROOM * np.abs(np.einsum("ln,ln->l", left, loop.pushed)) * group.lanes.motor.static
-        growth = np.abs(value) - 1.0
-        return (part * growth > _ROOM * shoved) & (growth * periods > 0.05)
+    pushed = loop.pushed * group.push[:, None]
+    rest = solve_lanes(np.eye(n) - loop.A, pushed[..., None])[..., 0]
+    part = np.abs(np.einsum("ln,ln->l", left, group.state - rest))
+    shoved = np.abs(np.einsum("ln,ln->l", left, loop.misread)) * 0.5 * group.lanes.resolution
+    shoved += _ROOM * np.abs(np.einsum("ln,ln->l", left, loop.pushed)) * group.lanes.motor.static
+    growth = np.abs(value) - 1.0
+    return (part * growth > _ROOM * shoved) & (growth * periods > 0.05)
 
 
 def _repeats(group: LaneGroup, bilateral: np.ndarray, sensed: np.ndarray, periods: int) -> np.ndarray:
@@ -299,15 +304,14 @@ def _repeats(group: LaneGroup, bilateral: np.ndarray, sensed: np.ndarray, period
     for keeps, which in ((None, ~loose), (kept, loose)):
         if which.any():
             part = LoopMap(*(piece[which] for piece in loop))
-            with np.errstate(all="ignore"):
-                rest = _find_rest(part, 0.0 * gap[which], gap[which], None if keeps is None else keeps[which], False)
-                position = np.zeros((which.sum(), 1, gap.shape[1]))
-                position[:, 0, 0] = 1.0
-                # Differences of cycles add up to e - G^j e: G the map of a cycle, (1 - G) e the first.
-                pairs = zip(rest.map, length[which], strict=True)
-                cycles = np.stack([np.linalg.matrix_power(moves, span) for moves, span in pairs])
-                whole = solve_lanes(np.eye(gap.shape[1]) - cycles, rest.deviation[..., None])[..., 0]
-                total = 2.0 * rest.reach(position, whole)[:, 0]
-                drift = np.abs(np.einsum("ln,ln->l", rest.left, gap[which])) * periods * 20.0 / length[which]
-                found[at[which]] = rest.stable & (total + drift < room[which] * quantum[which])
+            rest = _find_rest(part, 0.0 * gap[which], gap[which], None if keeps is None else keeps[which], False)
+            position = np.zeros((which.sum(), 1, gap.shape[1]))
+            position[:, 0, 0] = 1.0
+            # Differences of cycles add up to e - G^j e: G the map of a cycle, (1 - G) e the first.
+            pairs = zip(rest.map, length[which], strict=True)
+            cycles = np.stack([np.linalg.matrix_power(moves, span) for moves, span in pairs])
+            whole = solve_lanes(np.eye(gap.shape[1]) - cycles, rest.deviation[..., None])[..., 0]
+            total = 2.0 * rest.reach(position, whole)[:, 0]
+            drift = np.abs(np.einsum("ln,ln->l", rest.left, gap[which])) * periods * 20.0 / length[which]
+            found[at[which]] = rest.stable & (total + drift < room[which] * quantum[which])
     return found

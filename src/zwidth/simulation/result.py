@@ -86,7 +86,7 @@ class Motion:
         outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
             (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the
             tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider. STEADY: it goes on,
-            its readings repeat, or it has no place to rest and the tail's halves are alike by 5 % and the encoder's
+            its readings repeat, or it has no place to rest and the tail's windows are alike by 5 % and the encoder's
             steps. DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed.
@@ -167,9 +167,9 @@ def classify(known: Any, outlook: Any, blur: np.ndarray, course: Any) -> np.ndar
 
     slow, quick = outlook.pace > _FOR_GOOD * course.periods, outlook.pace <= course.periods
     linear = slow & (outlook.settles | outlook.grows)
-    lasting = swinging & (
-        outlook.repeats | alike(whole[:, 0], _ALIKE) & linear | alike(whole[:, 0], _ABOUT) & outlook.restless & quick
-    )
+    # Bounces without order may look alike in halves, hardly in every window.
+    even = alike(high[:, 0] - low[:, 0], _ABOUT)
+    lasting = swinging & (outlook.repeats | alike(whole[:, 0], _ALIKE) & linear | even & outlook.restless & quick)
     rising = whole[1, 0] >= whole[0, 0]
     kind = np.full(first.shape, MotionKind.UNCLEAR)
     growing = outlook.grows & ~still & (rising | (outlook.pace <= 2 * course.periods))

@@ -26,12 +26,12 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 import zwidth.sweep.study  # noqa: F401  (registers its kind)
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
-from zwidth.config.fields import Name, Strict, members
+from zwidth.config.faults import LocatedProblem, problem
+from zwidth.config.fields import Name, Strict, find_kind, members
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
-from zwidth.words.formatting import describe, suggestion
+from zwidth.words.formatting import describe
 from zwidth.words.units import looks_like_number
 
 FORMAT_VERSION = 1
@@ -56,20 +56,9 @@ def _read_study(raw: Any) -> Any:
         return raw
     if isinstance(raw, PydanticCustomError):
         raise raw
-    kinds = f"a study is a mapping with one of the kinds {listing(sorted(KINDS))}"
-    if not isinstance(raw, dict):
-        raise problem(f"got {describe(raw)}", kinds, "write '- kind: boundary' and its fields, or remove the entry")
-    kind = raw.get("kind")
-    if "kind" not in raw:
-        raise validation_error("study", [(("kind",), problem("missing", kinds, "add 'kind: boundary'"))])
-    model = _find_model(kind)
-    if model is None:
-        what = problem(
-            f"got {describe(kind)}",
-            f"the kinds are {listing(sorted(KINDS))}",
-            suggestion(kind, KINDS, "write one of these"),
-        )
-        raise validation_error("study", [(("kind",), what)])
+    _find_model(raw.get("kind") if isinstance(raw, dict) else None)
+    known = {kind: KINDS[kind] for kind in sorted(KINDS)}
+    model = find_kind(raw, known, "a study", "'- kind: boundary' and its fields, or remove the entry")
     return model.model_validate(raw)
 
 

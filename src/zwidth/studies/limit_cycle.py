@@ -8,7 +8,7 @@ from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, get_type_hints
 
 import numpy as np
-from pydantic import Field, WrapValidator, create_model
+from pydantic import WrapValidator, create_model
 
 from zwidth import figures
 from zwidth.config.axes import Axis, AxisOf, axis_of
@@ -43,7 +43,7 @@ _MOST_CURVES = 6
 
 # All that the study sets for every condition may be set for one; what is not is None.
 _OWN: Any = {
-    name: (hint | None, Field(default=None, description=Circumstances.model_fields[name].description))
+    name: (hint | None, None)
     for name, hint in get_type_hints(Circumstances, include_extras=True).items()
     if name in Circumstances.model_fields
 }
@@ -54,6 +54,7 @@ class CycleCondition(_Own):
     """What one panel of a limit_cycle study has of its own."""
 
     what: ClassVar[str] = "a condition"
+    described_by = (Circumstances,)
 
     label: str
     """Name of the condition, each one its own."""

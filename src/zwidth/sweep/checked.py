@@ -13,13 +13,12 @@ from zarr.storage import LocalStore
 
 from zwidth.sweep.files.whole import content
 from zwidth.sweep.plan import Task
+from zwidth.sweep.store import Store
 from zwidth.words.errors import StoreError
 
 if TYPE_CHECKING:
     from zarr.abc.store import ByteRequest
     from zarr.core.buffer import Buffer, BufferPrototype
-
-    from zwidth.sweep.store import Store
 
 
 class CheckedStore(LocalStore):

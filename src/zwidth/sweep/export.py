@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.files.whole import hidden_beside
-from zwidth.sweep.store import open_dataset
 from zwidth.words.errors import StoreError, StoreExistsError
 from zwidth.words.formatting import header, to_cell
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES

@@ -179,7 +179,7 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
     disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
-    model = "device with parts, held delay" if study.with_parts else _model(_most_periods(study))
+    model = "device with parts, held delay" if study.with_parts else _model(study.axes.most_periods)
     return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
@@ -276,19 +276,6 @@ def _bytes_per_point(outputs: tuple[str, ...]) -> int:
 def _disk_bits(outputs: tuple[str, ...]) -> int:
     """Bits for a point on the disk: numbers hardly shrink, truth values are packed, a status is nearly always 0."""
     return 1 + sum({"float64": 64, "bool": 1, "uint8": 1}[OUTPUTS[name].dtype] for name in outputs)
-
-
-def _most_periods(study: SweepStudy) -> float:
-    """The longest delay in periods."""
-    given = study.axes.given
-    if "d" in given:
-        return study.axes.end("d", largest=True)
-    if "delay" not in given:
-        return 0.0
-    longest = study.axes.end("delay", largest=True)
-    if study.axes.delay_in_periods:
-        return longest
-    return longest * (study.axes.end("rate", True) if "rate" in given else 1.0 / study.axes.end("period", False))
 
 
 def _size(count: float) -> str:

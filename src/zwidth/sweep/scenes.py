@@ -8,7 +8,6 @@ import numpy as np
 
 from zwidth.scenes.scene import Scene
 from zwidth.sweep.grid import SceneBlock
-from zwidth.sweep.part_axes import make_scene
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError, ZwidthError
 from zwidth.words.quantities import OUTPUTS, STATUS_OF, Family
@@ -34,7 +33,7 @@ def compute_scenes(
     for k in range(devices):
         values = {name: float(column[k]) for name, column in block.parameters.items()}
         try:
-            scene = _keep(make_scene(study, values))
+            scene = _keep(study.make_scene(values))
             walls = block.stiffness[k][:, None], block.virtual_damping[k][None, :]
             one, told = _compute_walls(scene, outputs, *walls) if family == "wall" else _compute_device(scene)
         except InputError:

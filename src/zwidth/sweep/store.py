@@ -5,7 +5,7 @@ of a chunk are there, their checksums are written, in one small file that says b
 Every file appears under its name at once and whole. That holds when a program is killed at any moment; it does not
 when the machine loses power, since nothing waits for the disk: whoever reads a file compares its checksum.
 
-Only this module and `checked`, which it reads through, import zarr, xarray or a library for HDF5.
+Only this module, which writes, and `dataset` with `checked`, which read, import zarr or xarray.
 """
 
 from __future__ import annotations
@@ -31,19 +31,18 @@ from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 
 if TYPE_CHECKING:
-    import xarray
     import zarr
 
 SUFFIX = ".zarr"
 FORMAT = 1
-_SEAL = "attributes_sha256"
-_FILES = "file_checksums"
+SEAL = "attributes_sha256"
+FILES = "file_checksums"
 # Zarr reads the first; the second is a copy of it, for the whole store would be lost with one flipped bit.
 _DESCRIPTIONS = ("zarr.json", "zwidth.json")
 
 
 @contextmanager
-def _silence_zarr() -> Iterator[None]:
+def silence_zarr() -> Iterator[None]:
     """Keep back what zarr says about every codec and type that is not in its core specification."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*Zarr", category=UserWarning)
@@ -61,7 +60,7 @@ def check_installed() -> None:
             )
 
 
-def _name_checksums(family: str) -> str:
+def name_checksums(family: str) -> str:
     return f"{family}_checksum"
 
 
@@ -78,7 +77,7 @@ class Store:
         for name in _DESCRIPTIONS:
             try:
                 attributes = json.loads((self.path / name).read_text(encoding="utf-8"))["attributes"]
-                if digest({key: value for key, value in attributes.items() if key != _SEAL}) == attributes[_SEAL]:
+                if digest({key: value for key, value in attributes.items() if key != SEAL}) == attributes[SEAL]:
                     break
                 faults.append(f"{name} is damaged, its checksum is wrong")
             except FileNotFoundError:
@@ -113,13 +112,13 @@ class Store:
     def _group(self) -> zarr.Group:
         import zarr
 
-        with _silence_zarr():
+        with silence_zarr():
             return zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
 
     @cached_property
     def _arrays(self) -> dict[str, Any]:
         names = [name for family in self.plan.families for name in family.variables]
-        with _silence_zarr():
+        with silence_zarr():
             arrays: dict[str, Any] = {name: self._group[name] for name in names}
         # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
@@ -132,7 +131,7 @@ class Store:
 
     def flag(self, task: Task) -> Path:
         """The file that says by being there that a chunk is done."""
-        return self.path / _name_checksums(task.family) / "c" / str(task.index) / "0"
+        return self.path / name_checksums(task.family) / "c" / str(task.index) / "0"
 
     def is_done(self, task: Task) -> bool:
         """Whether a chunk is marked as done."""
@@ -157,7 +156,7 @@ class Store:
         place = family.place(task.index)
         files = self.files(task)
         shape = tuple(part.stop - part.start for part in place)
-        with _silence_zarr():
+        with silence_zarr():
             for name, file in zip(family.variables, files, strict=True):
                 # Zarr would read what is left of a damaged chunk at the edge of the grid before it replaces it.
                 remove_quietly(file)
@@ -187,7 +186,7 @@ class Store:
     @property
     def described(self) -> dict[str, int]:
         """The checksums of the files beside the chunks, by their names: coordinates and descriptions of variables."""
-        return self.attributes[_FILES]
+        return self.attributes[FILES]
 
     def damaged_files(self) -> list[str]:
         """Those files that are not what was written, and the store's own description where it is damaged."""
@@ -228,7 +227,7 @@ def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
     study = SweepStudy.model_validate(attributes["study"])
     plan, grid = kept_plan(study, attributes["plan"]), Grid(study)
     with hidden_beside(path) as fresh:
-        with _silence_zarr():
+        with silence_zarr():
             _build(fresh, plan, grid)
         files = sorted(file for file in fresh.rglob("*") if file.is_file() and file != fresh / "zarr.json")
         sums = {file.relative_to(fresh).as_posix(): checksum(file) for file in files}
@@ -237,9 +236,9 @@ def _build_beside(path: Path, attributes: dict[str, Any]) -> Iterator[Path]:
             name for name in grid.coordinates() if name not in {dim.replace(".", "_") for dim in grid.dims}
         )
         described = {"Conventions": "CF-1.11", "zwidth_format": FORMAT, "coordinates": auxiliary, **attributes}
-        described = {key: value for key, value in described.items() if key not in (_FILES, _SEAL)} | {_FILES: sums}
+        described = {key: value for key, value in described.items() if key not in (FILES, SEAL)} | {FILES: sums}
         document = json.loads((fresh / "zarr.json").read_text(encoding="utf-8"))
-        document["attributes"] = {**described, _SEAL: digest(described)}
+        document["attributes"] = {**described, SEAL: digest(described)}
         for name in _DESCRIPTIONS:
             write_whole(fresh / name, json.dumps(document, indent=2).encode())
         yield fresh
@@ -287,7 +286,7 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
         group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **common, **code)
         group.create_array(
-            _name_checksums(family.family),
+            name_checksums(family.family),
             shape=(family.count, len(family.variables)),
             chunks=(1, len(family.variables)),
             dtype="<u4",
@@ -303,54 +302,6 @@ def find_stores(path: Path) -> list[Path]:
     if (path / "zarr.json").is_file() or path.name.endswith(SUFFIX):
         return [path]
     return sorted(found for found in path.glob(f"*{SUFFIX}") if not found.name.startswith("."))
-
-
-def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
-    """Open the results of a sweep, without reading them yet.
-
-    Every file is compared with its checksum when it is read, values when they are asked for. What is damaged or missing
-    is a `StoreError` that names it; `zwidth.run` with ``resume`` mends it.
-
-    Args:
-        path: a store ``<study>.zarr``, or the folder of a run that holds only one.
-
-    Returns:
-        An `xarray.Dataset` backed by dask, one dask chunk a chunk of the store. ``attrs["complete"]`` is 1 where every
-        chunk is there; the points of the others have the status 255, "not computed".
-
-    Raises:
-        StoreError: there is no store, there are several, or its descriptions or coordinates are damaged.
-        InputError: the libraries for stores are not installed.
-
-    Example:
-        >>> import tempfile, zwidth
-        >>> from zwidth.studies import Config
-        >>> axes = {"alpha": [0.1, 0.9], "beta": 0.1, "delta": 0.1, "d": 1}
-        >>> studies = [{"kind": "sweep", "name": "small", "axes": axes}]
-        >>> config = Config.model_validate({"version": 1, "name": "example", "studies": studies})
-        >>> with tempfile.TemporaryDirectory() as folder:
-        ...     _ = zwidth.run(config, out=folder)
-        ...     zwidth.open_dataset(folder).stable.values
-        array([ True, False])
-    """
-    store = find_store(path)
-    check_installed()
-    import xarray
-
-    # Loads Zarr.
-    from zwidth.sweep.checked import CheckedStore
-
-    attributes = store.attributes
-    checked = CheckedStore(store)
-    with _silence_zarr():
-        dataset = xarray.open_zarr(checked, consolidated=False, chunks={})
-    dataset = dataset.drop_vars([_name_checksums(family.family) for family in store.plan.families])
-    if "device" in dataset.coords:
-        # Neither netCDF nor pandas knows NumPy's strings of variable length.
-        labels = np.array([str(label) for label in dataset["device"].values])
-        dataset = dataset.assign_coords(device=("device", labels, dataset["device"].attrs))
-    dataset.attrs = {key: value for key, value in attributes.items() if key not in (_SEAL, _FILES, "coordinates")}
-    return dataset.assign_attrs(complete=int(checked.complete))
 
 
 def find_store(path: str | os.PathLike[str]) -> Store:

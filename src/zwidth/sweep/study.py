@@ -3,25 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from typing import Annotated, Any, ClassVar, Literal
+from collections.abc import Iterable, Iterator
+from dataclasses import MISSING, fields
+from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
+from pydantic import BeforeValidator, ValidationError, WithJsonSchema, WrapValidator
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import Axis, axis_of
-from zwidth.config.device_table import DeviceTable, TableField, read_table
+from zwidth.config.device_table import DeviceTable, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
-from zwidth.config.fields import Strict, describe_parameter, members
-from zwidth.config.parts import list_parts, make_parts_base
+from zwidth.config.fields import members
+from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
 from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Quantity
-from zwidth.sweep.part_axes import find_faults
+from zwidth.parts.device import Device
+from zwidth.parts.paths import PARTS
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import BackwardDifference
+from zwidth.scenes.scene import Scene
+from zwidth.sweep.axes import Axes
+from zwidth.words.errors import InputError
 from zwidth.words.quantities import (
     MAX_DELAY_PERIODS,
-    NORMALIZED,
-    OF_PARTS,
     OUTPUTS,
     OUTPUTS_WITH_PARTS,
     PARAMETERS,
@@ -34,6 +38,11 @@ from zwidth.words.quantities import (
 
 MAX_SWEEP_POINTS = 10**12
 
+_EXAMPLES = {
+    "velocity": "velocity: {kind: low_pass, cutoff: 100 Hz}",
+    "coupling": "coupling: {mass: 50 g, stiffness: 20 kN/m}",
+}
+
 
 def _check_output(name: Any) -> str:
     if not isinstance(name, str) or name not in OUTPUTS:
@@ -42,100 +51,6 @@ def _check_output(name: Any) -> str:
 
 
 OutputName = Annotated[str, BeforeValidator(_check_output), WithJsonSchema({"type": "string", "enum": list(OUTPUTS)})]
-
-
-def _axis_field(name: str) -> tuple[Any, Any]:
-    if name == "devices":
-        rows = "Parameters that move together, one row a device: lists of equal length, or a CSV file."
-        return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
-    axis: Any = Annotated[Axis, axis_of(name)]
-    words = describe_parameter(PARAMETERS[name]) + ("." if name in WALL else "; the scene's where left out.")
-    return axis | None, Field(default=None, description=words)
-
-
-# In the order in which a store keeps what was asked of it.
-_OF_WALL, _OF_DEVICE = ("stiffness", "virtual_damping"), ("mass", "damping", "period", "rate", "delay")
-_FIELDS: Any = {name: _axis_field(name) for name in (*OF_PARTS, "devices", *NORMALIZED, *_OF_WALL, *_OF_DEVICE)}
-# Some of the names have dots, which a class body cannot have.
-_Axes: Any = create_model("_Axes", __base__=Strict, **_FIELDS)
-
-
-class Axes(_Axes):
-    """The parameters of a sweep and the values that each of them takes."""
-
-    what: ClassVar[str] = "the axes of a sweep"
-
-    @classmethod
-    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        return _mixed([key for key in raw if key in PARAMETERS], "axes")
-
-    def limits(self) -> Iterable[LocatedProblem]:
-        """A parameter that is both an axis and a column, and kinds that only the table's columns show."""
-        columns = tuple(self.devices.columns) if self.devices else ()
-        own = [name for name in PARAMETERS if getattr(self, name) is not None]
-        for name in own:
-            if name in columns:
-                twice = "given twice, as an axis and as a column of devices"
-                yield (name,), problem(twice, "each parameter once", "remove one")
-        if columns and not any(name in columns for name in own):
-            yield from ((("devices",), what) for _, what in _mixed([*own, *columns], "axes and devices together"))
-
-    @property
-    def given(self) -> tuple[str, ...]:
-        """The parameters that are axes or columns, in the order of a store's dimensions."""
-        columns = self.devices.columns if self.devices else {}
-        return tuple(name for name in PARAMETERS if name in columns or getattr(self, name) is not None)
-
-    @property
-    def given_of_parts(self) -> tuple[str, ...]:
-        """Those of them that belong to a velocity filter, a hand or a coupling."""
-        return tuple(name for name in self.given if name in OF_PARTS)
-
-    @property
-    def physical(self) -> bool:
-        """Whether the parameters are SI quantities."""
-        return any(name in PHYSICAL for name in self.given)
-
-    @property
-    def delay_in_periods(self) -> bool:
-        """Whether the delays count sampling periods."""
-        source = self.devices if self.delay is None else self.delay
-        return source is not None and source.in_periods
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """The dimensions, slow ones first; a single number is none."""
-        sizes = {"device": self.devices.size} if self.devices else {}
-        for name in PARAMETERS:
-            axis = getattr(self, name)
-            if axis is not None and axis.form != "number":
-                sizes[name] = axis.size
-        return sizes
-
-    def end(self, name: str, largest: bool) -> float:
-        """The largest or smallest value of a parameter."""
-        if self.devices and name in self.devices.columns:
-            column = self.devices.columns[name]
-            return max(column) if largest else min(column)
-        axis: Axis = getattr(self, name)
-        return axis.largest if largest else float(axis.values().min())
-
-
-def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
-    """What is wrong with a set of parameters."""
-    if not keys:
-        return
-    physical = keys[0] in PHYSICAL
-    for key in keys:
-        if (key in PHYSICAL) != physical:
-            kinds = "physical key, after normalized ones" if not physical else "normalized key, after physical ones"
-            allowed = f"{where} are in SI units or normalized, never both"
-            remedy = f"choose from {listing(PHYSICAL if physical else NORMALIZED)}"
-            yield (key,), problem(kinds, allowed, remedy, on_key=True)
-    if "period" in keys and "rate" in keys:
-        second = [key for key in keys if key in ("period", "rate")][1]
-        allowed = "the sampling period and its rate say the same"
-        yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
 
 
 class _Swept(Study):
@@ -232,8 +147,8 @@ class SweepStudy(_Parts, _Swept):
         if not walls:
             for name in (name for name in given if name in WALL):
                 allowed = f"{listing(self.outputs)} do not depend on the wall"
-                place = ("axes", "devices") if getattr(self.axes, name) is None else ("axes", name)
-                yield place, problem(f"got {name!r}, which moves no output", allowed, "remove it or add 'stable'")
+                what = f"got {name!r}, which moves no output"
+                yield ("axes", self.axes.place(name)), problem(what, allowed, "remove it or add 'stable'")
         for index, name in enumerate(self.outputs):
             if OUTPUTS[name].physical_only and not physical:
                 allowed = "it needs a device in SI units"
@@ -252,20 +167,64 @@ class SweepStudy(_Parts, _Swept):
             elif name == "passive" and self.coupling is not None and self.coupling.sensor == "tip":
                 allowed = "it is known where the force acts on the body whose position is sensed"
                 yield ("outputs", index), problem("got 'passive' with the sensor at the tip", allowed, "remove it")
-        if not {"mass"} <= set(given) or not {"period", "rate"} & set(given):
-            return
-        yield from find_faults(self)
+        if {"mass"} <= set(given) and {"period", "rate"} & set(given):
+            yield from self._find_part_faults()
+
+    def _find_part_faults(self) -> Iterable[LocatedProblem]:
+        """Axes of parts that are not there, and values that the parts refuse."""
+        absent = [name for name in self.axes.given_of_parts if not self._has_parameter(name)]
+        for name in absent:
+            part, _, key = name.partition(".")
+            what = f"got the axis {name!r}, but no {part} with the key {key!r}"
+            remedy = f"add {_EXAMPLES.get(part, part)!r}"
+            yield ("axes", self.axes.place(name)), problem(what, "an axis changes a part that is there", remedy)
+        found = {} if absent else {str(error): locate_refusal(error) for error in self._find_refusals()}
+        for field, what in found.values():
+            name = ".".join(map(str, field))
+            yield (("axes", self.axes.place(name)) if name in self.axes.given else ("axes",)), what
+
+    def _has_parameter(self, name: str) -> bool:
+        """Whether the part that an axis belongs to is there, and has such a key."""
+        part, _, key = name.partition(".")
+        section = getattr(self, part)
+        kind = section.part if section is not None else PARTS.get(part, BackwardDifference)
+        # A part that has no section is there where it needs no numbers.
+        needed = section is None and any(item.default is MISSING for item in fields(kind))
+        return not needed and key in kind.__dataclass_fields__
+
+    def _find_refusals(self) -> Iterator[InputError]:
+        """What the parts refuse with every parameter at its least value, and with those of parts at their ends."""
+        least = {name: self.axes.ends(name)[0] for name in self.axes.given if name not in WALL}
+        for changed in ({}, *({name: self.axes.ends(name)[1]} for name in self.axes.given_of_parts)):
+            try:
+                self.make_scene({**least, **changed}).check_parts()
+            except InputError as error:
+                yield error
+
+    def make_scene(self, values: dict[str, float]) -> Scene:
+        """The scene at a point of the grid, from the parameters that the axes give.
+
+        Raises:
+            InputError: the parts refuse the values.
+        """
+        given = dict(values)
+        period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
+        delay = given.pop("delay", 0.0) * (period if self.axes.delay_in_periods else 1.0)
+        parts = build_parts(self)
+        for name in given:
+            part = name.partition(".")[0]
+            if part in PARTS and part not in parts:
+                parts[part] = PARTS[part]()
+        device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0))
+        return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
     def _delay_limits(self, given: tuple[str, ...]) -> Iterable[LocatedProblem]:
         if "delay" not in given or not {"period", "rate"} & set(given):
             return
-        axis = self.axes.delay
-        longest = self.axes.end("delay", largest=True)
-        if not self.axes.delay_in_periods:
-            longest *= self.axes.end("rate", True) if "rate" in given else 1.0 / self.axes.end("period", False)
+        longest = self.axes.most_periods
         if not longest <= MAX_DELAY_PERIODS:
-            place = ("axes", "devices") if axis is None else ("axes", "delay")
             what = f"the longest delay is {longest:.6g} of the shortest periods"
+            place = ("axes", self.axes.place("delay"))
             yield place, problem(what, f"at most {MAX_DELAY_PERIODS:g} periods", "check the units")
 
     @property

@@ -10,7 +10,7 @@ from sweeping import config_of, failing_on_2, main_of, run_sweeps, study
 from zwidth.figures import draw_curves, draw_outlines, draw_plane
 from zwidth.runs import draw
 from zwidth.runs.draw import draw_stores
-from zwidth.sweep.store import open_dataset
+from zwidth.sweep.dataset import open_dataset
 from zwidth.words.errors import InputError, StoreError
 
 PLANE = {

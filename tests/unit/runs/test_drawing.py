@@ -12,7 +12,7 @@ from zwidth.figures import draw_curves, draw_plane
 from zwidth.figures.style import figure_of
 from zwidth.runs import draw
 from zwidth.runs.draw import Drawing, draw_stores
-from zwidth.sweep.store import open_dataset
+from zwidth.sweep.dataset import open_dataset
 from zwidth.words.errors import InputError
 
 AXES = {

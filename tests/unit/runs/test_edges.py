@@ -8,7 +8,8 @@ from zwidth import Device, LowPass, Scene, Timing, is_passive, is_stable
 from zwidth.figures import draw_outlines, draw_plane
 from zwidth.figures.grid import prepare
 from zwidth.runs.edges import make_edges
-from zwidth.sweep.store import Store, open_dataset
+from zwidth.sweep.dataset import open_dataset
+from zwidth.sweep.store import Store
 
 WALLS = {
     "alpha": {"linear": {"start": 0.0, "stop": 1.0, "num": 21}},

@@ -9,7 +9,7 @@ from run_folders import record_of
 
 import zwidth
 from zwidth.runs.inputs import gather_inputs
-from zwidth.sweep.store import open_dataset
+from zwidth.sweep.dataset import open_dataset
 from zwidth.words.errors import StoreExistsError
 
 TABLE = "label,mass [kg],damping [N s/m]\none,0.1,1\ntwo,0.2,1\n"

@@ -74,19 +74,15 @@ def test_an_encoder_at_rest_does_not_kick():
     assert set(found.outcome.tolist()) == {MotionKind.REST}
 
 
-def test_labels_hold_in_longer_runs():
-    rng = np.random.default_rng(3)
-    share, push = rng.uniform(0.1, 1.3, 60), rng.uniform(0, 2, 60)
-    for extra in ({}, {"contact": "unilateral"}, {"resolution": 1e-5}, {"coulomb": 0.2}, {"max_force": 5.0}):
-        given = {"start_position": -1e-4, "push": push, "record": False, **extra}
-        walls = share * TOP.stiffness, TOP.virtual_damping
-        short = SCENE.simulate(*walls, periods=800, **given)
-        late = SCENE.simulate(*walls, periods=8000, tail=200, **given)
-        kind = short.outcome
-        assert np.mean(kind == MotionKind.UNCLEAR) < 0.4
-        assert np.all(late.amplitude[kind == MotionKind.REST] < 1e-9)
-        assert np.all((late.amplitude < short.amplitude)[kind == MotionKind.DECAYING])
-        assert np.all((late.amplitude > short.amplitude)[kind == MotionKind.GROWING])
+def test_who_flies_off_does_not_return():
+    damped = SCENE.replace(damping=0.4)
+    hit = {"start_position": -1e-3, "start_velocity": 0.1, "contact": "unilateral", "periods": 120, "record": False}
+    # Next to the wall still, and as slow as it will be: only its direction tells.
+    found = damped.simulate(2 * TOP.stiffness, 5.0, push=[0.0, -0.01, 0.01], **hit)
+    assert found.bounces.tolist() == [1, 1, 1]
+    assert MotionKind(found.outcome[0]) is MotionKind.DECAYING
+    # One is pushed away for good, the other comes back.
+    assert set(found.outcome[1:].tolist()) == {MotionKind.UNCLEAR}
 
 
 @pytest.mark.parametrize("names", [("a", "b"), (), ("position",)])

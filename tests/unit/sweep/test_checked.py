@@ -7,7 +7,7 @@ import shutil
 import pytest
 from sweeping import chunk_file, config_of, cut, flip, main_of, run_sweeps, study, values_of
 
-from zwidth.sweep.store import open_dataset
+from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.verify import verify
 from zwidth.words.errors import StoreError
 

@@ -8,8 +8,8 @@ import xarray
 from sweeping import config_of, run_sweeps, study
 
 from zwidth.sweep import export
+from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.export import to_csv, to_netcdf
-from zwidth.sweep.store import open_dataset
 from zwidth.words.errors import StoreError, StoreExistsError
 
 AXES = {"devices": {"label": ["a", "b"], "mass": [0.1, 1], "damping": [1, 2]}, "rate": 1000, "stiffness": [10, 20, 1e6]}

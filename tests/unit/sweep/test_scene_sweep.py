@@ -10,9 +10,8 @@ from zwidth.config.faults import ConfigFileError
 from zwidth.runs.draw import draw_stores
 from zwidth.studies.document import Config
 from zwidth.sweep.chunks import perform
+from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.export import to_csv, to_netcdf
-from zwidth.sweep.part_axes import make_scene
-from zwidth.sweep.store import open_dataset
 from zwidth.sweep.study import SweepStudy
 from zwidth.sweep.verify import verify
 from zwidth.words.status import Status
@@ -158,7 +157,7 @@ def test_every_parameter_of_every_part_is_an_axis(path, values, parts, tmp_path)
     assert isinstance(sweep, SweepStudy)
     axis = getattr(sweep.axes, path).values().tolist()
     for value, stiffness in zip(axis, found.stiffness_max.values, strict=True):
-        scene = make_scene(sweep, {"mass": 0.1, "damping": 2.0, "period": 1e-3, path: value})
+        scene = sweep.make_scene({"mass": 0.1, "damping": 2.0, "period": 1e-3, path: value})
         assert scene.parameters()[path] == value
         # Rows that are stable from soft walls on lead to no island.
         low, high = np.moveaxis(scene.stable_stiffness(np.linspace(0, 300, 601)), -1, 0)

@@ -25,8 +25,9 @@ from sweeping import (
 )
 
 import zwidth
+from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.plan import Task
-from zwidth.sweep.store import Store, open_dataset
+from zwidth.sweep.store import Store
 from zwidth.sweep.verify import verify
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.status import Status

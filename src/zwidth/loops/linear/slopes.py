@@ -20,6 +20,8 @@ from zwidth.words.types import Array
 
 # The step of a difference, as a share of the parameter; its sixth power is rounding. And that of an imaginary step.
 _STEP, _TINY = 1e-3, 1e-30
+# A parameter below this share of its unit is next to 0: in steps of its own size rounding ate up to 3e-6 of a slope.
+_NEXT_TO_NOTHING = 1e-5
 # Weights of the differences: around a value, and from it on.
 _CENTRAL = [(-3, -1 / 60), (-2, 3 / 20), (-1, -3 / 4), (1, 3 / 4), (2, -3 / 20), (3, 1 / 60)]
 _ONE_SIDED = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
@@ -176,6 +178,9 @@ def _stencils(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
     value = float(scene.parameters()[path])
     period = float(scene.timing.period)
     units = {"mass": scene.mass, "damping": scene.mass / period, "stiffness": scene.mass / period**2, "delay": period}
-    step = _STEP * (abs(value) or float(next(unit for name, unit in units.items() if path.endswith(name))))
+    unit = float(next((unit for name, unit in units.items() if path.endswith(name)), 0.0))
+    # Rates are linear in dampings and springs, and smooth in the delay, over all of the unit; a light mass has its own.
+    least = 0.0 if path.endswith("mass") else _NEXT_TO_NOTHING * unit
+    step = _STEP * (abs(value) if abs(value) > least else unit)
     yield from ([[(value + k * step, weight / step) for k, weight in _CENTRAL]] if value > 3.0 * step else [])
     yield from ([(value + side * k * step, side * w / step) for k, w in enumerate(_ONE_SIDED)] for side in (1, -1))

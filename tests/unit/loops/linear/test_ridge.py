@@ -188,6 +188,16 @@ def test_derivatives_of_a_rigid_scene_are_the_closed_ones():
     assert per["operator.stiffness"] == pytest.approx(change / spring, rel=1e-4)
 
 
+def test_derivatives_at_a_double_pole_of_a_chain_are_the_closed_ones():
+    """A hand's spring of 1e-10 of K_max keeps the chain from being a rigid device, and changes nothing else."""
+    scene = Scene(Device(0.1, 600.0), Timing(1e-3), operator=Operator(0.02, 10.0, 3e-4))
+    found = wanted(scene, True)
+    assert (found.first, found.second) == (Condition.MINUS_ONE, Condition.STATIONARY)
+    per, expected = scene.sensitivities().per, zwidth.sensitivities(mass=0.12, damping=610.0, period=1e-3)
+    for name in ("mass", "damping", "period", "delay"):
+        assert per[name] == pytest.approx(float(getattr(expected, f"per_{name}")), rel=1e-7), name
+
+
 def filtered(cutoff):
     return PAPER.replace(velocity=LowPass(cutoff=cutoff)).max_stiffness().stiffness
 
@@ -281,3 +291,12 @@ scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3), velocity
 assert scene.max_stiffness().status == 0 and "jax" not in sys.modules
 """
     subprocess.run([sys.executable, "-c", program], check=True, timeout=LONGEST)
+
+
+def test_slopes_next_to_a_parameter_of_0_are_those_at_0():
+    scene = Scene(Device(1.5, 0.0, Coupling(1.0, 300.0, 0.0)), Timing(period=2e-4))
+    tiny = scene.replace(**{"damping": 1e-7, "coupling.damping": 1e-7, "delay": 1e-13})
+    at_zero, beside = scene.sensitivities().per, tiny.sensitivities().per
+    # In steps of a thousandth of themselves, rounding moved those in both dampings by 4e-3, that in the delay by 7e-6.
+    for path in ("damping", "coupling.damping", "delay", "coupling.stiffness"):
+        assert beside[path] == pytest.approx(at_zero[path], rel=1e-7)
