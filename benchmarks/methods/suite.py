@@ -120,6 +120,15 @@ def radius_error(radius: Callable[[Walls], Any], d: float, points: int) -> Error
     return float(np.max(np.abs(np.asarray(radius(walls)) - exact) / exact)), 0, exact.size
 
 
+def map_error(radius: Any, walls: Walls, checked: int = 2_000) -> Error:
+    """The largest relative error of some of a map's radii, against these walls by themselves."""
+    picked = np.random.default_rng(5).choice(radius.size, min(checked, radius.size), replace=False)
+    place = np.unravel_index(picked, radius.shape)
+    alone = spectral_radius(*(np.broadcast_to(part, radius.shape)[place] for part in walls))
+    known = np.isfinite(alone)
+    return float(np.max(np.abs(radius[place] / alone - 1.0)[known])), 0, int(known.sum())
+
+
 def largest(z: Any) -> np.ndarray:
     """The largest modulus of each wall's poles."""
     return np.abs(z).max(axis=-1)
@@ -175,6 +184,13 @@ def _radii(d: float, sizes: Sizes) -> Iterator[Row]:
         if not _possible(method, d):
             continue
         yield from _time_layouts("spectral_radius", method, d, radius_error(radius, d, sizes.roots), radius, points)
+    # The trade of a map: the same walls to each accuracy, against some of them one by one.
+    plane = problems.grid(d, sizes.map_points)
+    for accuracy in (1e-2, 1e-4, 1e-6, 1e-9):
+        call = partial(spectral_radius, *plane, accuracy=accuracy)
+        first, warm = clock(call)
+        error = map_error(call(), plane)
+        yield Row("spectral_radius", f"map to {accuracy:g}", "map", d, plane.points, first, plane.points / warm, *error)
     for name, tool in available().items():
         if d > _LONGEST_BASELINE or (tool.only_whole and d != int(d)):
             continue

@@ -211,7 +211,7 @@ def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
     if "stable" in study.outputs:
         methods["stable"] = ("crossover", "no pole is needed: the end of each row in closed form, then a comparison")
     if RADIUS_OUTPUTS & set(study.outputs):
-        proof = f"each value proved to {study.accuracy:g} by two counts of the poles, at a cost that is flat in d"
+        proof = f"each value proved to {study.accuracy:g} by counts of poles inside circles, at a cost flat in d"
         methods["spectral_radius"] = ("newton", proof)
     return methods
 

@@ -80,9 +80,10 @@ class SweepStudy(_Parts, _Swept):
     accuracy: Annotated[float, Quantity(allowed=Range(1e-12, 0.1))] = 1e-9
     """Relative error to prove of every spectral radius.
 
-    It is proved by counting the poles inside two circles; most values have nearly all digits whatever is
-    asked for. Where no proof is found, next to double poles above all, the status is NOT_CONVERGED: the value is there
-    if a larger error of at most 0.1 is proved, and NaN otherwise.
+    On a map (alpha or the stiffness along one axis, the damping along another) a larger one is quicker: a Taylor series
+    serves a cell of walls, and one count of the poles inside a circle proves it for all of them. Single walls have
+    nearly all digits whatever is asked for. Where no proof is found, next to double poles above all, the status is
+    NOT_CONVERGED: the value is there if a larger error of at most 0.1 is proved, and NaN otherwise.
     """
 
     delay_model: HeldOnly = "held"
