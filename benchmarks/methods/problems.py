@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -123,12 +124,28 @@ def with_radius(d: float, points: int) -> tuple[Walls, np.ndarray]:
     return Walls(*walls), radius
 
 
+def ball_polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> list[Any]:
+    """The coefficients of P as balls, lowest power first."""
+    import flint
+
+    with flint.ctx.workprec(bits):
+        here = certified_balls.device(delta, d, bits)
+        n = [a for a in (here.a0, here.a1, here.a2) if a is not None]
+        stiffness, damping = flint.arb(alpha), flint.arb(beta)
+        s = stiffness + damping
+        wall = [-n[0] * damping, *(left * s - right * damping for left, right in pairwise(n)), n[-1] * s]
+        p = [*wall, *[flint.arb(0)] * (int(d) + 1)]
+        for index, value in enumerate((here.c, -(1 + here.c), flint.arb(1)), len(p) - 3):
+            p[index] += value
+        return p
+
+
 def exact_radius(alpha: float, beta: float, delta: float, d: float) -> float:
     """The largest of all isolated poles: an enclosure far narrower than a rounding error."""
     import flint
 
     with flint.ctx.workprec(_ROOT_BITS):
-        coefficients = certified_balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
+        coefficients = ball_polynomial(alpha, beta, delta, d, _ROOT_BITS)
         roots = flint.acb_poly([flint.acb(value) for value in coefficients]).roots(tol=_ROOT_WIDTH)
         return max(float(abs(root).mid()) for root in roots)
 
@@ -145,7 +162,7 @@ def refined_radius(alpha: float, beta: float, delta: float, d: float) -> float:
     if not pole.error[0] <= 1e-9:
         raise ArithmeticError(f"no proof of the outermost pole at {(alpha, beta, delta, d)}")
     with flint.ctx.workprec(_ROOT_BITS):
-        coefficients = certified_balls.polynomial(alpha, beta, delta, d, _ROOT_BITS)
+        coefficients = ball_polynomial(alpha, beta, delta, d, _ROOT_BITS)
         terms = [(k, value.mid()) for k, value in enumerate(coefficients) if value != 0]
         start = z = flint.acb(float(pole.re[0]), float(pole.im[0])).exp()
         step = z

@@ -13,6 +13,7 @@ from .fitting.log import fit_log as fit_log
 from .fitting.safe_wall import SafeWall as SafeWall
 from .loops.normalization import denormalize as denormalize
 from .loops.normalization import normalize as normalize
+from .loops.rigid.area import passive_area as passive_area
 from .loops.rigid.area import stable_area as stable_area
 from .loops.rigid.boundary import BoundaryPoint as BoundaryPoint
 from .loops.rigid.boundary import boundary as boundary
@@ -21,7 +22,6 @@ from .loops.rigid.counting import count_poles as count_poles
 from .loops.rigid.margins import Margins as Margins
 from .loops.rigid.margins import margins as margins
 from .loops.rigid.modulus import modulus_margin as modulus_margin
-from .loops.rigid.passive_area import passive_area as passive_area
 from .loops.rigid.passivity import is_passive as is_passive
 from .loops.rigid.passivity import passivity_margin as passivity_margin
 from .loops.rigid.poles import poles as poles

@@ -8,7 +8,7 @@ that, and lays nothing out. A scene picks its loop once (`zwidth.Scene.loop`); a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, NamedTuple, get_args
 
@@ -61,6 +61,8 @@ class LinearLoop:
     """The loop of any scene with a linear velocity estimate; alpha and beta are arrays of one shape."""
 
     scene: Any
+    # The stiffest walls that were found: a scene is asked for them often.
+    _ridges: dict[bool, BoundRidge | None] = field(default_factory=dict, init=False, repr=False)
 
     # The delay models that it knows, and how many devices of its kind are drawn where a person waits for the answer:
     # a stiffest wall takes some 50 ms.
@@ -188,11 +190,6 @@ class LinearLoop:
         found = self._ridges[negative]
         return found, Status.NO_BOUNDARY if found is None else Status.OK
 
-    @cached_property
-    def _ridges(self) -> dict[bool, BoundRidge | None]:
-        """Those that were found: a scene is asked for them often."""
-        return {}
-
     def sensitivities(self, negative: bool) -> SceneSensitivities:
         """What a little more of each parameter of the scene buys of the stiffest wall, in SI units."""
         return differentiate(self.scene, *self.ridge(negative))
@@ -300,5 +297,6 @@ class RigidLoop(LinearLoop):
 
 def make_plain(scene: AnyScene) -> AnyScene:
     """The scene with floats in place of JAX's own numbers that nothing traces."""
-    held = {path: value for path, value in list_parameters(scene).items() if is_jax(value) and not is_traced(value)}
-    return replace_parameters(scene, {path: float(value) for path, value in held.items()}) if held else scene
+    numbers = list_parameters(scene).items()
+    held = {path: float(value) for path, value in numbers if is_jax(value) and not is_traced(value)}
+    return replace_parameters(scene, held) if held else scene

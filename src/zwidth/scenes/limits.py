@@ -82,8 +82,7 @@ def _stiffness(scene: Scene) -> float:
 def _ideals(scene: Scene) -> list[tuple[str, str, Scene]]:
     """The scene with one thing ideal, for each thing it has."""
     found = []
-    plain = isinstance(scene.velocity, BackwardDifference) and scene.velocity.coded_period is None
-    if not plain:
+    if "velocity" in scene.parts_beyond:
         found.append(("velocity", "the velocity unfiltered", scene.replace(velocity=BackwardDifference())))
     if scene.timing.delay > 0:
         found.append(("delay", "no delay", scene.replace(delay=0.0)))

@@ -306,7 +306,7 @@ def _worst(low: np.ndarray, high: np.ndarray) -> tuple:
     for tolerance in (_TOLERANCE, *_LOOSER):
         for _ in range(_ROUNDS):
             target = float(_stiffest(_devices(share[None], low, high))[0]) * (1.0 - tolerance)
-            proof = _prove(target, lambda centers, k=target: _middle(*_stable_dampings(k, centers)), low, high)
+            proof = _prove(target, lambda centers, k=target: 0.5 * np.add(*_stable_dampings(k, centers)), low, high)
             if proof.holds:
                 proved, status = target, Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED
             if proof.holds or not len(proof.open):
@@ -318,10 +318,6 @@ def _worst(low: np.ndarray, high: np.ndarray) -> tuple:
     worst = _devices(share, low, high)
     is_vertex = bool(np.all((worst == low) | (worst == high)))
     return proved, float(_stiffest(worst[None])[0]), *worst, is_vertex, status
-
-
-def _middle(lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    return 0.5 * (lower + upper)
 
 
 def _best_wall(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
@@ -338,11 +334,7 @@ def _best_wall(devices: np.ndarray) -> tuple[float, Callable[[float], float]]:
     # Rounded up: no wall reaches it.
     limit = float(np.nextafter(bisect(suits, np.float64(0.0), np.min(_stiffest(devices))), np.inf))
 
-    def middle(stiffness: float) -> float:
-        lower, upper = common(stiffness)
-        return 0.5 * (lower + upper)
-
-    return limit, middle
+    return limit, lambda stiffness: 0.5 * float(np.add(*common(stiffness)))
 
 
 def _wall(low: np.ndarray, high: np.ndarray) -> tuple:

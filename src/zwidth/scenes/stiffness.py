@@ -128,16 +128,7 @@ def sensitivities(
     return evaluate(_sensitivities_kernel, arguments, delay_model, classify_delays(device.d))
 
 
-def _sensitivities_kernel(
-    mass: Array,
-    damping: Array,
-    period: Array,
-    delay: Array,
-    delta: Array,
-    d: Array,
-    delay_model: str,
-    kind: DelayClasses,
-) -> Sensitivities:
+def _sensitivities_kernel(mass, damping, period, delay, delta, d, delay_model, kind) -> Sensitivities:
     xp = namespace(mass, delta, d)
     found = slopes_kernel(delta, d, delay_model, kind)
     # An array's entry beyond the range of its quantity is NaN in delta or d; the quantities tell why.

@@ -26,7 +26,8 @@ def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
     nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
     whose own neighbors contradict that is sought by labels alone.
     """
-    met = np.unique(np.concatenate([_on_curve(boundary, alpha), _on_lines(boundary, alpha)]))
+    on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
+    met = np.unique(np.concatenate([_on_curve(boundary, alpha), on_lines]))
     met = met[np.isfinite(met)]
     if not np.isfinite(alpha) or not met.size:
         return np.zeros((0, 2))
@@ -48,10 +49,6 @@ def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
         low, high = met[k] - 1e-12 * (high - low), met[k] + 1e-12 * (high - low)
     ends = np.concatenate([[-np.inf], met, [np.inf]])
     return np.stack([ends[:-1][stable], ends[1:][stable]], -1)
-
-
-def _on_lines(boundary: Boundary, alpha: float) -> np.ndarray:
-    return np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
 
 
 def _on_curve(boundary: Boundary, alpha: float) -> np.ndarray:

@@ -121,7 +121,8 @@ def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: fl
     def excess(delay: float) -> float:
         loop = loop_at(loops.chain, delay)
         if at.curve < 0:
-            return float(np.log(abs(_last(loop, alpha, beta))))
+            last = OpenLoop.lay_out(loop, alpha, beta, np.array([3.0])).L.value[-1].real
+            return float(np.log(abs(float(last))))
         here = _cross(loop, alpha, beta, nodes_of(loop))
         share = (delay - low_end) / (high_end - low_end)
         place = int(np.argmin(np.abs(here.w - (w0 + share * (w1 - w0)))))
@@ -148,10 +149,6 @@ def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: fl
         else:
             high, last = x, value
     return 0.5 * (low + high) + at.periods
-
-
-def _last(loop: LoopRoots, alpha: float, beta: float) -> float:
-    return float(OpenLoop.lay_out(loop, alpha, beta, np.array([3.0])).L.value[-1].real)
 
 
 def _is_first_loss(chain: Chain, alpha: float, beta: float, margin: float) -> bool:

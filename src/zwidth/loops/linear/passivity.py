@@ -21,7 +21,6 @@ import numpy as np
 
 from zwidth.arrays.circle import Jet, circle, lag_jet, product_jet
 from zwidth.parts.estimate import Estimate
-from zwidth.words.errors import InputError
 from zwidth.words.types import Array
 
 _NODES, _ROUNDS, _MOST = 129, 80, 1 << 18
@@ -32,15 +31,6 @@ _PROVED = 1e-13
 def has_condition(device: Any) -> bool:
     """Whether force and sensed motion are those of one point, which the condition is about."""
     return device.coupling is None or device.coupling.sensor == "motor"
-
-
-def check_has_condition(device: Any) -> None:
-    """Refuse a device for which the condition does not hold."""
-    if not has_condition(device):
-        raise InputError(
-            "coupling.sensor: 'tip' has no passivity condition of this kind: force and sensed motion are not those of "
-            "one point, so that no damping of the motor bounds the energy; ask is_stable with the hand as operator"
-        )
 
 
 @dataclass(frozen=True)

@@ -52,30 +52,16 @@ def in_series(first: Matrices, second: Matrices) -> Matrices:
     return Matrices(A, B, np.concatenate([second.D @ first.C, second.C], 1), second.D @ first.D)
 
 
-def _shift(count: int) -> Matrices:
-    """A register of the last inputs; the outputs are these, the newest first."""
-    A = np.eye(count, k=-1)
-    B = np.zeros((count, 1))
-    B[:1] = 1.0
-    return Matrices(A, B, np.eye(count), np.zeros((count, 1)))
-
-
 def estimate_matrices(estimate: Estimate) -> Matrices:
     """The velocity estimate, from sampled position."""
-    behind = _filter(estimate)
-    if not estimate.window:
+    behind, count = _filter(estimate), estimate.window
+    if not count:
         return behind
-    past = _shift(estimate.window)
-    weights = np.zeros((1, estimate.window + 1))
-    weights[0, [0, -1]] = 1.0 / estimate.window, -1.0 / estimate.window
-    difference = Matrices(past.A, past.B, weights[:, 1:], weights[:, :1])
+    weights = np.zeros((1, count + 1))
+    weights[0, [0, -1]] = 1.0 / count, -1.0 / count
+    # A register of the last inputs, the newest first.
+    difference = Matrices(np.eye(count, k=-1), np.eye(count, 1), weights[:, 1:], weights[:, :1])
     return in_series(difference, behind)
-
-
-def wall_matrices(estimate: Estimate, alpha: float, beta: float) -> Matrices:
-    """``alpha + beta F``."""
-    f = estimate_matrices(estimate)
-    return Matrices(f.A, f.B, beta * f.C, alpha + beta * f.D)
 
 
 def delayed_device(chain: Chain) -> Matrices:
@@ -102,7 +88,8 @@ def delayed_device(chain: Chain) -> Matrices:
 
 def open_loop(chain: Chain, alpha: float, beta: float) -> Matrices:
     """``L = (alpha + beta F) G``, from the position that the wall is given to the one that its force answers."""
-    return in_series(wall_matrices(chain.estimate, alpha, beta), delayed_device(chain))
+    f = estimate_matrices(chain.estimate)
+    return in_series(Matrices(f.A, f.B, beta * f.C, alpha + beta * f.D), delayed_device(chain))
 
 
 def closed_loop(chain: Chain, alpha: float, beta: float) -> Matrices:

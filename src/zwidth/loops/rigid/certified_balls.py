@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 from importlib.util import find_spec
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -129,22 +128,6 @@ def _take_lag(u: flint.arb, whole: int) -> Lag:
     sine, cosine = lag.sin_cos()
     half = (lag / 2).sin()
     return Lag(cosine, sine, half * half, lag < turn, w * (whole + 1) > turn)
-
-
-def polynomial(alpha: float, beta: float, delta: float, d: float, bits: int) -> list[Any]:
-    """The coefficients of P as balls, lowest power first."""
-    import flint
-
-    with flint.ctx.workprec(bits):
-        here = device(delta, d, bits)
-        n = [a for a in (here.a0, here.a1, here.a2) if a is not None]
-        stiffness, damping = flint.arb(alpha), flint.arb(beta)
-        s = stiffness + damping
-        wall = [-n[0] * damping, *(left * s - right * damping for left, right in pairwise(n)), n[-1] * s]
-        p = [*wall, *[flint.arb(0)] * (int(d) + 1)]
-        for index, value in enumerate((here.c, -(1 + here.c), flint.arb(1)), len(p) - 3):
-            p[index] += value
-        return p
 
 
 def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

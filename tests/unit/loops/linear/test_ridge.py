@@ -188,6 +188,16 @@ def test_derivatives_of_a_rigid_scene_are_the_closed_ones():
     assert per["operator.stiffness"] == pytest.approx(change / spring, rel=1e-4)
 
 
+def test_derivatives_at_a_double_pole_of_a_chain_are_the_closed_ones():
+    """A hand's spring of 1e-10 of K_max keeps the chain from being a rigid device, and changes nothing else."""
+    scene = Scene(Device(0.1, 600.0), Timing(1e-3), operator=Operator(0.02, 10.0, 3e-4))
+    found = wanted(scene, True)
+    assert (found.first, found.second) == (Condition.MINUS_ONE, Condition.STATIONARY)
+    per, expected = scene.sensitivities().per, zwidth.sensitivities(mass=0.12, damping=610.0, period=1e-3)
+    for name in ("mass", "damping", "period", "delay"):
+        assert per[name] == pytest.approx(float(getattr(expected, f"per_{name}")), rel=1e-7), name
+
+
 def filtered(cutoff):
     return PAPER.replace(velocity=LowPass(cutoff=cutoff)).max_stiffness().stiffness
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import oracles
+from methods.problems import ball_polynomial
 from zwidth.loops.rigid import certified_balls
 from zwidth.words.status import Status
 
@@ -47,7 +48,7 @@ def test_without_stiffness_the_other_poles_decide(d, delta):
 def test_polynomial_is_the_printed_one(delta, d):
     with mp.workdps(60):
         exact = oracles.polynomial(0.3, 0.2, delta, d)[::-1]
-        found = certified_balls.polynomial(0.3, 0.2, delta, d, 200)
+        found = ball_polynomial(0.3, 0.2, delta, d, 200)
         assert len(found) == len(exact)
         for ball, value in zip(found, exact, strict=True):
             assert abs(float(ball) - float(value)) <= 1e-15 * (1 + abs(float(value)))

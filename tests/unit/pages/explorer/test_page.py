@@ -83,7 +83,7 @@ def test_parts_show_their_ridge_and_slopes_on_demand(page, monkeypatch):
     say(page, set={"velocity": "LowPass"}, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) == 0
-    monkeypatch.setattr(model, "_FEW_RIDGE_POINTS", 3)
+    monkeypatch.setattr(model, "_RIDGE_POINTS", 3)
     say(page, costly=True, rest=True)
     page.queue.work()
     assert len(page.sources["ridge"].data["x"]) == 3
