@@ -144,7 +144,7 @@ def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: flo
     rubbed = both.theta.copy()
     rubbed[-2:] = 0.0, rubbed[-1] + abs(rubbed[-2])
     for theta, none in ((rubbed, rubbed.size - 2), (pushed, rubbed.size - 1)):
-        simple = FittedModel(model, *_settle(model, theta, longest, (none,)), resolution)
+        simple = _fit(model, theta, longest, resolution, (none,))
         if simple.leaves_open and simple.explains_as_well(both):
             return simple
     return both
@@ -186,12 +186,14 @@ def _choose(model: Recordings, starts: list[np.ndarray], longest: float) -> np.n
     return min(found, key=lambda found: found[1])[0]
 
 
-def _fit(model: Recordings, start: np.ndarray, longest: float, resolution: float) -> FittedModel:
+def _fit(
+    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
+) -> FittedModel:
     """Least squares from a start, or at rest where that is as good."""
-    best = _settle(model, start, longest)
+    best = _settle(model, start, longest, held)
     still = _rest(model, *best[:2])
     if still is not None:
-        resting = _settle(model, still, longest)
+        resting = _settle(model, still, longest, held)
         # A start at rest needs one number less.
         count = model.measured.size
         if not best[2] or count * np.log(resting[1] / best[1]) < np.log(count):

@@ -274,8 +274,9 @@ def _repeats(group: LaneGroup, bilateral: np.ndarray, sensed: np.ndarray, period
     memory = group.window + group.late + 2
     length = np.zeros(quantum.size, int)
     for span in range(1, (len(reading) - memory) // 2):
-        ends = (reading[-memory:] == reading[-memory - span : -span]).all(0) & (length == 0)
-        (likely,) = np.nonzero(ends)
+        (likely,) = np.nonzero((reading[-1] == reading[-1 - span]) & (length == 0))
+        ends = reading[-memory:, likely] == reading[-memory - span : -span, likely]
+        likely = likely[ends.all(0)]
         same = reading[-span - memory :, likely] == reading[-2 * span - memory : -span, likely]
         length[likely[same.all(0)]] = span
     found = np.zeros(quantum.size, bool)

@@ -32,6 +32,17 @@ def test_both_sides_are_what_is_told(parameter, stiffness, side):
         assert beyond.max_stiffness().stiffness < stiffness
 
 
+def test_of_several_crossings_the_nearest_is_told():
+    """K_max is least at some mass between them."""
+    scene = RIGID.replace(velocity=LowPass(cutoff=100.0))
+    light, heavy = (scene.replace(mass=mass).required("mass", 7.8e3, within=(0.01, 0.5)) for mass in (0.012, 0.2))
+    assert [crossing.enough for crossing in light.crossings] == ["below", "above"]
+    assert (light.enough, heavy.enough) == ("below", "above")
+    assert light.value < 0.03 < heavy.value
+    for found in (light, heavy):
+        assert scene.replace(mass=found.value).max_stiffness().stiffness == pytest.approx(7.8e3, rel=1e-9)
+
+
 def test_a_rate_is_the_inverse_of_a_period():
     rate, period = (FILTERED.required(name, 8.5e3) for name in ("rate", "period"))
     assert (rate.enough, period.enough) == ("above", "below")
