@@ -59,6 +59,7 @@ def test_a_tiny_run_measures_every_method(rows):
     assert methods == {
         *(("stable", name) for name in ("crossover", "companion", "certified")),
         *(("spectral_radius", name) for name in ("newton", "companion", "aberth")),
+        *(("spectral_radius", f"map to {accuracy}") for accuracy in ("0.01", "0.0001", "1e-06", "1e-09")),
         ("passive", "worst frequency"),
         ("alpha_max", "newton"),
     }

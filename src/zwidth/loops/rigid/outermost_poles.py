@@ -20,12 +20,23 @@ from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.delay_classes import classify_delays
 from zwidth.loops.rigid.folding import Points, fold
 from zwidth.loops.rigid.pole_map import Area, follow_poles
-from zwidth.loops.rigid.pole_search import Found, certification_width, certify_pole, has_bound, quick_kernel, search
+from zwidth.loops.rigid.pole_search import (
+    LONG,
+    SHORT,
+    Found,
+    certification_width,
+    certify_both,
+    has_bound,
+    quick_kernel,
+    search,
+)
 from zwidth.words.status import Status
 
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(12)
 _LARGEST_ERROR = 0.1
+# How far below a pole the search for a larger one begins.
+_BELOW = 1e-6
 # Closer to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is: of the
 # radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
 _DOUBTFUL = 1e-8
@@ -59,67 +70,83 @@ def _compile_quick(fractional: bool) -> Any:
     return jax.jit(lambda a, b, c, d, accuracy: quick_kernel(a, b, c, d, accuracy, fractional), compiler_options=WIDE)
 
 
-def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW, patient: bool = True) -> OutermostPoles:
-    """The outermost poles of equally long columns of alpha, beta, delta and d; up to ``few`` without a compiler.
-
-    Without patience some are not proved that could be.
-    """
+def outermost_poles(columns: list[np.ndarray], accuracy: float, few: int = FEW) -> OutermostPoles:
+    """The outermost poles of equally long columns of alpha, beta, delta and d; up to ``few`` without a compiler."""
     fractional = columns[3] != np.floor(columns[3])
     if not fractional.any() or fractional.all():
-        return _of_one_kind(columns, accuracy, bool(fractional.any()), few, patient)
+        return _of_one_kind(columns, accuracy, bool(fractional.any()), few)
     # A mixed batch pays for the cubic only where it must.
     whole = OutermostPoles(*(np.empty(fractional.size) for _ in OutermostPoles._fields))
     for part in (np.flatnonzero(fractional), np.flatnonzero(~fractional)):
-        for leaf, found in zip(whole, outermost_poles([c[part] for c in columns], accuracy, few, patient), strict=True):
+        for leaf, found in zip(whole, outermost_poles([c[part] for c in columns], accuracy, few), strict=True):
             leaf[part] = found
     return whole
 
 
-def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int, patient: bool) -> OutermostPoles:
+def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: int) -> OutermostPoles:
     size = columns[0].size
     with np.errstate(all="ignore"):
         if size == 1 <= few:
             # Plain numbers are several times faster than arrays of one.
-            alpha, beta, delta, d = (column[0] for column in columns)
-            found = [np.reshape(leaf, 1) for leaf in quick_kernel(alpha, beta, delta, d, accuracy, kind)]
+            found = [np.reshape(leaf, 1) for leaf in _quick([column[0] for column in columns], accuracy, kind)]
         elif size <= few:
-            alpha, beta, delta, d = columns
-            found = quick_kernel(alpha, beta, delta, d, np.full(size, accuracy), kind)
+            pieces = [[column[start : start + FEW] for column in columns] for start in range(0, max(size, 1), FEW)]
+            parts = _on_every_processor(lambda piece: _quick(piece, accuracy, kind), pieces)
+            found = list(map(np.concatenate, zip(*parts, strict=True)))
         else:
             # Always of one size: other batches may round differently.
             short = max(0, PIECE - size)
             padded = [np.pad(c, (0, short), mode="edge") for c in (*columns, np.full(size, accuracy))]
             found = [leaf[:size] for leaf in map_blocks(_compile_quick(kind), padded, PIECE)]
-    return _finish_poles(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind, patient)
+    return _finish_poles(columns, Found(*(np.array(leaf) for leaf in found)), accuracy, kind)
 
 
-def _finish_poles(
-    columns: list[np.ndarray], found: Found, accuracy: float, kind: bool, patient: bool
-) -> OutermostPoles:
+def _quick(columns: list[Any], accuracy: float, kind: bool) -> Found:
+    alpha, beta, delta, d = columns
+    return quick_kernel(alpha, beta, delta, d, accuracy + 0.0 * alpha, kind)
+
+
+def _on_every_processor(work: Callable[[Any], Any], pieces: list[Any]) -> list[Any]:
+    def quietly(piece: Any) -> Any:
+        with np.errstate(all="ignore"):
+            return work(piece)
+
+    if len(pieces) < 2:
+        return [quietly(piece) for piece in pieces]
+    with ThreadPoolExecutor(processors()) as pool:
+        return list(pool.map(quietly, pieces))
+
+
+def _finish_poles(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool) -> OutermostPoles:
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
     error = np.where(found.proved, accuracy, np.inf)
-    left = np.flatnonzero(~found.proved & patient)
-    for first in range(0, left.size, FEW):
-        _patiently(columns, found, error, left[first : first + FEW], accuracy, kind)
+    left = np.flatnonzero(~found.proved)
+    pieces = [left[start : start + FEW] for start in range(0, left.size, FEW)]
+    _on_every_processor(lambda piece: _patiently(columns, found, error, piece, accuracy, kind), pieces)
     return OutermostPoles(found.re, found.im, error, found.doubt)
 
 
 def _patiently(
     columns: list[np.ndarray], found: Found, error: np.ndarray, left: np.ndarray, accuracy: float, kind: bool
 ) -> None:
-    with np.errstate(all="ignore"):
-        alpha, beta, delta, d = (column[left] for column in columns)
-        loop = factor_loop(alpha, beta, delta, d, kind)
-        again = certify_pole(found.re[left], found.im[left], accuracy, loop, kind, False)
-        left, loop = _store_poles(found, error, left, loop, again, again.proved, accuracy)
+    alpha, beta, delta, d = (column[left] for column in columns)
+    loop = factor_loop(alpha, beta, delta, d, kind)
+    one, other = certify_both(accuracy, loop, kind)
+    new = Found(*(np.where(one.proved, *pair) for pair in zip(one, other, strict=True)))
+    # Where neither start leads there, a third pole is next to the larger of what they lead to, more often than not.
+    low = np.fmax(one.re, other.re)[~new.proved] - _BELOW
+    left, loop = _store_poles(found, error, left, loop, new, new.proved, accuracy)
+    for start, halvings in ((low, SHORT), (None, LONG)):
         if left.size:
-            left, loop = _store_poles(found, error, left, loop, search(accuracy, loop, kind), True, accuracy)
-        for factor in _LADDER[accuracy * _LADDER <= _LARGEST_ERROR]:
-            if not left.size:
-                return
-            here = has_bound(found.re[left], factor * accuracy, loop, kind)
-            error[left[here]], found.doubt[left[here]] = factor * accuracy, np.inf
-            left, loop = left[~here], type(loop)(*(part[~here] for part in loop))
+            new = search(accuracy, loop, kind, start, halvings)
+            good = new.proved | (halvings == LONG)
+            left, loop = _store_poles(found, error, left, loop, new, good, accuracy)
+    for factor in _LADDER[accuracy * _LADDER <= _LARGEST_ERROR]:
+        if not left.size:
+            return
+        here = has_bound(found.re[left], factor * accuracy, loop, kind)
+        error[left[here]], found.doubt[left[here]] = factor * accuracy, np.inf
+        left, loop = left[~here], type(loop)(*(part[~here] for part in loop))
 
 
 def _store_poles(
@@ -182,17 +209,14 @@ def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPole
     found = WallPoles(re, error, -re if with_rate else _NONE)
     held = (area.d % 1.0 != 0.0)[missing[0]]
     kinds = [missing[:, held == kind] for kind in (False, True)]
-    pieces = [part[:, start : start + FEW] for part in kinds for start in range(0, part.shape[1], FEW)]
-
-    def solve(places: np.ndarray) -> None:
+    for places in kinds:
+        if not places.size:
+            continue
         # A multiple of 16: NumPy rounds odd ones at the end of a list otherwise.
         walls = area.walls(np.pad(places, ((0, 0), (0, -places.shape[1] % 16)), mode="edge"))
-        for whole, leaf in zip(found, list_poles(walls, accuracy, with_rate), strict=True):
+        for whole, leaf in zip(found, list_poles(walls, accuracy, with_rate, few=walls[0].size), strict=True):
             if leaf.size:
                 whole[tuple(places)] = leaf[: places.shape[1]]
-
-    with ThreadPoolExecutor(processors()) as pool:
-        list(pool.map(solve, pieces))
     return found
 
 
@@ -216,7 +240,7 @@ def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = Fals
     area, order, sizes = laid
     back = np.argsort(order)
     return area_poles(area, accuracy, with_rate).map(
-        lambda leaf: np.broadcast_to(np.ascontiguousarray(leaf.reshape(sizes).transpose(back)), shape)
+        lambda leaf: np.broadcast_to(leaf.reshape(sizes).transpose(back), shape)
     )
 
 

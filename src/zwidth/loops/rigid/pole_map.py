@@ -288,7 +288,8 @@ class _Level:
 
     def solve_all(self, cells: np.ndarray, fractional: bool) -> np.ndarray:
         """`solve` for lists of cells, on every processor."""
-        lists = [cells[:, start : start + _LIST] for start in range(0, cells.shape[1], _LIST)]
+        size = min(_LIST, max(_LIST // 8, -(-cells.shape[1] // processors())))
+        lists = [cells[:, start : start + size] for start in range(0, cells.shape[1], size)]
 
         def solve(some: np.ndarray) -> np.ndarray:
             with np.errstate(all="ignore"):

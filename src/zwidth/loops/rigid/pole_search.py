@@ -27,7 +27,9 @@ _AFTER = 1.4
 _COUNTED, _RELATIVE = 4096.0, 2e-11
 # From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
 # crossovers depend on it.
-_SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
+_SMALLEST, LONG, _POLISHING = -690.0, 62, 6
+# Enough to begin the steps from.
+SHORT = 14
 
 
 class Found(NamedTuple):
@@ -132,8 +134,15 @@ def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Arr
     return above.full & above.sure & ~below.full & below.sure
 
 
-def search(tolerance: Array, loop: Loop, fractional: bool) -> Found:
-    """The outermost pole by halvings of the interval that counts leave, then a few steps."""
+def certify_both(tolerance: Array, loop: Loop, fractional: bool) -> tuple[Found, Found]:
+    """What both starts lead to, and whether it is the outermost pole."""
+    slow_re, slow_im, re, im = both_poles(_BOTH + _LARGER, loop, fractional)
+    one = certify_pole(slow_re, slow_im, tolerance, loop, fractional, False)
+    return one, certify_pole(re, im, tolerance, loop, fractional, False)
+
+
+def search(tolerance: Array, loop: Loop, fractional: bool, low: Array | None = None, halvings: int = LONG) -> Found:
+    """The outermost pole by halvings of the interval that counts leave, from a lower end on; then a few steps."""
     xp = namespace(loop.alpha)
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -142,7 +151,7 @@ def search(tolerance: Array, loop: Loop, fractional: bool) -> Found:
         return xp.where(full, state[0], middle), xp.where(full, middle, state[1])
 
     high = _largest(loop)
-    _, radius = repeat(_HALVINGS, step, (0.0 * high + _SMALLEST, high), xp)
+    _, radius = repeat(halvings, step, (0.0 * high + _SMALLEST if low is None else low, high), xp)
     best, im = np.inf, 0.0 * radius
     # On that circle the pole is at a crossover or at one of the ends.
     for place in (0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings):

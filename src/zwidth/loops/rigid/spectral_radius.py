@@ -64,9 +64,9 @@ def spectral_radius(
     Numerics:
         Float64 when called directly, few points and maps without JAX; the ambient precision inside `jit`, where d may
         be traced. On a map a Taylor series serves a cell of walls (`loops.rigid.pole_map`); its terms fall faster than
-        the bound that is proved of them. Derivatives are those of the outermost pole, of every order up to the second; NaN where it is a multiple one.
-        Next to a k-fold pole the radius is known to about 1e-16^(1/k). How slowly a loop decays that is stable by less
-        than 1e-16, `decay_rate` tells.
+        the bound that is proved of them. Derivatives are those of the outermost pole, of every order up to the second;
+        NaN where it is a multiple one. Next to a k-fold pole the radius is known to about 1e-16^(1/k). How slowly a
+        loop decays that is stable by less than 1e-16, `decay_rate` tells.
 
     References:
         Hulin, Preusche, Hirzinger 2006, eq. (17).
@@ -127,7 +127,8 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     check_scalars(arguments)
     if is_traced(*values):
         return -evaluate(traced_kernel, arguments, _has_fraction(d))
-    return to_caller(find_poles(broadcast(arguments), _DECAY_ACCURACY, with_rate=True).rate, values)
+    rate = find_poles(broadcast(arguments), _DECAY_ACCURACY, with_rate=True).rate
+    return to_caller(np.array(rate), values)
 
 
 def _exp(value: Array) -> Array:
