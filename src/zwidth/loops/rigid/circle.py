@@ -263,9 +263,7 @@ def count_in_cell(
 ) -> tuple[np.ndarray, np.ndarray]:
     """How many poles are outside ``|z| = e^log_r``, and whether that is so for every wall of a cell.
 
-    The walls are those whose alpha and beta differ by at most ``half`` from the loop's. A pole is on the circle only
-    where |T| is within what |B| is for these walls, between the crossovers with the least and with the largest |B|. It
-    is there only if arg T - arg B, which moves by a bounded amount in that interval and in the cell, can be pi.
+    The walls are those whose alpha and beta differ by at most ``half`` from the loop's (docs/theory/maps.md, C4).
     """
     at = _circle(log_r, loop, fractional, np)
     a, b = half

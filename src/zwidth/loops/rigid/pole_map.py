@@ -1,23 +1,13 @@
 """Outermost poles of maps: one Taylor series a cell of walls, and one proof for all of its walls.
 
-**Series.** On a pole ``alpha + beta f = Q(z)``, ``f = 1 - 1/z``, ``Q = -z^n (z - 1)(z - c)/M(z)``. From the pole z0 of
-the cell's middle, with ``z = z0 (1 + u)``, ``alpha = alpha0 + a xi``, ``beta = beta0 + b eta`` (|xi|, |eta| <= 1),
+On a pole ``alpha + beta f = Q(z)``, ``f = 1 - 1/z``, ``Q = -z^n (z - 1)(z - c)/M(z)``. From the pole z0 of a cell's
+middle, with ``z = z0 (1 + u)``, ``alpha = alpha0 + a xi``, ``beta = beta0 + b eta`` (|xi|, |eta| <= 1),
 
     A(u) = Q(z) - beta0 f(z) - alpha0 = a xi + b eta f(z)
 
-Lagrange's formula gives log z: with ``phi = a u/A(u)`` the coefficient of xi^i eta^j, k = i + j, is
-
-    binomial(k, j)/k [u^(k-1)] phi^k (b f/a)^j/(1 + u)
-
-**Its error.** Where ``|A| > R (a + b |f|)`` on |u| = U and u = 0 is the only zero of A inside, there is (Rouché) one
-pole in that disk for all complex |xi|, |eta| <= R, analytic in both, and ``|log(1 + u)| <= V = -log(1 - U)``. By
-Cauchy's estimate, along the line from the middle to a wall, the terms beyond order m are at most ``V R^-m/(R - 1)``.
-
-**The outermost.** On a circle a little inside of all that pole's values no wall of the cell has a pole, and outside of
-it the middle has as many as were followed (`loops.rigid.circle.count_in_cell`): then every wall has, and they are the
-followed ones. Neither may become a double pole meanwhile, for in its disk it is alone.
-
-Cells of 16 x 16 walls that fail are cut in four, down to 4 x 4; what is left then is for single walls.
+is solved for log z by Lagrange's formula. The proofs, C1 to C5, are in docs/theory/maps.md: of the series' error, and
+that the followed pole is the outermost of every wall. Cells that fail are cut in four; what is left of the smallest is
+for single walls.
 """
 
 from __future__ import annotations
@@ -166,7 +156,7 @@ def _complex(re: np.ndarray, im: np.ndarray) -> np.ndarray:
 
 
 def _bound_errors(a: np.ndarray, nodes: _Nodes, moduli: list[np.ndarray], fractional: bool) -> np.ndarray:
-    """What series of each order miss, from the moduli of A's coefficients and of its factors."""
+    """What series of each order miss (C2, C3), from the moduli of A's coefficients and of its factors."""
     (loop, half), (near, off, r, w, f, lead, rho, late) = nodes, moduli
     limit = 1.0 / np.maximum(1.0, np.maximum(rho, late) if fractional else rho)
     best = np.full((len(_ORDERS), r.size), np.inf)
@@ -191,7 +181,7 @@ def _bound_errors(a: np.ndarray, nodes: _Nodes, moduli: list[np.ndarray], fracti
 
 
 def _coefficients(series: _Series, half: tuple[np.ndarray, np.ndarray], m: int) -> np.ndarray:
-    """The coefficients of log |z| to order m, (cells, powers of eta, powers of xi)."""
+    """The coefficients of log |z| to order m (C1), (cells, powers of eta, powers of xi)."""
     count, by, first = series.f.size, half[1] / half[0], 1.0 / series.a[1]
     ratio, phi = series.a[2 : m + 1] * first, np.empty((m, count), complex)
     phi[0] = half[0] * first
@@ -256,7 +246,7 @@ class _Followed(NamedTuple):
 
 
 def _prove(followed: list[_Followed], nodes: _Nodes, fractional: bool) -> np.ndarray:
-    """In which cells these poles are the outermost, whatever the wall."""
+    """In which cells these poles are the outermost, whatever the wall (C4, C5)."""
     low, wanted = followed[0].low, followed[0].many
     for other in followed[1:]:
         low, wanted = np.minimum(low, other.low), wanted + other.many

@@ -94,15 +94,21 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: st
     """`loops.rigid.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
     if namespace(plant.a2, lag) is np:
         return solve(plant, lag, start, delay_model, kind)
+    import jax
     import jax.numpy as jnp
 
     ridge = _jax_ridge()(plant, lag, start, delay_model, kind)
     if delay_model == "held":
         return ridge
-    # The corner is left like -d^(2/3) as soon as d > 0: all three fall with infinite slope.
+    # The corner is left as soon as d > 0, alpha like -d^(2/3), omega like -d^(1/3), with infinite slopes.
     corner = ridge.s >= 1.0
     fall = jnp.where(corner, jnp.sqrt(jnp.where(corner, lag, 1.0)), 0.0)
-    return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - fall, omega=ridge.omega - fall)
+    # Turned by pi d the curve's alpha(q) and beta(q), q = 1 - s^2, become alpha + a1 q - 2 t, beta + b1 q + t, and the
+    # largest alpha has t = -a1 q: it moves by 3 a1 q, beta by (b1 - a1) q.
+    phi1, body = plant.a2 + plant.a1, plant.a1 * (1.0 + plant.a2 * ridge.beta)
+    lean = plant.a2 + plant.c * plant.a1 - plant.a1 * (2.0 * ridge.beta * phi1 + ridge.alpha * plant.a2)
+    share = jax.lax.stop_gradient(jnp.where(corner, (body / lean - 1.0) / 3.0, 0.0))
+    return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - share * fall, omega=ridge.omega - fall)
 
 
 @cache

@@ -125,3 +125,17 @@ def test_a_start_is_close_everywhere():
         point = ridge_kernel(delta, np.minimum(d, 1e5), "held")
         assert (point.status == 0).all()
         assert np.isfinite(point.alpha).all()
+
+
+@pytest.mark.parametrize(("delta", "beta"), [(3.7, -np.inf), (4.0, -np.inf), (4.3, np.inf), (100.0, np.inf)])
+def test_the_corner_is_left_with_infinite_slopes_of_the_right_sign(delta, beta):
+    """The paper's z^d moves the corner like d^(2/3): differences of the exact ridges say which way."""
+
+    def ridge(d):
+        top = zwidth.alpha_max(delta, d, delay="fractional_power")
+        return top.alpha, top.beta, top.omega
+
+    slopes = jax.jacfwd(ridge)(0.0)
+    assert [float(slope) for slope in slopes] == [-np.inf, beta, -np.inf]
+    moves = [float(new) - float(old) for new, old in zip(ridge(1e-8), ridge(0.0), strict=True)]
+    np.testing.assert_array_equal(np.sign(moves), np.sign([-np.inf, beta, -np.inf]))
