@@ -12,7 +12,7 @@ DEVICE, TIMING = zwidth.Device(mass=0.1), zwidth.Timing(period=1e-3)
 
 
 def scene(velocity):
-    return zwidth.Scene(DEVICE, TIMING, velocity=velocity).loop
+    return zwidth.Scene(DEVICE, TIMING, velocity=velocity).check_parts()
 
 
 CASES = {
@@ -75,7 +75,7 @@ CASES = {
     "something else than a part": (lambda: zwidth.Scene(DEVICE, TIMING, velocity=5), "velocity", "zwidth.LowPass"),  # type: ignore[arg-type]
     "coupling of a number": (lambda: zwidth.Device(0.1, coupling=5), "coupling", "zwidth.Coupling"),  # type: ignore[arg-type]
     "link that cannot be resolved": (
-        lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e14)), TIMING).loop,
+        lambda: zwidth.Scene(zwidth.Device(0.1, coupling=zwidth.Coupling(0.1, 1e14)), TIMING).check_parts(),
         "coupling.stiffness",
         "leave the coupling out",
     ),

@@ -193,7 +193,7 @@ class WallPoles(NamedTuple):
 
     def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
         """The same in another layout."""
-        return WallPoles(*(function(leaf) if leaf.size else leaf for leaf in self))
+        return WallPoles(*(leaf if leaf is _NONE else function(leaf) for leaf in self))
 
 
 def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:

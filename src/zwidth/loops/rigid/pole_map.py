@@ -65,7 +65,7 @@ class Area(NamedTuple):
         return [self.alpha[alpha, column], self.beta[beta, row], self.delta[device], self.d[device]]
 
 
-class _Axis(NamedTuple):
+class _AxisPieces(NamedTuple):
     """An axis in pieces: their middles and half lengths (devices, pieces), and places (walls, devices, pieces)."""
 
     middle: np.ndarray
@@ -80,14 +80,14 @@ class MapPoles(NamedTuple):
     error: np.ndarray
 
 
-def _cut(values: np.ndarray, side: int) -> _Axis:
+def _cut(values: np.ndarray, side: int) -> _AxisPieces:
     with np.errstate(all="ignore"):
         pieces = np.pad(values, ((0, 0), (0, -values.shape[1] % side)), mode="edge")
         pieces = pieces.reshape(values.shape[0], -1, side)
         low, high = pieces.min(-1), pieces.max(-1)
         middle = 0.5 * (low + high)
         half = np.maximum(0.5 * (high - low), 1e-12 * np.abs(middle) + 1e-200)
-        return _Axis(
+        return _AxisPieces(
             middle, half, np.ascontiguousarray(((pieces - middle[..., None]) / half[..., None]).transpose(2, 0, 1))
         )
 
@@ -223,7 +223,7 @@ def _find(mask: np.ndarray) -> np.ndarray:
     return np.pad(index, (0, -index.size % 16), mode="edge") if index.size else index
 
 
-class _Followed(NamedTuple):
+class _CellPole(NamedTuple):
     """One pole in all of a cell."""
 
     re: np.ndarray  # coefficients of log |z|, (cells, powers of eta, powers of xi)
@@ -232,7 +232,7 @@ class _Followed(NamedTuple):
     many: np.ndarray  # 2 with its conjugate
 
     @classmethod
-    def expand(cls, series: _Series, nodes: _Nodes, k: int) -> _Followed:
+    def expand(cls, series: _Series, nodes: _Nodes, k: int) -> _CellPole:
         """By the series of the k-th order."""
         re = _coefficients(series, nodes.half, _ORDERS[k])
         spread = np.abs(re).sum((1, 2)) - np.abs(re[:, 0, 0])
@@ -240,12 +240,12 @@ class _Followed(NamedTuple):
         many = np.where(np.sin(series.log_z.imag) < _REAL, 1, 2)
         return cls(re, error, re[:, 0, 0] - spread - error, many)
 
-    def pick(self, index: Any) -> _Followed:
+    def pick(self, index: Any) -> _CellPole:
         """The same of some of the cells."""
-        return _Followed(*(leaf[index] for leaf in self))
+        return _CellPole(*(leaf[index] for leaf in self))
 
 
-def _prove(followed: list[_Followed], nodes: _Nodes, fractional: bool) -> np.ndarray:
+def _prove(followed: list[_CellPole], nodes: _Nodes, fractional: bool) -> np.ndarray:
     """In which cells these poles are the outermost, whatever the wall (C4, C5)."""
     low, wanted = followed[0].low, followed[0].many
     for other in followed[1:]:
@@ -313,7 +313,7 @@ class _Level:
             index = _find(needed == k)
             if index.size:
                 own = _pick(nodes, index)
-                one = _Followed.expand(_pick(larger, index), own, k)
+                one = _CellPole.expand(_pick(larger, index), own, k)
                 proved = _prove([one], own, fractional)
                 self._write(cells, index[proved], [one.pick(proved)], places)
                 alone[index] = proved
@@ -325,13 +325,13 @@ class _Level:
             apart = np.abs(other.log_z - larger.log_z[rest]) > _APART
             good = _find((other.errors[-1] <= self.accuracy) & apart)
             both, own = rest[good], _pick(nodes, rest[good])
-            pair = [_Followed.expand(one, own, -1) for one in (_pick(larger, both), _pick(other, good))]
+            pair = [_CellPole.expand(one, own, -1) for one in (_pick(larger, both), _pick(other, good))]
             proved = _prove(pair, own, fractional)
             self._write(cells, both[proved], [one.pick(proved) for one in pair], places)
             written[both] = proved
         return cells[:, :count][:, ~written[:count]]
 
-    def _write(self, cells: np.ndarray, index: np.ndarray, followed: list[_Followed], places: Any) -> None:
+    def _write(self, cells: np.ndarray, index: np.ndarray, followed: list[_CellPole], places: Any) -> None:
         """The poles of all walls of some cells."""
         size = max(1, _WALLS // self.side**2)
         tiles = [leaf.reshape(leaf.shape[0], -1, self.side, leaf.shape[2] // self.side, self.side) for leaf in self.out]
