@@ -6,13 +6,12 @@ On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks, processors
+from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks
 from zwidth.arrays.xla import WIDE
 from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.circle import count, factor_loop
@@ -91,7 +90,7 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: in
             found = [np.reshape(leaf, 1) for leaf in _quick([column[0] for column in columns], accuracy, kind)]
         elif size <= few:
             pieces = [[column[start : start + FEW] for column in columns] for start in range(0, max(size, 1), FEW)]
-            parts = _on_every_processor(lambda piece: _quick(piece, accuracy, kind), pieces)
+            parts = [_quick(piece, accuracy, kind) for piece in pieces]
             found = list(map(np.concatenate, zip(*parts, strict=True)))
         else:
             # Always of one size: other batches may round differently.
@@ -106,23 +105,13 @@ def _quick(columns: list[Any], accuracy: float, kind: bool) -> Found:
     return quick_kernel(alpha, beta, delta, d, accuracy + 0.0 * alpha, kind)
 
 
-def _on_every_processor(work: Callable[[Any], Any], pieces: list[Any]) -> list[Any]:
-    def quietly(piece: Any) -> Any:
-        with np.errstate(all="ignore"):
-            return work(piece)
-
-    if len(pieces) < 2:
-        return [quietly(piece) for piece in pieces]
-    with ThreadPoolExecutor(processors()) as pool:
-        return list(pool.map(quietly, pieces))
-
-
 def _finish_poles(columns: list[np.ndarray], found: Found, accuracy: float, kind: bool) -> OutermostPoles:
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
     error = np.where(found.proved, accuracy, np.inf)
     left = np.flatnonzero(~found.proved)
-    pieces = [left[start : start + FEW] for start in range(0, left.size, FEW)]
-    _on_every_processor(lambda piece: _patiently(columns, found, error, piece, accuracy, kind), pieces)
+    with np.errstate(all="ignore"):
+        for start in range(0, left.size, FEW):
+            _patiently(columns, found, error, left[start : start + FEW], accuracy, kind)
     return OutermostPoles(found.re, found.im, error, found.doubt)
 
 

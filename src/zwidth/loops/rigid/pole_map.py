@@ -12,13 +12,11 @@ for single walls.
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
 from math import comb
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import processors
 from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
 from zwidth.loops.rigid.pole_search import both_poles
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
@@ -277,18 +275,10 @@ class _Level:
         return np.stack([device, row, column])[:, inside]
 
     def solve_all(self, cells: np.ndarray, fractional: bool) -> np.ndarray:
-        """`solve` for lists of cells, on every processor."""
-        size = min(_LIST, max(_LIST // 8, -(-cells.shape[1] // processors())))
-        lists = [cells[:, start : start + size] for start in range(0, cells.shape[1], size)]
-
-        def solve(some: np.ndarray) -> np.ndarray:
-            with np.errstate(all="ignore"):
-                return self.solve(some, fractional)
-
-        if len(lists) < 2:
-            return np.concatenate([cells[:, :0], *map(solve, lists)], axis=1)
-        with ThreadPoolExecutor(processors()) as pool:
-            return np.concatenate(list(pool.map(solve, lists)), axis=1)
+        """`solve` list by list; threads would wait for each other, for NumPy's steps are short."""
+        lists = (cells[:, start : start + _LIST] for start in range(0, cells.shape[1], _LIST))
+        with np.errstate(all="ignore"):
+            return np.concatenate([cells[:, :0], *(self.solve(some, fractional) for some in lists)], axis=1)
 
     def solve(self, cells: np.ndarray, fractional: bool) -> np.ndarray:
         """Write the poles of the cells of which all is proved; the others are returned."""
