@@ -6,13 +6,13 @@ import math
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.xp import is_jax, is_traced
+from zwidth.arrays.xp import is_jax, is_traced, tree_map
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
@@ -90,14 +90,6 @@ def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shape
     except ValueError:
         shapes = ", ".join(f"{name} {shape}" for name, shape in named)
         raise InputError(f"{what} do not broadcast: {shapes}; make each axis equal or 1") from None
-
-
-def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """Apply a function to the arrays of a (named) tuple, or to a single array."""
-    if not isinstance(tree, tuple):
-        return function(tree, *others)
-    parts = [tree_map(function, *leaves) for leaves in zip(tree, *others, strict=True)]
-    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
 
 
 def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:

@@ -23,16 +23,18 @@ from zwidth.arrays.arguments import (
     check_scalars,
     compute_concretely,
     to_caller,
-    tree_map,
 )
 from zwidth.arrays.xla import STRIP, WIDE
-from zwidth.arrays.xp import is_traced
+from zwidth.arrays.xp import is_traced, tree_map
 from zwidth.words.types import ArrayLike
 
 # "auto": NumPy for few points; "numpy": for all of them; "jax": compiled, however few they are, so that a point's value
 # does not depend on how many others came with it (the two routes may differ in the last place), or for lack of a text
 # for NumPy.
 Route: TypeAlias = Literal["auto", "numpy", "jax"]
+
+# The values of a kernel at concrete points, and for each argument how every result moves with it.
+Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
 # Up to so many points NumPy is done before a compiler has begun.
 FEW = 1 << 12
@@ -48,11 +50,13 @@ def evaluate(
     *static: Any,
     weight: int = 1,
     route: Route = "auto",
+    slopes: Slopes | None = None,
 ) -> Any:
     """Apply ``kernel(*arrays, *static)`` to arguments that broadcast, and give results of their shape and type.
 
     Plain numbers beyond the range of their name are refused. ``weight`` says how many plain points one point counts
-    for, in time and memory: a kernel that makes samples of each point weighs more.
+    for, in time and memory: a kernel that makes samples of each point weighs more. ``slopes`` spares a gradient of few
+    points the compiler.
     """
     values = tuple(arguments.values())
     check_scalars(arguments)
@@ -65,7 +69,7 @@ def evaluate(
             with np.errstate(all="ignore"):
                 return tree_map(_plain, kernel(*numbers, *static))
     if is_traced(*values):
-        return compile_traced(kernel, static)(*broadcast_traced(values))
+        return compile_traced(kernel, static, slopes)(*broadcast_traced(values))
     arrays = broadcast(arguments)
     shape = arrays[0].shape
     flat = evaluate_columns(kernel, [array.reshape(-1) for array in arrays], *static, weight=weight, route=route)
@@ -96,12 +100,15 @@ def _plain(leaf: Any) -> Any:
 
 
 @cache
-def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+def compile_traced(
+    kernel: Callable[..., Any], static: tuple[Any, ...], slopes: Slopes | None = None
+) -> Callable[..., Any]:
     """A kernel compiled for traced values, with its derivatives as one product for each argument.
 
     A point depends on itself alone, so that all there is to differentiate is a few numbers a point. Left to itself,
     `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge
-    1.2 to 1.5 times as long (benchmarks/bench_xla.py).
+    1.2 to 1.5 times as long (benchmarks/bench_xla.py). There the values are concrete: where ``slopes`` are known for
+    them, nothing is compiled.
     """
     import jax
 
@@ -121,7 +128,7 @@ def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Calla
         if len(moving) == 1:
             value, slopes = jax.jvp(of_moving, points, (ones,))
             return value, tree_map(lambda leaf: leaf[None], slopes)
-        sides = tuple(side.reshape(-1, *(1,) * ones.ndim) * ones for side in np.eye(len(moving), dtype=ones.dtype))
+        sides = tuple(side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype))
         # The values are computed once for all sides.
         return jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
 
@@ -132,18 +139,30 @@ def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Calla
         active = tuple(not isinstance(tangent, jax.custom_derivatives.SymbolicZero) for tangent in tangents)
         if not any(active):
             return function(*primals), tree_map(_no_change, function(*primals))
-        value, slopes = sloped(active, *primals)
+        if slopes is None or is_traced(*primals) or primals[0].size > FEW:
+            value, sides = sloped(active, *primals)
+        else:
+            with np.errstate(all="ignore"):
+                value, sides = slopes(*(np.asarray(primal, np.float64) for primal in primals), *static)
+            value = tree_map(lambda leaf: jax.numpy.asarray(leaf, _type_of(leaf, primals[0])), value)
+            sides = tree_map(lambda *leaves: leaves, *(by for by, moves in zip(sides, active, strict=True) if moves))
         moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
 
         def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            return sum((by[k] * tangent for k, tangent in enumerate(moving[1:], 1)), by[0] * moving[0])
+            parts = [jax.numpy.asarray(by[k], leaf.dtype) * tangent for k, tangent in enumerate(moving)]
+            return sum(parts[1:], parts[0])
 
-        return value, tree_map(change, value, slopes)
+        return value, tree_map(change, value, sides)
 
     function.defjvp(rule, symbolic_zeros=True)
     return function
+
+
+def _type_of(leaf: Any, argument: Any) -> Any:
+    """The type of a result: real numbers are as precise as the argument."""
+    return argument.dtype if np.issubdtype(leaf.dtype, np.inexact) else leaf.dtype
 
 
 def _no_change(leaf: Any) -> Any:

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import tree_map
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import frozen, horner, namespace, repeat
+from zwidth.arrays.xp import frozen, horner, namespace, repeat, tree_map
 from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, device
 from zwidth.loops.rigid.plant import Plant
 from zwidth.loops.rigid.ridge_newton import guess_start, solve

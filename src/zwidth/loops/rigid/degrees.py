@@ -7,9 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64, broadcast, broadcast_traced, check_scalars, to_caller, tree_map
+from zwidth.arrays.arguments import as_float64, broadcast, broadcast_traced, check_scalars, to_caller
 from zwidth.arrays.evaluate import FEW, Route, evaluate_columns
-from zwidth.arrays.xp import is_traced
+from zwidth.arrays.xp import is_traced, tree_map
 from zwidth.loops.domain import LONGEST_DELAY
 from zwidth.words.errors import TracedDelayError
 from zwidth.words.types import ArrayLike

@@ -18,6 +18,7 @@ from zwidth.loops.rigid.ridge_slopes import (
     alpha_change,
     differentiable_plant,
     differentiable_ridge,
+    move_ridge,
     plant_slopes,
 )
 from zwidth.words.errors import check_choice
@@ -82,12 +83,27 @@ def alpha_max(
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, delay, route="jax"))
-    return evaluate(ridge_kernel, arguments, delay, classify_delays(d))
+    return evaluate(ridge_kernel, arguments, delay, classify_delays(d), slopes=move_point if delay == "held" else None)
 
 
 def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgePoint:
     """`alpha_max`, elementwise."""
     return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
+
+
+def move_point(
+    delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY
+) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
+    """`ridge_kernel` of a held delay, and how it moves with delta and d."""
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
+    point, still, arrived = _point(ridge, status), np.zeros_like(lag), converged(ridge)
+
+    def move(change: Plant) -> RidgePoint:
+        alpha, beta, omega, *_ = move_ridge(ridge, plant, lag, change, still, delay_model, kind)
+        return point._replace(**dict(zip(RidgePoint._fields, nan_unless(arrived, alpha, beta, omega), strict=False)))
+
+    by_delta, by_f = plant_slopes(delta, f)
+    return point, (move(by_delta), move(by_f))
 
 
 class RidgeSlopes(NamedTuple):

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays import phi
-from zwidth.arrays.xp import horner, namespace
+from zwidth.arrays.xp import horner, namespace, push_forward
 from zwidth.loops.rigid.delay_classes import DelayClasses
 from zwidth.loops.rigid.plant import Plant, held_plant
 from zwidth.loops.rigid.ridge_newton import (
@@ -111,6 +111,28 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: st
     return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - share * fall, omega=ridge.omega - fall)
 
 
+def move_ridge(
+    ridge: Ridge, plant: Plant, lag: Array, change: Plant, lag_change: Array, delay_model: str, kind: DelayClasses
+) -> Ridge:
+    """How the ridge moves when the plant and the lag do; whole periods do not."""
+    xp = namespace(ridge.s, plant.a2)
+    corner = ridge.s >= 1.0
+    undelayed = is_undelayed(delay_model, kind)
+    alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
+    if delay_model == "fractional_power":
+        alpha += xp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
+    else:
+        lag_change = xp.zeros_like(lag)
+    curve = expand_curve(plant)
+    along = (push_forward(expand_curve, (plant,), (change,), xp), lag_change)
+    first = push_forward(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along, xp)
+    _, second = stationarity(ridge.s, curve, lag, undelayed)
+    s = xp.where(corner, 0.0, -first / xp.where(corner, 1.0, second))
+    _, beta = push_forward(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along), xp)
+    root = xp.sqrt(xp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
+    return Ridge(alpha, beta, 2.0 * s / root, s, xp.zeros_like(s))
+
+
 @cache
 def _jax_plant() -> Any:
     import jax
@@ -129,7 +151,6 @@ def _jax_plant() -> Any:
 @cache
 def _jax_ridge() -> Any:
     import jax
-    import jax.numpy as jnp
 
     function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
 
@@ -137,22 +158,7 @@ def _jax_ridge() -> Any:
     def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # The rule calls the function itself and is made of differentiable formulas: hence right to any order.
         plant, lag, start = primals
-        change, lag_change = tangents[:2]
         ridge = function(plant, lag, start, delay_model, kind)
-        corner = ridge.s >= 1.0
-        undelayed = is_undelayed(delay_model, kind)
-        alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
-        if delay_model == "fractional_power":
-            alpha += jnp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
-        curve, curve_change = jax.jvp(expand_curve, (plant,), (change,))
-        along = (curve_change, lag_change if delay_model == "fractional_power" else jnp.zeros_like(lag))
-        # Whole periods do not move.
-        _, first = jax.jvp(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along)
-        _, second = stationarity(ridge.s, curve, lag, undelayed)
-        s = jnp.where(corner, 0.0, -first / jnp.where(corner, 1.0, second))
-        _, (_, beta) = jax.jvp(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along))
-        root = jnp.sqrt(jnp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
-        moved = Ridge(alpha, beta, 2.0 * s / root, s, jnp.zeros_like(s))
-        return ridge, moved
+        return ridge, move_ridge(ridge, plant, lag, tangents[0], tangents[1], delay_model, kind)
 
     return function
