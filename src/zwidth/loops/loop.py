@@ -18,22 +18,20 @@ from zwidth.arrays.xp import is_jax, is_traced, namespace
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import Chain, chain_of, find_roots
-from zwidth.loops.linear.columns import stable_dampings
-from zwidth.loops.linear.delay_margin import linear_margins
+from zwidth.loops.linear.margins import linear_margins
 from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
 from zwidth.loops.linear.pieces import Island
 from zwidth.loops.linear.poles import is_marginal, log_size, poles_less_one
-from zwidth.loops.linear.radius import spectral_radius as linear_radius
+from zwidth.loops.linear.poles import spectral_radius as linear_radius
 from zwidth.loops.linear.ridge import BoundRidge, find_ridge
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.loops.linear.rows import bound_intervals, label_walls
+from zwidth.loops.linear.rows import bound_intervals, label_walls, stable_dampings
 from zwidth.loops.linear.slopes import SceneSensitivities, differentiate, differentiate_rigid
-from zwidth.loops.rigid.boundary import boundary_point
+from zwidth.loops.rigid.boundary import boundary_point, stable_region
 from zwidth.loops.rigid.margins import Margins, margins
 from zwidth.loops.rigid.outermost_poles import outermost_poles
 from zwidth.loops.rigid.passivity import passivity_margin
 from zwidth.loops.rigid.poles import poles
-from zwidth.loops.rigid.region import stable_region
 from zwidth.loops.rigid.ridge import RidgePoint, alpha_max
 from zwidth.loops.rigid.spectral_radius import decay_rate, spectral_radius
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod, decide_stability, is_stable

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.arrays.circle import circle
+from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.loops.linear.margins import open_loop_response
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.loops.linear.pieces import Island

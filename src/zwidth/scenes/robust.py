@@ -12,11 +12,10 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.affine import quantities
-from zwidth.arrays.arguments import as_float64, join_shapes
+from zwidth.arrays.balls import quantities
+from zwidth.arrays.evaluate import as_float64, join_shapes
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import within
+from zwidth.arrays.xp import is_traced, within
 from zwidth.loops.normalization import normalize
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.boxes import stable_everywhere

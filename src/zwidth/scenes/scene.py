@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import are_numbers, as_float64, join_shapes
+from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
 from zwidth.loops.linear.border import Outline, outlines
 from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.slopes import SceneSensitivities
@@ -21,8 +21,7 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import NoWall, VirtualWall, resolve_wall
 from zwidth.scenes.answers import SceneAnswers
-from zwidth.scenes.best_damping import BestDamping, Goal, find_best_damping
-from zwidth.scenes.required import RequiredValue, require
+from zwidth.scenes.required import BestDamping, Goal, RequiredValue, find_best_damping, require
 from zwidth.scenes.stiffest import StiffestWall, allows_negative, stiffest_wall
 from zwidth.simulation.result import Motion
 from zwidth.simulation.simulate import simulate

@@ -12,8 +12,8 @@ from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, register
 from zwidth.figures.region import Outlines
+from zwidth.loops.rigid.boundary import stable_region
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
-from zwidth.loops.rigid.region import stable_region
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
 from zwidth.scenes.passive import passive_edge

@@ -16,10 +16,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth.arrays.arguments import broadcast_traced
 from zwidth.arrays.circle import circle
-from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import nan_with_nan_slopes
+from zwidth.arrays.evaluate import broadcast_traced
+from zwidth.arrays.xp import is_traced, nan_with_nan_slopes
 from zwidth.loops.linear.chain import Chain, chain_of, required_wall, respond
 from zwidth.loops.linear.ridge import Condition
 from zwidth.loops.linear.slopes import moving_paths

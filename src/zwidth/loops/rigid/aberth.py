@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import epsilon, namespace, repeat
-from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
-from zwidth.loops.rigid.degrees import Degree
+from zwidth.arrays.xp import epsilon, namespace, nan_with_nan_slopes, repeat
+from zwidth.loops.rigid.device import valid_wall
+from zwidth.loops.rigid.folding import Degree
 from zwidth.loops.rigid.polynomial import choose_plant
 from zwidth.words.types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirst
 

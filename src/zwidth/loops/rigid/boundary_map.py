@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.arguments import compute_concretely
-from zwidth.arrays.evaluate import evaluate_columns
-from zwidth.loops.domain import WALL_RANGE, within
-from zwidth.loops.rigid.delay_classes import device
+from zwidth.arrays.evaluate import compute_concretely, evaluate_columns
+from zwidth.arrays.xp import within
+from zwidth.loops.rigid.device import device
 from zwidth.loops.rigid.folding import Points, group_by
 from zwidth.loops.rigid.row_limit import long_lobe, long_row, short_row
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
 
 # Smaller maps are compared by NumPy, with nothing to compile.

@@ -1,6 +1,6 @@
 """Whether every wall of a box of walls and devices is stable, proved by the one text of the verdict in affine forms.
 
-The text is that of `loops.rigid.crossover`; the numbers are those of `arrays.affine`. NumPy's sine, cosine and arcsine
+The text is that of `loops.rigid.crossover`; the numbers are those of `arrays.balls`. NumPy's sine, cosine and arcsine
 are trusted to 2^-45.
 """
 
@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from zwidth.arrays.affine import Form, chord
-from zwidth.arrays.balls import UNIT
+from zwidth.arrays.balls import UNIT, Form, chord
 from zwidth.arrays.xp import horner
 from zwidth.loops.rigid.certified_filter import functions
 from zwidth.loops.rigid.crossover import Lag, first_zero, long_verdict, short_verdict
-from zwidth.loops.rigid.delay_classes import DeviceTerms
+from zwidth.loops.rigid.device import DeviceTerms
 
 # Of the phi-functions, slightly negative arguments included.
 _PHI_ERROR = 100.0 * UNIT
@@ -37,7 +36,7 @@ def _phi_forms(x: Form) -> tuple[Form, Form, Form]:
 
 
 def plant(delta: Form, f: Form) -> DeviceTerms:
-    """The devices of boxes, in the form of `loops.rigid.plant.held_plant`."""
+    """The devices of boxes, in the form of `loops.rigid.device.held_plant`."""
     t = 1.0 - f
     x_t, x_f = delta * t, delta * f
     (e_t, phi2_t, psi_t), (_, phi2_f, psi_f), (c, phi2, psi) = _phi_forms(x_t), _phi_forms(x_f), _phi_forms(delta)

@@ -5,7 +5,7 @@ proved errors. ``u = 2^-53``. No library's exp is trusted.
 
 - ``exp``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 14 terms below 3u: together
   below 8u. Below x = -700 it is off by 1e-304 at most.
-- `numerics.phi.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have
+- `loops.rigid.device.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have
   positive terms only, 4u: phi1 and gap are within 14u, phi2 15u, and psi, in which phi1 and gap share the error of the
   exponential, 8u + 12u. Above, where c < 0.083, phi1 is within 5u, phi2 7u, psi 14u, gap 20u. All are within 30u.
 - Held fraction: t = 1 - f is off by u, and x = delta t by 2u. phi1 and phi2 amplify that at most once and psi twice,
@@ -22,14 +22,12 @@ import numpy as np
 
 from zwidth.arrays.balls import TINY, UNIT, Ball
 from zwidth.arrays.evaluate import evaluate_columns
-from zwidth.arrays.phi import phi_functions
-from zwidth.arrays.xla import COSINE, SINE, fit_arcsine, store_once
-from zwidth.arrays.xp import horner, namespace
-from zwidth.loops.domain import WALL_RANGE, wall_status
+from zwidth.arrays.xp import COSINE, SINE, fit_arcsine, horner, namespace, store_once
 from zwidth.loops.rigid.boundary_map import row_limits
 from zwidth.loops.rigid.crossover import Lag, first_zero, long_verdict, short_verdict
-from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, classify_delays, device
+from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, classify_delays, device, phi_functions, wall_status
 from zwidth.loops.rigid.folding import Points, pick_points
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
 

@@ -30,10 +30,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import newton
-from zwidth.arrays.xla import ARCSINE, COSINE, SINE
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace
-from zwidth.loops.rigid.delay_classes import ANY, DelayClasses
-from zwidth.loops.rigid.plant import split_delay
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
+from zwidth.loops.rigid.device import ANY, DelayClasses, split_delay
 from zwidth.words.types import Array
 
 # Of the peak, from its fit; of the direction from which it exists, from twice its beta at most.

@@ -20,15 +20,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64, check_scalars, to_caller
-from zwidth.arrays.evaluate import FEW, evaluate, evaluate_columns
-from zwidth.arrays.xp import horner, is_traced, namespace
-from zwidth.loops.domain import LONGEST_DELAY, nan_with_nan_slopes, valid_wall
-from zwidth.loops.rigid.degrees import NAMES
-from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
-from zwidth.loops.rigid.folding import fold_arguments, group_by
+from zwidth.arrays.evaluate import FEW, as_float64, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.arrays.xp import horner, is_traced, namespace, nan_with_nan_slopes
+from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, valid_wall
+from zwidth.loops.rigid.folding import NAMES, fold_arguments, group_by
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
 
 # Chebyshev terms: the last one is below 1e-16 for every delay.
@@ -153,7 +151,7 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         d: delay in periods, >= 0, whole or not (held). All four broadcast.
 
     Returns:
-        Array of the broadcast shape; NaN where the input is out of range (see `loops.domain`).
+        Array of the broadcast shape; NaN where the input is out of range (see `loops.rigid.device`).
 
     Numerics:
         About 1e-15 of what is needed, at a cost that does not grow with d. Where the condition peaks is proved for

@@ -8,15 +8,14 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64
-from zwidth.arrays.evaluate import map_blocks
+from zwidth.arrays.evaluate import as_float64, map_blocks
 from zwidth.arrays.xp import is_traced, namespace, repeat
-from zwidth.loops.domain import LONGEST_DELAY, wall_status
 from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, join, product_form, replace_invalid, split, with_zero
-from zwidth.loops.rigid.degrees import Degree, few_poles, find_degree, map_by_degree
+from zwidth.loops.rigid.device import wall_status
+from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
 from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
-from zwidth.words.quantities import MOST_POLES
+from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, Coefficients, Counts, Matrices, Reals, Roots, RootsFirst
 

@@ -17,10 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays import phi
 from zwidth.arrays.xp import horner, namespace, push_forward
-from zwidth.loops.rigid.delay_classes import DelayClasses
-from zwidth.loops.rigid.plant import Plant, held_plant
+from zwidth.loops.rigid.device import DelayClasses, Plant, held_plant, phi_functions
 from zwidth.loops.rigid.ridge_newton import (
     Ridge,
     Start,
@@ -34,7 +32,7 @@ from zwidth.loops.rigid.ridge_newton import (
 )
 from zwidth.words.types import Array
 
-# -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `arrays.phi`
+# -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `loops.rigid.device`
 _CHI = [(k + 1.0) / factorial(2 * k + 3) for k in range(13)]
 
 
@@ -47,10 +45,10 @@ def _chi(x: Array, gap: Array) -> Array:
 
 
 def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
-    """The derivatives of `loops.rigid.plant.held_plant` in delta and in the fraction."""
+    """The derivatives of `loops.rigid.device.held_plant` in delta and in the fraction."""
     f, t = fraction, 1.0 - fraction
-    c, e_t = phi.decay(delta), phi.decay(delta * t)
-    at_t, at_f = phi.phi_functions(delta * t), phi.phi_functions(delta * f)
+    c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
+    at_t, at_f = phi_functions(delta * t), phi_functions(delta * f)
     chi_t, chi_f = _chi(delta * t, at_t.gap), _chi(delta * f, at_f.gap)
     # Every term of a1 falls.
     a2 = -t * t * t * chi_t
@@ -86,7 +84,7 @@ def alpha_by_lag(ridge: Ridge, lag: Array) -> Array:
 
 
 def differentiable_plant(delta: Array, fraction: Array) -> Plant:
-    """`loops.rigid.plant.held_plant`, in JAX with its derivatives in closed form."""
+    """`loops.rigid.device.held_plant`, in JAX with its derivatives in closed form."""
     return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
 
 

@@ -4,7 +4,7 @@ For a held delay d = n + f the stable walls of one (beta, delta, d) are ``0 < al
 lobe of the boundary curve, cut by the line on which a real pole crosses at z = -1 (docs/theory/one-lobe.md,
 Theorem C).
 
-Notation: ``N(z) = a2 z^2 + a1 z + a0`` of `loops.rigid.plant`, ``em = 1 - c``, ``sigma = a2 + a0``, ``mu = a2 - a0``,
+Notation: ``N(z) = a2 z^2 + a1 z + a0`` of `loops.rigid.device`, ``em = 1 - c``, ``sigma = a2 + a0``, ``mu = a2 - a0``,
 ``y = sin(w/2)^2``, ``k = n + 1/2``, and the boundary at ``z = e^(j w)`` in the form
 
     alpha = 2 sin(w/2)/V (sin((n+1) w)/cos(w/2) E + 2 sin(w/2) cos((n+1) w) H)
@@ -24,9 +24,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xla import COSINE, SINE
-from zwidth.arrays.xp import horner, namespace, repeat
-from zwidth.loops.rigid.delay_classes import DeviceTerms
+from zwidth.arrays.xp import COSINE, SINE, horner, namespace, repeat
+from zwidth.loops.rigid.device import DeviceTerms, long_curve, short_curve
 from zwidth.words.types import Array
 
 # From the starting points below each sequence doubles its digits a step: 6 steps end a lobe, the last one to confirm;
@@ -66,17 +65,6 @@ def _sin_cos(x: Array) -> tuple[Array, Array]:
     return x * horner(square, SINE[:8]), horner(square, COSINE[:9])
 
 
-def short_curve(here: Any) -> tuple[tuple[Any, Any], tuple[Any, Any, Any], tuple[Any, Any, Any]]:
-    """The lobe for a held d < 1 by powers of y, in any arithmetic: ``V b = y (u0 + u1 y)``, V, ``alpha V/(4 y)``."""
-    p1, em, a2, a1, a0, f = here.p1, here.em, here.a2, here.a1, here.a0, here.f
-    t = 1.0 - f
-    # Both coefficients of b are sums of terms of one sign.
-    slack = f * (f * em + p1) + t * (f * here.p1_t + t * here.psi_t) + a0
-    by_b = p1 * slack * 4.0, a0 * (f + t * here.p1_t) * -16.0
-    size = p1 * p1, (a1 * (a2 + a0) + a2 * a0 * 4.0) * -4.0, a2 * a0 * 16.0
-    return by_b, size, (p1 * (em + f * em + p1), (a1 + a0 * 3.0 + a0 * em) * -4.0, a0 * 16.0)
-
-
 def short_place(b: Array, curve: Any) -> tuple[Array, Array]:
     """The y of a row on the lobe of `short_curve`, the first zero of a quadratic, and whether there is one."""
     (u0, u1), (v0, v1, v2), _ = curve
@@ -113,18 +101,6 @@ def short_row(beta: Array, device: DeviceTerms) -> Array:
 def _finish(limit: Array, b: Array) -> Array:
     xp = namespace(b)
     return xp.where(xp.isfinite(b), xp.where((b > 0) & (limit > 0), limit, 0.0), xp.nan)
-
-
-def long_curve(here: Any) -> tuple[tuple, tuple, tuple, tuple]:
-    """E, H, V and ``(delta V - E)/y`` rearranged, by powers of y, in any arithmetic; a0 is None for whole d."""
-    p1, em, a2, a1, a0 = here.p1, here.em, here.a2, here.a1, here.a0
-    if a0 is None:
-        return (em * p1, (here.gap - em * a2) * 2.0), (p1 * p1,), (p1 * p1, a1 * a2 * -4.0), (p1 * here.gap * -2.0,)
-    sigma, mu, corner = a2 + a0, a2 - a0, a2 * a0 * 4.0
-    g = em * p1, (p1 + sigma * em - mu * 2.0) * -2.0, a0 * 8.0
-    b1 = p1 * 2.0 - mu * 4.0 + here.delta * (sigma * (sigma - a1) - corner * 2.0) * 2.0
-    b2 = a0 * (1.0 - here.delta * a2 * 2.0) * -8.0
-    return g, (p1 * (p1 + here.f * em), a0 * -4.0), (p1 * p1, (a1 * sigma + corner) * -4.0, corner * 4.0), (b1, b2)
 
 
 def open_lobe(device: DeviceTerms) -> LongLobe:

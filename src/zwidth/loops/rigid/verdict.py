@@ -6,15 +6,12 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.arguments import are_numbers, check_scalars, to_caller
-from zwidth.arrays.evaluate import evaluate, evaluate_columns
+from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import wall_status
 from zwidth.loops.rigid.boundary_map import boundary_map
 from zwidth.loops.rigid.crossover import stable_kernel
-from zwidth.loops.rigid.degrees import NAMES
-from zwidth.loops.rigid.delay_classes import classify_delays
-from zwidth.loops.rigid.folding import Points, fold_arguments
+from zwidth.loops.rigid.device import classify_delays, wall_status
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments
 from zwidth.loops.rigid.poles import unstable_poles
 from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.words.errors import InputError, check_choice

@@ -5,7 +5,7 @@ import pytest
 
 from zwidth.loops.rigid import boundary_map as maps
 from zwidth.loops.rigid.boundary_map import row_limits
-from zwidth.loops.rigid.delay_classes import device
+from zwidth.loops.rigid.device import device
 from zwidth.loops.rigid.row_limit import long_lobe, long_row
 from zwidth.loops.rigid.verdict import is_stable
 

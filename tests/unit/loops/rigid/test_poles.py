@@ -13,7 +13,7 @@ from mpmath.libmp import NoConvergence
 import oracles
 import zwidth
 from zwidth.loops.rigid.aberth import aberth_kernel
-from zwidth.loops.rigid.degrees import map_by_degree
+from zwidth.loops.rigid.folding import map_by_degree
 from zwidth.loops.rigid.poles import _eigenvalues, companion, radius_by_companion, unstable_poles
 from zwidth.words.errors import InputError
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.loops.rigid.plant import held_plant
+from zwidth.loops.rigid.device import held_plant
 from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel
 from zwidth.loops.rigid.ridge_slopes import plant_slopes
 
