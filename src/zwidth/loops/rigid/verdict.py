@@ -8,12 +8,12 @@ import numpy as np
 
 from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.rigid.boundary_map import boundary_map
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import classify_delays, wall_status
 from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments
 from zwidth.loops.rigid.poles import unstable_poles
 from zwidth.loops.rigid.polynomial import check_has_poles
+from zwidth.loops.rigid.row_limit import boundary_map
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.status import Method, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
@@ -76,13 +76,13 @@ def is_stable(
         array([ True,  True, False])
     """
     values = (alpha, beta, delta, d)
-    _check(method, delay)
-    arguments = dict(zip(NAMES, values, strict=True))
-    traced = is_traced(*values)
-    if method in ("auto", "crossover") and (traced or are_numbers(*values)):
+    arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
+    if not (numbers and method == "auto" and delay == "held"):
+        _check(method, delay)
+    if method in ("auto", "crossover") and (numbers or is_traced(*values)):
         return evaluate(stable_kernel, arguments, classify_delays(d))
     check_scalars(arguments)
-    if traced:
+    if is_traced(*values):
         return _traced(values, method)
     laid = fold_arguments(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
@@ -129,10 +129,6 @@ def decide_stability(
     status = ranged if status is None else np.where(ranged == Status.OK, status, ranged)
     codes = (np.broadcast_to(status, laid.points.shape).astype(np.int32), np.asarray(used, np.int32))
     return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
-
-
-# Deprecated: the name goes with version 0.2.
-stability_of = decide_stability
 
 
 def _check(method: str, delay_model: str) -> None:
