@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.xp import STRIP, WIDE, is_jax, is_traced
+from zwidth.arrays.xp import STRIP, WIDE, is_jax, is_traced, tree_map
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
@@ -101,14 +101,6 @@ def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shape
         raise InputError(f"{what} do not broadcast: {shapes}; make each axis equal or 1") from None
 
 
-def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
-    """Apply a function to the arrays of a (named) tuple, or to a single array."""
-    if not isinstance(tree, tuple):
-        return function(tree, *others)
-    parts = [tree_map(function, *leaves) for leaves in zip(tree, *others, strict=True)]
-    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
-
-
 def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
     """Hand NumPy results to a caller who passed NumPy or plain numbers, JAX arrays to one who passed any."""
     if any(map(is_jax, values)):
@@ -158,6 +150,9 @@ def _stack_level() -> int:
 # for NumPy.
 Route: TypeAlias = Literal["auto", "numpy", "jax"]
 
+# The values of a kernel at concrete points, and for each argument how every result moves with it.
+Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
+
 # Up to so many points NumPy is done before a compiler has begun.
 FEW = 1 << 12
 # A compiled call gets so many points at most: one compilation, bounded memory, work for every processor.
@@ -172,11 +167,13 @@ def evaluate(
     *static: Any,
     weight: int = 1,
     route: Route = "auto",
+    slopes: Slopes | None = None,
 ) -> Any:
     """Apply ``kernel(*arrays, *static)`` to arguments that broadcast, and give results of their shape and type.
 
     Plain numbers beyond the range of their name are refused. ``weight`` says how many plain points one point counts
-    for, in time and memory: a kernel that makes samples of each point weighs more.
+    for, in time and memory: a kernel that makes samples of each point weighs more. ``slopes`` spares a gradient of few
+    points the compiler.
     """
     values = tuple(arguments.values())
     check_scalars(arguments)
@@ -190,7 +187,7 @@ def evaluate(
                 found = kernel(*numbers, *static)
             return found if isinstance(found, np.generic) else tree_map(_plain, found)
     if is_traced(*values):
-        return compile_traced(kernel, static)(*broadcast_traced(values))
+        return compile_traced(kernel, static, slopes)(*broadcast_traced(values))
     arrays = broadcast(arguments)
     shape = arrays[0].shape
     flat = evaluate_columns(kernel, [array.reshape(-1) for array in arrays], *static, weight=weight, route=route)
@@ -221,12 +218,15 @@ def _plain(leaf: Any) -> Any:
 
 
 @cache
-def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+def compile_traced(
+    kernel: Callable[..., Any], static: tuple[Any, ...], slopes: Slopes | None = None
+) -> Callable[..., Any]:
     """A kernel compiled for traced values, with its derivatives as one product for each argument.
 
     A point depends on itself alone, so that all there is to differentiate is a few numbers a point. Left to itself,
     `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge
-    1.2 to 1.5 times as long (benchmarks/bench_xla.py).
+    1.2 to 1.5 times as long (benchmarks/bench_xla.py). There the values are concrete: where ``slopes`` are known for
+    them, nothing is compiled.
     """
     import jax
 
@@ -246,7 +246,9 @@ def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Calla
         if len(moving) == 1:
             value, slopes = jax.jvp(of_moving, points, (ones,))
             return value, tree_map(lambda leaf: leaf[None], slopes)
-        sides = tuple(side.reshape(-1, *(1,) * ones.ndim) * ones for side in np.eye(len(moving), dtype=ones.dtype))
+        sides = tuple(
+            side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype)
+        )
         # The values are computed once for all sides.
         return jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
 
@@ -257,18 +259,30 @@ def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Calla
         active = tuple(not isinstance(tangent, jax.custom_derivatives.SymbolicZero) for tangent in tangents)
         if not any(active):
             return function(*primals), tree_map(_no_change, function(*primals))
-        value, slopes = sloped(active, *primals)
+        if slopes is None or is_traced(*primals) or primals[0].size > FEW:
+            value, sides = sloped(active, *primals)
+        else:
+            with np.errstate(all="ignore"):
+                value, sides = slopes(*(np.asarray(primal, np.float64) for primal in primals), *static)
+            value = tree_map(lambda leaf: jax.numpy.asarray(leaf, _type_of(leaf, primals[0])), value)
+            sides = tree_map(lambda *leaves: leaves, *(by for by, moves in zip(sides, active, strict=True) if moves))
         moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
 
         def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            return sum((by[k] * tangent for k, tangent in enumerate(moving[1:], 1)), by[0] * moving[0])
+            parts = [jax.numpy.asarray(by[k], leaf.dtype) * tangent for k, tangent in enumerate(moving)]
+            return sum(parts[1:], parts[0])
 
-        return value, tree_map(change, value, slopes)
+        return value, tree_map(change, value, sides)
 
     function.defjvp(rule, symbolic_zeros=True)
     return function
+
+
+def _type_of(leaf: Any, argument: Any) -> Any:
+    """The type of a result: real numbers are as precise as the argument."""
+    return argument.dtype if np.issubdtype(leaf.dtype, np.inexact) else leaf.dtype
 
 
 def _no_change(leaf: Any) -> Any:

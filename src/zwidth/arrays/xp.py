@@ -18,6 +18,8 @@ import numpy as np
 from zwidth.words.types import Array
 
 State = TypeVar("State")
+# Its square is nothing beside any derivative.
+_STEP = 1e-100
 _HOST_TYPES = (float, int, np.ndarray, np.generic, bool, list, tuple, str, type(None))
 
 
@@ -67,6 +69,27 @@ def frozen(values: State, xp: Any) -> State:
     from jax.lax import stop_gradient
 
     return stop_gradient(values)
+
+
+def tree_map(function: Callable[..., Any], tree: Any, *others: Any) -> Any:
+    """Apply a function to the arrays of a (named) tuple, or to a single array."""
+    if not isinstance(tree, tuple):
+        return function(tree, *others)
+    parts = [tree_map(function, *leaves) for leaves in zip(tree, *others, strict=True)]
+    return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
+
+
+def push_forward(function: Callable[..., Any], values: tuple[Any, ...], changes: tuple[Any, ...], xp: Any) -> Any:
+    """How the results of an analytic function move when its arguments do; trees are (named) tuples.
+
+    NumPy takes a step into the complex plane, which no difference rounds.
+    """
+    if xp is not np:
+        from jax import jvp
+
+        return jvp(function, values, changes)[1]
+    moved = tree_map(lambda value, change: value + 1j * _STEP * change, values, changes)
+    return tree_map(lambda result: np.imag(result) / _STEP, function(*moved))
 
 
 def along(values: np.ndarray, like: Any) -> Any:

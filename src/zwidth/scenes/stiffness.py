@@ -78,11 +78,21 @@ def max_stiffness(*, mass: ArrayLike, damping: ArrayLike = 0.0, period: ArrayLik
     """
     device = checked_device(mass=mass, damping=damping, period=period, delay=delay)
     arguments = {"mass": mass, "period": period, "delta": device.delta, "d": device.d}
-    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d))
+    return evaluate(max_stiffness_kernel, arguments, classify_delays(device.d), slopes=move_max_stiffness)
 
 
 def max_stiffness_kernel(mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses) -> Array:
     return ridge_kernel(delta, d, "held", kind).alpha * (mass / period) / period
+
+
+def move_max_stiffness(
+    mass: Array, period: Array, delta: Array, d: Array, kind: DelayClasses
+) -> tuple[Array, tuple[Array, ...]]:
+    """`max_stiffness_kernel`, and how it moves with each of mass, period, delta and d."""
+    found = slopes_kernel(delta, d, "held", kind)
+    scale = (mass / period) / period
+    value = found.point.alpha * scale
+    return value, (value / mass, -2.0 * value / period, found.by_delta * scale, found.by_d * scale)
 
 
 class Sensitivities(NamedTuple):

@@ -15,9 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import tree_map
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import frozen, horner, namespace, repeat
+from zwidth.arrays.xp import frozen, horner, namespace, repeat, tree_map
 from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, Plant, device, short_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (

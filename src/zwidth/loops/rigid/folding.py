@@ -23,9 +23,8 @@ from zwidth.arrays.evaluate import (
     evaluate_columns,
     join_shapes,
     to_caller,
-    tree_map,
 )
-from zwidth.arrays.xp import is_traced
+from zwidth.arrays.xp import is_traced, tree_map
 from zwidth.words.errors import TracedDelayError
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import ArrayLike

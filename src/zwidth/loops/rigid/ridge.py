@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, horner, namespace, nan_unless
+from zwidth.arrays.xp import epsilon, horner, namespace, nan_unless, push_forward
 from zwidth.loops.rigid.device import (
     ANY,
     DelayClasses,
@@ -116,6 +116,28 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: st
     return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - share * fall, omega=ridge.omega - fall)
 
 
+def move_ridge(
+    ridge: Ridge, plant: Plant, lag: Array, change: Plant, lag_change: Array, delay_model: str, kind: DelayClasses
+) -> Ridge:
+    """How the ridge moves when the plant and the lag do; whole periods do not."""
+    xp = namespace(ridge.s, plant.a2)
+    corner = ridge.s >= 1.0
+    undelayed = is_undelayed(delay_model, kind)
+    alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
+    if delay_model == "fractional_power":
+        alpha += xp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
+    else:
+        lag_change = xp.zeros_like(lag)
+    curve = expand_curve(plant)
+    along = (push_forward(expand_curve, (plant,), (change,), xp), lag_change)
+    first = push_forward(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along, xp)
+    _, second = stationarity(ridge.s, curve, lag, undelayed)
+    s = xp.where(corner, 0.0, -first / xp.where(corner, 1.0, second))
+    _, beta = push_forward(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along), xp)
+    root = xp.sqrt(xp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
+    return Ridge(alpha, beta, 2.0 * s / root, s, xp.zeros_like(s))
+
+
 @cache
 def _jax_plant() -> Any:
     import jax
@@ -134,7 +156,6 @@ def _jax_plant() -> Any:
 @cache
 def _jax_ridge() -> Any:
     import jax
-    import jax.numpy as jnp
 
     function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
 
@@ -142,23 +163,8 @@ def _jax_ridge() -> Any:
     def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
         # The rule calls the function itself and is made of differentiable formulas: hence right to any order.
         plant, lag, start = primals
-        change, lag_change = tangents[:2]
         ridge = function(plant, lag, start, delay_model, kind)
-        corner = ridge.s >= 1.0
-        undelayed = is_undelayed(delay_model, kind)
-        alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
-        if delay_model == "fractional_power":
-            alpha += jnp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
-        curve, curve_change = jax.jvp(expand_curve, (plant,), (change,))
-        along = (curve_change, lag_change if delay_model == "fractional_power" else jnp.zeros_like(lag))
-        # Whole periods do not move.
-        _, first = jax.jvp(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along)
-        _, second = stationarity(ridge.s, curve, lag, undelayed)
-        s = jnp.where(corner, 0.0, -first / jnp.where(corner, 1.0, second))
-        _, (_, beta) = jax.jvp(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along))
-        root = jnp.sqrt(jnp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
-        moved = Ridge(alpha, beta, 2.0 * s / root, s, jnp.zeros_like(s))
-        return ridge, moved
+        return ridge, move_ridge(ridge, plant, lag, tangents[0], tangents[1], delay_model, kind)
 
     return function
 
@@ -221,12 +227,27 @@ def alpha_max(
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, delay, route="jax"))
-    return evaluate(ridge_kernel, arguments, delay, classify_delays(d))
+    return evaluate(ridge_kernel, arguments, delay, classify_delays(d), slopes=move_point if delay == "held" else None)
 
 
 def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgePoint:
     """`alpha_max`, elementwise."""
     return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
+
+
+def move_point(
+    delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY
+) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
+    """`ridge_kernel` of a held delay, and how it moves with delta and d."""
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
+    point, still, arrived = _point(ridge, status), np.zeros_like(lag), converged(ridge)
+
+    def move(change: Plant) -> RidgePoint:
+        alpha, beta, omega, *_ = move_ridge(ridge, plant, lag, change, still, delay_model, kind)
+        return point._replace(**dict(zip(RidgePoint._fields, nan_unless(arrived, alpha, beta, omega), strict=False)))
+
+    by_delta, by_f = plant_slopes(delta, f)
+    return point, (move(by_delta), move(by_f))
 
 
 class RidgeSlopes(NamedTuple):
