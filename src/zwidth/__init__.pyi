@@ -37,7 +37,6 @@ from .loops.rigid.spectral_radius import decay_rate as decay_rate
 from .loops.rigid.spectral_radius import spectral_radius as spectral_radius
 from .loops.rigid.verdict import decide_stability as decide_stability
 from .loops.rigid.verdict import is_stable as is_stable
-from .loops.rigid.verdict import stability_of as stability_of
 from .pages.report.page import write_report as write_report
 from .parts import devices as devices
 from .parts.device import Coupling as Coupling

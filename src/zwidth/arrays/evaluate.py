@@ -184,7 +184,8 @@ def evaluate(
             pass  # An integer beyond float64: the long way names it.
         else:
             with np.errstate(all="ignore"):
-                return tree_map(_plain, kernel(*numbers, *static))
+                found = kernel(*numbers, *static)
+            return found if isinstance(found, np.generic) else tree_map(_plain, found)
     if is_traced(*values):
         return compile_traced(kernel, static, slopes)(*broadcast_traced(values))
     arrays = broadcast(arguments)

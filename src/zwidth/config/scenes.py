@@ -22,8 +22,8 @@ from zwidth.config.parts import (
 )
 from zwidth.config.values import Delay, NonNegative, Number, describe_entry, quantity_of
 from zwidth.loops.normalization import normalize
+from zwidth.parts.checks import Span
 from zwidth.parts.device import Device
-from zwidth.parts.span import Span
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import FOAW
 from zwidth.parts.wall import VirtualWall

@@ -13,7 +13,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import join_shapes, refuse_masked
 from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_unless, within
-from zwidth.parts.span import accept_units, in_periods
+from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES
 from zwidth.words.status import Status

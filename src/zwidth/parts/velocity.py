@@ -275,21 +275,10 @@ def _offsets(polynomial: np.ndarray) -> np.ndarray:
 def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
     """The standard deviation of a velocity estimate whose positions are quantized, in m/s.
 
-    A device that moves over many counts Q a period has an error of its position that is nearly white, of variance
-    ``Q^2/12``. Through ``F(z)`` with the impulse response f its variance becomes ``Q^2/12 sum f_k^2``, with ``sum f^2``
-    of ``2/(n T)^2`` for a difference over n, ``2 (1 - p)^2/((1 + p) T^2)`` for a low-pass of pole p, and ``2 (1 -
-    p)^3/((1 + p)^3 T^2)`` for two.
-
-    Args:
-        velocity: a difference, a windowed difference or a low-pass.
-        period: of the loop, in s.
-        resolution: Q, one count of the position, in m.
-
-    Raises:
-        InputError: there is no closed form for the estimate.
-
-    References:
-        Widrow, Kollar 2008, Quantization Noise, chapter 5 (the white error of variance Q^2/12).
+    The positions' error is nearly white, of variance ``Q^2/12`` with Q the resolution in m (Widrow, Kollar 2008,
+    chapter 5). Through ``F(z)`` with the impulse response f that becomes ``Q^2/12 sum f_k^2``, with ``sum f^2`` of
+    ``2/(n T)^2`` for a difference over n, ``2 (1 - p)^2/((1 + p) T^2)`` for a low-pass of pole p, ``2 (1 - p)^3/((1 +
+    p)^3 T^2)`` for two; of other estimates there is no closed form.
     """
     estimate = velocity.estimate(period)
     power = 2.0 * (float(estimate.gain) / (estimate.window * period)) ** 2 if estimate.window else math.nan

@@ -24,7 +24,7 @@ from zwidth.loops.normalization import Normalized, denormalize, normalize, quant
 from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, device_status
 from zwidth.loops.rigid.polynomial import check_delay_model
 from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slopes
-from zwidth.parts.span import accept_units, in_periods
+from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE
 from zwidth.words.status import Status

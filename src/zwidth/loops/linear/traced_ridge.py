@@ -24,8 +24,8 @@ from zwidth.loops.linear.ridge import Condition
 from zwidth.loops.linear.slopes import moving_paths
 from zwidth.loops.rigid.exact_points import polish
 from zwidth.loops.rigid.ridge import RidgePoint
+from zwidth.parts.checks import in_periods
 from zwidth.parts.paths import replace_parameters
-from zwidth.parts.span import in_periods
 from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind, Status

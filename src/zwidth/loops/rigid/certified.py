@@ -155,36 +155,12 @@ def certified_stable(
 ) -> CertifiedResult:
     """Decide whether every pole lies strictly inside the unit circle, for the inputs exactly as given.
 
-    ``stable`` means ``max |z| < 1`` over the zeros of `zwidth.char_poly`, held delay. The verdict is the phase at the
-    one gain crossover, below one period the end of the row; both are sums, products, quotients and roots of the
-    inputs, and are computed with a bound of every rounding (`loops.rigid.certified_filter`). Where the bound
-    leaves the sign open, the same lines run in ball arithmetic (python-flint), doubling the precision.
-
-    Args:
-        alpha: normalized stiffness K T^2/m.
-        beta: normalized virtual damping B T/m.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not. All four broadcast; one device (delta and d of size one) is fastest.
-        max_bits: the largest precision of the balls, 64 or more.
-
-    Returns:
-        CertifiedResult of NumPy arrays of the broadcast shape: ``stable``; ``status``; ``bits``, 0 where the filter
-        or a sign decided, otherwise the precision that was needed. ``stable`` is False wherever the status is not OK:
-        ON_BOUNDARY, no pole is outside and at least one exactly on the circle; UNDECIDED, more than ``max_bits`` is
-        needed, or the filter left the point open and the extra ``certified`` is not installed; INVALID_INPUT, NaN,
-        infinite or negative where it must not be; OUT_OF_RANGE, see `loops.rigid.device`.
-
-    Raises:
-        InputError: an argument is no real number, shapes do not broadcast, or ``max_bits`` is below 64.
-
-    Numerics:
-        A label is a theorem about the float64 inputs, provided that ``+ - * /`` and the square root round correctly,
-        as XLA's do unless its fast-math flags are set. The filter decides more than 99.9 % of a map and of scattered
-        points; balls take about 0.1 milliseconds a point. Neither grows with d.
-
-    References:
-        Walton, Marshall 1987 (delays by the phase at unit gain). Rump 1999 (midpoint-radius arithmetic).
-        Johansson 2017 (Arb).
+    A label is a theorem about the float64 inputs, provided that ``+ - * /`` and the square root round correctly, as
+    XLA's do unless its fast-math flags are set. ``stable`` is False wherever the status is not OK: ON_BOUNDARY, no pole
+    is outside and at least one exactly on the circle; UNDECIDED, more than ``max_bits`` (at least 64) is needed, or the
+    filter left the point open and the extra ``certified`` is not installed; or the input is out of range. ``bits`` is 0
+    where the filter or a sign decided. The filter decides more than 99.9 % of a map and of scattered points; balls take
+    about 0.1 ms a point (Walton, Marshall 1987; Rump 1999; Johansson 2017).
 
     Example:
         >>> from zwidth.loops.rigid.certified import certified_stable

@@ -1,16 +1,8 @@
 """Passivity of the sampled wall of the rigid loop (Colgate's condition), for any delay.
 
-Per frequency the condition is a lower bound on the physical damping. For whole d, with D = sin((d + 1/2) w)/sin(w/2),
-
-    delta > alpha D/2 - beta cos((d + 1) w)            for every w in (0, pi]
-
-which at d = 0 is eq. (21), ``delta > alpha/2 + |beta|``. For a held delay d = n + f the worst motion also bends when
-the force arrives; with s = sin(w/2) and G = j e^(jw(n + 1/2)) (alpha - 2j beta s e^(jw/2)) the bound becomes
-
-    delta > (-h + sqrt(h^2 + 4 f (1 - f) s^2 |G|^2)) / (4 s),   h = Re{((1 - f) + f e^(jw)) G}
-
-Both are convex and homogeneous in (alpha, beta): one convex set for each delay, whatever the device. Where the bound is
-highest: `loops.rigid.needed_damping`. On a map of one delay it is a polynomial of one variable, the direction.
+Per frequency the condition is a lower bound on the physical damping (docs/theory/passivity.md), convex and homogeneous
+in (alpha, beta): one convex set for each delay, whatever the device. Where the bound is highest:
+`loops.rigid.needed_damping`. On a map of one delay it is a polynomial of one variable, the direction.
 """
 
 from __future__ import annotations

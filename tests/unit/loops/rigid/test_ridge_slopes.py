@@ -8,8 +8,7 @@ import pytest
 
 import zwidth
 from zwidth.loops.rigid.device import held_plant
-from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel
-from zwidth.loops.rigid.ridge_slopes import plant_slopes
+from zwidth.loops.rigid.ridge import plant_slopes, ridge_kernel, slopes_kernel
 
 DELTAS = [0.0, 1e-9, 0.1, 1.0, 2.4, 2.6, 10.0, 100.0, 1e4]
 FRACTIONS = [0.0, 1e-8, 0.3, 0.99]
