@@ -98,6 +98,8 @@ def is_wrong(now: Any, later: Any, arguments: dict[str, Any]) -> bool:
         return not still
     if kind == MotionKind.DECAYING:
         return not (still or later.amplitude < now.amplitude) or then in (MotionKind.GROWING, MotionKind.DIVERGED)
+    if kind == MotionKind.RESTLESS:
+        return still or then in (MotionKind.REST, MotionKind.DECAYING)
     if kind == MotionKind.GROWING:
         return not later.amplitude > now.amplitude
     if kind == MotionKind.STEADY:

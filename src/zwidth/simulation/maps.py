@@ -14,6 +14,9 @@ from zwidth.simulation.lanes import Lanes, Options
 
 # Squarings of a map, at most; rounding hides slower motions.
 _SQUARINGS = 36
+# Eigenvalues that nothing is left of after so many steps and two for every number of the state, which share of a state
+# is nothing, and what surely lies inside of the unit circle.
+_FAST, _EXACT, _NOTHING, _INSIDE = 0.5, 32, 1e-10, 1.0 - 1e-10
 
 
 class LoopMap(NamedTuple):
@@ -137,28 +140,47 @@ def lay_loop(group: LaneGroup, seen: bool, touching: bool, held: bool) -> LoopMa
     return LoopMap(A, pushed, misread, command, misled)
 
 
-def square(A: np.ndarray, weigh: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """How many squarings shrink a map by half, negative where they show that it grows, 0 where neither; and P.
+def square(A: np.ndarray) -> np.ndarray:
+    """How many squarings shrink a map by half, negative where they show that it grows, 0 where neither.
 
-    ``trace A^N > n`` needs an eigenvalue outside of the unit circle, ``|A^N| < 1`` needs none. P is the sum of
-    ``(A^k)^T A^k``: ``d^T P d`` falls from sample to sample.
+    ``trace A^N > n`` needs an eigenvalue outside of the unit circle, ``|A^N| < 1`` needs none.
     """
     count, n = A.shape[:2]
-    found, P = np.zeros(count, int), np.broadcast_to(np.eye(n), A.shape).copy()
-    left = np.arange(count)
-    power = A
+    found, left, power = np.zeros(count, int), np.arange(count), A
     for j in range(1, _SQUARINGS + 1):
-        if weigh:
-            P[left] += power.mT @ P[left] @ power
         power = power @ power
-        small = np.abs(power).sum(-1).max(-1) < (1e-17 if weigh else 0.5)
+        small = np.abs(power).sum(-1).max(-1) < 0.5
         large = np.abs(np.trace(power, axis1=1, axis2=2)) > n
         found[left[small]], found[left[large]] = j, -j
         going = ~(small | large)
         left, power = left[going], power[going]
         if not left.size:
             break
-    return found, P
+    return found
+
+
+def bound_rows(A: np.ndarray, state: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the most that rows of a state that A moves ever are, (lanes, rows); NaN where it does not decay.
+
+    The first steps as they are; then no row is further from 0 than the sum of what the slow eigenvectors add to it,
+    ``|g v| |c| |eigenvalue|^k``, which falls. By then the others, shift registers among them, have no share.
+    """
+    values, vectors = np.linalg.eig(A)
+    slow = np.abs(values) > _FAST
+    vectors = np.where(slow[:, None], vectors, 0.0)
+    size, low, high = np.abs(state).max(-1), np.inf, -np.inf
+    for _ in range(_EXACT + 2 * A.shape[1]):
+        now = np.einsum("lrn,ln->lr", rows, state)
+        low, high = np.minimum(low, now), np.maximum(high, now)
+        state = np.einsum("lnm,lm->ln", A, state)
+    adjoint = vectors.conj().mT
+    normal = adjoint @ vectors + ~slow[..., None] * np.eye(A.shape[1])
+    share = solve_lanes(normal, adjoint @ state[..., None])
+    rest = np.abs(state - (vectors @ share)[..., 0].real).max(-1)
+    most = np.abs(rows @ vectors) @ np.abs(share)
+    shown = (np.abs(values).max(-1) < _INSIDE) & (rest <= _NOTHING * size)
+    most = np.where(shown[:, None], most[..., 0], np.nan)
+    return np.minimum(low, -most), np.maximum(high, most)
 
 
 def solve_lanes(A: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -173,38 +195,30 @@ def solve_lanes(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def take(group: LaneGroup, own: np.ndarray) -> LaneGroup:
-    lanes, at = group.lanes, np.flatnonzero(own)
+    """Some lanes of a group, by their places or a mask."""
 
-    def pick(part: Any) -> Any:
-        return part[at] if isinstance(part, np.ndarray) else part
+    def pick(parts: Any) -> Any:
+        return parts._replace(
+            **{name: part[own] for name, part in parts._asdict().items() if isinstance(part, np.ndarray)}
+        )
 
-    own_lanes = lanes._replace(
-        **{name: pick(part) for name, part in lanes._asdict().items()},
-    )
-    own_lanes = own_lanes._replace(
-        motor=type(lanes.motor)(*map(pick, lanes.motor)), estimator=type(lanes.estimator)(*map(pick, lanes.estimator))
-    )
-    return group._replace(
-        lanes=own_lanes,
-        **{name: getattr(group, name)[at] for name in ("plant", "held", "state", "push")},
-    )
+    lanes = pick(group.lanes)._replace(motor=pick(group.lanes.motor), estimator=pick(group.lanes.estimator))
+    return pick(group)._replace(lanes=lanes)
 
 
-def find_kept(group: LaneGroup, loop: LoopMap, seen: bool, wall: bool, held: bool) -> tuple[np.ndarray, np.ndarray]:
-    """What the map keeps, and of which lanes: the place of a held body, or a shift of bodies that no spring returns."""
+def find_kept(group: LaneGroup, seen: bool, held: bool) -> np.ndarray:
+    """What the maps of lanes keep: the place of a held body, a shift of bodies that no spring returns, or 0."""
     n, m = group.state.shape[1], group.bodies
+    kept = np.zeros((len(group.state), n))
     if held:
-        place = np.zeros((len(group.state), n))
-        place[:, :m] = group.lanes.place[:, 0]
-        return place, np.ones(len(group.state), bool)
-    loose = np.all(group.lanes.rate[:, :, 0] == 0, axis=1)
-    shift = np.zeros((len(group.state), n))
-    shift[:, 0] = 1.0
+        kept[:, :m] = group.lanes.place[:, 0]
+        return kept
+    kept[:, 0] = 1.0
     if seen:
         # Readings shift with it, and what a filter of them settles on.
-        shift[:, n - group.late - 1 - group.window : n - group.late - 1] = 1.0
+        kept[:, n - group.late - 1 - group.window : n - group.late - 1] = 1.0
         if not group.window and group.filter:
             own = np.eye(group.filter) - group.lanes.estimator.A
-            shift[:, m : m + group.filter] = solve_lanes(own, group.lanes.estimator.B[..., None])[..., 0]
-        loose &= group.lanes.alpha == 0
-    return shift, loose
+            kept[:, m : m + group.filter] = solve_lanes(own, group.lanes.estimator.B[..., None])[..., 0]
+    loose = np.all(group.lanes.rate[:, :, 0] == 0, axis=1)
+    return kept * (loose & (~np.bool_(seen) | (group.lanes.alpha == 0)))[:, None]

@@ -25,10 +25,11 @@ class MotionKind(IntEnum):
     DIVERGED = 4
     UNCLEAR = 5
     INVALID = 6
+    RESTLESS = 7
 
 
 # A tail this small beside the widest motion is at rest; windows this much alike are steady, halves hold so many swings.
-_AT_REST, _STILL, _ALIKE, _ABOUT, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 0.05, 2, 1e100
+_AT_REST, _STILL, _ALIKE, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 2, 1e100
 # Who halves in so many times the periods has changed by 2 % after 20 times as many.
 _FOR_GOOD = 4000.0
 
@@ -162,17 +163,12 @@ def classify(known: Any, outlook: Any, blur: np.ndarray, course: Any) -> np.ndar
     swinging = np.stack([known.turns[1 : half + 1].sum(0), known.turns[half + 1 :].sum(0)]).min(0) >= _SWINGS
     swinging &= ~still
 
-    def alike(wide: np.ndarray, share: float) -> np.ndarray:
-        return np.ptp(wide, axis=0) <= share * wide.max(0) + blur
-
-    slow, quick = outlook.pace > _FOR_GOOD * course.periods, outlook.pace <= course.periods
+    alike = np.ptp(whole[:, 0], axis=0) <= _ALIKE * whole[:, 0].max(0) + blur
+    slow = outlook.pace > _FOR_GOOD * course.periods
     linear = slow & (outlook.settles | outlook.grows)
-    # Bounces without order may look alike in halves, hardly in every window.
-    even = alike(high[:, 0] - low[:, 0], _ABOUT)
-    lasting = swinging & (outlook.repeats | alike(whole[:, 0], _ALIKE) & linear | even & outlook.restless & quick)
-    rising = whole[1, 0] >= whole[0, 0]
-    kind = np.full(first.shape, MotionKind.UNCLEAR)
-    growing = outlook.grows & ~still & (rising | (outlook.pace <= 2 * course.periods))
+    lasting = swinging & (outlook.repeats | (alike & linear))
+    growing = outlook.grows & ~still & ((whole[1, 0] >= whole[0, 0]) | (outlook.pace <= 2 * course.periods))
+    kind = np.where(outlook.restless & (second > _AT_REST * known.widest), MotionKind.RESTLESS, MotionKind.UNCLEAR)
     kind = np.where(growing, MotionKind.GROWING, kind)
     kind = np.where(outlook.settles, np.where(still, MotionKind.REST, MotionKind.DECAYING), kind)
     kind = np.where(lasting, MotionKind.STEADY, kind)
