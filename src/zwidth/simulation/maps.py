@@ -15,8 +15,8 @@ from zwidth.simulation.lanes import Lanes, Options
 # Squarings of a map, at most; rounding hides slower motions.
 _SQUARINGS = 36
 # Eigenvalues that nothing is left of after so many steps and two for every number of the state, which share of a state
-# is nothing, and what surely lies inside of the unit circle.
-_FAST, _EXACT, _NOTHING, _INSIDE = 0.5, 32, 1e-10, 1.0 - 1e-10
+# is nothing, what surely lies inside of the unit circle, and how long a motion is followed at most.
+_FAST, _EXACT, _NOTHING, _INSIDE, _LONGEST = 0.5, 32, 1e-10, 1.0 - 1e-10, 1024
 
 
 class LoopMap(NamedTuple):
@@ -166,21 +166,32 @@ def bound_rows(A: np.ndarray, state: np.ndarray, rows: np.ndarray) -> tuple[np.n
     ``|g v| |c| |eigenvalue|^k``, which falls. By then the others, shift registers among them, have no share.
     """
     values, vectors = np.linalg.eig(A)
-    slow = np.abs(values) > _FAST
+    slow, inside = np.abs(values) > _FAST, np.abs(values).max(-1) < _INSIDE
     vectors = np.where(slow[:, None], vectors, 0.0)
-    size, low, high = np.abs(state).max(-1), np.inf, -np.inf
-    for _ in range(_EXACT + 2 * A.shape[1]):
-        now = np.einsum("lrn,ln->lr", rows, state)
-        low, high = np.minimum(low, now), np.maximum(high, now)
-        state = np.einsum("lnm,lm->ln", A, state)
+    nothing, first = _NOTHING * np.abs(state).max(-1), np.einsum("lrn,ln->lr", rows, state)
+    low, high, state = _follow(A, state, rows, first, first, _EXACT + 2 * A.shape[1])
     adjoint = vectors.conj().mT
     normal = adjoint @ vectors + ~slow[..., None] * np.eye(A.shape[1])
     share = solve_lanes(normal, adjoint @ state[..., None])
     rest = np.abs(state - (vectors @ share)[..., 0].real).max(-1)
-    most = np.abs(rows @ vectors) @ np.abs(share)
-    shown = (np.abs(values).max(-1) < _INSIDE) & (rest <= _NOTHING * size)
-    most = np.where(shown[:, None], most[..., 0], np.nan)
+    most = (np.abs(rows @ vectors) @ np.abs(share))[..., 0]
+    # Equal eigenvalues have too few eigenvectors: those motions are followed until nothing is left of them.
+    own = np.flatnonzero(inside & ~(rest <= nothing))
+    low[own], high[own], left = _follow(A[own], state[own], rows[own], low[own], high[own], _LONGEST)
+    most[own], rest[own] = 0.0, np.abs(left).max(-1)
+    most = np.where((inside & (rest <= nothing))[:, None], most, np.nan)
     return np.minimum(low, -most), np.maximum(high, most)
+
+
+def _follow(
+    A: np.ndarray, state: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray, steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The least and the most of rows on so many steps, with what they were before, and the state behind these."""
+    for _ in range(steps if len(A) else 0):
+        state = np.einsum("lnm,lm->ln", A, state)
+        now = np.einsum("lrn,ln->lr", rows, state)
+        low, high = np.minimum(low, now), np.maximum(high, now)
+    return low, high, state
 
 
 def solve_lanes(A: np.ndarray, b: np.ndarray) -> np.ndarray:

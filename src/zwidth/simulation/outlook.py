@@ -47,7 +47,7 @@ class Outlook(NamedTuple):
 def foresee(
     lanes: Lanes, options: Options, state: Any, push: np.ndarray, known: np.ndarray, sensed: np.ndarray, periods: int
 ) -> Outlook:
-    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, what was last read.
+    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, the last positions.
 
     A motion near the end of the range of floats overflows, and nothing is proved of it.
     """
