@@ -35,6 +35,7 @@ class LaneGroup(NamedTuple):
     lanes: Any  # `Lanes` of numbers along the first axis
     plant: np.ndarray  # (lanes, m, m + 2): the bodies' map, and by the force before and after its change
     held: np.ndarray  # (lanes, m, m)
+    halfway: np.ndarray  # (lanes, m, m + 1): the bodies' map until the force changes
     state: np.ndarray  # (lanes, n)
     push: np.ndarray
     late: int
@@ -49,19 +50,22 @@ def _rows(part: Any, at: np.ndarray) -> np.ndarray:
     return part[at] if len(part) > 1 else np.broadcast_to(part, (at.size, *part.shape[1:]))
 
 
-def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> np.ndarray:
-    """The bodies' map over a period, from the map of each piece of it."""
+def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The bodies' map over a period and until the force changes, from the map of each piece of it."""
     change = _rows(lanes.pieces.change, at)
     size = change.shape[-2]
     whole = np.concatenate([np.eye(size), np.zeros((size, 2))], 1)
-    whole = np.broadcast_to(whole, (at.size, size, size + 2))
+    whole = halfway = np.broadcast_to(whole, (at.size, size, size + 2))
     for j in range(options.substeps):
         for piece in range(options.pieces):
             part = change[:, j, piece]
-            whole = whole + part[..., :-1] @ whole
             # Of two pieces the first feels the older command.
-            whole[..., size if piece + 1 < options.pieces else size + 1] += part[..., -1]
-    return whole
+            newer = piece + 1 == options.pieces
+            force = np.eye(size + 2)[size + newer]
+            whole = whole + part[..., :-1] @ whole + part[..., -1:] * force
+            if not newer:
+                halfway = halfway + part[..., :-1] @ halfway + part[..., -1:] * force
+    return whole, halfway[..., :-1]
 
 
 def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int, at: np.ndarray) -> LaneGroup:
@@ -84,7 +88,7 @@ def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int,
         pieces=lanes.pieces,
         digits=lanes.digits,
     )
-    plant = _compose(lanes, options, at)
+    plant, halfway = _compose(lanes, options, at)
     size = plant.shape[1]
     held = plant[..., :size]
     if options.friction:
@@ -93,7 +97,7 @@ def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int,
         held = np.eye(size) + _rows(lanes.digits.change[1, 0], at)[..., :-1]
         held = held @ (np.eye(size) - force[..., :, None] * motion[..., None, :])
     return LaneGroup(
-        own, plant, held, np.concatenate(parts, 1), push[at], late, window, size, program.filtered.shape[0]
+        own, plant, held, halfway, np.concatenate(parts, 1), push[at], late, window, size, program.filtered.shape[0]
     )
 
 
@@ -159,28 +163,37 @@ def square(A: np.ndarray) -> np.ndarray:
     return found
 
 
-def bound_rows(A: np.ndarray, state: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the most that rows of a state that A moves ever are, (lanes, rows); NaN where it does not decay.
+def bound_rows(
+    A: np.ndarray, state: np.ndarray, rows: np.ndarray, signed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The least and the most that rows of a state that A moves ever are, and whether the signed rows stay above 0.
 
     The first steps as they are; then no row is further from 0 than the sum of what the slow eigenvectors add to it,
-    ``|g v| |c| |eigenvalue|^k``, which falls. By then the others, shift registers among them, have no share.
+    ``|g v| |c| |eigenvalue|^k``, which falls. By then the others, shift registers among them, have no share. A row
+    stays above 0 if the slowest adds more to it than all others. NaN where the state does not decay.
     """
     values, vectors = np.linalg.eig(A)
     slow, inside = np.abs(values) > _FAST, np.abs(values).max(-1) < _INSIDE
     vectors = np.where(slow[:, None], vectors, 0.0)
-    nothing, first = _NOTHING * np.abs(state).max(-1), np.einsum("lrn,ln->lr", rows, state)
-    low, high, state = _follow(A, state, rows, first, first, _EXACT + 2 * A.shape[1])
+    nothing, count = _NOTHING * np.abs(state).max(-1), rows.shape[1]
+    every = np.concatenate([rows, signed], 1)
+    first = np.einsum("lrn,ln->lr", every, state)
+    low, high, state = _follow(A, state, every, first, first, _EXACT + 2 * A.shape[1])
     adjoint = vectors.conj().mT
     normal = adjoint @ vectors + ~slow[..., None] * np.eye(A.shape[1])
     share = solve_lanes(normal, adjoint @ state[..., None])
     rest = np.abs(state - (vectors @ share)[..., 0].real).max(-1)
-    most = (np.abs(rows @ vectors) @ np.abs(share))[..., 0]
+    parts = every @ vectors * share.mT
+    most = np.abs(parts).sum(-1)
+    slowest = np.take_along_axis(parts, np.argmax(np.abs(values), -1)[:, None, None], -1)[..., 0]
+    above = np.all(((low > 0) & (2.0 * slowest.real > most * (1 + 1e-9)))[:, count:], axis=1)
     # Equal eigenvalues have too few eigenvectors: those motions are followed until nothing is left of them.
     own = np.flatnonzero(inside & ~(rest <= nothing))
-    low[own], high[own], left = _follow(A[own], state[own], rows[own], low[own], high[own], _LONGEST)
-    most[own], rest[own] = 0.0, np.abs(left).max(-1)
+    low[own], high[own], left = _follow(A[own], state[own], every[own], low[own], high[own], _LONGEST)
+    most[own], above[own], rest[own] = 0.0, False, np.abs(left).max(-1)
     most = np.where((inside & (rest <= nothing))[:, None], most, np.nan)
-    return np.minimum(low, -most), np.maximum(high, most)
+    low, high = np.minimum(low, -most), np.maximum(high, most)
+    return low[:, :count], high[:, :count], above
 
 
 def _follow(

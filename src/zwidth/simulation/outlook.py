@@ -80,12 +80,15 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
     unstable = squarings < 0
     linear = exact & bilateral & endless & ~dry & pulling
     settles = linear & (squarings > 0)
-    # The decisions in force, of lanes that do not slip.
+    # The decisions in force; what slips on feels a constant friction.
     modes = np.stack([exact & touching, touching, stuck], 1)
-    other = ~linear & (stuck == dry) & ((squarings > 0) | stuck | ~modes[:, 0])
+    slip = np.where(dry, state.body.slip[at], 0.0)
+    other = ~linear & ((squarings > 0) | stuck | ~modes[:, 0]) & ((slip == 0) | (group.bodies == 2))
+    rubbed = group._replace(push=group.push - slip * motor.coulomb)
     for seen, wall, held in np.unique(modes[other], axis=0):
         own = other & (modes == (seen, wall, held)).all(1)
-        settles[own] = _settles(take(group, own), seen, wall, held, bilateral[own], pulling[own], periods)
+        part = take(rubbed, own)
+        settles[own] = _settles(part, (seen, wall, held), slip[own], bilateral[own], pulling[own], periods)
     repeats = linear & (squarings == 0)
     own = ~exact & ~dry & ~settles
     if own.any() and not group.filter:
@@ -104,9 +107,15 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
 
 
 def _settles(
-    group: LaneGroup, seen: bool, wall: bool, held: bool, bilateral: np.ndarray, pulling: np.ndarray, periods: int
+    group: LaneGroup,
+    mode: tuple[bool, bool, bool],
+    slip: np.ndarray,
+    bilateral: np.ndarray,
+    pulling: np.ndarray,
+    periods: int,
 ) -> np.ndarray:
     """Whether no decision changes any more: the wall is kept or left for good, the reading stays, no limit is met."""
+    seen, wall, held = mode
     lanes, motor, m, late = group.lanes, group.lanes.motor, group.bodies, group.late
     n = group.state.shape[1]
     sent, quantum = n - late - 1, lanes.resolution
@@ -143,8 +152,21 @@ def _settles(
     if not bilateral.all():
         # Where the map leads to another side of the wall there is nothing to bound.
         settled &= bilateral | (ends[:, 0] > 0) if wall else bilateral | (drift <= 0)
+    # A body that slips on keeps its velocity's sign, at the samples and where the force changes between them.
+    signed = np.zeros((len(reading), 2, n))
+    signed[:, 0, m // 2], signed[:, 1, :m] = 1.0, group.halfway[:, m // 2, :m]
+    signed[:, 1, sent + late] = group.halfway[:, m // 2, m]
     low, high = np.full(ends.shape, np.nan), np.full(ends.shape, np.nan)
-    low[settled], high[settled] = bound_rows((loop.A - both)[settled], (group.state - rest)[settled], rows[settled])
+    above = np.zeros(len(reading), bool)
+    low[settled], high[settled], above[settled] = bound_rows(
+        (loop.A - both)[settled],
+        (group.state - rest)[settled],
+        rows[settled],
+        (signed * slip[:, None, None])[settled],
+    )
+    # Or what is left could not turn the force of friction: that takes more than twice of it.
+    left = np.maximum(np.abs(low), np.abs(high))[:, 3:].max(-1) <= 1e-9 * motor.static
+    settled &= above | left | (slip == 0)
     # Forces that came before count as they are.
     slack = 1e-9 * (np.abs(ends) + np.maximum(high, -low))
     low, high = ends + low - slack, ends + high + slack
