@@ -26,7 +26,7 @@ from zwidth.simulation.maps import (
 from zwidth.simulation.period import round_to
 
 # Samples that a cycle of readings is looked for in, how much longer than simulated a drift must not matter.
-CYCLE, _LONG = 512, 1e3
+CYCLE, _LONG = 256, 1e3
 # What bounds between samples have room for.
 _ROOM = 2.0
 # How near, in steps of the encoder, a motion must come to where it was a cycle ago.
@@ -84,6 +84,8 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
     modes = np.stack([exact & touching, touching, stuck], 1)
     slip = np.where(dry, state.body.slip[at], 0.0)
     other = ~linear & ((squarings > 0) | stuck | ~modes[:, 0]) & ((slip == 0) | (group.bodies == 2))
+    # Who is pushed on no spring comes back.
+    other &= touching | stuck | (group.push <= 0) | np.any(lanes.rate[:, :, 0] != 0, axis=1)
     rubbed = group._replace(push=group.push - slip * motor.coulomb)
     for seen, wall, held in np.unique(modes[other], axis=0):
         own = other & (modes == (seen, wall, held)).all(1)
@@ -257,8 +259,10 @@ def _repeats(
     spans = np.arange(memory, len(counts) - memory)
     if not spans.size:
         return found
-    far = np.abs(counts[-1] - counts[-1 - spans]) + np.abs(counts[-2] - counts[-2 - spans])
-    far = np.where((lasted > 0) & (spans[:, None] >= lasted), far, np.inf)
+    last = len(counts) - 1 - memory
+    far = np.abs(counts[last : memory - 1 : -1] - counts[-1])
+    far += np.abs(counts[last - 1 : memory - 2 : -1] - counts[-2])
+    far[(lasted == 0) | (spans[:, None] < lasted)] = np.inf
     nearest = far.min(0)
     at = np.flatnonzero(nearest < _AGAIN)
     length = memory + np.argmax(far[:, at] <= 2.0 * nearest[at] + 1e-9, axis=0)
