@@ -149,8 +149,9 @@ def test_a_longer_motion_belies_no_label():
     ]
     assert [label for label in labels if label.wrong] == []
     assert not any(label.label == MotionKind.UNCLEAR for label in labels if label.kind == "linear")
-    # Half of the walls are unstable: bounces on these have no order that could be shown.
-    assert sum(label.label == MotionKind.UNCLEAR for label in labels) <= 0.5 * len(labels)
+    # Half of the walls are unstable: whether one of these with friction ever sticks for good is not shown.
+    assert sum(label.label == MotionKind.UNCLEAR for label in labels) <= 0.25 * len(labels)
+    assert not any(label.label == MotionKind.UNCLEAR for label in labels if label.kind == "contact and encoder")
 
 
 if __name__ == "__main__":

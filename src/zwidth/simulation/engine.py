@@ -203,8 +203,9 @@ def run_lanes(
     behind = -course.periods % BLOCK
     kept = jax.tree.map(lambda *parts: np.concatenate(parts), *recorded)
     kept = jax.tree.map(lambda part: part[: len(part) - behind], kept)
-    sensed, frames = kept
-    return state, sensed[-CYCLE:], *(frames or (None, None))
+    sensed, recording = kept
+    reading, frame = recording or (None, None)
+    return state, sensed[-CYCLE:], reading, frame
 
 
 def _cut(values: np.ndarray | None, first: int, rest: float, shape: tuple[int, ...]) -> np.ndarray:

@@ -182,11 +182,11 @@ def bound_rows(
     adjoint = vectors.conj().mT
     normal = adjoint @ vectors + ~slow[..., None] * np.eye(A.shape[1])
     share = solve_lanes(normal, adjoint @ state[..., None])
-    rest = np.abs(state - (vectors @ share)[..., 0].real).max(-1)
+    rest = np.abs(state - np.real(vectors @ share)[..., 0]).max(-1)
     parts = every @ vectors * share.mT
     most = np.abs(parts).sum(-1)
     slowest = np.take_along_axis(parts, np.argmax(np.abs(values), -1)[:, None, None], -1)[..., 0]
-    above = np.all(((low > 0) & (2.0 * slowest.real > most * (1 + 1e-9)))[:, count:], axis=1)
+    above = np.all(((low > 0) & (2.0 * np.real(slowest) > most * (1 + 1e-9)))[:, count:], axis=1)
     # Equal eigenvalues have too few eigenvectors: those motions are followed until nothing is left of them.
     own = np.flatnonzero(inside & ~(rest <= nothing))
     low[own], high[own], left = _follow(A[own], state[own], every[own], low[own], high[own], _LONGEST)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class MotionKind(IntEnum):
-    """How a motion ends, by the two halves of its tail."""
+    """What becomes of a motion: each proved, or `UNCLEAR` (docs/theory/simulation.md, T7)."""
 
     REST = 0
     DECAYING = 1
@@ -28,7 +28,7 @@ class MotionKind(IntEnum):
     RESTLESS = 7
 
 
-# A tail this small beside the widest motion is at rest; windows this much alike are steady, halves hold so many swings.
+# A tail this small beside the widest motion is at rest; halves this much alike are steady, and hold so many swings.
 _AT_REST, _STILL, _ALIKE, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 2, 1e100
 # Who halves in so many times the periods has changed by 2 % after 20 times as many.
 _FOR_GOOD = 4000.0
@@ -86,9 +86,9 @@ class Motion:
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
         outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
             (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the
-            tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider. STEADY: it goes on,
-            its readings repeat, or it has no place to rest and the tail's windows are alike by 5 % and the encoder's
-            steps. DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
+            tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider; STEADY, it goes on as
+            it is; RESTLESS, it never comes to rest, for there is no place where it could, and ``trend`` says how its
+            width changes; DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed.
     """
