@@ -29,7 +29,7 @@ from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls
 from zwidth.figures.step import draw_step
 from zwidth.figures.table import stack
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.limits import passive_edge
+from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError

@@ -16,7 +16,7 @@ from zwidth.loops.rigid.boundary import stable_region
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
-from zwidth.scenes.limits import passive_edge
+from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table
