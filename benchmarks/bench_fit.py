@@ -210,7 +210,7 @@ def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
     for name in (*NAMES, "offset", "stiffness_max"):
         held = [row["held"][name] for row in rows if name in row["held"]]
         off = np.array([row["off"][name] for row in rows if name in row["off"]])
-        sizes = "| |"
+        sizes = " | "
         if off.size:
             sizes = " | ".join(f"{size:.2f}" for size in (rms(off), np.median(np.abs(off)) / 0.6745))
         yield f"| {name} | {share(held)} | {sizes} |"
@@ -218,12 +218,12 @@ def tabulate(rows: list[dict[str, Any]]) -> Iterator[str]:
 
 def tabulate_kinds(rows: list[dict[str, Any]]) -> Iterator[str]:
     """How each kind of log fared, in Markdown."""
-    yield "| kind | mass | damping | delay | friction | K_max | friction open | doubted | safe walls that hold |"
-    yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|"
+    yield "| kind | mass | damping | delay | friction | offset | K_max | friction open | doubted | safe walls |"
+    yield "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|"
     for kind in KINDS:
         those = [row for row in rows if row["kind"] == kind]
         held = [share([row["held"][name] for row in those if name in row["held"]])
-                for name in (*NAMES, "stiffness_max")]  # fmt: skip
+                for name in (*NAMES, "offset", "stiffness_max")]  # fmt: skip
         safe = [row["safe"] for row in those if row["safe"] is not None]
         doubted = sum(bool(row["doubts"]) for row in those)
         cells = [*held, str(sum(row["open"] for row in those)), str(doubted), f"{sum(safe)} of {len(safe)}"]
@@ -274,7 +274,8 @@ def report(count: int, processes: int) -> str:
         "40 % of a period. A constant force and friction are always sought. The bound is that of Cramer and",
         "Rao for the model that is fitted, with the noise and the encoder's q²/12 as white. Errors over the",
         "bound are root mean squares; their median is that of the sizes, in units of a normal error's.",
-        "Intervals of friction count where the log does not leave it open.",
+        "Intervals of friction and of the constant force count where the log does not leave them open, safe walls",
+        "those that are stable on the true device.",
         "",
         *tabulate(fitted),
         "",

@@ -14,11 +14,11 @@ from zwidth.fitting.device_fit import (
     FittedMotion,
     StiffnessEstimate,
     in_si,
+    scene_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
-from zwidth.fitting.scenes import scene_of
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.words.errors import InputError
@@ -140,17 +140,17 @@ def fit_log(
         doubts.append(
             f"the delay ends the range looked in, {with_unit(longest * period, 's')}; give a longer max_delay"
         )
-    residuals = _place(best.residuals, logs, skip)
+    motions = _place(best, logs, skip, period)
     return stiffest.conclude(
         covariance,
         noise=float(np.sqrt(best.variance)),
-        residuals=residuals,
+        residuals=np.concatenate([motion.position - motion.modelled for motion in motions]),
         doubts=doubts,
         status=status,
         freedom=max(1, best.count - theta.size),
         parts={"offset": _in_newton(best, -2), "friction": _in_newton(best, -1)},
         resolution=step,
-        motions=_beside(residuals, logs, period),
+        motions=motions,
     )
 
 
@@ -247,20 +247,11 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
     return doubts
 
 
-def _beside(residuals: np.ndarray, logs: tuple[Log, ...], period: float) -> tuple[FittedMotion, ...]:
-    """Every log beside its fit."""
-    parts = np.split(residuals, np.cumsum([log.force.size for log in logs])[:-1])
+def _place(best: FittedModel, logs: tuple[Log, ...], skip: int, period: float) -> tuple[FittedMotion, ...]:
+    """Every log beside its fit, NaN at its first samples."""
+    ends = np.cumsum([log.force.size - skip for log in logs])
+    places = [np.append(np.full(skip, np.nan), part) for part in np.split(best.moved[0], ends[:-1])]
     return tuple(
-        FittedMotion(period * np.arange(rest.size), log.force, log.position, log.position - rest)
-        for log, rest in zip(logs, parts, strict=True)
+        FittedMotion(period * np.arange(place.size), log.force, log.position, place)
+        for log, place in zip(logs, places, strict=True)
     )
-
-
-def _place(residuals: np.ndarray, logs: tuple[Log, ...], skip: int) -> np.ndarray:
-    """Residuals at their samples, one log after the other."""
-    parts, first = [], 0
-    for log in logs:
-        count = log.force.size - skip
-        parts += [np.full(skip, np.nan), residuals[first : first + count]]
-        first += count
-    return np.concatenate(parts)
