@@ -151,7 +151,8 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
     inverse, power = 1.0 / ratio[own], np.array(ORDERS)[:, None] + 1
     share = rest[own] / (low[own] * (1.0 - inverse))
     error = inverse**power / (power * (1.0 - inverse)) + share / (1.0 - share)
-    error += 2.0**-48 * (4.5 * spread[outer] + spread[inner])
+    # Of the sums of powers of tau/A, and as often as there are points that of the middle's own poles.
+    error += 2.0**-48 * (1 + 48 * poles) * (4.5 * spread[outer] + spread[inner])
     error = np.where(good & (share < 0.5), error, np.inf)
     # Two stay in the smallest disk that will do; one moves from the center by less.
     if poles == 1:

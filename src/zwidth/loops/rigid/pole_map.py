@@ -36,8 +36,8 @@ _STEPS, _REAL = 5, 1e-7
 _COARSE = 1e-5
 # Of the accuracy, for sums of two poles: their difference is a square root.
 _FINER = 1e-3
-# How far inside of the groups the circles of a count are, in units of the distance between poles of a long delay.
-_INSIDE = (0.15, 0.5, 0.03)
+# How far inside of the groups the circles of a count are, in units of how far the groups move in the cell.
+_INSIDE = (0.3, 1.0, 3.0, 10.0)
 
 
 class Area(NamedTuple):
@@ -91,9 +91,8 @@ def _cut(values: np.ndarray, side: int) -> _AxisPieces:
         return _AxisPieces(middle, half, powers)
 
 
-def _find(mask: np.ndarray) -> np.ndarray:
-    """Where it is true, a multiple of 16 places: NumPy rounds odd ones at the end of a list otherwise."""
-    index = np.flatnonzero(mask)
+def _fill(index: np.ndarray) -> np.ndarray:
+    """A multiple of 16 places, the last one again: NumPy rounds odd ones at the end of a list otherwise."""
     return np.concatenate([index, np.repeat(index[-1:], -index.size % 16)])
 
 
@@ -126,31 +125,30 @@ class _Choice(NamedTuple):
         needed = np.maximum(needed, accuracy < _COARSE)
         return cls(groups, needed, needed.argmin(0))
 
-    def _chosen(self, name: str) -> np.ndarray:
-        return np.choose(self.best, [getattr(group, name) for group in self.groups])
-
     @property
     def known(self) -> np.ndarray:
         """Where one of the groups is known."""
         return self.needed.min(0) < len(ORDERS)
 
     @property
-    def low(self) -> np.ndarray:
-        """The least logarithm of a modulus in each cell."""
-        return self._chosen("low")
-
-    @property
     def many(self) -> np.ndarray:
         """How many poles that are, with their conjugates."""
         return np.where((self.best == 0) & (np.sin(self.groups[0].im) < _REAL), 1, 2)
 
+    def _choose(self, name: str) -> np.ndarray:
+        return np.choose(self.best, [getattr(group, name) for group in self.groups])
+
+    def inside(self, share: float) -> np.ndarray:
+        """The logarithm of a radius below all moduli in the cell, by so much of what these may differ."""
+        low = self._choose("low")
+        return low - share * (self._choose("re") - low)
+
     def is_apart(self, other: _Choice) -> np.ndarray:
         """Whether no pole is in both groups."""
-        (one, reach), (two, further) = (
-            (np.exp(choice._chosen("re") + 1j * choice._chosen("im")), choice._chosen("disk"))
-            for choice in (self, other)
+        places = [np.exp(choice._choose("re") + 1j * choice._choose("im")) for choice in (self, other)]
+        return np.abs(places[0] - places[1]) > sum(
+            np.abs(place) * choice._choose("disk") for place, choice in zip(places, (self, other), strict=True)
         )
-        return np.abs(one - two) > reach * np.abs(one) + further * np.abs(two)
 
 
 class _Level:
@@ -179,7 +177,7 @@ class _Level:
     def solve(self, places: np.ndarray, fractional: bool) -> np.ndarray:
         """Write the poles of the cells of which all is proved; the others are returned."""
         count = places.shape[1]
-        places = places[:, _find(np.ones(count, bool))]
+        places = places[:, _fill(np.arange(count))]
         along = self._along(places)
         alpha, beta = (axis.middle[place] for axis, place in zip(self.axes, along, strict=True))
         half = (axis.half[place] for axis, place in zip(self.axes, along, strict=True))
@@ -188,7 +186,7 @@ class _Level:
         re, im = _find_poles(loop, fractional)
         one = _Choice.of(self.accuracy, enclose(1, re[0], im[0], cells, fractional))
         written = self._try([[one]], places, cells, fractional)
-        left = _find(~written)
+        left = _fill(np.flatnonzero(~written))
         if left.size:
             # Next to a double pole the two are followed together; where another pole is about to take over, both.
             own, twice = pick(cells, left), pick(cells, np.tile(left, 2))
@@ -219,11 +217,11 @@ class _Level:
             known = np.logical_and.reduce([choice.known for choice in followed])
             if len(followed) == 2:
                 known &= followed[0].is_apart(followed[1])
-            index = _find(known)
-            low = np.minimum.reduce([choice.low for choice in followed])[index]
+            index = _fill(np.flatnonzero(known))
             wanted.append(sum(choice.many for choice in followed))
             indices.append(np.tile(index, len(_INSIDE)))
-            radii += [low - inside / (cells.loop.turns[index] + 1.0) for inside in _INSIDE]
+            for inside in _INSIDE:
+                radii.append(np.minimum.reduce([choice.inside(inside)[index] for choice in followed]))
         loop, a, b = pick(cells, np.concatenate(indices))
         # One count for all of the circles.
         outside, sure = count_in_cell(np.concatenate(radii), loop, (a, b), fractional)
@@ -243,8 +241,7 @@ class _Level:
             for k, order in enumerate(ORDERS):
                 index = np.flatnonzero(where & (choice.best == poles - 1) & (choice.needed[poles - 1] == k))
                 for start in range(0, index.size, _BATCH):
-                    some = index[start : start + _BATCH]
-                    some = np.concatenate([some, np.repeat(some[-1:], -some.size % 16)])
+                    some = _fill(index[start : start + _BATCH])
                     batch = pick(group, some)
                     self._write(places[:, some], sum_up(poles, batch, pick(cells, some), order), batch, k, merge)
 
@@ -262,7 +259,7 @@ class _Level:
             if len(sums) == 1:
                 values, error = on_walls[0], disk / (1.0 - disk) * error
             else:
-                values, error = larger_of_two(*on_walls, disk, error)
+                values, error = larger_of_two(on_walls[0], on_walls[1], disk, error)
             values += re
             inside = some[0], some[1] - self.first[0], slice(None), some[2] - self.first[1]
             whole, errors = self.tiles

@@ -86,7 +86,7 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
 
 
 def both_starts(loop: Loop, fractional: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-    """The slow pole and the pair, roughly."""
+    """The slow pole and the first pair of the ring, roughly."""
     return _slow_pole(loop), _pair(loop, fractional)
 
 
@@ -97,7 +97,8 @@ def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, 
         slow_re, slow_im, re, im = state
         return (*halley_step(slow_re, slow_im, loop, fractional), *halley_step(re, im, loop, fractional))
 
-    return repeat(steps, step, (*_slow_pole(loop), *_pair(loop, fractional)), namespace(loop.alpha))
+    slow, ring = both_starts(loop, fractional)
+    return repeat(steps, step, (*slow, *ring), namespace(loop.alpha))
 
 
 def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
