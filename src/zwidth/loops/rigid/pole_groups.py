@@ -28,6 +28,8 @@ _STEPS = 4
 # Radii of circles over the largest; how many places on the next one is that a mean over a group of one or two needs.
 _CIRCLES = 2.0 ** (-0.5 * np.arange(14))
 _BESIDE = {1: 2, 2: 1}
+# More than this A need not be over what walls change.
+_AMPLE = 100.0
 # Points on a circle and their weights: all around for one pole, and above the real axis, twice as dense, for two.
 _POINTS = {1: np.exp(2j * np.pi * np.arange(48) / 48), 2: np.exp(1j * np.pi * np.arange(49) / 48)}
 _WEIGHTS = {1: np.full(48, 1.0 / 48.0), 2: np.pad(np.full(47, 1.0 / 48.0), 1, constant_values=0.5 / 48.0)}
@@ -139,21 +141,28 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
     main = sizes[poles] * disk**poles
     low = 2.0 * main - total - rest
     ratio = low / (cells.a + cells.b * (level + by * disk / (1.0 - disk)))
-    # No pole is on the circles beside it either: then the mean of points on it is exact to 2^-48.
-    beside, score = _BESIDE[poles], np.where(ratio > 1.02, ratio / (1.0 + 1e12 * rest / low), 0.0)
-    best = (score[beside:-beside] * (score[: -2 * beside] > 0) * (score[2 * beside :] > 0)).argmax(0) + beside
-    outer, own, inner = ((best + step, np.arange(re.size)) for step in (-beside, 0, beside))
-    spread = np.log(main / low) - np.log1p(-1.0 / ratio)
-    good = np.minimum(np.minimum(score[outer], score[own]), score[inner]) > 0
+    score = np.where(ratio > 1.02, ratio / (1.0 + 1e12 * rest / low), 0.0)
+    # With circles beside it between which no pole is either, means of points on it are nearly exact.
+    beside, cells_of = _BESIDE[poles], np.arange(re.size)
+    # Where all is small enough for every order, a smaller circle is farther from what is outside.
+    rank = np.minimum(score, _AMPLE) * (1.0 + 0.01 * np.arange(_CIRCLES.size)[:, None])
+    best = (rank[beside:-beside] * (score[: -2 * beside] > 0) * (score[2 * beside :] > 0)).argmax(0) + beside
+    own, spread, alias = (best, cells_of), np.log(main / low) - np.log1p(-1.0 / ratio), np.full(re.size, np.inf)
+    for step in (beside, beside + 1):
+        outer, inner = np.maximum(best - step, 0), np.minimum(best + step, _CIRCLES.size - 1)
+        between = (outer + inner == 2 * best) & (np.minimum(score[outer, cells_of], score[inner, cells_of]) > 0)
+        # Of the sums of powers of tau/A, and as often as there are points that of the middle's own poles.
+        missed = 2.0 ** (-24 * step * poles) * (1 + 48 * poles)
+        missed = missed * (4.5 * spread[outer, cells_of] + spread[inner, cells_of])
+        alias = np.where(between, np.fmin(alias, missed), alias)
+    good = score[own] > 0
     if poles == 1:
         # A pole alone in a disk about a real center is real, and off the real axis in one that the axis does not meet.
         good &= (im == 0.0) | (im == np.pi) | (np.sin(im) > disk[own])
     inverse, power = 1.0 / ratio[own], np.array(ORDERS)[:, None] + 1
     share = rest[own] / (low[own] * (1.0 - inverse))
     error = inverse**power / (power * (1.0 - inverse)) + share / (1.0 - share)
-    # Of the sums of powers of tau/A, and as often as there are points that of the middle's own poles.
-    error += 2.0**-48 * (1 + 48 * poles) * (4.5 * spread[outer] + spread[inner])
-    error = np.where(good & (share < 0.5), error, np.inf)
+    error = np.where(good & (share < 0.5), error + alias, np.inf)
     # Two stay in the smallest disk that will do; one moves from the center by less.
     if poles == 1:
         reach = 1.0 / ratio + sizes[0] / low
