@@ -155,10 +155,9 @@ def follow_root(function: Function, root: Array, usable: Callable[[Array, Array]
         return root
     import jax
 
-    root = frozen(root, xp)
-    for _ in range(2):
+    def step(root: Array) -> Array:
         value, slope = jax.jvp(function, (root,), (xp.ones_like(root),))
-        step = value / xp.where(slope == 0, 1.0, slope)
-        taken = usable(*frozen((slope, step), xp))
-        root = root - xp.where(taken, value / xp.where(taken, slope, 1.0), 0.0)
-    return root
+        taken = usable(*frozen((slope, value / xp.where(slope == 0, 1.0, slope)), xp))
+        return root - xp.where(taken, value / xp.where(taken, slope, 1.0), 0.0)
+
+    return repeat(2, step, frozen(root, xp), xp)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.words.formatting import short
 from zwidth.words.quantities import FIELDS
 

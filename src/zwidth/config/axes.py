@@ -17,7 +17,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 from zwidth.config.faults import LocatedProblem, problem, problems_of, validation_error
 from zwidth.config.fields import Strict, repeated
 from zwidth.config.values import Quantity, quantity_of
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import Range
 

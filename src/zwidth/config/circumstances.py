@@ -9,7 +9,7 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict
 from zwidth.config.parts import SimulatedVelocityField
 from zwidth.config.values import Delay, Duration, Quantity
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.simulate import Contact
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE

@@ -12,7 +12,7 @@ from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, core_schema
 
 from zwidth.config.faults import problem, raise_problems
-from zwidth.parts.span import Span, read_span
+from zwidth.parts.checks import Span, read_span
 from zwidth.words.formatting import describe
 from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
 from zwidth.words.units import PERIOD_WORDS, check_range, find_dimension, looks_like_number, read_quantity, to_float

@@ -235,7 +235,7 @@ def save(
             usual = PNG_DPI if file.suffix == ".png" else "figure"
             figure.savefig(file, dpi=dpi or usual, metadata=_METADATA[file.suffix])
             # What is laid out once need not be again: it is half of the work.
-            figure.set_layout_engine("none")
+            figure.set_layout_engine(None)
     figure.set_layout_engine(engine)
     return files
 

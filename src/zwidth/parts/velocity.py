@@ -7,17 +7,58 @@ by the wrong time and the cut-off lies elsewhere: that is what the loop then doe
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from zwidth.arrays.circle import CirclePoints, Jet, lag_jet, product_jet
 from zwidth.arrays.xp import is_jax, namespace
 from zwidth.parts.checks import check_fields, check_whole
-from zwidth.parts.estimate import Estimate
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import Range
+
+
+def _no_roots() -> np.ndarray:
+    return np.zeros(0, complex)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The velocity estimate F: a difference over ``window`` periods, then a filter.
+
+    ``F(z) = gain prod(z - zeros)/(z^lag prod(z - poles)) (1 - z^-window)/window``, without the last factor for a window
+    of 0.
+    """
+
+    window: int = 1
+    gain: Any = 1.0
+    lag: int = 0
+    zeros: Any = field(default_factory=_no_roots)
+    poles: Any = field(default_factory=_no_roots)
+
+    def jet(self, at: CirclePoints) -> Jet:
+        """F and its derivative in w."""
+        xp = namespace(at.w)
+        parts = product_jet(at, self.zeros, self.gain)
+        if self.poles.size:
+            parts = parts.over(product_jet(at, self.poles, 1.0))
+        if self.lag:
+            parts = parts.times(lag_jet(at, -self.lag))
+        if self.window:
+            back = lag_jet(at, -self.window)
+            n = self.window
+            s = xp.sin(0.5 * n * at.w)
+            value = xp.where(at.w >= np.pi, 1.0 - back.value, 2.0 * s * s - 1j * back.value.imag) / n
+            parts = parts.times(Jet(value, -back.slope / n))
+        return parts
+
+    @property
+    def degree(self) -> int:
+        """By how much the estimate turns in all, a bound for how fast it varies."""
+        return self.window + abs(self.lag) + self.zeros.size + self.poles.size
 
 
 class _Checked:
@@ -269,3 +310,25 @@ def _offsets(polynomial: np.ndarray) -> np.ndarray:
     scale = np.abs(polynomial).sum()
     shifted = np.where(np.abs(shifted) <= 4 * polynomial.size * np.finfo(float).eps * scale, 0.0, shifted)
     return -np.polynomial.polynomial.polyroots(shifted) + 0j
+
+
+def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
+    """The standard deviation of a velocity estimate whose positions are quantized, in m/s.
+
+    The positions' error is nearly white, of variance ``Q^2/12`` with Q the resolution in m (Widrow, Kollar 2008,
+    chapter 5). Through ``F(z)`` with the impulse response f that becomes ``Q^2/12 sum f_k^2``, with ``sum f^2`` of
+    ``2/(n T)^2`` for a difference over n, ``2 (1 - p)^2/((1 + p) T^2)`` for a low-pass of pole p, ``2 (1 - p)^3/((1 +
+    p)^3 T^2)`` for two; of other estimates there is no closed form.
+    """
+    estimate = velocity.estimate(period)
+    power = 2.0 * (float(estimate.gain) / (estimate.window * period)) ** 2 if estimate.window else math.nan
+    if isinstance(velocity, LowPass):
+        offset = float(estimate.poles[0].real)
+        # 1 + p = 2 - (1 - p); the gain holds (1 - p) once for every low-pass.
+        power /= (2.0 - offset) if velocity.order == 1 else offset * (2.0 - offset) ** 3
+    elif not isinstance(velocity, BackwardDifference | WindowedDifference):
+        raise InputError(
+            f"velocity: got {type(velocity).__name__}, whose noise has no closed form here; use a difference, a "
+            "windowed difference or a low-pass"
+        )
+    return resolution * math.sqrt(power / 12.0)

@@ -15,8 +15,7 @@ from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
 from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.boundary import boundary_point
-from zwidth.loops.rigid.region import Piece, stable_region
+from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
 from zwidth.studies.outcome import CurvesStudy, Outcome, add_si_of_scene, share_of_device
 from zwidth.studies.passivity import passive_intervals, passive_outlines
 from zwidth.studies.ridge import needed_models, ridge_table

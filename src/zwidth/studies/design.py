@@ -19,8 +19,8 @@ from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.required import RequiredValue
 from zwidth.scenes.scene import Scene
+from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text
 from zwidth.words.errors import InputError

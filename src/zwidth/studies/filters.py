@@ -16,8 +16,7 @@ from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Quantity, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.parts.noise import find_velocity_noise
-from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
+from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference, find_velocity_noise
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, summarize_stiffest
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import POSITIVE

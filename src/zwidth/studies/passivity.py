@@ -12,11 +12,11 @@ from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, register
 from zwidth.figures.region import Outlines
+from zwidth.loops.rigid.boundary import stable_region
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
-from zwidth.loops.rigid.region import stable_region
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
-from zwidth.scenes.passive import passive_edge
+from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import CurvesStudy, Outcome
 from zwidth.studies.ridge import ridge_table

@@ -12,8 +12,7 @@ from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, register
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.slope import stiffness_slope
+from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.studies.outcome import CurvesStudy, Outcome, Table
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DelayModel

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.pages.explorer import model
-from zwidth.scenes.assessment import Assessment, assess
-from zwidth.scenes.limits import limits_of
+from zwidth.scenes.assessment import Assessment, assess, limits_of
 from zwidth.scenes.scene import Scene
 
 # Held while JAX is being imported: what looks for it meanwhile would find half of it.

@@ -6,7 +6,7 @@ import json
 from typing import Any
 
 from zwidth.pages.explorer.controls import Controls
-from zwidth.parts.spelling import spell_part, spell_scene
+from zwidth.parts.paths import spell_part, spell_scene
 
 _SCRIPT = """\
 import matplotlib.pyplot as plt
