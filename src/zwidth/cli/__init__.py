@@ -65,7 +65,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _describe_refusal(error: OSError) -> str:
     """What the system refused: the file, why, and what helps."""
-    from zwidth.sweep.files.whole import REMEDIES
+    from zwidth.sweep.files import REMEDIES
 
     what = ": ".join(str(part) for part in (error.filename, error.strerror or error) if part)
     remedy = REMEDIES.get(error.errno or 0)

@@ -1,7 +1,8 @@
-"""The group of commands, and those for one wall: thin shells over the library, which they import only when they run."""
+"""The group of commands, and those for one device: thin shells over the library, imported only when they run."""
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
 from typing import Any
@@ -11,7 +12,10 @@ import click
 from zwidth import __version__
 from zwidth.cli import words
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
+from zwidth.cli.words import row
 from zwidth.words.formatting import plain, with_unit
+
+_COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
 
 
 @click.group(
@@ -135,3 +139,44 @@ def schema() -> None:
     from zwidth.studies.document import config_json_schema
 
     words.print_json(config_json_schema())
+
+
+@cli.command()
+@click.argument("name", required=False)
+@json_option
+def devices(name: str | None, as_json: bool) -> None:
+    """List devices with published numbers; with a NAME, every number of one and its source.
+
+    A dash stands where nothing is published. Rotary devices have an inertia in kg m^2 and a damping in N m s/rad.
+    """
+    from zwidth.parts.devices import DEVICES, Published, find_device
+
+    chosen = DEVICES if name is None else (find_device(name),)
+    if as_json:
+        click.echo(json.dumps([device.as_dict() for device in chosen], indent=1, allow_nan=False))
+        return
+    if name is not None:
+        device = chosen[0]
+        click.echo(f"{device.title} ({device.motion})")
+        for quantity, number in device.numbers.items():
+            note = f" ({number.note})" if number.note else ""
+            click.echo(row(quantity, f"{_amount(number)}{note}; {number.source}"))
+        return
+
+    def cell(number: Published | None) -> str:
+        return "-" if number is None else _amount(number)
+
+    lines = [("name", *(column.replace("_", " ") for column in _COLUMNS))]
+    lines += [(device.name, *(cell(getattr(device, column)) for column in _COLUMNS)) for device in chosen]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        click.echo("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
+
+
+def _amount(number: tuple[float, str, str, str]) -> str:
+    """A number with its unit; inertias and counts without a prefix."""
+    value, unit = number[:2]
+    if unit == "counts":
+        return f"{value:g} counts"
+    # A prefix on "kg m^2" would be a second one.
+    return f"{value:g} {unit}" if unit == "kg m^2" else with_unit(value, unit, 3)

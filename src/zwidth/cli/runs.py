@@ -1,10 +1,11 @@
-"""Runs on the command line: ``run``, ``verify``, ``export`` and ``figures``."""
+"""Runs on the command line: ``run``, ``verify``, ``export``, ``figures`` and ``bench``."""
 
 from __future__ import annotations
 
 import re
 import shlex
 import signal
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -185,7 +186,7 @@ def verify(folder: Path, as_json: bool) -> None:
 
     Exit code 1 where something is damaged or missing; `zwidth run --resume` repairs it.
     """
-    from zwidth.sweep.verify import verify as verify_stores
+    from zwidth.sweep.dataset import verify as verify_stores
 
     found = verify_stores(folder)
     if as_json:
@@ -208,7 +209,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     """Write a sweep, a store or a folder DIR with one, as netCDF or CSV."""
     if netcdf is None and table is None:
         raise click.UsageError("give --netcdf FILE or --csv FILE")
-    from zwidth.sweep.export import to_csv, to_netcdf
+    from zwidth.sweep.dataset import to_csv, to_netcdf
     from zwidth.sweep.store import find_store
 
     missing = len(find_store(folder).missing())
@@ -257,3 +258,34 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
         print_json({"files": [str(file) for file in files]})
     if not files:
         raise SystemExit(_EXIT_FAILED)
+
+
+@cli.command()
+@click.option("--quick", is_flag=True, help="Few delays and small maps: less than a minute instead of some.")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("runs/bench"),
+    show_default=True,
+    help="Folder of bench.json, bench.md, summary.txt and the picture pareto.png.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace the results of an earlier run in that folder.")
+@json_option
+def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
+    """Measure speed against error of every method, beside NumPy, JAX and python-control.
+
+    It needs a checkout of the project, whose benchmarks/methods it runs, and for the errors the extra "test".
+    """
+    from zwidth.words.errors import ResourceError
+
+    # Beside the package's sources; nothing of it is installed with a wheel.
+    folder = Path(__file__).parents[3] / "benchmarks"
+    if not (folder / "methods").is_dir():
+        raise ResourceError(
+            "bench: needs a checkout of the project, with its folder benchmarks/; there: scripts/setup test, then "
+            ".venv/bin/zwidth bench"
+        )
+    sys.path.insert(0, str(folder))
+    from methods.report import run
+
+    run(quick, out, overwrite, as_json)

@@ -13,9 +13,8 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import Entry, in_one_unit, read_entries
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
-from zwidth.config.values import quantity_of
+from zwidth.config.values import Entry, in_one_unit, quantity_of, read_entries
 from zwidth.words.cells import read_rows, split_title
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, resembling, suggestion

@@ -14,8 +14,8 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
 from zwidth.figures import grid, region, style
+from zwidth.figures.alpha_beta import SHADES
 from zwidth.figures.contours import label_contours
-from zwidth.figures.stability_map import SHADES
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, Output
 

@@ -14,16 +14,14 @@ from typing import Any
 
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
-from zwidth.runs.inputs import gather_inputs, rename_inputs
-from zwidth.runs.record import RUN_FILE, Record
+from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.runs.result import ProgressCallback, RunResult, StudyEvent, StudyResult
 from zwidth.studies.document import Config, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
-from zwidth.sweep.engine import Progress, check_stores, compute_sweeps
-from zwidth.sweep.files.lock import holding
-from zwidth.sweep.files.whole import hopeless
+from zwidth.sweep.engine import Progress, check_stores, compute_sweeps, remove, store_path
+from zwidth.sweep.files import hopeless
+from zwidth.sweep.lock import holding
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
-from zwidth.sweep.resume import remove, store_path
 from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError

@@ -18,8 +18,7 @@ from zwidth.figures.table import stack
 from zwidth.loops.rigid.boundary import boundary_point
 from zwidth.loops.rigid.region import Piece, stable_region
 from zwidth.studies.outcome import CurvesStudy, Outcome, add_si_of_scene, share_of_device
-from zwidth.studies.passivity import passive_intervals, passive_outlines
-from zwidth.studies.ridge import needed_models, ridge_table
+from zwidth.studies.ridge import needed_models, passive_intervals, passive_outlines, ridge_table
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import DelayModel
 

@@ -12,11 +12,10 @@ import numpy as np
 from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 
 from zwidth import figures
-from zwidth.config.axes import Axis, axis_of, read_entries
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import register
-from zwidth.config.values import Fraction, Quantity, quantity_of
+from zwidth.config.values import Axis, Fraction, Quantity, axis_of, quantity_of, read_entries
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.required import RequiredValue

@@ -9,12 +9,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.config.axes import Axis, axis_of
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import locate_refusal
 from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
-from zwidth.config.values import Quantity, quantity_of
+from zwidth.config.values import Axis, Quantity, axis_of, quantity_of
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.noise import find_velocity_noise
 from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference

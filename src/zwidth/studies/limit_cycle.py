@@ -11,13 +11,12 @@ import numpy as np
 from pydantic import WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.axes import Axis, AxisOf, axis_of
 from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict, members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
-from zwidth.config.values import Quantity
+from zwidth.config.values import Axis, AxisOf, Quantity, axis_of
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW

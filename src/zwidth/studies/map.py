@@ -10,16 +10,16 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.config.fields import members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, register
+from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.figures.region import Outlines
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
 from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene, share_of_device
-from zwidth.studies.passivity import find_edges
+from zwidth.studies.ridge import find_edges
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 

@@ -13,11 +13,11 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.axes import Axis, DelayAxis, DeltaAxis
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
+from zwidth.config.values import Axis, DelayAxis, DeltaAxis
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.scenes.assessment import name_kind
 from zwidth.scenes.stiffest import StiffestWall

@@ -24,7 +24,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall, choose_damping
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, Table, add_si_columns
-from zwidth.studies.passivity import passive_outlines
+from zwidth.studies.ridge import passive_outlines
 from zwidth.studies.step import ResponseStudy
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE

@@ -9,13 +9,12 @@ from typing import Annotated, Literal
 import numpy as np
 
 from zwidth import figures
-from zwidth.config.axes import Axis, AxisOf
 from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.parts import NO_LINEAR_FORM, locate_refusal
 from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
 from zwidth.config.study import HeldOnly, register
-from zwidth.config.values import Quantity
+from zwidth.config.values import Axis, AxisOf, Quantity
 from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW

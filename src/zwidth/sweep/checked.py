@@ -11,7 +11,7 @@ import numpy as np
 from zarr.core.buffer.core import default_buffer_prototype
 from zarr.storage import LocalStore
 
-from zwidth.sweep.files.whole import content
+from zwidth.sweep.files import content
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
 from zwidth.words.errors import StoreError

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from zwidth.sweep.files.whole import check_folder, existing
+from zwidth.sweep.files import check_folder, existing
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import ResourceError

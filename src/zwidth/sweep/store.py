@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.sweep.files.provenance import digest
-from zwidth.sweep.files.whole import checksum, content, hidden_beside, remove_quietly, write_whole
+from zwidth.sweep.files import checksum, content, digest, hidden_beside, remove_quietly, write_whole
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.study import SweepStudy

@@ -17,8 +17,7 @@ from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, n
 from zwidth.parts.span import Span
 from zwidth.scenes.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
-from zwidth.studies.passivity import PassivityStudy
-from zwidth.studies.ridge import RidgeStudy
+from zwidth.studies.ridge import PassivityStudy, RidgeStudy
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))

@@ -15,7 +15,7 @@ from typing import Any
 from zwidth.config.study import KINDS
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.files.whole import write_whole
+from zwidth.sweep.files import write_whole
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import StoreError
 

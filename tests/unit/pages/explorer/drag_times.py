@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from bokeh.document import Document
 
-from zwidth.cli.explore import check_lines, slope_lines
+from zwidth.cli.pages import check_lines, slope_lines
 from zwidth.pages.explorer.controls import Controls
 from zwidth.pages.explorer.details import Words
 from zwidth.pages.explorer.page import Page

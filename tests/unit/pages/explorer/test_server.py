@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
 
-from zwidth.cli.explore import check_lines, slope_lines
+from zwidth.cli.pages import check_lines, slope_lines
 from zwidth.pages.explorer.controls import Controls
 from zwidth.pages.explorer.details import Words
 from zwidth.pages.explorer.server import Explorer

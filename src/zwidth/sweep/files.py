@@ -1,16 +1,22 @@
-"""Files that are whole or absent, whatever kills the program that writes them."""
+"""Files that are whole or absent, whatever kills the program that writes them; and what a store says of its making."""
 
 from __future__ import annotations
 
 import errno
+import hashlib
+import json
 import os
+import platform
 import secrets
 import shutil
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
+from zwidth import __version__
 from zwidth.words.errors import InputError
 
 REMEDIES = {
@@ -26,6 +32,8 @@ REMEDIES = {
 }
 """What helps against errors of the system; no chunk of a sweep would escape the first six of them."""
 _HOPELESS = frozenset(list(REMEDIES)[:6])
+# Packages whose release can change the last digit of a result.
+_PACKAGES = ("jax", "jaxlib", "numpy")
 
 
 def hopeless(error: BaseException | None) -> bool:
@@ -104,3 +112,32 @@ def checksum(path: Path) -> int:
         while block := stream.read(1 << 22):
             total = zlib.crc32(block, max(total, 0))
     return total
+
+
+def digest(value: Any) -> str:
+    """The SHA-256 of a JSON value, whatever the order of its keys."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True)
+    return hashlib.sha256(text.encode("ascii")).hexdigest()
+
+
+def versions(*more: str) -> dict[str, str]:
+    """The releases that results depend on, and those of more packages."""
+    found = {"zwidth": __version__, "python": platform.python_version()}
+    for name in (*_PACKAGES, *more):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            continue
+    return found
+
+
+def differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Where two JSON values differ: the dotted path, the old and the new value; None for one that is absent."""
+    if isinstance(old, dict) and isinstance(new, dict):
+        for key in dict.fromkeys((*old, *new)):
+            yield from differences(old.get(key), new.get(key), f"{path}.{key}" if path else str(key))
+    elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
+        for index, (before, after) in enumerate(zip(old, new, strict=True)):
+            yield from differences(before, after, f"{path}[{index}]")
+    elif old != new:
+        yield path, old, new

@@ -1,7 +1,8 @@
-"""`zwidth explore`: a local page on which a scene is moved by sliders."""
+"""Pages for a browser: ``zwidth explore`` and ``zwidth report``."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import click
 
 from zwidth.cli import words
 from zwidth.cli.commands import cli
+from zwidth.cli.options import json_option
 
 
 @cli.command()
@@ -53,3 +55,18 @@ def check_lines(scene: Any, verdict: Any, limits: list[Any]) -> list[str]:
 def slope_lines(scene: Any) -> list[str]:
     """What `zwidth ridge` says of a little more of every parameter."""
     return [slope.line() for slope in words.list_slopes(scene)]
+
+
+@cli.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="The file.  [default: DIR/report.html]")
+@json_option
+def report(folder: Path, out: Path | None, as_json: bool) -> None:
+    """Write the run in DIR as one HTML file: figures, slices of its maps, methods, versions, configuration.
+
+    The file needs no server and no network.
+    """
+    from zwidth.pages.report.page import write_report
+
+    file = write_report(folder, out)
+    click.echo(json.dumps({"file": str(file), "bytes": file.stat().st_size}) if as_json else f"wrote {file}")

@@ -22,7 +22,7 @@ from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 
-from zwidth.sweep.files.whole import check_folder
+from zwidth.sweep.files import check_folder
 from zwidth.words.errors import InputError, StoreBusyError
 
 FOLDER = ".locks"
