@@ -10,9 +10,9 @@ from typing import Any
 import click
 
 from zwidth import __version__
-from zwidth.cli import words
 from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
-from zwidth.cli.words import row
+from zwidth.pages import words
+from zwidth.pages.words import row
 from zwidth.words.formatting import plain, with_unit
 
 _COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
@@ -42,21 +42,16 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     from zwidth.scenes.passive import friction_rule
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
-    rule = None
+    result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
+    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
+    if as_json:
+        result["islands"] = [island._asdict() for island in scene.islands()]
     if friction is not None or resolution is not None:
         device = {"damping": scene.damping, "period": scene.timing.period}
         rule = friction_rule(**device, friction=friction, resolution=resolution)
-    if as_json:
-        result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
-        result["islands"] = [island._asdict() for island in scene.islands()]
-        if rule is not None:
-            result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
-        words.print_json(result)
-        return
-    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
-    lines += words.friction_lines(rule) if rule is not None else []
-    for line in [*lines, *(words.row("note", note) for note in notes)]:
-        click.echo(line)
+        result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
+        lines += words.friction_lines(rule)
+    words.tell(result, lines + words.note_lines(notes), as_json)
 
 
 @cli.command()
@@ -71,13 +66,7 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     help="How a delay that is not whole is modelled.",
 )
 @json_option
-def ridge(
-    delta: float | None,
-    d: float | None,
-    scene: Any,
-    delay_model: str,
-    as_json: bool,
-) -> None:
+def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as_json: bool) -> None:
     """Print the stiffest stable wall of a device.
 
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
@@ -106,31 +95,24 @@ def ridge(
         "omega": float(wall.frequency * (2.0 * math.pi * scene.timing.period)),
         "kind": kind,
     }
-    slopes, notes = [], []
+    lines = [
+        row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"),
+        row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
+        row("beta", f"{result['beta']:.12g}"),
+    ]
     if not normalized:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene)
-        result |= {
-            "stiffness_max": float(wall.stiffness),
-            "virtual_damping": float(wall.virtual_damping),
-            "frequency": float(wall.frequency),
+        found = wall.stiffness, wall.virtual_damping, wall.frequency
+        named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
+        result |= named | {
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
-    if as_json:
-        words.print_json(result)
-        return
-    for line in [] if normalized else words.scene_lines(scene):
-        click.echo(line)
-    click.echo(words.row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"))
-    click.echo(words.row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"))
-    click.echo(words.row("beta", f"{result['beta']:.12g}"))
-    if not normalized:
-        click.echo(words.row("K_max", with_unit(result["stiffness_max"], "N/m")))
-        click.echo(words.row("B", with_unit(result["virtual_damping"], "N s/m")))
-        click.echo(words.row("frequency", with_unit(result["frequency"], "Hz")))
-    for line in [*(slope.line() for slope in slopes), *(words.row("note", note) for note in notes)]:
-        click.echo(line)
+        labels = zip(("K_max", "B", "frequency"), named.values(), ("N/m", "N s/m", "Hz"), strict=True)
+        lines = [*words.scene_lines(scene), *lines, *(row(label, with_unit(*amount)) for label, *amount in labels)]
+        lines += [*(slope.line() for slope in slopes), *words.note_lines(notes)]
+    words.tell(result, lines, as_json)
 
 
 @cli.command()

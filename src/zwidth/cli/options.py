@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
 from functools import wraps
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -91,37 +91,27 @@ def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]
         required: whether there must be a scene; otherwise ``scene`` is None where no mass is given.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "mass", "damping", "period", "rate", "delay")
+    needed = ("stiffness", "mass") if required else ("stiffness",)
+    return _take_options("scene", (*bare, *_PARTS), needed, lambda given: build_scene(given, required))
+
+
+def _take_options(
+    name: str, paths: Sequence[str], needed: Sequence[str], make: Callable[[dict[str, Any]], Any]
+) -> Callable[[Command], Command]:
+    """The options of some parameters, of which the command gets what is made, under a name."""
 
     def decorate(function: Command) -> Command:
         @wraps(function)
-        def with_scene(**given: Any) -> Any:
-            named = {path: given.pop(path.replace(".", "__")) for path in (*bare, *_PARTS)}
-            scene = build_scene({path: value for path, value in named.items() if value is not None}, required)
-            return function(scene=scene, **given)
+        def with_made(**given: Any) -> Any:
+            named = {path: given.pop(path.replace(".", "__")) for path in paths}
+            return function(**{name: make({path: each for path, each in named.items() if each is not None})}, **given)
 
-        command = with_scene
-        for path in reversed((*bare, *_PARTS)):
-            command = _add_option(command, path, required=path == "stiffness" or (required and path == "mass"))
+        command = with_made
+        for path in reversed(paths):
+            command = _add_option(command, path, required=path in needed)
         return command
 
     return decorate
-
-
-def velocity_options(function: Command) -> Command:
-    """The options of a velocity estimate alone, which the command gets as ``velocity``."""
-    paths = [path for path in _PARTS if path.startswith("velocity.")]
-
-    @wraps(function)
-    def with_velocity(**given: Any) -> Any:
-        named = {path.partition(".")[2]: given.pop(path.replace(".", "__")) for path in paths}
-        return function(
-            velocity=_velocity({name: value for name, value in named.items() if value is not None}), **given
-        )
-
-    command = with_velocity
-    for path in reversed(paths):
-        command = _add_option(command, path)
-    return command
 
 
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
@@ -141,19 +131,16 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     for line in doubts_of(given):
         click.echo(f"zwidth: {line}", err=True)
 
-    def part(name: str) -> dict[str, Any]:
-        return {path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
-
-    def own(*names: str) -> dict[str, Any]:
+    def some(*names: str) -> dict[str, Any]:
         return {name: given[name] for name in names if name in given}
 
     try:
-        parts = {name: _make_part(name, kind, part(name)) for name, kind in PARTS.items() if part(name)}
+        parts = {name: _make_part(name, kind, own) for name, kind in PARTS.items() if (own := _own(given, name))}
         scene = Scene(
-            Device(**own("mass", "damping")),
-            Timing(**own("period", "rate", "delay")),
+            Device(**some("mass", "damping")),
+            Timing(**some("period", "rate", "delay")),
             VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
-            velocity=_velocity(part("velocity")),
+            velocity=_make_velocity(given),
         ).replace(**parts)
         scene.check_parts()
         return scene
@@ -177,9 +164,15 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
     return kind(**given)
 
 
-def _velocity(given: dict[str, Any]) -> Any:
+def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
+    """What is given of one part, by the names of its fields."""
+    return {path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
+
+
+def _make_velocity(options: dict[str, Any]) -> Any:
     from zwidth.parts.velocity import ESTIMATES
 
+    given = _own(options, "velocity")
     kind = given.pop("kind", None)
     if kind is None:
         low = {"cutoff", "time_constant"} & set(given)
@@ -200,4 +193,7 @@ friction_option = click.option(
 )
 resolution_option = click.option(
     "--resolution", type=quantity_type("m", Range(0.0, low_open=True)), help="One step Q of the position sensor, in m."
+)
+velocity_options = _take_options(
+    "velocity", [path for path in _PARTS if path.startswith("velocity.")], (), _make_velocity
 )

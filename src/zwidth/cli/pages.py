@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import click
 
-from zwidth.cli import words
 from zwidth.cli.commands import cli
 from zwidth.cli.options import json_option
 
@@ -35,26 +33,14 @@ def explore(path: Path | None, port: int, no_browser: bool) -> None:
             raise
         raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
     from zwidth.pages.explorer.controls import read_controls
-    from zwidth.pages.explorer.details import Words
 
-    explorer = Explorer(read_controls(path), Words(check_lines, slope_lines), port)
+    explorer = Explorer(read_controls(path), port)
     click.echo(f"{explorer.address}  (Ctrl-C ends it)")
     if not no_browser:
         # A browser in the terminal would keep the server waiting for its own page.
         threading.Thread(target=webbrowser.open, args=(explorer.address,), daemon=True).start()
     explorer.run()
     click.echo("stopped")
-
-
-def check_lines(scene: Any, verdict: Any, limits: list[Any]) -> list[str]:
-    """What `zwidth check` says of a scene's wall, without color."""
-    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
-    return [click.unstyle(line) for line in [*lines, *(words.row("note", n) for n in words.scene_notes(scene))]]
-
-
-def slope_lines(scene: Any) -> list[str]:
-    """What `zwidth ridge` says of a little more of every parameter."""
-    return [slope.line() for slope in words.list_slopes(scene)]
 
 
 @cli.command()

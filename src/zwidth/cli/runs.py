@@ -15,7 +15,7 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, json_option
-from zwidth.cli.words import print_json
+from zwidth.pages.words import print_json
 
 if TYPE_CHECKING:
     from zwidth.runs.result import RunResult

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import members
+from zwidth.config.faults import LocatedProblem
+from zwidth.config.fields import members, repeated
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalScene
 from zwidth.config.study import register
@@ -45,18 +45,16 @@ class CompareStudy(ComputedStudy):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        labels = [device.label for device in self.devices]
-        for index, label in enumerate(labels):
-            if label in labels[:index]:
-                yield ("devices", index, "label"), problem(f"got {label!r} twice", "each label once", "rename one")
+        for place, what in repeated([device.label for device in self.devices], "rename one"):
+            yield ("devices", *place, "label"), what
 
     @property
-    def extent(self) -> str:
-        return f"devices = {len(self.devices)}"
+    def sizes(self) -> dict[str, int]:
+        return {"devices": len(self.devices)}
 
     @property
     def points(self) -> int:
-        return len(self.devices) * _POINTS_PER_OUTLINE
+        return super().points * _POINTS_PER_OUTLINE
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The outlines of every device, and a table of the stiffest walls."""

@@ -142,8 +142,8 @@ class DesignStudy(ComputedStudy):
         return known | {"rate": 1.0 / known["period"]}
 
     @property
-    def extent(self) -> str:
-        return f"stiffnesses = {self.stiffness.size}"
+    def sizes(self) -> dict[str, int]:
+        return {"stiffnesses": self.stiffness.size}
 
     @property
     def draws(self) -> int:

@@ -74,13 +74,9 @@ class FiltersStudy(ComputedStudy):
         return np.array([self.device.damping]) if self.damping is None else self.damping.values()
 
     @property
-    def extent(self) -> str:
-        return f"damping x filters = {self.dampings.size} x {len(list(self.estimates()))}"
-
-    @property
-    def points(self) -> int:
-        sizes = [axis.size for axis in (self.cutoff, self.samples) if axis is not None]
-        return self.dampings.size * (1 + sum(sizes))
+    def sizes(self) -> dict[str, int]:
+        filters = 1 + sum(axis.size for axis in (self.cutoff, self.samples) if axis is not None)
+        return {"damping": self.dampings.size, "filters": filters}
 
     def estimates(self) -> Iterator[tuple[dict[str, Any], Velocity]]:
         """Every estimate with the columns that name it; the difference of two samples first."""

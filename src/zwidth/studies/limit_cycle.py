@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, get_type_hints
@@ -13,7 +12,7 @@ from pydantic import WrapValidator, create_model
 from zwidth import figures
 from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict, members
+from zwidth.config.fields import Strict, members, repeated
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Axis, AxisOf, Quantity, axis_of
@@ -124,11 +123,9 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        labels = [each.label for each in self.conditions]
+        for place, what in repeated([each.label for each in self.conditions], "rename one"):
+            yield ("conditions", *place, "label"), what
         for index, condition in enumerate(self.conditions):
-            if condition.label in labels[:index]:
-                what = f"got {condition.label!r} twice"
-                yield ("conditions", index, "label"), problem(what, "each label once", "rename one")
             for name in self.axes.given:
                 if getattr(condition, name, None) is not None:
                     what = "given twice, here and as an axis"
@@ -155,13 +152,8 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         ]
 
     @property
-    def extent(self) -> str:
-        sizes = " x ".join(f"{axis.size} {name}" for name, axis in self.axes.varied.items())
-        return f"conditions x walls = {len(self.conditions)} x {sizes}"
-
-    @property
-    def points(self) -> int:
-        return len(self.conditions) * math.prod(axis.size for axis in self.axes.varied.values())
+    def sizes(self) -> dict[str, int]:
+        return {"conditions": len(self.conditions)} | {name: axis.size for name, axis in self.axes.varied.items()}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """What becomes of every wall, as arrays with a first axis of conditions, and how much of them stays silent."""

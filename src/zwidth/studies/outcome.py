@@ -91,17 +91,9 @@ class CurvesStudy(ComputedStudy):
     """Delay in periods, an axis; the scene's where left out."""
 
     @property
-    def models(self) -> int:
-        """How many delay models are computed."""
-        return len(getattr(self, "delay_models", ("held",)))
-
-    @property
-    def extent(self) -> str:
-        return f"delta x d x delay models = {self.delta.size} x {self.d.size} x {self.models}"
-
-    @property
-    def points(self) -> int:
-        return self.delta.size * self.d.size * self.models
+    def sizes(self) -> dict[str, int]:
+        models = getattr(self, "delay_models", ("held",))
+        return {"delta": self.delta.size, "d": self.d.size, "delay models": len(models)}
 
 
 class WallsStudy(ComputedStudy):

@@ -242,12 +242,8 @@ class PublishedStudy(ComputedStudy):
     kind: Literal["published"]
 
     @property
-    def extent(self) -> str:
-        return "the numbers of the paper"
-
-    @property
-    def points(self) -> int:
-        return 100
+    def sizes(self) -> dict[str, int]:
+        return {"numbers of the paper": 22}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """Compare every printed number with the computed one, as text and as JSON."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, fields
 from typing import Annotated, Any, ClassVar, Literal
@@ -342,18 +341,13 @@ class SweepStudy(_Parts, _Swept):
         return {family: names for family, names in groups.items() if names}
 
     @property
-    def points(self) -> int:
-        return math.prod(self.axes.sizes.values())
+    def sizes(self) -> dict[str, int]:
+        return self.axes.sizes
 
     @property
     def nbytes(self) -> int:
         # As they are in memory, with a status code.
         return self.points * (1 + 8 * len(self.outputs))
-
-    @property
-    def extent(self) -> str:
-        sizes = self.axes.sizes
-        return f"{' x '.join(sizes) or 'one point'} = {' x '.join(str(size) for size in sizes.values()) or 1}"
 
 
 def _columns(raw: Any) -> set[str]:

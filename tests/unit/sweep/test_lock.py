@@ -14,8 +14,8 @@ import yaml
 from sweeping import assert_same, config_of, main_of, run_sweeps, study, values_of
 
 import zwidth
-from zwidth.sweep.dataset import verify
 from zwidth.sweep import lock
+from zwidth.sweep.dataset import verify
 from zwidth.sweep.lock import held_briefly, holding
 from zwidth.words.errors import InputError, StoreBusyError
 

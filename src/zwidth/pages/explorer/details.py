@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from threading import Lock
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from zwidth.pages.explorer import model
+from zwidth.pages.words import check_lines, list_slopes
 from zwidth.scenes.assessment import Assessment, assess
 from zwidth.scenes.limits import limits_of
 from zwidth.scenes.scene import Scene
@@ -19,13 +20,6 @@ IMPORTING = Lock()
 
 # What a part of the page shows: the columns of a source, or a text, by name.
 Update = dict[str, Any]
-
-
-class Words(NamedTuple):
-    """What the commands say of a scene, line by line: `zwidth check` of a verdict and its limits, `zwidth ridge`."""
-
-    check: Callable[..., list[str]]
-    slopes: Callable[[Scene], list[str]]
 
 
 @dataclass(frozen=True)
@@ -41,28 +35,28 @@ class Wish:
     costly: bool  # what takes seconds in a scene with parts
 
 
-def compute_details(wish: Wish, words: Words) -> Iterator[Update]:
+def compute_details(wish: Wish) -> Iterator[Update]:
     """The parts in the order in which they are wanted; whoever asks may stop after each."""
     scene, quick = wish.scene, wish.scene.loop.outline() is not None
     if wish.outline and not quick:
         yield show_outlines(model.outlines(scene))
     verdict = assess(scene)
     own = model.normalized_lines(verdict) if wish.normalized else None
-    lines = own or words.check(scene, verdict, [])
+    lines = own or check_lines(scene, verdict, [])
     yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(wish, verdict)}
     if wish.outline:
         passive = model.passive_set(scene)
         x, y = passive if passive is not None else (np.empty(0), np.empty(0))
         yield {"passive": {"x": x, "y": y}, "contours": model.contours(scene, wish.across, wish.up)}
     if not own:
-        yield {"verdict": "\n".join(words.check(scene, verdict, limits_of(scene)))}
+        yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
     if wish.contact or (wish.costly and not quick):
         with IMPORTING:
             import jax  # noqa: F401
     if quick or wish.costly:
         x, y = model.ridge_path(scene)
         yield {"ridge": {"x": x, "y": y}}
-        yield {"slopes": "\n".join([] if wish.normalized else words.slopes(scene))}
+        yield {"slopes": "\n".join([] if wish.normalized else [slope.line() for slope in list_slopes(scene)])}
     if wish.contact:
         time, position, force, text = model.contact_motion(scene, 2 * model.length_of(scene, verdict))
         position = position * _length(wish)

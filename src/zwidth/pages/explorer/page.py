@@ -17,7 +17,7 @@ from bokeh.plotting import figure
 from zwidth.figures import style
 from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls
-from zwidth.pages.explorer.details import IMPORTING, Update, Wish, Words, compute_details, show_outlines
+from zwidth.pages.explorer.details import IMPORTING, Update, Wish, compute_details, show_outlines
 from zwidth.pages.explorer.recipes import to_python, to_yaml
 from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import ZwidthError
@@ -49,8 +49,8 @@ _TURN = np.linspace(0.0, 2.0 * np.pi, 361)
 class Page:
     """One open page."""
 
-    def __init__(self, document: Document, controls: Controls, words: Words, executor: Executor) -> None:
-        self.document, self.controls, self.words, self.executor = document, controls, words, executor
+    def __init__(self, document: Document, controls: Controls, executor: Executor) -> None:
+        self.document, self.controls, self.executor = document, controls, executor
         self.generation, self.serial, self.dark = 0, 0, False
         self.device: tuple[Any, ...] = ()
         self.drawn = False
@@ -253,7 +253,7 @@ class Page:
     def _compute(self, generation: int, wish: Wish) -> None:
         """In the worker's thread: compute part by part, unless something newer is wanted."""
         try:
-            for update in compute_details(wish, self.words):
+            for update in compute_details(wish):
                 if generation != self.generation:
                     return
                 self._hand_over(generation, update)

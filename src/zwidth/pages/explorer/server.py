@@ -28,7 +28,6 @@ from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler, RedirectHandler, RequestHandler, StaticFileHandler
 
 from zwidth.pages.explorer.controls import CHOICES, SLIDERS, Controls
-from zwidth.pages.explorer.details import Words
 from zwidth.pages.explorer.page import Page
 from zwidth.words.errors import InputError
 
@@ -126,7 +125,7 @@ class PageHandler(_Closed, SessionHandler):
 class Explorer:
     """A server that listens; `run` serves until it is told to stop."""
 
-    def __init__(self, controls: Controls, words: Words, port: int = 0) -> None:
+    def __init__(self, controls: Controls, port: int = 0) -> None:
         try:
             listening = socket.create_server((HOST, port), backlog=256)
         except OSError as error:
@@ -144,7 +143,7 @@ class Explorer:
 
         def make(document: Document) -> None:
             document.title = "zwidth explore"
-            page = Page(document, controls, words, self._executor)
+            page = Page(document, controls, self._executor)
             document.on_session_destroyed(lambda _: page.close())
 
         application = GuardedServer(make, token, self.port)

@@ -1,4 +1,4 @@
-"""What `zwidth check` and `zwidth ridge` say of a scene, its wall and what limits it, in plain words."""
+"""What `zwidth check`, `zwidth ridge` and the explorer say of a scene, its wall and what limits it, in plain words."""
 
 from __future__ import annotations
 
@@ -30,6 +30,14 @@ def row(label: str, text: str) -> str:
 def print_json(result: Any) -> None:
     """Print what a machine reads; null stands for what is not known or not finite."""
     click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
+
+
+def tell(result: Any, lines: list[str], as_json: bool) -> None:
+    """Print an answer for machines, or its lines for people."""
+    if as_json:
+        print_json(result)
+    for line in () if as_json else lines:
+        click.echo(line)
 
 
 def scene_lines(scene: Scene) -> list[str]:
@@ -162,6 +170,12 @@ def pole_words(constant: float, frequency: float) -> str:
     return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"
 
 
+def check_lines(scene: Scene, verdict: Assessment, limits: list[Limit]) -> list[str]:
+    """What `zwidth check` says of a scene's wall, without color."""
+    lines = [*verdict_lines(scene, verdict), *limit_lines(limits), *note_lines(scene_notes(scene))]
+    return [click.unstyle(line) for line in lines]
+
+
 def limit_lines(limits: list[Limit]) -> list[str]:
     """What limits the stiffest wall, the largest gain first."""
     lines = []
@@ -209,6 +223,10 @@ def scene_notes(scene: Scene) -> list[str]:
     from zwidth.scenes.limits import describe_islands
 
     return [*coded_period_notes(scene), *describe_islands(scene)]
+
+
+def note_lines(notes: list[str]) -> list[str]:
+    return [row("note", note) for note in notes]
 
 
 class Slope(NamedTuple):
