@@ -13,8 +13,8 @@ from matplotlib.colors import ListedColormap, Normalize, TwoSlopeNorm
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from zwidth.figures import region, style
-from zwidth.figures.region import draw_zeros, mark_wall, shade_region
+from zwidth.figures import stable_set, style
+from zwidth.figures.stable_set import draw_zeros, mark_wall, shade_region
 from zwidth.figures.table import Table, curves, select, si_scale
 from zwidth.words.errors import InputError
 
@@ -138,7 +138,7 @@ def draw_map(
     output: str,
     axes: style.AnyAxes | None = None,
     *,
-    edges: Callable[[float, float], region.Outlines | None] = lambda delta, d: None,
+    edges: Callable[[float, float], stable_set.Outlines | None] = lambda delta, d: None,
 ) -> np.ndarray:
     """Draw one output over alpha and beta: panels for delta (columns) and d (rows), three of each at most.
 
@@ -181,13 +181,13 @@ def draw_map(
 
 
 def _draw_region(
-    ax: Axes, arrays: Mapping[str, np.ndarray], output: str, place: Any, exact: region.Outlines | None
+    ax: Axes, arrays: Mapping[str, np.ndarray], output: str, place: Any, exact: stable_set.Outlines | None
 ) -> bool:
     """The region within its exact edge, or within the contour of the radius; tells whether either is known."""
     alpha, beta, good = arrays["alpha"], arrays["beta"], arrays[output][place].T.astype(bool)
     look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
-    if exact is not None and region.agrees(exact, alpha, beta, good):
-        region.draw_region(ax, exact, SHADES[output], label="exact edge", **look)
+    if exact is not None and stable_set.agrees(exact, alpha, beta, good):
+        stable_set.draw_region(ax, exact, SHADES[output], label="exact edge", **look)
         return True
     radius = arrays["spectral_radius"][place].T if output == "stable" and "spectral_radius" in arrays else None
     # On alpha = 0 a pole sits at z = 1 whatever beta is, and the contour would follow that column.

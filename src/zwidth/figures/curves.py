@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.figures import grid, style
 from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
-from zwidth.figures.region import agrees, draw_region, fit_axes
+from zwidth.figures.stable_set import agrees, draw_region, fit_axes
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, WALL
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import style
-from zwidth.figures.region import MARKS, mark_wall, name_axes
+from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import Table, curves, select
 from zwidth.words.formatting import header
 

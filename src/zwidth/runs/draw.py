@@ -14,7 +14,7 @@ import numpy as np
 from zwidth.figures.curves import draw_curves, draw_outlines, find_family
 from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
-from zwidth.figures.region import Outlines
+from zwidth.figures.stable_set import Outlines
 from zwidth.figures.style import save, style_sheet
 from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset

@@ -10,7 +10,6 @@ import numpy as np
 from pydantic import WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict, members, repeated
 from zwidth.config.scenes import AnyScene
@@ -22,7 +21,7 @@ from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
-from zwidth.studies.simulate import SimulatedStudy, check_circumstances
+from zwidth.studies.simulate import Circumstances, SimulatedStudy, check_circumstances
 from zwidth.words.formatting import header, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 from zwidth.words.status import Status

@@ -13,7 +13,7 @@ from zwidth.config.fields import members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, register
 from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
-from zwidth.figures.region import Outlines
+from zwidth.figures.stable_set import Outlines
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable

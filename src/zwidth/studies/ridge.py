@@ -12,7 +12,7 @@ import numpy as np
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, HeldOnly, register
-from zwidth.figures.region import Outlines
+from zwidth.figures.stable_set import Outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.region import stable_region

@@ -110,7 +110,7 @@ def compute_sweeps(
 
                 finished = on_cluster(list(points), client, perform)
             elif workers is not None:
-                from zwidth.sweep.pool import in_workers
+                from zwidth.sweep.jobs import in_workers
 
                 finished = in_workers(list(points), workers, perform)
             else:

@@ -1,7 +1,8 @@
-"""What can be set on the page: the numbers and the parts of a scene."""
+"""What can be set on the page, the numbers and the parts of a scene; and the view as text that reproduces it."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from math import isfinite
@@ -10,6 +11,7 @@ from typing import Any, NamedTuple
 
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS, find_parts
+from zwidth.parts.spelling import spell_part, spell_scene
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
 from zwidth.parts.wall import VirtualWall
@@ -24,6 +26,22 @@ from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
 _MOST_POLES = 80
 # Of a number that the page sends, in its units.
 _LARGEST = 1e100
+_SCRIPT = """\
+import matplotlib.pyplot as plt
+import zwidth
+
+{notes}scene = {scene}
+verdict = zwidth.assess(scene)
+print("stable" if verdict.stable else "UNSTABLE", f"spectral radius {{verdict.spectral_radius:.6f}}")
+print(f"K_max = {{scene.max_stiffness().stiffness:.6g}} {unit}")
+
+for outline in scene.stable_region():
+    plt.fill(outline.stiffness, outline.virtual_damping, fill=False)
+plt.plot(scene.wall.stiffness, scene.wall.virtual_damping, "o")
+plt.xlabel("{x}")
+plt.ylabel("{y}")
+plt.show()
+"""
 
 
 class Slider(NamedTuple):
@@ -207,3 +225,41 @@ def read_controls(path: Path | None) -> Controls:
         wall, half = (0.0, 0.0), 0.5 * float(best.stiffness)
         wall = (half, choose_damping(controls.scene, best, half)) if isfinite(half) else wall
     return replace(controls, scene=replace(controls.scene, wall=VirtualWall(*wall))).check()
+
+
+def to_yaml(controls: Controls) -> str:
+    """A configuration: the scene, its stable walls and, of a rigid device, the passive ones and the response."""
+    scene = controls.scene
+    studies: list[dict[str, Any]] = [{"kind": "boundary", "name": "stable_walls"}]
+    if not scene.parts_beyond:
+        studies[0] |= {"passivity": True} if scene.operator is None else {}
+        studies.append({"kind": "step", "name": "response"})
+    # JSON is YAML of one line.
+    lines = ["version: 1", "name: explored", "scene:"]
+    lines += [f"  {name}: {json.dumps(value)}" for name, value in _section(controls).items()]
+    return "\n".join([*lines, "studies:", *(f"  - {json.dumps(study)}" for study in studies)]) + "\n"
+
+
+def _section(controls: Controls) -> dict[str, Any]:
+    """The scene as a configuration spells it."""
+    if controls.normalized:
+        return {name: value for name, value in controls.shown().items() if name != "mode"}
+    return spell_scene(controls.scene)
+
+
+def to_python(controls: Controls) -> str:
+    """A script that builds the scene, judges its wall and draws the stable set."""
+    parts = spell_part(controls.scene)
+    text = "zwidth.Scene(\n" + "".join(f"    {name}={_spell(part)},\n" for name, part in parts.items()) + ")"
+    normalized = {"notes": "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "unit": "(alpha)"}
+    normalized |= {"x": "normalized stiffness alpha", "y": "normalized damping beta"}
+    physical = {"notes": "", "unit": "N/m", "x": "stiffness K in N/m", "y": "virtual damping B in N s/m"}
+    return _SCRIPT.format(scene=text, **(normalized if controls.normalized else physical))
+
+
+def _spell(part: Any) -> str:
+    """A part as Python writes it."""
+    if not hasattr(part, "__dataclass_fields__"):
+        return repr(part)
+    given = ", ".join(f"{name}={_spell(value)}" for name, value in spell_part(part).items())
+    return f"zwidth.{type(part).__name__}({given})"
