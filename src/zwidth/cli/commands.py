@@ -240,7 +240,6 @@ def find_examples() -> dict[str, Path]:
 
 
 def describe_example(text: str) -> str:
-    """The first sentence of a configuration's comments."""
     comments = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")][1:]
     sentence = re.match(r".*?[.?](?= |$)", " ".join(line for line in comments if line))
     assert sentence is not None, "every example says what it is"

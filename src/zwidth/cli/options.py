@@ -122,7 +122,6 @@ def flag_of(path: str) -> str:
 
 
 def _add_option(command: Command, path: str, required: bool = False) -> Command:
-    """The option of a parameter or of a choice."""
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:

@@ -56,11 +56,9 @@ class DeviceTable:
 
     @property
     def size(self) -> int:
-        """How many rows there are."""
         return len(next(iter(self.columns.values())))
 
     def values(self, name: str) -> np.ndarray:
-        """One column as float64."""
         return np.array(self.columns[name], dtype=np.float64)
 
     def spelling(self) -> dict[str, Any]:
@@ -233,7 +231,6 @@ def _read_cell(entry: Entry, cell: str, unit: str, place: str) -> float:
 
 
 def _make_schema() -> dict[str, Any]:
-    """The JSON Schema of a table."""
     column = {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}}
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     names = {"type": "object", "additionalProperties": {"type": "string"}}

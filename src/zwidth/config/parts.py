@@ -51,7 +51,6 @@ class PartSection(Strict):
     part: ClassVar[Any]
 
     def to_part(self) -> Any:
-        """The part of the scene."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 

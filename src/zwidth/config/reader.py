@@ -118,7 +118,6 @@ def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
 
 
 def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
-    """An error with a single fault."""
     line, column = place or (None, None)
     return ConfigFileError.of([Fault(file, line, column, dotted(path), *parts)])
 

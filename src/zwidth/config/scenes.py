@@ -381,7 +381,6 @@ AnyWall: TypeAlias = PhysicalWall | NormalizedWall
 
 
 def read_scene(raw: Any) -> AnyScene:
-    """A scene of either kind."""
     return _as_either(raw, PhysicalScene, NormalizedScene)
 
 

@@ -90,7 +90,6 @@ class Quantity:
 
     @cached_property
     def read(self) -> Callable[[Any], Any]:
-        """What reads a value, or raises a problem."""
         if self.periods:
             return raise_problems(lambda value: read_span(value, self.allowed))
         if self.unit == "1":
@@ -100,7 +99,6 @@ class Quantity:
 
     @property
     def schema(self) -> dict[str, Any]:
-        """Its JSON Schema."""
         if self.unit != "1":
             return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()))
         low, high, low_open, high_open = self.allowed
@@ -119,7 +117,6 @@ class Quantity:
 
 
 def quantity_of(name: str) -> Quantity:
-    """That of a parameter."""
     parameter = PARAMETERS[name]
     return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay")
 
@@ -152,14 +149,12 @@ class Axis:
     in_periods: bool = False  # whether the values are delays in sampling periods
 
     def values(self) -> np.ndarray:
-        """The values as a one-dimensional float64 array."""
         if self.form in _SPACINGS:
             return _SPACINGS[self.form](*self.entries, self.size)
         return np.array(self.entries, dtype=np.float64)
 
     @property
     def largest(self) -> float:
-        """The largest of the values."""
         return max(self.entries)
 
     def spelling(self) -> Any:
@@ -239,7 +234,6 @@ class AxisOf:
         return {"linear": self.quantity, "log": replace(self.quantity, allowed=positive)}
 
     def read(self, raw: Any) -> Axis:
-        """A validator."""
         if isinstance(raw, Axis):
             return raw
         form, ends = "number", raw
@@ -305,7 +299,6 @@ def _accept_whole_floats(entry: Entry) -> Entry:
 
 
 def axis_of(name: str) -> AxisOf:
-    """That of a parameter."""
     return AxisOf(quantity_of(name))
 
 

@@ -132,7 +132,6 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
 def _name_colors(
     axes: np.ndarray, names: list[str], colors: list[Any], *, outside: bool, title: str | None = None
 ) -> None:
-    """Which color is which."""
     longest = max(10 if "$" in name else len(name) for name in names)
     columns = max(1, min(len(names), 6, _LINE // max(longest, 1)))
     handles = [style.line(name, color=color) for name, color in zip(names, colors, strict=True) if name]

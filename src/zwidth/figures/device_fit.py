@@ -141,7 +141,6 @@ def _put_above(ax: Axes, handles: Any = None) -> None:
 
 
 def _draw_onsets(ax: Axes, walls: Table) -> None:
-    """How far walls that buzzed lie from the fit."""
     buzzing = select(walls, kind="buzzing")
     damping, unit = _column(buzzing, "virtual_damping")
     for name, marker, color in (("stiffness", "o", style.VERMILION), ("frequency", "s", style.BLUE)):

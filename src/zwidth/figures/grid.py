@@ -38,7 +38,6 @@ _CANDIDATES = 60
 
 
 def list_varied(data: xarray.Dataset, name: str) -> list[str]:
-    """The parameters that a variable varies over."""
     return [str(dim) for dim in data[name].dims if data.sizes[dim] > 1]
 
 

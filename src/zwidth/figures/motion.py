@@ -95,7 +95,6 @@ def _read_responses(table: Table) -> list[Any]:
 
 
 def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
-    """The force of the wall over time."""
     for each in responses:
         # Steps are too short for dashes: lightness has to do.
         look = {"color": each.look["color"], "linewidth": 1.1, "label": f"wall_force, {style.literal(each.label)}"}

@@ -164,7 +164,6 @@ def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
 
 
 def _draw_limit(ax: Axes, paths: list[Any], models: list[Any], colors: dict[float, Any]) -> None:
-    """g over the delay, with the delays of the paths marked."""
     for model in models:
         look = {"color": style.GRAY, "linestyle": style.dash_of(model), "zorder": 2}
         ax.plot(model.d, model.slope, label=f"g, {model.delay_model}", **look)

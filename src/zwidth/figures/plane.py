@@ -161,7 +161,6 @@ def _draw_cells(ax: Axes, part: xarray.Dataset, values: Any, **look: Any) -> Any
 
 
 def _find_peak(part: xarray.Dataset) -> list[float] | None:
-    """The stiffest stable wall, where it lies within the panel."""
     peaks = {str(name)[: -len("_peak")]: float(value) for name, value in part.items() if str(name).endswith("_peak")}
     inside = (part[dim].min() <= value <= part[dim].max() for dim, value in peaks.items())
     return list(peaks.values()) if peaks and all(inside) else None
@@ -268,7 +267,6 @@ def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
 
 
 def _draw_corners(ax: Axes, x: np.ndarray, y: np.ndarray, part: xarray.Dataset) -> None:
-    """Hatch where the stiffest wall is a corner of the stable region."""
     if "kind" not in part or min(x.size, y.size) < 2 or not (part["kind"] == 1).any():
         return
     corner = (part["kind"].values == 1).astype(float)
@@ -283,7 +281,6 @@ def _colors(output: Output) -> Any:
 
 
 def _norm(parts: list[xarray.Dataset], name: str) -> Any:
-    """The colors of all panels alike."""
     output = OUTPUTS[name]
     low, high = _range(parts, name) or (0.0, 1.0)
     if output.look == "diverging":
@@ -298,13 +295,11 @@ def _norm(parts: list[xarray.Dataset], name: str) -> Any:
 
 
 def _range(parts: list[xarray.Dataset], name: str) -> tuple[float, float] | None:
-    """The least and the largest finite value in all panels."""
     finite = np.concatenate([part[name].values[np.isfinite(part[name].values)] for part in parts])
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
 def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: Any, *, outside: bool) -> None:
-    """The legend, and the colors of numbers."""
     handles: list[Any] = []
     output = OUTPUTS[name]
     if output.look == "truth":

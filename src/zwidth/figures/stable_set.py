@@ -132,7 +132,6 @@ def tabulate_walls(scene: Scene, stiffness: Any, virtual_damping: Any) -> dict[s
 
 
 def name_wall(stiffness: float, virtual_damping: float) -> str:
-    """A wall in words."""
     return f"K = {with_unit(stiffness, 'N/m')}, B = {with_unit(virtual_damping, 'N s/m')}"
 
 

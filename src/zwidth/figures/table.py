@@ -23,7 +23,6 @@ class Table(Protocol):
 
 
 def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:
-    """The rows that have the wanted values in some columns."""
     columns = {str(name): np.asarray(table[name]) for name in table}
     for name, value in wanted.items():
         keep = columns[name] == value

@@ -41,7 +41,6 @@ def tell(result: Any, lines: list[str], as_json: bool) -> None:
 
 
 def scene_lines(scene: Scene) -> list[str]:
-    """Device, timing and parts."""
     device, timing = scene.device, scene.timing
     lines = [
         row("device", f"m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}"),
@@ -83,7 +82,6 @@ def stability_word(stable: bool, marginal: bool = False) -> str:
 
 
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
-    """The verdict on a scene's wall."""
     wall = scene.wall
     word = stability_word(verdict.stable, verdict.marginal)
     best = "none: no stiffness is stable at any damping"
@@ -177,7 +175,6 @@ def check_lines(scene: Scene, verdict: Assessment, limits: list[Limit]) -> list[
 
 
 def limit_lines(limits: list[Limit]) -> list[str]:
-    """What limits the stiffest wall, the largest gain first."""
     lines = []
     for limit in limits:
         if isfinite(limit.stiffness):
@@ -188,7 +185,6 @@ def limit_lines(limits: list[Limit]) -> list[str]:
 
 
 def friction_lines(rule: FrictionRule) -> list[str]:
-    """The rule of friction and resolution."""
     parts = []
     if rule.by_damping is not None:
         parts.append(f"2 b/T = {with_unit(rule.by_damping, 'N/m')}")
@@ -238,11 +234,9 @@ class Slope(NamedTuple):
     words: str
 
     def line(self) -> str:
-        """For people."""
         return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
         return {"value": self.value, "unit": self.unit}
 
 

@@ -68,7 +68,6 @@ def make_edges(store: Store) -> Edges:
 
 
 def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
-    """Outlines in the units of a store."""
     slices = tuple(slice(k, k + 1) for k in place)
     try:
         if store.study.with_parts:
@@ -185,7 +184,6 @@ def _check_axes(axes: Mapping[str, str], slices: Mapping[Path, xarray.Dataset]) 
 
 
 def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
-    """Why nothing of a sweep is drawn."""
     # A store lists its dimensions in any order.
     varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
     missing = ", ".join(name for name in axes.values() if name not in varied)

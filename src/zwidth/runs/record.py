@@ -51,19 +51,15 @@ class Record:
         self._read()
 
     def _read(self) -> None:
+        where, remedy = self.folder / RUN_FILE, "choose another folder with --out DIR, or remove it"
         try:
-            content = json.loads((self.folder / RUN_FILE).read_text(encoding="utf-8"))
+            content = json.loads(where.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
             return
         except (OSError, ValueError) as error:
-            raise StoreError(
-                f"{self.folder / RUN_FILE}: cannot be read ({error}); choose another folder with --out DIR, or remove "
-                "it"
-            ) from error
+            raise StoreError(f"{where}: cannot be read ({error}); {remedy}") from error
         if not isinstance(content, dict) or not isinstance(content.get("studies"), list):
-            raise StoreError(
-                f"{self.folder / RUN_FILE}: no record of a run; choose another folder with --out DIR, or remove it"
-            )
+            raise StoreError(f"{where}: no record of a run; {remedy}")
         seal = content.pop(_SEAL, None)
         if seal is not None and digest(content) != seal:
             self.damaged = True
@@ -72,16 +68,14 @@ class Record:
                 content["studies"] = [{**entry, "state": "open"} for entry in content["studies"] if _names_files(entry)]
         fault = _find_fault(content)
         if fault:
-            raise StoreError(f"{self.folder / RUN_FILE}: {fault}; choose another folder with --out DIR, or remove it")
+            raise StoreError(f"{where}: {fault}; {remedy}")
         self.content = content
 
     @property
     def exists(self) -> bool:
-        """Whether the folder holds a run."""
         return bool(self.content)
 
     def entry(self, name: str) -> dict[str, Any] | None:
-        """What is recorded of a study."""
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
     def check_free(self, config: str, *, overwrite: bool, going_on: bool) -> None:
@@ -141,7 +135,6 @@ class Record:
         refuse_versions(where, self.content.get("versions", {}))
 
     def start(self, **about: Any) -> None:
-        """Write down what the run is about, before its first study."""
         about |= {"format": RUN_FORMAT, "started": datetime.now(UTC).isoformat(timespec="seconds")}
         about |= {"precision": "float64", "versions": versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
@@ -289,7 +282,6 @@ def _belongs_to_runs(name: str) -> bool:
 
 
 def file_hash(path: Path) -> str:
-    """The SHA-256 of a file; empty where there is none, or a link to one."""
     try:
         if path.is_symlink():
             return ""

@@ -119,7 +119,6 @@ class BoundaryStudy(CurvesStudy):
 
     @property
     def points(self) -> int:
-        """About a thousand frequencies a curve; over delta, one point."""
         return super().points * (_POINTS_PER_CURVE if self.plane == "alpha_beta" else 1)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:

@@ -150,7 +150,6 @@ class DesignStudy(ComputedStudy):
 
     @property
     def draws(self) -> int:
-        """Devices drawn for each stiffness."""
         if self.tolerances is None:
             return 0
         return self.samples or self.device.to_scene().loop.draws
@@ -288,7 +287,6 @@ class FiltersStudy(ComputedStudy):
 
     @property
     def dampings(self) -> np.ndarray:
-        """The values of the physical damping."""
         return np.array([self.device.damping]) if self.damping is None else self.damping.values()
 
     @property

@@ -144,7 +144,6 @@ class Config(Strict):
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        """Two studies of one name."""
         studies = raw.get("studies")
         first: dict[str, int] = {}
         for index, study in enumerate(studies if isinstance(studies, list | tuple) else ()):

@@ -90,7 +90,6 @@ class LogSection(Strict):
             yield ("sha256",), problem(what, "it is the file that was fitted before", "remove sha256 if it may change")
 
     def read(self, period: float | None) -> LoggedMotion:
-        """The columns; raises `InputError`."""
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
         return read_log(find_file(self.csv), columns, resolution=self.resolution, period=period)
 
@@ -105,7 +104,6 @@ def _digest(name: Any) -> str:
 
 
 def _read_logs(raw: Any, handler: Any) -> Any:
-    """One log, or a list of them."""
     if isinstance(raw, str):
         raise problem(f"got {describe(raw)}", "a log is a CSV file and its columns", "write {csv: NAME.csv}")
     if isinstance(raw, dict):
@@ -233,7 +231,6 @@ class FitStudy(ComputedStudy):
 
     @property
     def units(self) -> AxisUnits:
-        """SI units of the axis."""
         return ROTARY if any(motion.rotary for motion in self._motions) else LINEAR
 
     @property
@@ -300,7 +297,6 @@ _LABELS = ("m", "J", "b", "t_d", "K_max", "set", "no wall", "fitted to")
 
 
 def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
-    """What the fits rest on."""
     found = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
     below = {name: stack([tables[name] for tables in found]) for name in ("boundary", "walls")}
     return {**found[0], **below}

@@ -81,12 +81,10 @@ class CycleAxes(Strict):
 
     @property
     def given(self) -> dict[str, Axis]:
-        """The axes that there are."""
         return {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
 
     @property
     def varied(self) -> dict[str, Axis]:
-        """Those with several values."""
         return {name: axis for name, axis in self.given.items() if axis.size > 1}
 
     def lay_out(self) -> dict[str, np.ndarray]:
@@ -142,7 +140,6 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
                     yield (("conditions", index, *path) if own else path), what
 
     def list_circumstances(self) -> list[Circumstances]:
-        """The circumstances of every condition."""
         common = {name: getattr(self, name) for name in Circumstances.model_fields}
         owns = [{name: getattr(each, name) for name in common} for each in self.conditions]
         return [

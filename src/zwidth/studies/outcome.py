@@ -157,7 +157,6 @@ def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Phy
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
-    """A stiffest wall as columns of a table."""
     found = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
     return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 

@@ -62,7 +62,6 @@ class Sharpened:
 
 
 def published_numbers() -> list[Comparison]:
-    """Compare every number that the paper prints with the computed one."""
     return [
         *_compare_undamped(),
         *_example(),
@@ -177,7 +176,6 @@ def sharpened_numbers() -> list[Sharpened]:
 
 
 def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
-    """The report for machines."""
     example: dict[str, Any] = {
         "mass_kg": MASS,
         "period_s": PERIOD,
@@ -196,7 +194,6 @@ def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
 
 
 def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
-    """The report for readers."""
     agreeing = sum(row.agrees for row in printed)
     lines = [
         "# The paper's numbers, computed",

@@ -109,7 +109,6 @@ class RecommendStudy(ResponseStudy):
 
 
 def _outline_rigid(device: PhysicalDevice) -> Table:
-    """The stable and the passive walls of a rigid device."""
     edge = outline(device.delta, device.d, "held")
     passive = passive_outlines(np.array([device.delta]), np.array([device.d]), device.own_share)
     return add_si_columns(stack([edge, *passive]), device)
@@ -176,7 +175,6 @@ def _find_ends(best: dict[str, Any]) -> tuple[float, float]:
 
 
 def _describe(scene: Scene, found: dict[str, Any]) -> str:
-    """The recommendation for a reader."""
     best, most, device = found["recommended"], found["maximum"], scene.device
 
     def spell(value: float | None, unit: str = "") -> str:

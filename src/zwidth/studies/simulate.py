@@ -104,7 +104,6 @@ class Circumstances(Strict):
             yield ("duration",), problem(what, f"1 to {LONGEST} periods", "change the duration")
 
     def count_periods(self, period: float) -> int:
-        """The length of the motion."""
         return max(1, round(self.duration.periods(period)))
 
     def place(self, scene: Scene) -> Scene:
@@ -112,7 +111,6 @@ class Circumstances(Strict):
         return scene if self.velocity is None else scene.replace(velocity=self.velocity.to_part())
 
     def options(self, period: float) -> dict[str, Any]:
-        """The arguments of `zwidth.simulate`."""
         names = [name for name in Circumstances.model_fields if name not in ("duration", "velocity", "jitter")]
         given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
         return {**given, "periods": self.count_periods(period), "jitter": self.jitter.seconds(period)}
@@ -168,7 +166,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
 
     @property
     def count(self) -> int:
-        """How many motions there are."""
         return self.stiffness_fraction.size if self.stiffness_fraction is not None else len(self.walls or ())
 
     @property
@@ -181,7 +178,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         return int(self.count * min(self.duration.periods(self.device.period), 1e15) * self.substeps)
 
     def list_walls(self, scene: Scene) -> list[tuple[str, float, float]]:
-        """Each wall by its name, stiffness and virtual damping."""
         if self.stiffness_fraction is not None:
             top = scene.max_stiffness()
             stiffness, damping = float(top.stiffness), float(top.virtual_damping)

@@ -39,7 +39,6 @@ class CheckedStore(LocalStore):
 
     @property
     def complete(self) -> bool:
-        """Whether every chunk was done."""
         return not self._missing
 
     def get_sync(
@@ -77,7 +76,6 @@ class CheckedStore(LocalStore):
         return data
 
     def _task_of(self, name: str) -> Task | None:
-        """The chunk to which a file belongs."""
         variable, *place = name.split("/")
         family = next((one for one in self._kept.plan.families if variable in one.variables), None)
         if family is None or place[:1] != ["c"]:

@@ -59,7 +59,6 @@ def in_pieces(function: Callable[..., tuple[np.ndarray, ...]], columns: Columns,
 
 
 def _devices(block: Block) -> dict[str, np.ndarray]:
-    """What belongs to devices."""
     alpha, beta, _, kind, status = in_pieces(
         lambda *columns: tuple(alpha_max(*columns)), (block.delta, block.d), _PIECE
     )
@@ -77,7 +76,6 @@ def _devices(block: Block) -> dict[str, np.ndarray]:
 
 
 def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
-    """What belongs to walls."""
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
     found: dict[str, np.ndarray] = {}
     unproved = False
@@ -113,7 +111,6 @@ def _status(
     block: Block,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Why each wall has its values."""
     status = np.full(shape, Status.OK, dtype=np.uint8)
     status[unproved] = Status.NOT_CONVERGED
     for name in outputs:

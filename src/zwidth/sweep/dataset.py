@@ -150,7 +150,6 @@ def _place(name: str) -> int:
 
 
 def _plain_attribute(value: Any) -> Any:
-    """An attribute of a kind that netCDF knows."""
     if isinstance(value, list) and all(isinstance(item, int) for item in value):
         return np.array(value, dtype=np.int64 if max(value, default=0) > NOT_COMPUTED else np.uint8)
     return json.dumps(value) if value is None or isinstance(value, dict | list) else value

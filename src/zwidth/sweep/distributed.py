@@ -139,7 +139,6 @@ def _ask_for_threads(client: Client) -> dict[str, int]:
 
 
 def _perform_there(perform: Perform, path: str, family: str, index: int) -> None:
-    """What a worker does."""
     if not os.path.isdir(path):
         from distributed import get_worker
 

@@ -10,10 +10,10 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from zwidth.sweep.files import differences, digest, versions
-from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process
+from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process, in_workers
 from zwidth.sweep.plan import Plan, Task
 from zwidth.sweep.store import SUFFIX, Store, create
 from zwidth.sweep.study import SweepStudy
@@ -95,36 +95,48 @@ def compute_sweeps(
 
             client = stack.enter_context(connected(scheduler))
         stores, repaired = _prepare_stores(planned, folder, about, shard)
-        results = {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
-        names = {str(store.path): name for name, store in stores.items()}
-        points: dict[Job, int] = {}
+        sweeps = Sweeps(
+            {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
+        )
+        chunks: dict[Job, _Chunk] = {}
         for name, store in stores.items():
-            tasks = _pick_share(store.plan, shard)
+            tasks, sweep = _pick_share(store.plan, shard), sweeps.results[name]
             missing = [task for task in tasks if not store.is_done(task)]
-            points |= {Job(str(store.path), task): store.plan.points(task) for task in missing}
-            results[name].total, results[name].skipped = len(tasks), len(tasks) - len(missing)
-        sweeps = Sweeps(results)
-        if points:
+            chunks |= {Job(str(store.path), task): _Chunk(name, store, task) for task in missing}
+            sweep.total, sweep.skipped = len(tasks), len(tasks) - len(missing)
+        if chunks:
             if client is not None:
                 from zwidth.sweep.distributed import on_cluster
 
-                finished = on_cluster(list(points), client, perform)
+                finished = on_cluster(list(chunks), client, perform)
             elif workers is not None:
-                from zwidth.sweep.jobs import in_workers
-
-                finished = in_workers(list(points), workers, perform)
+                finished = in_workers(list(chunks), workers, perform)
             else:
-                finished = in_this_process(list(points), perform)
+                finished = in_this_process(list(chunks), perform)
             try:
-                _follow(finished, points, sweeps, stores, names, progress)
+                _follow(finished, chunks, sweeps, progress)
             except LostSchedulerError as error:
                 sweeps.lost = f"scheduler: {scheduler} {error}"
-            _count(list(points), sweeps, stores, names)
+            _count(chunks, sweeps)
         return sweeps
 
 
+class _Chunk(NamedTuple):
+    """One chunk of one sweep."""
+
+    study: str
+    store: Store
+    task: Task
+
+    @property
+    def points(self) -> int:
+        return self.store.plan.points(self.task)
+
+    def __str__(self) -> str:
+        return f"{self.study}/{self.store.plan.describe(self.task)}"
+
+
 def _pick_share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
-    """The chunks that are this run's to compute."""
     tasks = list(plan.tasks())
     return tasks if shard is None else tasks[shard[0] - 1 :: shard[1]]
 
@@ -161,27 +173,21 @@ def _prepare_stores(
 
 
 def _follow(
-    results: Generator[Finished],
-    points: dict[Job, int],
-    sweeps: Sweeps,
-    stores: dict[str, Store],
-    names: dict[str, str],
-    progress: Callable[[Progress], None],
+    results: Generator[Finished], chunks: dict[Job, _Chunk], sweeps: Sweeps, progress: Callable[[Progress], None]
 ) -> None:
-    """Keep count of chunks while they are computed."""
-    start, ended, computed, total = time.perf_counter(), 0, 0, sum(points.values())
+    start, ended, computed = time.perf_counter(), 0, 0
+    total = sum(chunk.points for chunk in chunks.values())
     try:
         for number, finished in enumerate(results, start=1):
-            name = names[finished.job.path]
-            sweep = sweeps.results[name]
-            ended += points[finished.job]
+            chunk = chunks[finished.job]
+            ended += chunk.points
             if finished.error:
-                sweep.failed[f"{name}/{stores[name].plan.describe(finished.job.task)}"] = finished.error
+                sweeps.results[chunk.study].failed[str(chunk)] = finished.error
             else:
-                computed += points[finished.job]
+                computed += chunk.points
             rate = computed / max(time.perf_counter() - start, 1e-9)
             left = (total - ended) / rate if rate else math.nan
-            progress(Progress(name, number, len(points), ended, total, rate, left, finished.error))
+            progress(Progress(chunk.study, number, len(chunks), ended, total, rate, left, finished.error))
             if finished.hopeless:
                 sweeps.hopeless = finished.error
                 return
@@ -192,23 +198,20 @@ def _follow(
         results.close()
 
 
-def _count(jobs: list[Job], sweeps: Sweeps, stores: dict[str, Store], names: dict[str, str]) -> None:
+def _count(chunks: dict[Job, _Chunk], sweeps: Sweeps) -> None:
     """Count the chunks that are done: not those that an engine calls so, but those that the stores hold."""
     over = sweeps.hopeless or sweeps.interrupted or sweeps.lost
-    for job in jobs:
-        name = names[job.path]
-        sweep, store = sweeps.results[name], stores[name]
-        chunk = f"{name}/{store.plan.describe(job.task)}"
-        if store.holds(job.task):
+    for chunk in chunks.values():
+        sweep = sweeps.results[chunk.study]
+        if chunk.store.holds(chunk.task):
             sweep.computed += 1
             # Somebody else has done it in the meantime, a worker that was given up say.
-            sweep.failed.pop(chunk, None)
+            sweep.failed.pop(str(chunk), None)
         elif not over:
-            sweep.failed.setdefault(chunk, "it was computed, and is not in the store")
+            sweep.failed.setdefault(str(chunk), "it was computed, and is not in the store")
 
 
 def store_path(folder: Path, study: SweepStudy) -> Path:
-    """Where a study's results are kept."""
     return folder / f"{study.name}{SUFFIX}"
 
 

@@ -61,12 +61,10 @@ def attempt(perform: Perform, job: Job) -> Finished:
 
 
 def describe_failure(job: Job, error: BaseException) -> Finished:
-    """What an exception means for a job and the others."""
     return Finished(job, f"{type(error).__name__}: {error}", hopeless(error))
 
 
 def in_this_process(jobs: Iterable[Job], perform: Perform) -> Generator[Finished]:
-    """Do one job after the other."""
     for job in jobs:
         yield attempt(perform, job)
 
@@ -141,7 +139,6 @@ class _Worker:
         theirs.close()
 
     def start(self, job: Job) -> None:
-        """Hand over a job."""
         self.job = job
         # Where the worker is dead already, its sentinel says so.
         with suppress(OSError):
@@ -157,7 +154,6 @@ class _Worker:
         return finished
 
     def cause_of_death(self) -> str:
-        """How the process ended, for messages."""
         self.process.join()
         code = self.process.exitcode or 0
         return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
@@ -176,7 +172,6 @@ class _Worker:
 
 
 def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
-    """The life of a worker."""
     # Ctrl-C reaches the whole group of processes; the parent decides what becomes of it.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # Ends as a program does, so that Python has no leaked semaphore to complain about.

@@ -61,12 +61,10 @@ class FamilyPlan:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """How many chunks there are along each dimension."""
         return tuple(-(-size // chunk) for size, chunk in zip(self.shape, self.chunks, strict=True))
 
     @property
     def count(self) -> int:
-        """How many chunks there are."""
         return math.prod(self.counts)
 
     @property
@@ -80,20 +78,16 @@ class FamilyPlan:
         return " x ".join(f"{dim} {size}" for dim, size in zip(self.dims, self.shape, strict=True)) or "one point"
 
     def position(self, index: int) -> tuple[int, ...]:
-        """The position of a chunk along each dimension."""
         return tuple(int(part) for part in np.unravel_index(index, self.counts)) if self.counts else ()
 
     def place(self, index: int) -> tuple[slice, ...]:
-        """The points of a chunk."""
         starts = zip(self.position(index), self.chunks, self.shape, strict=True)
         return tuple(slice(at * chunk, min((at + 1) * chunk, size)) for at, chunk, size in starts)
 
     def points(self, index: int) -> int:
-        """How many points a chunk has."""
         return math.prod(part.stop - part.start for part in self.place(index))
 
     def describe(self, index: int) -> str:
-        """A chunk by its name and its place, for messages."""
         parts = zip(self.dims, self.place(index), strict=True)
         place = ", ".join(f"{dim} {part.start}:{part.stop}" for dim, part in parts)
         return f"{Task(self.family, index)}{f' ({place})' if place else ''}"
@@ -113,7 +107,6 @@ class Plan:
     seconds: float  # on one core, a rough guess
 
     def family(self, name: str) -> FamilyPlan:
-        """The plan of one family."""
         return next(family for family in self.families if family.family == name)
 
     def tasks(self) -> Iterator[Task]:
@@ -122,11 +115,9 @@ class Plan:
             yield from (Task(family.family, index) for index in range(family.count))
 
     def points(self, task: Task) -> int:
-        """How many points a chunk has."""
         return self.family(task.family).points(task.index)
 
     def describe(self, task: Task) -> str:
-        """A chunk for messages."""
         return self.family(task.family).describe(task.index)
 
     @property
@@ -142,7 +133,6 @@ class Plan:
         }
 
     def lines(self) -> Iterator[str]:
-        """The plan in words."""
         yield f"study {self.study}"
         for family in self.families:
             chunk = " x ".join(map(str, family.chunks))
@@ -217,7 +207,6 @@ def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
 
 
 def _model(longest: float) -> str:
-    """What is modelled, in words."""
     degree = math.floor(longest) + 3
     if longest == math.floor(longest):
         return f"damped mass, zero-order hold, held delay: polynomials of degree up to {degree}"

@@ -82,7 +82,6 @@ class Axes(_Axes):
 
     @property
     def given(self) -> tuple[str, ...]:
-        """The parameters that are axes or columns, in the order of a store's dimensions."""
         columns = self.devices.columns if self.devices else {}
         return tuple(name for name in PARAMETERS if name in columns or getattr(self, name) is not None)
 
@@ -93,7 +92,6 @@ class Axes(_Axes):
 
     @property
     def physical(self) -> bool:
-        """Whether the parameters are SI quantities."""
         return any(name in PHYSICAL for name in self.given)
 
     @property
@@ -104,7 +102,6 @@ class Axes(_Axes):
 
     @property
     def sizes(self) -> dict[str, int]:
-        """The dimensions, slow ones first; a single number is none."""
         sizes = {"device": self.devices.size} if self.devices else {}
         for name in PARAMETERS:
             axis = getattr(self, name)
@@ -113,12 +110,10 @@ class Axes(_Axes):
         return sizes
 
     def ends(self, name: str) -> tuple[float, float]:
-        """The smallest and the largest value of a parameter."""
         source = self.devices.columns[name] if self.place(name) == "devices" else getattr(self, name).entries
         return min(source), max(source)
 
     def place(self, name: str) -> str:
-        """The key below which a parameter is given."""
         return "devices" if getattr(self, name) is None else name
 
     @property
@@ -135,7 +130,6 @@ class Axes(_Axes):
 
 
 def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
-    """What is wrong with a set of parameters."""
     if not keys:
         return
     physical = keys[0] in PHYSICAL
@@ -334,7 +328,6 @@ class SweepStudy(_Parts, _Swept):
 
     @property
     def families(self) -> dict[Family, tuple[str, ...]]:
-        """The outputs of walls and those of devices."""
         groups: dict[Family, tuple[str, ...]] = {
             family: tuple(name for name in self.outputs if OUTPUTS[name].family == family) for family in STATUS_OF
         }

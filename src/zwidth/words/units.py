@@ -30,12 +30,10 @@ class Dimension(NamedTuple):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Their names."""
         return (*self.powers, *self.factors)
 
     @property
     def base(self) -> str:
-        """The SI unit that a number without a unit is in."""
         return next(iter(self.powers))
 
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
@@ -75,7 +73,6 @@ PERIOD_WORDS = ("periods", "period")
 
 
 def find_dimension(unit: str) -> Dimension:
-    """The units beside an SI base unit."""
     return _OF_UNIT[unit]
 
 

@@ -97,7 +97,6 @@ class Controls:
 
     @property
     def wall(self) -> tuple[float, float]:
-        """K and B."""
         return float(self.scene.wall.stiffness), float(self.scene.wall.virtual_damping)
 
     def shown(self) -> dict[str, Any]:
@@ -189,7 +188,6 @@ def _find_form(part: Any) -> str:
 
 
 def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Controls:
-    """The controls of a normalized wall."""
     scene = Scene(Device(1.0, float(delta)), Timing(1.0, float(d)), VirtualWall(float(alpha), float(beta)))
     return Controls(scene, normalized=True)
 

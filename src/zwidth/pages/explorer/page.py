@@ -108,7 +108,6 @@ def _length(wish: Wish) -> float:
 
 
 def _wall_curves(wish: Wish, verdict: Assessment) -> Update:
-    """The Nyquist curve, its crossover, the step response, and the stiffest wall."""
     scene = wish.scene
     curve, cross = model.nyquist_curve(scene), model.crossover(scene, verdict)
     time, position = model.step_motion(scene, model.length_of(scene, verdict))
@@ -227,7 +226,6 @@ class Page:
         return plot
 
     def _paint(self) -> None:
-        """Colors for a light page or a dark one."""
         inks = _DARK if self.dark else _LIGHT
         for glyph, name, ink in self.inks:
             setattr(glyph, name, inks[ink])
@@ -337,7 +335,6 @@ class Page:
             self._hand_over(generation, {"error": _explain(error), "busy": False})
 
     def close(self) -> None:
-        """Want nothing more."""
         self.generation += 1
 
     def _hand_over(self, generation: int, update: Update) -> None:

@@ -87,7 +87,6 @@ class _Closed(RequestHandler):
     """What the browser is told of everything of ours."""
 
     def set_default_headers(self) -> None:
-        """Nothing from elsewhere, nothing for elsewhere."""
         self.set_header("Content-Security-Policy", _POLICY.format(host=self.application.host))  # pyright: ignore[reportAttributeAccessIssue]
         self.set_header("Referrer-Policy", "no-referrer")
         self.set_header("X-Content-Type-Options", "nosniff")
@@ -152,7 +151,6 @@ class Explorer:
         self._server = BaseServer(self.loop, application, http)
 
     def run(self) -> None:
-        """Serve until Ctrl-C or SIGTERM."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: self.loop.add_callback_from_signal(self.loop.stop))

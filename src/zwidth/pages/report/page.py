@@ -113,7 +113,6 @@ def _section(where: Path, entry: dict[str, Any]) -> str:
 
 
 def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
-    """Figures, slices and tables of a study."""
     for file in sorted(entry.get("files", {})):
         path = where / file
         if file.endswith(".svg"):
