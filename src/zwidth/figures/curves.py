@@ -78,15 +78,11 @@ def draw_curves(
 
 def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
     """The output whose contours are the boundaries of walls, and the parameter each of whose values has one."""
-    name = next((name for name in (*SMOOTH, "stable") if name in data and _has_walls(data, name)), None)
+    planes = {name: grid.choose_axes(data, name) for name in (*SMOOTH, "stable") if name in data}
+    name = next((name for name, axes in planes.items() if len(axes) == 2 and axes[1] in WALL), None)
     dims = [dim for dim in grid.list_varied(data, name) if dim not in WALL] if name else []
     first = next((dim for dim in ("delta", "damping", *reversed(dims)) if dim in dims), None)
     return (name, first) if name and first else None
-
-
-def _has_walls(data: xarray.Dataset, name: str) -> bool:
-    dims = grid.choose_axes(data, name)
-    return len(dims) == 2 and dims[1] in WALL
 
 
 @style.house_style()

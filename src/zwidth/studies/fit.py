@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -27,7 +27,7 @@ from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
 from zwidth.parts.velocity import BackwardDifference
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, plain, with_unit
 from zwidth.words.quantities import POSITIVE
@@ -245,7 +245,9 @@ class FitStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         """The fits as a table, their evidence as tables and a figure, and a configuration of each fitted device."""
         fits, units = self._fit(), self.units
-        evidence = _gather(fits, units)
+        gathered = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
+        below = {name: stack([tables[name] for tables in gathered]) for name in ("boundary", "walls")}
+        evidence = {**gathered[0], **below}
         documents = {f"{self.name}_{name}.csv": csv_text(table) for name, table in evidence.items()}
         for each in fits:
             middle = f"_{each.name}" if len(fits) > 1 else ""
@@ -294,12 +296,6 @@ class FitStudy(ComputedStudy):
 # Labels of what a device is, and of all that is told in answers.
 _DEVICE = ("m", "J", "b", "t_d", "friction")
 _LABELS = ("m", "J", "b", "t_d", "K_max", "set", "no wall", "fitted to")
-
-
-def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
-    found = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
-    below = {name: stack([tables[name] for tables in found]) for name in ("boundary", "walls")}
-    return {**found[0], **below}
 
 
 def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:

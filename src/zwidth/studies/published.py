@@ -62,27 +62,6 @@ class Sharpened:
 
 
 def published_numbers() -> list[Comparison]:
-    return [
-        *_compare_undamped(),
-        *_example(),
-        *_factors(),
-        Comparison(_LINE, "section V, remark 3", "2.3", line_appears()),
-    ]
-
-
-def _ridge(delta: float, d: float) -> tuple[float, float]:
-    point = alpha_max(delta, d)
-    return float(point.alpha), float(point.beta)
-
-
-def _compare_undamped() -> list[Comparison]:
-    """Remark 4: K_max T^2/m without physical damping."""
-    printed = ((0, "eq. (24)", "0.6863"), (1, "eq. (25)", "0.1445"))
-    return [Comparison(f"alpha_max(delta = 0, d = {d})", where, text, _ridge(0.0, d)[0]) for d, where, text in printed]
-
-
-def _example() -> list[Comparison]:
-    """Section VIII: the normalized damping, 75 % of the maximum stiffness and the damping at the maximum."""
     deltas = [float(normalize(mass=MASS, damping=damping, period=PERIOD).delta) for damping in DAMPINGS]
     ridge = [_ridge(delta, DELAY_FACTOR) for delta in deltas]
     columns = (
@@ -90,21 +69,26 @@ def _example() -> list[Comparison]:
         ("0.75 alpha_max", ("0.108", "0.149", "0.656"), [STIFFNESS_FRACTION * alpha for alpha, _ in ridge]),
         ("beta at alpha_max", ("0.425", "0.416", "0.388"), [beta for _, beta in ridge]),
     )
-    return [
-        Comparison(f"{name}, b = {damping:g} N s/m", "section VIII", text, computed)
-        for name, printed, found in columns
-        for damping, text, computed in zip(DAMPINGS, printed, found, strict=True)
-    ]
-
-
-def _factors() -> list[Comparison]:
-    """Section VIII: how much stiffer damping makes the wall, and how much stiffer it is than in practice."""
     undamped, damped = (STIFFNESS_FRACTION * _ridge(delta, DELAY_FACTOR)[0] for delta in (0.0, 1.0))
-    stiffness = undamped * MASS / PERIOD**2
+    over_practice = undamped * MASS / PERIOD**2 / MASSIE_SALISBURY
     return [
+        # Remark 4: K_max T^2/m without physical damping.
+        Comparison("alpha_max(delta = 0, d = 0)", "eq. (24)", "0.6863", _ridge(0.0, 0)[0]),
+        Comparison("alpha_max(delta = 0, d = 1)", "eq. (25)", "0.1445", _ridge(0.0, 1)[0]),
+        *(
+            Comparison(f"{name}, b = {damping:g} N s/m", "section VIII", text, computed)
+            for name, printed, found in columns
+            for damping, text, computed in zip(DAMPINGS, printed, found, strict=True)
+        ),
         Comparison("stiffness for b = 100 N s/m over that for b = 0", "section VIII", "6", damped / undamped),
-        Comparison("stiffness for b = 0 over 3.5 kN/m", "section VIII", "3", stiffness / MASSIE_SALISBURY),
+        Comparison("stiffness for b = 0 over 3.5 kN/m", "section VIII", "3", over_practice),
+        Comparison(_LINE, "section V, remark 3", "2.3", line_appears()),
     ]
+
+
+def _ridge(delta: float, d: float) -> tuple[float, float]:
+    point = alpha_max(delta, d)
+    return float(point.alpha), float(point.beta)
 
 
 def line_appears() -> float:
@@ -206,7 +190,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         "| quantity | where | printed | computed | agrees |",
         "|---|---|---|---|---|",
         *(
-            f"| {row.quantity} | {row.where} | {row.printed} | {_digits(row.computed)} "
+            f"| {row.quantity} | {row.where} | {row.printed} | {row.computed:{'#' if row.computed else ''}.10g} "
             f"| {'yes' if row.agrees else '**NO**'} |"
             for row in printed
         ),
@@ -222,11 +206,6 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         "",
     ]
     return "\n".join(lines)
-
-
-def _digits(value: float) -> str:
-    """Ten significant digits; zero as it is."""
-    return f"{value:.10g}" if value == 0 else f"{value:#.10g}"
 
 
 @register

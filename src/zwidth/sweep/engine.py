@@ -164,7 +164,9 @@ def _prepare_stores(
         if path.exists():
             stores[study.name] = store = Store(path)
             if shard is None:
-                remove_partials(path)
+                # Unfinished files of a run that was killed.
+                for left in path.rglob("*.partial"):
+                    left.unlink(missing_ok=True)
             repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard))]
         else:
             stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)
@@ -283,12 +285,6 @@ def repair(store: Store, tasks: Iterable[Task]) -> list[str]:
             store.forget(task)
             found.append(f"{store.plan.describe(task)}: {fault}")
     return found
-
-
-def remove_partials(path: Path) -> None:
-    """Remove the unfinished files of a run that was killed from a store."""
-    for left in path.rglob("*.partial"):
-        left.unlink(missing_ok=True)
 
 
 def remove(folder: Path, study: SweepStudy) -> None:

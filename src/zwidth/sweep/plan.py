@@ -167,7 +167,9 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
         families.append(FamilyPlan(family, outputs, grid.dims_of(family), shape, chunk_shape(shape, target)))
         seconds += size * slowness
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
-    disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
+    # Numbers hardly shrink, truth values are packed, a status is nearly always 0.
+    bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
+    disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
     model = "device with parts, held delay" if study.with_parts else _model(study.axes.most_periods)
     return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
@@ -260,11 +262,6 @@ def _bytes_per_point(outputs: tuple[str, ...]) -> int:
     hidden += 32 if MARGIN_OUTPUTS & set(outputs) else 0
     hidden += 8 if {"passive", "passivity_margin"} & set(outputs) else 0
     return 8 * floats + hidden + (16 if floats else 0) + len(outputs) + 4
-
-
-def _disk_bits(outputs: tuple[str, ...]) -> int:
-    """Bits for a point on the disk: numbers hardly shrink, truth values are packed, a status is nearly always 0."""
-    return 1 + sum({"float64": 64, "bool": 1, "uint8": 1}[OUTPUTS[name].dtype] for name in outputs)
 
 
 def _size(count: float) -> str:
