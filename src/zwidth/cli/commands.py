@@ -13,11 +13,12 @@ from typing import Any
 import click
 
 from zwidth import __version__
-from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
+from zwidth.cli.options import json_option, quantity_type, scene_options
 from zwidth.pages import words
 from zwidth.pages.words import row
 from zwidth.words.errors import InputError, ZwidthError, check_choice
 from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 
 _COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -39,8 +40,8 @@ def cli() -> None:
 
 @cli.command()
 @scene_options(wall=True, required=True)
-@friction_option
-@resolution_option
+@click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
+@click.option("--resolution", type=quantity_type("m", POSITIVE), help="One step Q of the position sensor, in m.")
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""

@@ -11,7 +11,7 @@ import click
 
 from zwidth.parts.span import Span
 from zwidth.words.formatting import short
-from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, OF_PARTS, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_PARTS, PARAMETERS, Range
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -238,12 +238,6 @@ def _make_velocity(options: dict[str, Any]) -> Any:
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-friction_option = click.option(
-    "--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N."
-)
-resolution_option = click.option(
-    "--resolution", type=quantity_type("m", Range(0.0, low_open=True)), help="One step Q of the position sensor, in m."
-)
 velocity_options = _take_options(
     "velocity", [path for path in _PARTS if path.startswith("velocity.")], (), _make_velocity
 )

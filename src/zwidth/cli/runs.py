@@ -20,7 +20,7 @@ from zwidth.pages.words import print_json
 from zwidth.words.formatting import plain
 
 if TYPE_CHECKING:
-    from zwidth.runs.result import RunResult, StudyEvent
+    from zwidth.runs.run import RunResult, StudyEvent
     from zwidth.sweep.engine import Progress
 
 _EXIT_FAILED = 1

@@ -15,9 +15,8 @@ from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
 from zwidth.config.values import Entry, in_one_unit, quantity_of, read_entries
-from zwidth.words.cells import read_rows, split_title
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, from_cell, resembling, suggestion
+from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.units import looks_like_number
 

@@ -42,7 +42,6 @@ _Model = TypeVar("_Model", bound=BaseModel)
 MAX_FILE_BYTES = 2**20
 MAX_NODES = 50_000
 MAX_DEPTH = 20
-MAX_ALIAS_NODES = 1000
 
 
 def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Model:
@@ -206,7 +205,7 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         self.keys: dict[FieldPath, tuple[int, int]] = {}
         self.scalars: dict[FieldPath, tuple[str, int, int]] = {}  # as written, with the ends in the text
         self.faults: list[Fault] = []
-        self._nodes = self._alias_nodes = 0
+        self._nodes = 0
         self._anchors: dict[str, list[yaml.Event]] = {}
         self._unfinished: dict[str, list[yaml.Event]] = {}
         try:
@@ -273,10 +272,7 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         self.values.setdefault(path, _mark_place(event.start_mark))
         if isinstance(event, yaml.AliasEvent):
             return self._read(path, iter(self._recall(event, path)), in_alias=True)
-        if in_alias:
-            self._count_alias_node(path)
-        else:
-            self._count_node(event, path, path)
+        self._count_node(event, path, path, in_alias)
         anchor = None if in_alias else event.anchor
         if anchor is not None:
             if anchor in self._anchors or anchor in self._unfinished:
@@ -309,9 +305,9 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
     def _invalid(self, event: yaml.Event, what: str, remedy: str) -> ConfigFileError:
         return _fail(self.file, _mark_place(event.start_mark), "not valid YAML", what, remedy)
 
-    def _count_node(self, event: Any, path: FieldPath, field: FieldPath) -> None:
+    def _count_node(self, event: Any, path: FieldPath, field: FieldPath, in_alias: bool) -> None:
         """Refuse one that is too many, and its tag; PyYAML itself has no limits."""
-        place = _mark_place(event.start_mark)
+        place = self.values[path] if in_alias else _mark_place(event.start_mark)
         self._nodes += 1
         if self._nodes > MAX_NODES:
             what, allowed = "too many values", f"at most {MAX_NODES} values a file"
@@ -319,15 +315,9 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         if len(path) >= MAX_DEPTH:
             what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
             raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
-        if event.tag is not None:
+        if event.tag is not None and not in_alias:
             # A fault of its own; the value is read as if it were not there.
             self._add_fault(place, field, f"got the tag {describe(event.tag)}", "tags are not used", "remove the tag")
-
-    def _count_alias_node(self, path: FieldPath) -> None:
-        self._alias_nodes += 1
-        if self._alias_nodes > MAX_ALIAS_NODES or len(path) > MAX_DEPTH:
-            what, allowed = "too many values by alias", f"aliases may stand for at most {MAX_ALIAS_NODES} values"
-            raise _fail(self.file, self.values[path], what, allowed, "write them out", path=path)
 
     def _add_fault(self, place: tuple[int, int], path: FieldPath, *parts: str) -> None:
         self.faults.append(Fault(self.file, *place, dotted(path), *parts))
@@ -340,7 +330,7 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
             place, key = _mark_place(event.start_mark), None
             if isinstance(event, yaml.ScalarEvent):
                 if not in_alias:
-                    self._count_node(event, path, (*path, event.value))
+                    self._count_node(event, path, (*path, event.value), in_alias)
                     self._anchors |= {event.anchor: [event]} if event.anchor else {}
                 key = self._read_scalar(event)
                 what = f"got the key {describe(key)}"

@@ -171,16 +171,9 @@ def name_heights(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: 
     spec = ax.get_subplotspec()
     rows = spec.get_gridspec().nrows if spec else 1
     places = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
+    look: dict[str, Any] = {"xycoords": "axes fraction", "fontsize": 8, "va": "center", "annotation_clip": False}
     for name, place, color in zip(names, places, colors, strict=True):
-        ax.annotate(
-            name,
-            (1.015, place),
-            xycoords="axes fraction",
-            color=color,
-            fontsize=8,
-            va="center",
-            annotation_clip=False,
-        )
+        ax.annotate(name, (1.015, place), color=color, **look)
 
 
 def line(label: str, dash: Any = SOLID, width: float | None = None, color: str = GRAY, **keywords: Any) -> Line2D:

@@ -122,7 +122,6 @@ class BoundaryStudy(CurvesStudy):
         return super().points * (_POINTS_PER_CURVE if self.plane == "alpha_beta" else 1)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """One boundary for every delta, d and delay model, or that of a device with parts, as a table and a figure."""
         if self.device is not None and self.device.parts_beyond:
             return outline_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
@@ -212,7 +211,6 @@ class CompareStudy(ComputedStudy):
         return super().points * _POINTS_PER_OUTLINE
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The outlines of every device, and a table of the stiffest walls."""
         rows, outlines, walls = [], [], []
         for device in self.devices:
             label, loop = device.label, device.to_scene()

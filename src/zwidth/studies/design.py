@@ -159,7 +159,6 @@ class DesignStudy(ComputedStudy):
         return self.stiffness.size * (_TRIALS + self.draws) + self.num
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The value that each stiffness needs, K_max over the parameter, and a figure of both."""
         nominal = self.device.to_scene()
         rows, notes, ranges = [], [], []
         for stiffness in self.stiffness.values().tolist():
@@ -305,7 +304,6 @@ class FiltersStudy(ComputedStudy):
             yield named, WindowedDifference(int(samples))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The stiffest wall behind every filter, as a table and figures."""
         rows = []
         bare = self.device.to_scene()
         for damping in self.dampings.tolist():

@@ -243,7 +243,6 @@ class FitStudy(ComputedStudy):
         return sum(motion.position.size for motion in self._motions) + len(self.buzz or ())
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The fits as a table, their evidence as tables and a figure, and a configuration of each fitted device."""
         fits, units = self._fit(), self.units
         gathered = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
         below = {name: stack([tables[name] for tables in gathered]) for name in ("boundary", "walls")}

@@ -152,7 +152,6 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         return {"conditions": len(self.conditions)} | {name: axis.size for name, axis in self.axes.varied.items()}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """What becomes of every wall, as arrays with a first axis of conditions, and how much of them stays silent."""
         axes, varied = self.axes.lay_out(), self.axes.varied
         labels = [each.label for each in self.conditions]
         found: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}

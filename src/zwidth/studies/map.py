@@ -64,7 +64,6 @@ class MapStudy(ComputedStudy):
         return self.points * (1 + sum(np.dtype(_TYPES[name]).itemsize for name in self.outputs))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The outputs on the grid, as arrays, and a figure of each."""
         alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
         share = share_of_device(self.delta, self.d, scene)
         outputs = {name: np.empty(tuple(self.sizes.values()), dtype=_TYPES[name]) for name in self.outputs}

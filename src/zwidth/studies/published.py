@@ -222,7 +222,6 @@ class PublishedStudy(ComputedStudy):
         return {"numbers of the paper": 22}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Compare every printed number with the computed one, as text and as JSON."""
         printed, sharpened = published_numbers(), sharpened_numbers()
         return Outcome(
             documents={

@@ -69,7 +69,6 @@ class RecommendStudy(ResponseStudy):
         return ((self.device, None),)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Recommend a wall, judge it, and write both down as text and JSON, with a table and a figure."""
         stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
         bare, share = self.device.to_scene(), self.stiffness_fraction
         top, verdict, notes = bare.max_stiffness(), None, describe_islands(bare)

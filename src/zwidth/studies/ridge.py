@@ -48,7 +48,6 @@ class RidgeStudy(CurvesStudy):
     """Show the small deltas in a panel of their own, as fig. 10 of the paper does."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The maximum stiffness over delta, as a table and a figure."""
         parts, notes = [], []
         for model, delays in needed_models(self.delay_models, self.d.values()):
             part, remarks = ridge_table(self.delta.values(), delays, model)
@@ -107,7 +106,6 @@ class PassivityStudy(CurvesStudy):
     """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The stiffest passive and the stiffest stable wall over delta, as a table and a figure."""
         ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
         table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
         slopes = [passive_stiffness_slope(d) for d in self.d.values().tolist()]

@@ -189,7 +189,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         return [(name_wall(*wall), *wall) for wall in walls]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The motions, as tables and figures, and in words how each ends."""
         placed = self.place(self.device.to_scene())
         walls = self.list_walls(placed)
         stiffness, damping = np.array([wall[1:] for wall in walls]).T

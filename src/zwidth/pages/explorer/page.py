@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from threading import Lock
@@ -138,23 +138,20 @@ class Page:
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))
         self.inks: list[tuple[Any, str, str]] = []
         self.frame: tuple[model.Range, model.Range] | None = None
-        self.plots = {name: draw() for name, draw in self._drawings().items()}
+        self.plots = {
+            "plane": self._draw_plane(),
+            "poles": self._draw_poles(),
+            "nyquist": self._draw_nyquist(),
+            "step": self._draw_motion("step", "y"),
+            "contact": self._draw_motion("contact", "position"),
+            "force": self._draw_motion("contact", "force"),
+        }
         self.plots["plane"].tags = [self.inputs, self.answer]
         self.plots["plane"].on_event(Tap, self._tap)
         for name, plot in self.plots.items():
             plot.name = name
             document.add_root(plot)
         self._paint()
-
-    def _drawings(self) -> dict[str, Callable[[], figure]]:
-        return {
-            "plane": self._draw_plane,
-            "poles": self._draw_poles,
-            "nyquist": self._draw_nyquist,
-            "step": lambda: self._draw_motion("step", "y", "position over force"),
-            "contact": lambda: self._draw_motion("contact", "position", "position"),
-            "force": lambda: self._draw_motion("contact", "force", "wall force"),
-        }
 
     def _new(self, height: int, **keywords: Any) -> figure:
         tools = "pan,wheel_zoom,box_zoom,reset"
@@ -219,10 +216,9 @@ class Page:
         plot.xaxis.axis_label, plot.yaxis.axis_label = "Re L", "Im L"
         return plot
 
-    def _draw_motion(self, source: str, column: str, label: str) -> figure:
+    def _draw_motion(self, source: str, column: str) -> figure:
         plot = self._new(220)
         self._add(plot, "line", source, "edge", x="x", y=column, line_width=2)
-        plot.xaxis.axis_label, plot.yaxis.axis_label = "time", label
         return plot
 
     def _paint(self) -> None:
