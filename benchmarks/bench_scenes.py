@@ -23,7 +23,7 @@ import numpy as np
 
 import zwidth
 from methods.clock import time_calls
-from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
 
 MAP, SAMPLE, SCATTERED = 2000, 20_000, 100_000

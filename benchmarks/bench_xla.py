@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure what each trick of `arrays.xla` gains: the same work with it and without, in turns, in one process.
+"""Measure what each trick of `arrays.xp` gains: the same work with it and without, in turns, in one process.
 
     python benchmarks/bench_xla.py [--points 65536] [--runs 15] [--only TEXT]
 
@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from methods.clock import time_calls
-from zwidth.arrays import evaluate, xla
+from zwidth.arrays import evaluate, xp
 from zwidth.loops.rigid import (
     certified_filter,
     circle,
@@ -32,7 +32,7 @@ from zwidth.loops.rigid import (
 from zwidth.loops.rigid import (
     pole_search as radius,
 )
-from zwidth.loops.rigid.delay_classes import ANY
+from zwidth.loops.rigid.device import ANY
 
 Make = Callable[[], Callable[..., Any]]
 
@@ -116,10 +116,10 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
         return ridge.ridge_kernel(a, b, "held", ANY)
 
     strips = evaluate._compile_strips.__wrapped__
-    wide = xla.WIDE
+    wide = xp.WIDE
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
-    yield "STRIP, verdict", lambda: strips(stable, (), xla.STRIP), compiled(stable, wide), columns
+    yield "STRIP, verdict", lambda: strips(stable, (), xp.STRIP), compiled(stable, wide), columns
     few = (delta[:8192], d[:8192])
     yield (
         "store_once, ridge kkt",
@@ -128,7 +128,7 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
         few,
     )
     yield "store_once, ridge", compiled(top), compiled(top, newton__store_once=same), (delta, d)
-    yield "angle, alone", compiled(xla.angle), compiled(their_angle), (alpha - 1.0, beta)
+    yield "angle, alone", compiled(xp.angle), compiled(their_angle), (alpha - 1.0, beta)
     other = {"circle__angle": their_angle, "circle__find_turn": their_turn, "radius__angle": their_angle}
     yield "angle and find_turn, radius", compiled(quick, wide), compiled(quick, wide, **other), columns
     by_rule, alone = slopes()

@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 
 from methods.problems import Walls
-from zwidth.loops.rigid.boundary import boundary
+from zwidth.loops.rigid.boundary import boundary, sample_lobe
 from zwidth.loops.rigid.certified import certified_stable
-from zwidth.loops.rigid.region import lobe
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.loops.rigid.verdict import StabilityMethod, is_stable
 from zwidth.words.status import Status
@@ -57,7 +56,7 @@ def _group(name: str, parts: list[tuple[np.ndarray, ...]], d: float) -> Group:
 
 
 def _near(delta: float, d: float, rng: np.random.Generator) -> tuple[np.ndarray, ...]:
-    end = float(lobe(delta, d, points=16)[0][-1])
+    end = float(sample_lobe(delta, d, points=16)[0][-1])
     distance = np.repeat(DISTANCES, 4)
     curve = boundary(rng.uniform(0.02, 0.98, distance.size) * end, delta, d)
     alpha = np.asarray(curve.alpha) * (1.0 + distance * np.tile([1.0, -1.0], distance.size // 2))

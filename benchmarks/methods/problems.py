@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.rigid import certified_balls
-from zwidth.loops.rigid.boundary import boundary
+from zwidth.loops.rigid import certified
+from zwidth.loops.rigid.boundary import boundary, sample_lobe
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.outermost_poles import outermost_poles
-from zwidth.loops.rigid.region import lobe
 from zwidth.loops.rigid.ridge import alpha_max
 from zwidth.words.status import Status
 
@@ -58,7 +57,7 @@ class Labelled(NamedTuple):
 def grid(d: float, points: int) -> Walls:
     """A map of about ``points`` walls that covers the stable region of one device and some of what is beyond."""
     side = max(2, round(points**0.5))
-    _, _, beta = lobe(MAP_DELTA, d)
+    _, _, beta = sample_lobe(MAP_DELTA, d)
     ridge = float(alpha_max(MAP_DELTA, d).alpha)
     low, high = float(np.min(beta)), float(np.max(beta))
     margin = 0.05 * (high - low)
@@ -95,7 +94,7 @@ def near_boundary(d: float, points: int) -> Labelled:
     each = max(1, points // len(ERROR_DELTAS))
     alphas, betas, deltas, distances = [], [], [], []
     for delta in ERROR_DELTAS:
-        omega_max = float(lobe(delta, d, points=16)[0][-1])
+        omega_max = float(sample_lobe(delta, d, points=16)[0][-1])
         omega = generator.uniform(0.02, 0.995, each) * omega_max
         curve = boundary(omega, delta, d)
         offset = 10.0 ** generator.uniform(-15.0, -3.0, each) * generator.choice([-1.0, 1.0], each)
@@ -129,7 +128,7 @@ def ball_polynomial(alpha: float, beta: float, delta: float, d: float, bits: int
     import flint
 
     with flint.ctx.workprec(bits):
-        here = certified_balls.device(delta, d, bits)
+        here = certified.device(delta, d, bits)
         n = [a for a in (here.a0, here.a1, here.a2) if a is not None]
         stiffness, damping = flint.arb(alpha), flint.arb(beta)
         s = stiffness + damping

@@ -14,7 +14,7 @@ from methods import problems
 from methods.baselines import available
 from methods.clock import time_calls
 from methods.problems import Walls
-from zwidth.loops.rigid import certified_balls
+from zwidth.loops.rigid import certified
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.passivity import is_passive, passivity_margin
 from zwidth.loops.rigid.poles import poles
@@ -250,4 +250,4 @@ def _growing_maps(sizes: Sizes) -> Iterator[Row]:
 
 def can_measure() -> bool:
     """Whether what errors are measured against is installed."""
-    return certified_balls.available() and find_spec("mpmath") is not None
+    return certified.available() and find_spec("mpmath") is not None

@@ -188,7 +188,6 @@ OTHERS = {
     "simulate": "whole motions: tests/unit/simulation/test_against_integrator.py",
     "simulate_tolerances": "one scene: tests/unit/scenes/test_tolerances.py",
     "stable_region": "one device: tests/unit/loops/rigid/test_region.py",
-    "stability_of": "the former name of `decide_stability`",
     "step_response": "one wall: tests/unit/loops/rigid/test_response.py",
     "to_control": "one scene: tests/unit/scenes/test_answers.py",
     "use_compilation_cache": "a setting: tests/unit/arrays/test_kernel_cache.py",

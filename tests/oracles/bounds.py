@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import broadcast
-from zwidth.loops.domain import wall_status
-from zwidth.loops.rigid.degrees import NAMES
+from zwidth.arrays.evaluate import broadcast
+from zwidth.loops.rigid.device import wall_status
+from zwidth.loops.rigid.folding import NAMES
 from zwidth.loops.rigid.outermost_poles import prove_radii
 from zwidth.words.status import Status
 

@@ -13,10 +13,10 @@ from jaxtyping import AbstractArray, jaxtyped
 
 import zwidth
 from zwidth.loops.rigid.aberth import aberth_kernel, discs, product_form
-from zwidth.loops.rigid.degrees import find_degree
+from zwidth.loops.rigid.boundary import sample_lobe
+from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.poles import companion, pole_kernel, radius_kernel, unstable_poles
 from zwidth.loops.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
-from zwidth.loops.rigid.region import lobe
 from zwidth.loops.rigid.response import step_response
 from zwidth.words import types as _types
 from zwidth.words.types import Reals, Roots
@@ -42,7 +42,7 @@ CALLS = [
         {"zeros": np.ones((3, 1)), "poles": np.ones((2, 1, 2)), "gain": np.float64(0.1), "lag": np.array([1, 2, 3])},
     ),
     (zwidth.stable_region, {"delta": 0.1, "d": 1.0, "points": 20}),
-    (lobe, {"delta": 0.1, "d": 1.0, "points": 20}),
+    (sample_lobe, {"delta": 0.1, "d": 1.0, "points": 20}),
     (step_response, {"alpha": 0.1, "beta": 0.2, "delta": 0.1, "d": 1.0, "periods": 20}),
     (affine, {**DEVICE, "degree": HALF}),
     (coefficients, KERNEL),

@@ -35,15 +35,21 @@ import zwidth
 from zwidth.cli import cli
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.simulation.result import MotionKind
-from zwidth.words.status import Status
+from zwidth.words.status import RidgeKind, Status
 
 SEED = 20
 # Relative distance from the edge within which two roads may round to different sides.
 BAND = 1e-8
 # K_max by different roads: polished by Newton's method on one hand, the highest point of an edge on the other.
 SAME = 1e-9
+# Within which share of K_max a row that leads up to it ends, and how far below the tip of a wedge is asked.
+WEDGE = 1e-4
 # Derivatives: implicit ones by JAX beside those of the host.
 SAME_SLOPE = 1e-6
+# How far off eigenvalues of a matrix may be: walls too soft for it are left to the other roads.
+ROUGH = 1e-13
+# Where two poles are almost one.
+ROUGH_DOUBLE = 2e-8
 # Numbers that two roads pass on alike.
 ALIKE = 1e-12
 # Slower motions tell no growth within so many periods.
@@ -135,16 +141,22 @@ def verdicts(wall: Wall) -> dict[str, bool | None]:
         "is_stable of arrays": bool(scene.is_stable([K, 2 * K, K], [B, B, 0.0])[0]),
         **{f"decide_stability, {name}": _known(told) for name, told in decided.items()},
         "spectral_radius": None if np.isnan(radius) else radius < 1,
-        "poles": bool(poles.max() < 1),
+        "poles": _inside(poles, ROUGH_DOUBLE if scene.is_rigid else ROUGH),
         "pole_table": bool(np.abs(table.z).max() < 1),
         "stable_stiffness": bool(np.any((rows[:, 0] < K) & (rows[:, 1] > K))),
-        "state_space": bool(np.abs(np.linalg.eigvals(scene.state_space(K, B).A)).max() < 1),
-        "to_control": bool(np.abs(control.poles(zwidth.to_control(scene, K, B))).max() < 1),
+        "state_space": _inside(np.linalg.eigvals(scene.state_space(K, B).A)),
+        "to_control": _inside(control.poles(zwidth.to_control(scene, K, B))),
     }
     if scene.is_rigid:
         alpha, beta = (float(part) for part in scene.normalize_walls(K, B))
         said["zwidth.is_stable"] = bool(zwidth.is_stable(alpha, beta, scene.delta, scene.d))
     return said
+
+
+def _inside(eigenvalues: np.ndarray, rough: float = ROUGH) -> bool | None:
+    """Whether all lie in the unit circle; None where the rounding of eigenvalues decides."""
+    beyond = float(np.abs(eigenvalues).max()) - 1
+    return None if abs(beyond) < rough else beyond < 0
 
 
 def _known(told: Any) -> bool | None:
@@ -178,13 +190,19 @@ def highest_questions(wall: Wall) -> Iterator[Question]:
         tops["alpha_max"] = zwidth.alpha_max(scene.delta, scene.d).alpha * scene.units.stiffness
     yield Question("K_max", tops, SAME)
     if top.status == Status.OK:
-        ends = scene.stable_stiffness(top.virtual_damping).reshape(-1, 2)
-        # A corner may be the tip of a wedge, with nothing stable on its row.
-        if len(ends) == 1 and ends[0, 0] == 0:
-            answers = {"max_stiffness": top.stiffness, "stable_stiffness": ends[0, 1]}
-            yield Question("K_max ends its row", answers, SAME)
+        ends = scene.stable_stiffness(top.virtual_damping).reshape(-1, 2)[:, 1]
+        reached = ends[np.abs(ends / top.stiffness - 1) <= WEDGE]
+        if reached.size:
+            yield Question("K_max ends its row", {"max_stiffness": top.stiffness, "stable_stiffness": reached[0]}, SAME)
             below = bool(scene.is_stable(top.stiffness * (1 - 1e-7), top.virtual_damping))
             yield Question("stable below K_max", {"max_stiffness": True, "is_stable": below})
+        else:
+            # A corner may be the tip of a wedge that leans: its own row misses it, the columns below do not.
+            edges = scene.stable_damping(top.stiffness * (1 - WEDGE))
+            near = edges.size and np.abs(edges / top.virtual_damping - 1).min() <= math.sqrt(WEDGE)
+            yield Question(
+                "K_max is a tip", {"max_stiffness": top.kind == RidgeKind.CORNER, "stable_damping": bool(near)}
+            )
 
 
 def assessed_questions(wall: Wall) -> Iterator[Question]:

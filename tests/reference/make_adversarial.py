@@ -235,8 +235,8 @@ def labelled(count: int, seed: int) -> dict[str, np.ndarray]:
 
 def check(points: dict[str, np.ndarray]) -> int:
     """Hold the certified method to the labels; how many it gets wrong or leaves undecided."""
-    from zwidth.loops.domain import wall_status
     from zwidth.loops.rigid.certified import certified_stable
+    from zwidth.loops.rigid.device import wall_status
     from zwidth.words.status import Status
 
     start = time.perf_counter()

@@ -8,31 +8,150 @@ kernel is called and the ambient precision holds.
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+import sys
+import threading
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import cache
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.arguments import (
-    are_numbers,
-    broadcast,
-    broadcast_traced,
-    check_scalars,
-    compute_concretely,
-    to_caller,
-    tree_map,
-)
-from zwidth.arrays.xla import STRIP, WIDE
-from zwidth.arrays.xp import is_traced
+from zwidth.arrays.xp import STRIP, WIDE, is_jax, is_traced, tree_map
+from zwidth.words.errors import InputError, PrecisionWarning
+from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
+
+# The types whose conversion needs no check; bool and 0-d arrays take the long way.
+_PLAIN = frozenset({float, int, np.float64})
+_NUMBERS = (int, float, np.floating, np.integer)
+
+
+@contextmanager
+def compute_concretely() -> Iterator[None]:
+    """Compute in float64 and at once, though the caller may be inside a JAX transformation that traces other values.
+
+    The settings belong to the thread and end with the block.
+    """
+    import jax
+
+    with jax.enable_x64(True), jax.ensure_compile_time_eval():
+        yield
+
+
+def are_numbers(*values: ArrayLike) -> bool:
+    """Whether all values are plain numbers, whose conversion needs no check."""
+    return _PLAIN.issuperset(map(type, values))
+
+
+def check_scalars(arguments: Mapping[str, ArrayLike]) -> None:
+    """Raise `InputError` for a plain number beyond the range of its name; NaN, negatives and arrays get a status."""
+    for name, value in arguments.items():
+        if name not in SIZES or not isinstance(value, _NUMBERS):
+            continue
+        # What is infinite gets a status, as what is negative.
+        least, most = SIZES[name]
+        size = abs(value) if least else value
+        if 0 < size < least or most < size < math.inf:
+            allowed = f"0 or {least:g} to {most:g} in magnitude" if least else f"0 to {most:g}"
+            raise InputError(f"{name}: got {value!r}; it must be {allowed}")
+
+
+def refuse_masked(name: str, value: ArrayLike) -> None:
+    """Raise `InputError` for a masked array; the module that defines them is loaded by those who make some."""
+    masked = sys.modules.get("numpy.ma")
+    if masked is not None and isinstance(value, masked.MaskedArray):
+        raise InputError(f"{name}: got a masked array, whose mask would be lost; fill it, with NaN say, first")
+
+
+def as_float64(name: str, value: ArrayLike) -> np.ndarray:
+    """Convert one concrete argument to float64, or say what is wrong with it."""
+    refuse_masked(name, value)
+    if is_traced(value):
+        raise InputError(f"{name}: got a value that JAX traces; give numbers, outside of jit, vmap and grad")
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind in "OSUcVmM":
+            raise TypeError(array.dtype)
+        return array.astype(np.float64, copy=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(
+            f"{name}: got {value!r}, a real number or a rectangular array of real numbers is needed"
+        ) from error
+
+
+def broadcast(arguments: Mapping[str, ArrayLike]) -> list[np.ndarray]:
+    """Convert concrete arguments to float64 arrays of one common shape."""
+    arrays = {name: as_float64(name, value) for name, value in arguments.items()}
+    join_shapes((name, array.shape) for name, array in arrays.items())
+    return list(np.broadcast_arrays(*arrays.values()))
+
+
+def join_shapes(named: Iterable[tuple[str, tuple[int, ...]]], what: str = "shapes") -> tuple[int, ...]:
+    """The shape that arguments of these shapes broadcast to; an `InputError` with all of them where they do not."""
+    named = list(named)
+    try:
+        return np.broadcast_shapes(*(shape for _, shape in named))
+    except ValueError:
+        shapes = ", ".join(f"{name} {shape}" for name, shape in named)
+        raise InputError(f"{what} do not broadcast: {shapes}; make each axis equal or 1") from None
+
+
+def to_caller(result: Any, values: Iterable[ArrayLike]) -> Any:
+    """Hand NumPy results to a caller who passed NumPy or plain numbers, JAX arrays to one who passed any."""
+    if any(map(is_jax, values)):
+        import jax.numpy as jnp
+
+        # Without this a caller with JAX's default precision would lose half of the digits on the way out.
+        with compute_concretely():
+            return tree_map(jnp.asarray, result)
+    return tree_map(lambda leaf: np.asarray(leaf)[()], result)
+
+
+def broadcast_traced(values: Iterable[ArrayLike]) -> list[Any]:
+    """The arguments inside a transformation: one shape, the ambient precision."""
+    import jax.numpy as jnp
+
+    dtype = jnp.result_type(float)
+    if dtype == np.float32:
+        _warn_of_float32()
+    return jnp.broadcast_arrays(*(jnp.asarray(value, dtype) for value in values))
+
+
+_warned = threading.Event()
+
+
+def _warn_of_float32() -> None:
+    """Say once a process that half of the digits are missing: an optimizer would stop there and not tell."""
+    if not _warned.is_set():
+        _warned.set()
+        warnings.warn(
+            "computing in float32 inside a JAX transformation; call jax.config.update('jax_enable_x64', True) first "
+            "for float64",
+            PrecisionWarning,
+            stacklevel=_stack_level(),
+        )
+
+
+def _stack_level() -> int:
+    """How far up the first caller outside of zwidth and JAX is: the warning then names a line of the user's."""
+    frame, level = sys._getframe(1), 1
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("zwidth", "jax"):
+        frame, level = frame.f_back, level + 1
+    return level
+
 
 # "auto": NumPy for few points; "numpy": for all of them; "jax": compiled, however few they are, so that a point's value
 # does not depend on how many others came with it (the two routes may differ in the last place), or for lack of a text
 # for NumPy.
 Route: TypeAlias = Literal["auto", "numpy", "jax"]
+
+# The values of a kernel at concrete points, and for each argument how every result moves with it.
+Slopes: TypeAlias = Callable[..., tuple[Any, Sequence[Any]]]
 
 # Up to so many points NumPy is done before a compiler has begun.
 FEW = 1 << 12
@@ -48,11 +167,13 @@ def evaluate(
     *static: Any,
     weight: int = 1,
     route: Route = "auto",
+    slopes: Slopes | None = None,
 ) -> Any:
     """Apply ``kernel(*arrays, *static)`` to arguments that broadcast, and give results of their shape and type.
 
     Plain numbers beyond the range of their name are refused. ``weight`` says how many plain points one point counts
-    for, in time and memory: a kernel that makes samples of each point weighs more.
+    for, in time and memory: a kernel that makes samples of each point weighs more. ``slopes`` spares a gradient of few
+    points the compiler.
     """
     values = tuple(arguments.values())
     check_scalars(arguments)
@@ -63,9 +184,10 @@ def evaluate(
             pass  # An integer beyond float64: the long way names it.
         else:
             with np.errstate(all="ignore"):
-                return tree_map(_plain, kernel(*numbers, *static))
+                found = kernel(*numbers, *static)
+            return found if isinstance(found, np.generic) else tree_map(_plain, found)
     if is_traced(*values):
-        return compile_traced(kernel, static)(*broadcast_traced(values))
+        return compile_traced(kernel, static, slopes)(*broadcast_traced(values))
     arrays = broadcast(arguments)
     shape = arrays[0].shape
     flat = evaluate_columns(kernel, [array.reshape(-1) for array in arrays], *static, weight=weight, route=route)
@@ -96,12 +218,15 @@ def _plain(leaf: Any) -> Any:
 
 
 @cache
-def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+def compile_traced(
+    kernel: Callable[..., Any], static: tuple[Any, ...], slopes: Slopes | None = None
+) -> Callable[..., Any]:
     """A kernel compiled for traced values, with its derivatives as one product for each argument.
 
     A point depends on itself alone, so that all there is to differentiate is a few numbers a point. Left to itself,
     `jax.grad` outside `jit` would compile a program that hands out every intermediate result: for the ridge
-    1.2 to 1.5 times as long (benchmarks/bench_xla.py).
+    1.2 to 1.5 times as long (benchmarks/bench_xla.py). There the values are concrete: where ``slopes`` are known for
+    them, nothing is compiled.
     """
     import jax
 
@@ -121,7 +246,9 @@ def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Calla
         if len(moving) == 1:
             value, slopes = jax.jvp(of_moving, points, (ones,))
             return value, tree_map(lambda leaf: leaf[None], slopes)
-        sides = tuple(side.reshape(-1, *(1,) * ones.ndim) * ones for side in np.eye(len(moving), dtype=ones.dtype))
+        sides = tuple(
+            side.reshape(-1, *(1,) * ones.ndim) * ones[None] for side in np.eye(len(moving), dtype=ones.dtype)
+        )
         # The values are computed once for all sides.
         return jax.vmap(lambda *side: jax.jvp(of_moving, points, side), out_axes=(None, 0))(*sides)
 
@@ -132,18 +259,30 @@ def compile_traced(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Calla
         active = tuple(not isinstance(tangent, jax.custom_derivatives.SymbolicZero) for tangent in tangents)
         if not any(active):
             return function(*primals), tree_map(_no_change, function(*primals))
-        value, slopes = sloped(active, *primals)
+        if slopes is None or is_traced(*primals) or primals[0].size > FEW:
+            value, sides = sloped(active, *primals)
+        else:
+            with np.errstate(all="ignore"):
+                value, sides = slopes(*(np.asarray(primal, np.float64) for primal in primals), *static)
+            value = tree_map(lambda leaf: jax.numpy.asarray(leaf, _type_of(leaf, primals[0])), value)
+            sides = tree_map(lambda *leaves: leaves, *(by for by, moves in zip(sides, active, strict=True) if moves))
         moving = [tangent for tangent, moves in zip(tangents, active, strict=True) if moves]
 
         def change(leaf: Any, by: Any) -> Any:
             if not jax.numpy.issubdtype(leaf.dtype, np.inexact):
                 return _no_change(leaf)
-            return sum((by[k] * tangent for k, tangent in enumerate(moving[1:], 1)), by[0] * moving[0])
+            parts = [jax.numpy.asarray(by[k], leaf.dtype) * tangent for k, tangent in enumerate(moving)]
+            return sum(parts[1:], parts[0])
 
-        return value, tree_map(change, value, slopes)
+        return value, tree_map(change, value, sides)
 
     function.defjvp(rule, symbolic_zeros=True)
     return function
+
+
+def _type_of(leaf: Any, argument: Any) -> Any:
+    """The type of a result: real numbers are as precise as the argument."""
+    return argument.dtype if np.issubdtype(leaf.dtype, np.inexact) else leaf.dtype
 
 
 def _no_change(leaf: Any) -> Any:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.words.formatting import short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_PARTS, PARAMETERS, Range
 
@@ -93,7 +93,7 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
     """A number in its SI unit, or a number with a unit; a length of time that may be in periods becomes a `Span`."""
 
     def read(text: str) -> Any:
-        from zwidth.parts.span import read_span
+        from zwidth.parts.checks import read_span
         from zwidth.words.units import find_dimension, read_quantity
 
         number = number_or_text(text)

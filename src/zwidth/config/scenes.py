@@ -9,6 +9,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias
 import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, WrapValidator
 
+from zwidth.arrays.xp import within
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import Strict
 from zwidth.config.parts import (
@@ -20,17 +21,16 @@ from zwidth.config.parts import (
     make_parts_base,
 )
 from zwidth.config.values import Delay, NonNegative, Number, describe_entry, quantity_of
-from zwidth.loops.domain import LARGEST_DAMPING, WALL_RANGE, within
 from zwidth.loops.normalization import normalize
+from zwidth.parts.checks import Span
 from zwidth.parts.device import Device
-from zwidth.parts.span import Span
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import FOAW
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, short
-from zwidth.words.quantities import MAX_DELAY_PERIODS
+from zwidth.words.quantities import LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
 from zwidth.words.types import DelayModel
 
 _PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES})

@@ -18,7 +18,7 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
 from zwidth.config.faults import LocatedProblem, problem, problems_of, raise_problems, validation_error
 from zwidth.config.fields import Strict, repeated
-from zwidth.parts.span import Span, read_span
+from zwidth.parts.checks import Span, read_span
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
 from zwidth.words.units import PERIOD_WORDS, check_range, find_dimension, looks_like_number, read_quantity, to_float

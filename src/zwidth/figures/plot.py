@@ -21,14 +21,14 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle
 
-from zwidth.arrays.arguments import as_float64
+from zwidth.arrays.evaluate import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import scale_axis
 from zwidth.figures.motion import draw_motion, draw_step
 from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.passive import passive_edge
+from zwidth.scenes.limits import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError

@@ -19,8 +19,8 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
 from zwidth.fitting.scenes import with_cutoff
-from zwidth.loops.rigid.plant import held_plant, split_delay
-from zwidth.loops.rigid.ridge_slopes import plant_slopes
+from zwidth.loops.rigid.device import held_plant, split_delay
+from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.estimate import Estimate
 from zwidth.parts.velocity import Velocity
 

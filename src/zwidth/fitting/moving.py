@@ -19,8 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.phi import PhiFunctions, phi_functions
-from zwidth.loops.rigid.plant import split_delay
+from zwidth.loops.rigid.device import PhiFunctions, phi_functions, split_delay
 
 
 class Pieces(NamedTuple):

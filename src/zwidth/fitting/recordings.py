@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64
+from zwidth.arrays.evaluate import as_float64
 from zwidth.fitting.moving import Recording
 from zwidth.parts.checks import check_number
 from zwidth.words.errors import InputError

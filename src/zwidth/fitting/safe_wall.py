@@ -18,10 +18,10 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
 from zwidth.fitting.scenes import scene_of
-from zwidth.loops.domain import device_status
-from zwidth.loops.linear.polynomial import affine_polynomial
+from zwidth.loops.linear.roots import affine_polynomial
+from zwidth.loops.loop import RigidVariants
+from zwidth.loops.rigid.device import device_status
 from zwidth.loops.rigid.poles import companion
-from zwidth.loops.variants import RigidVariants
 from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.scenes.scene import Scene

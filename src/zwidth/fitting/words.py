@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
-from zwidth.parts.spelling import spell_estimate
+from zwidth.parts.paths import spell_estimate
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import Status

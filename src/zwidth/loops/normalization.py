@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import join_shapes, refuse_masked
-from zwidth.arrays.xp import is_jax, is_traced, namespace
-from zwidth.loops.domain import nan_unless, within
-from zwidth.parts.span import accept_units, in_periods
+from zwidth.arrays.evaluate import join_shapes, refuse_masked
+from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_unless, within
+from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES
 from zwidth.words.status import Status

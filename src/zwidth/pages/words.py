@@ -15,8 +15,7 @@ from zwidth.words.quantities import PARAMETERS
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment, Intervals
-    from zwidth.scenes.limits import Limit
-    from zwidth.scenes.passive import FrictionRule
+    from zwidth.scenes.limits import FrictionRule, Limit
     from zwidth.scenes.scene import Scene
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.

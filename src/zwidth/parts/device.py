@@ -3,11 +3,44 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 from zwidth.parts.checks import check_fields
-from zwidth.parts.coupling import Coupling
 from zwidth.words.errors import InputError
+
+
+@dataclass(frozen=True)
+class Coupling:
+    """The mass beyond a spring and a damper: a tendon's, a belt's, a gear's or a link's elasticity.
+
+    ``m x1'' = F - b x1' + k (x2 - x1) + c (x2' - x1')``, ``m2 x2'' = -k (x2 - x1) - c (x2' - x1')`` with the wall's
+    force F on the motor side.
+
+    Args:
+        mass: m2, the mass on the tip's side, in kg, > 0.
+        stiffness: k of the spring between, in N/m, > 0.
+        damping: c of the damper between, in N s/m, >= 0.
+        sensor: where the position is measured, "motor" or "tip".
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.Coupling(mass=0.05, stiffness=20e3, damping=1.0).sensor
+        'motor'
+    """
+
+    # Forms that the explorer offers.
+    usual: ClassVar[dict[str, dict[str, Any]]] = {
+        "motor": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0},
+        "tip": {"mass": 0.05, "stiffness": 20e3, "damping": 2.0, "sensor": "tip"},
+    }
+
+    mass: Any
+    stiffness: Any
+    damping: Any = 0.0
+    sensor: Literal["motor", "tip"] = "motor"
+
+    def __post_init__(self) -> None:
+        check_fields(self, "coupling")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The parameters of a scene by dotted path, as YAML writes them: ``mass``, ``period``, ``velocity.cutoff``, ...
+"""A scene as configurations spell it, its parameters by dotted path: ``mass``, ``period``, ``velocity.cutoff``, ...
 
 Device, timing and wall go by bare names, for each name is one thing there; velocity estimate, hand and coupling go by
 their own: ``velocity.``, ``operator.``, ``coupling.``.
@@ -7,17 +7,16 @@ their own: ``velocity.``, ``operator.``, ``coupling.``.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import fields, replace
+from dataclasses import MISSING, fields, replace
 from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 
 from zwidth.arrays.xp import is_jax
-from zwidth.parts.coupling import Coupling
-from zwidth.parts.device import Device
+from zwidth.parts.device import Coupling, Device
 from zwidth.parts.operator import Operator
 from zwidth.parts.timing import Timing
-from zwidth.parts.velocity import Velocity
+from zwidth.parts.velocity import BackwardDifference, Velocity, name_estimate
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.words.errors import InputError, describe_choice
 
@@ -107,3 +106,27 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
         coupling = replace(scene.device.coupling, **changed.pop("coupling"))
         changed.setdefault("device", {})["coupling"] = coupling
     return replace(scene, **{part: replace(getattr(scene, part), **own) for part, own in changed.items()})
+
+
+def spell_scene(scene: Any) -> dict[str, Any]:
+    """The section ``scene`` of a configuration, with the keys that differ from their defaults."""
+    parts = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
+    own = {name: value for name, value in spell_part(scene.device).items() if name not in PARTS}
+    own |= {"damping": scene.device.damping} | spell_part(scene.timing) | spell_part(scene.wall)
+    return own | spell_estimate(scene.velocity) | parts
+
+
+def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]:
+    """The key ``velocity``, nothing for the difference of two samples; ``every`` writes defaults as well."""
+    given = {"kind": name_estimate(velocity), **spell_part(velocity, every=every)}
+    return {} if velocity == BackwardDifference() else {"velocity": given}
+
+
+def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
+    """The fields of a part that differ from their defaults, or every one that is not None."""
+    values = {field.name: (getattr(part, field.name), field.default) for field in fields(part)}
+    return {
+        name: value
+        for name, (value, default) in values.items()
+        if (value is not None if every else default is MISSING or value != default)
+    }

@@ -8,8 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from zwidth.arrays.xp import is_jax
-from zwidth.parts.checks import check_number, check_span
-from zwidth.parts.span import Span, in_periods
+from zwidth.parts.checks import Span, check_number, check_span, in_periods
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, DelayModel
 

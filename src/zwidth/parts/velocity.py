@@ -7,6 +7,7 @@ by the wrong time and the cut-off lies elsewhere: that is what the loop then doe
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, TypeAlias
@@ -269,3 +270,25 @@ def _offsets(polynomial: np.ndarray) -> np.ndarray:
     scale = np.abs(polynomial).sum()
     shifted = np.where(np.abs(shifted) <= 4 * polynomial.size * np.finfo(float).eps * scale, 0.0, shifted)
     return -np.polynomial.polynomial.polyroots(shifted) + 0j
+
+
+def find_velocity_noise(velocity: Velocity, period: Any, resolution: float) -> float:
+    """The standard deviation of a velocity estimate whose positions are quantized, in m/s.
+
+    The positions' error is nearly white, of variance ``Q^2/12`` with Q the resolution in m (Widrow, Kollar 2008,
+    chapter 5). Through ``F(z)`` with the impulse response f that becomes ``Q^2/12 sum f_k^2``, with ``sum f^2`` of
+    ``2/(n T)^2`` for a difference over n, ``2 (1 - p)^2/((1 + p) T^2)`` for a low-pass of pole p, ``2 (1 - p)^3/((1 +
+    p)^3 T^2)`` for two; of other estimates there is no closed form.
+    """
+    estimate = velocity.estimate(period)
+    power = 2.0 * (float(estimate.gain) / (estimate.window * period)) ** 2 if estimate.window else math.nan
+    if isinstance(velocity, LowPass):
+        offset = float(estimate.poles[0].real)
+        # 1 + p = 2 - (1 - p); the gain holds (1 - p) once for every low-pass.
+        power /= (2.0 - offset) if velocity.order == 1 else offset * (2.0 - offset) ** 3
+    elif not isinstance(velocity, BackwardDifference | WindowedDifference):
+        raise InputError(
+            f"velocity: got {type(velocity).__name__}, whose noise has no closed form here; use a difference, a "
+            "windowed difference or a low-pass"
+        )
+    return resolution * math.sqrt(power / 12.0)

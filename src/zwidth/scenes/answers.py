@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64, join_shapes
 from zwidth.arrays.circle import circle
+from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
 from zwidth.loops.linear.margins import open_loop_response
 from zwidth.loops.linear.passivity import has_condition
-from zwidth.loops.linear.pieces import Island
 from zwidth.loops.linear.poles import log_size, poles_less_one
+from zwidth.loops.linear.rows import Island
 from zwidth.loops.linear.state_space import Matrices, closed_loop, delayed_device, open_loop
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod
@@ -58,6 +58,19 @@ class SceneAnswers:
 
     Without a stiffness and a damping each means the scene's own wall (`zwidth.parts.wall.resolve_wall`).
     """
+
+    def normalize_walls(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
+        units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping)
+        if are_numbers(*both):
+            both = np.float64(both[0]), np.float64(both[1])
+        else:
+            both = as_float64("stiffness", both[0]), as_float64("virtual_damping", both[1])
+            join_shapes([("stiffness", both[0].shape), ("virtual_damping", both[1].shape)])
+        with np.errstate(all="ignore"):
+            return both[0] / units.stiffness, both[1] / units.virtual_damping
 
     def poles(self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None) -> np.ndarray:
         """All poles of walls, along a new last axis and in no particular order; NaN where a wall is not finite.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import are_numbers, as_float64, join_shapes
+from zwidth.arrays.evaluate import as_float64
 from zwidth.loops.linear.border import Outline, outlines
 from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.slopes import SceneSensitivities
@@ -19,11 +19,18 @@ from zwidth.parts.operator import Operator
 from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
-from zwidth.parts.wall import NoWall, VirtualWall, resolve_wall
+from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.answers import SceneAnswers
-from zwidth.scenes.best_damping import BestDamping, Goal, find_best_damping
-from zwidth.scenes.required import RequiredValue, require
-from zwidth.scenes.stiffest import StiffestWall, allows_negative, stiffest_wall
+from zwidth.scenes.stiffest import (
+    BestDamping,
+    Goal,
+    RequiredValue,
+    StiffestWall,
+    allows_negative,
+    find_best_damping,
+    require,
+    stiffest_wall,
+)
 from zwidth.simulation.result import Motion
 from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
@@ -179,19 +186,6 @@ class Scene(SceneAnswers):
         """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
         rate = self.mass / self.timing.period
         return WallSI(rate / self.timing.period, rate)
-
-    def normalize_walls(
-        self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
-        units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping)
-        if are_numbers(*both):
-            both = np.float64(both[0]), np.float64(both[1])
-        else:
-            both = as_float64("stiffness", both[0]), as_float64("virtual_damping", both[1])
-            join_shapes([("stiffness", both[0].shape), ("virtual_damping", both[1].shape)])
-        with np.errstate(all="ignore"):
-            return both[0] / units.stiffness, both[1] / units.virtual_damping
 
     def boundary(self, omega: ArrayLike) -> WallSI:
         """The walls that put a pole pair on the unit circle at a frequency.

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
 from zwidth.arrays.xp import is_jax, is_traced
+from zwidth.loops.linear.margins import OpenLoop
 from zwidth.parts.velocity import BackwardDifference
+from zwidth.parts.wall import resolve_wall
+from zwidth.words.errors import InputError, check_choice, describe_choice
+from zwidth.words.status import Status
 from zwidth.words.types import Array
 
 # By what share a row may end below the stiffest wall that is on it.
@@ -59,3 +64,181 @@ def soft_dampings(scene: Any, stiffness: float, negative_damping: bool | None = 
     """The intervals of beta with which walls of a stiffness are stable in a piece with soft walls."""
     least = -math.inf if allows_negative(scene, negative_damping) else 0.0
     return scene.loop.soft_column(stiffness / scene.units.stiffness, least)
+
+
+# How far the range reaches to both sides of the present value where none is given, and its points.
+_REACH, _POINTS = 30.0, 25
+# By what share of the value both sides of a crossing are proved, the closest that tells them apart.
+_BESIDE = (1e-11, 1e-9, 1e-7, 1e-5)
+
+# The logarithm of a stiffness that counts as none.
+_HARDLY_ANY = 60.0
+
+Side = Literal["above", "below", "everywhere", "nowhere"]
+
+
+class Crossing(NamedTuple):
+    """A value of a parameter at which K_max passes the wanted stiffness, and on which side of it there is enough."""
+
+    value: float
+    enough: Side
+
+
+class RequiredValue(NamedTuple):
+    """The value to choose, the side on which there is enough, and every crossing in the range, ascending."""
+
+    value: float
+    enough: Side
+    crossings: tuple[Crossing, ...]
+    range: tuple[float, float]
+    status: Status
+
+
+def require(
+    scene: Any,
+    parameter: str,
+    stiffness: float,
+    within: tuple[float, float] | None = None,
+    negative_damping: bool | None = None,
+) -> RequiredValue:
+    """See `zwidth.Scene.required`."""
+    if not (isinstance(stiffness, int | float | np.number) and math.isfinite(stiffness) and stiffness > 0):
+        raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in N/m)")
+    now = _present_value(scene, parameter)
+    low, high = _range(parameter, now, within)
+
+    def surplus(value: float) -> float:
+        """How K_max compares with the wanted stiffness, in logarithms; NaN where it cannot be computed."""
+        wall = stiffest_wall(scene.replace(**{parameter: value}), negative_damping)
+        if wall.status == Status.NO_BOUNDARY:
+            return -_HARDLY_ANY
+        return math.log(wall.stiffness / stiffness) if wall.status == Status.OK else math.nan
+
+    grid, values = [], []
+    for value in np.geomspace(low, high, _POINTS).tolist():
+        try:
+            values.append(surplus(value))
+        except InputError:
+            # The range ends where values are refused, as for a cut-off at half the sampling rate.
+            continue
+        grid.append(value)
+    if not grid:
+        raise InputError(f"within: {parameter} cannot have any value from {low:g} to {high:g}")
+    low, high = grid[0], grid[-1]
+    enough = [value >= 0 for value in values if not math.isnan(value)]
+    if not enough or not any(enough):
+        status = Status.UNREACHABLE if enough and len(enough) == len(values) else Status.NOT_CONVERGED
+        return RequiredValue(math.nan, "nowhere", (), (low, high), status)
+    if len(enough) == len(values) and all(enough):
+        return RequiredValue(min(max(now, low), high), "everywhere", (), (low, high), Status.OK)
+    found = tuple(
+        _cross(surplus, grid[k], grid[k + 1])
+        for k in range(len(grid) - 1)
+        if (values[k] >= 0) != (values[k + 1] >= 0) and not math.isnan(values[k] + values[k + 1])
+    )
+    proved = tuple(crossing for crossing in found if crossing is not None)
+    if not proved or len(proved) < len(found):
+        return RequiredValue(math.nan, "nowhere", proved, (low, high), Status.NOT_CONVERGED)
+    middle = now if now > 0 else low
+    best = min(proved, key=lambda crossing: abs(math.log(crossing.value / middle)))
+    return RequiredValue(best.value, best.enough, proved, (low, high), Status.OK)
+
+
+def _present_value(scene: Any, parameter: str) -> float:
+    known = scene.parameters()
+    known = {path: value for path, value in known.items() if path not in ("stiffness", "virtual_damping")}
+    known["rate"] = 1.0 / known["period"]
+    if parameter not in known:
+        raise InputError(f"parameter: {describe_choice(parameter, tuple(known))}")
+    if isinstance(known[parameter], int | np.integer):
+        raise InputError(f"parameter: got {parameter!r}, a whole number; try its few values one by one")
+    return float(known[parameter])
+
+
+def _range(parameter: str, now: float, within: tuple[float, float] | None) -> tuple[float, float]:
+    if within is None:
+        if not now > 0:
+            raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
+        return now / _REACH, now * _REACH
+    low, high = (float(end) for end in within)
+    if not 0 < low < high < math.inf:
+        raise InputError(f"within: got {within!r}; two finite numbers with 0 < low < high are needed")
+    return low, high
+
+
+def _cross(surplus: Callable[[float], float], low: float, high: float) -> Crossing | None:
+    """The crossing between two values, proved by a value on each side of it; None where it cannot be."""
+    from scipy.optimize import brentq
+
+    root = brentq(lambda x: surplus(min(max(math.exp(x), low), high)), math.log(low), math.log(high))
+    place = math.exp(cast("float", root))
+    for share in _BESIDE:
+        ends = place * (1.0 - share), place * (1.0 + share)
+        below, above = (surplus(end) >= 0 for end in ends)
+        if below != above:
+            return Crossing(ends[1], "above") if above else Crossing(ends[0], "below")
+    return None
+
+
+Goal = Literal["fast", "robust"]
+
+# Samples across a column, how many of their dips are refined, and by how many steps of golden section.
+_SAMPLES, _DIPS, _STEPS = 66, 3, 52
+_GOLDEN = 0.3819660112501051
+
+
+class BestDamping(NamedTuple):
+    """A virtual damping in N s/m, the spectral radius and the modulus margin there, and the `zwidth.Status`."""
+
+    virtual_damping: float
+    spectral_radius: float
+    modulus_margin: float
+    status: Status
+
+
+def find_best_damping(
+    scene: Any, stiffness: float | None, goal: Goal, negative_damping: bool | None = None
+) -> BestDamping:
+    """See `zwidth.Scene.best_damping`."""
+    check_choice("goal", goal, get_args(Goal))
+    stiffness = float(resolve_wall(scene.wall, None, None)[0] if stiffness is None else stiffness)
+    if not (math.isfinite(stiffness) and stiffness > 0):
+        raise InputError(f"stiffness: got {stiffness:g}; it must be finite and greater than 0 (in N/m)")
+
+    units = scene.units
+
+    def radius(beta: Any) -> np.ndarray:
+        return scene.spectral_radius(stiffness, beta * units.virtual_damping)
+
+    @np.vectorize
+    def margin(beta: float) -> float:
+        loop = scene.loop
+        wall = OpenLoop.lay_out(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
+        return wall.least_distance()[0]
+
+    cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
+    columns = soft_dampings(scene, stiffness, negative_damping)
+    if not columns:
+        return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
+    best = min((_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))
+    return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)
+
+
+def _lowest(cost: Callable[[np.ndarray], np.ndarray], low: float, high: float) -> float:
+    """Where a function with kinks and several dips is lowest: samples, then golden section around the lowest dips."""
+    grid = np.linspace(low, high, _SAMPLES)
+    # On the boundary itself nothing is gained.
+    values = np.pad(cost(grid[1:-1]), 1, constant_values=math.inf)
+    dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
+    dips = dips[np.argsort(values[dips])][:_DIPS]
+    left, middle, right, value = grid[dips - 1], grid[dips], grid[dips + 1], values[dips]
+    for _ in range(_STEPS):
+        upwards = right - middle > middle - left
+        trial = middle + _GOLDEN * np.where(upwards, right - middle, left - middle)
+        reached = cost(trial)
+        # Of the trial and the middle the lower one becomes the middle, the other one an end.
+        better = reached < value
+        end, is_right = np.where(better, middle, trial), better ^ (trial > middle)
+        left, right = np.where(is_right, left, end), np.where(is_right, end, right)
+        middle, value = np.where(better, trial, middle), np.where(better, reached, value)
+    return float(middle[np.argmin(value)])

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.arguments import compute_concretely
-from zwidth.arrays.evaluate import processors
+from zwidth.arrays.evaluate import compute_concretely, processors
 from zwidth.loops.linear.chain import Chain, chain_of
 from zwidth.parts.estimate import Estimate
 from zwidth.parts.paths import Parts, replace_parameters

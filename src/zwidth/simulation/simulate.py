@@ -8,8 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64, join_shapes
-from zwidth.arrays.evaluate import processors
+from zwidth.arrays.evaluate import as_float64, join_shapes, processors
 from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole
 from zwidth.parts.wall import resolve_wall

@@ -18,8 +18,7 @@ from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, Physic
 from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.boundary import boundary_point
-from zwidth.loops.rigid.region import Piece, stable_region
+from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
 from zwidth.studies.outcome import (
     ComputedStudy,
     CurvesStudy,

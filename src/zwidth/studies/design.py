@@ -18,11 +18,10 @@ from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Fraction, Quantity, axis_of, quantity_of, read_entries
 from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.parts.noise import find_velocity_noise
-from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference
+from zwidth.parts.velocity import BackwardDifference, LowPass, Velocity, WindowedDifference, find_velocity_noise
 from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.required import RequiredValue
 from zwidth.scenes.scene import Scene
+from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
 from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest
 from zwidth.words.errors import InputError

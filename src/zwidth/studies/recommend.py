@@ -16,7 +16,7 @@ from zwidth.config.study import register
 from zwidth.config.values import Fraction
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
-from zwidth.loops.rigid.settling import decay_time
+from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.assessment import Assessment, assess, name_kind
 from zwidth.scenes.limits import describe_islands

@@ -14,13 +14,12 @@ from zwidth.config.scenes import AnyScene
 from zwidth.config.study import DelayModels, HeldOnly, register
 from zwidth.figures.stable_set import Outlines
 from zwidth.figures.table import stack
+from zwidth.loops.rigid.boundary import stable_region
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
-from zwidth.loops.rigid.region import stable_region
-from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.slope import stiffness_slope
+from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
-from zwidth.scenes.passive import passive_edge
+from zwidth.scenes.limits import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import CurvesStudy, Outcome, Table
 from zwidth.words.status import RidgeKind, Status

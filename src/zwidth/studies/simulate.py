@@ -17,7 +17,7 @@ from zwidth.config.study import HeldOnly, register
 from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity
 from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import SI_COLUMNS, stack
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind

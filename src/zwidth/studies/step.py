@@ -32,7 +32,7 @@ from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.response import step_response
 from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import LONGEST_SETTLING, Range

@@ -14,13 +14,13 @@ from typing import TypeAlias
 
 import numpy as np
 
-from zwidth.loops.rigid.boundary_map import row_limits
 from zwidth.loops.rigid.margins import margins_kernel
 from zwidth.loops.rigid.outermost_poles import area_poles, list_poles, radius_at
 from zwidth.loops.rigid.passivity import margin_at_one_delay
 from zwidth.loops.rigid.pole_map import Area
+from zwidth.loops.rigid.response import decay_time
 from zwidth.loops.rigid.ridge import alpha_max
-from zwidth.loops.rigid.settling import decay_time
+from zwidth.loops.rigid.row_limit import row_limits
 from zwidth.sweep.grid import Block
 from zwidth.words.quantities import MARGIN_OUTPUTS, NOT_COMPUTED, OUTPUTS, RADIUS_OUTPUTS, STATUS_OF, Family
 from zwidth.words.status import Status

@@ -11,9 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from zwidth.arrays import arguments
-from zwidth.arrays.arguments import as_float64, broadcast, check_scalars
-from zwidth.arrays.evaluate import FEW, evaluate, evaluate_columns, map_blocks
+from zwidth.arrays import evaluate as module
+from zwidth.arrays.evaluate import FEW, as_float64, broadcast, check_scalars, evaluate, evaluate_columns, map_blocks
 from zwidth.arrays.xp import is_jax, is_traced, namespace
 from zwidth.words.errors import InputError, PrecisionWarning
 
@@ -195,7 +194,7 @@ def test_plain_numbers_inside_somebody_elses_transformation_are_computed_at_once
 
 
 def test_float32_inside_a_transformation_is_said_once(monkeypatch):
-    monkeypatch.setattr(arguments, "_warned", threading.Event())
+    monkeypatch.setattr(module, "_warned", threading.Event())
     with jax.enable_x64(True), warnings.catch_warnings():
         warnings.simplefilter("error")
         jax.jit(lambda x: evaluate(fragile, {"x": x}))(1.0)

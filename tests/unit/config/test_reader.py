@@ -14,7 +14,7 @@ from waiting import LONGEST
 
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, normalized_wall
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.scenes.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
 from zwidth.studies.ridge import PassivityStudy, RidgeStudy

@@ -4,15 +4,9 @@ import jax
 import numpy as np
 import pytest
 
-from zwidth.loops.domain import (
-    LARGEST_DAMPING,
-    LONGEST_DELAY,
-    WALL_RANGE,
-    device_status,
-    nan_unless,
-    nan_with_nan_slopes,
-    wall_status,
-)
+from zwidth.arrays.xp import nan_unless, nan_with_nan_slopes
+from zwidth.loops.rigid.device import device_status, wall_status
+from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, WALL_RANGE
 from zwidth.words.status import Status
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import signal
 
 import zwidth
-from zwidth.parts.noise import find_velocity_noise
+from zwidth.parts.velocity import find_velocity_noise
 from zwidth.words.errors import InputError
 
 PERIOD, COUNT = 1e-3, 20e-6

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 
 
 def test_parts_read_texts_with_units():

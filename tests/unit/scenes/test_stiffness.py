@@ -77,3 +77,12 @@ def test_wrong_input_is_named(bad, message):
     for function in (max_stiffness, sensitivities):
         with pytest.raises(zwidth.InputError, match=message):
             function(**(good | bad))
+
+
+def test_gradients_at_concrete_devices_are_those_that_are_compiled(x64):
+    def stiffness(mass, damping, period, delay):
+        return zwidth.max_stiffness(mass=mass, damping=damping, period=period, delay=delay)
+
+    every = jax.value_and_grad(stiffness, argnums=(0, 1, 2, 3))
+    at = (0.1, 3.0, 1e-3, 1.25e-3)
+    np.testing.assert_allclose(np.hstack(every(*at)), np.hstack(jax.jit(every)(*at)), rtol=1e-12)

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from zwidth.parts.span import Span
+from zwidth.parts.checks import Span
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.units import (
     ANGLE,

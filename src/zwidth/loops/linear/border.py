@@ -12,9 +12,8 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.crossing_lines import CrossingLine
-from zwidth.loops.linear.curve import curve_at, zeros_of
-from zwidth.loops.linear.pieces import Island, StablePieces
+from zwidth.loops.linear.curve import CrossingLine, curve_at, zeros_of
+from zwidth.loops.linear.rows import Island, StablePieces
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
 _ROUNDS = 11

@@ -19,9 +19,18 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import ON_CIRCLE, circle, depths
-from zwidth.loops.linear.arcs import Arc, cut_arcs
-from zwidth.loops.linear.crossing_lines import CrossingLine, circle_zeros, end_lines, interior_line
-from zwidth.loops.linear.curve import curve_at, find_dips, nodes_of, zeros_of
+from zwidth.loops.linear.curve import (
+    Arc,
+    CrossingLine,
+    circle_zeros,
+    curve_at,
+    cut_arcs,
+    end_lines,
+    find_dips,
+    interior_line,
+    nodes_of,
+    zeros_of,
+)
 from zwidth.loops.linear.roots import LoopRoots
 
 # Newton steps at most, every sixth one a bisection; and the step, as a share of w, after which it has arrived.

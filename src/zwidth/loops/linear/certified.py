@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.chain import Chain, chain_of, rates
-from zwidth.loops.rigid import certified_balls
+from zwidth.loops.rigid import certified
 from zwidth.parts.velocity import Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -38,7 +38,7 @@ class BallPolynomials(NamedTuple):
 
 def decide_walls(scene: Any, stiffness: np.ndarray, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels and statuses of walls of one shape, in SI units."""
-    if not certified_balls.available():
+    if not certified.available():
         raise InputError("method: 'certified' needs python-flint for this scene; pip install 'zwidth[certified]'")
     known: dict[int, BallPolynomials] = {}
     stable, status = np.zeros(stiffness.shape, bool), np.zeros(stiffness.shape, np.int32)

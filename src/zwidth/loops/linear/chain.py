@@ -23,7 +23,7 @@ import numpy as np
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.xp import namespace
 from zwidth.loops.linear.roots import LoopRoots
-from zwidth.loops.rigid.plant import Plant, held_plant, undelayed_plant
+from zwidth.loops.rigid.device import Plant, held_plant, undelayed_plant
 from zwidth.parts.estimate import Estimate
 from zwidth.parts.paths import Parts
 from zwidth.words.errors import InputError

@@ -1,15 +1,18 @@
-"""The boundary curve of any linear loop: points of it, nodes along it, its zeros and extremes (V8, V12).
+"""The boundary of any linear loop: the curve of pole pairs, its nodes, zeros and arcs, and the lines (V8 to V12).
 
-On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``.
+On ``z = e^(jw)``, 0 < w < pi, a pole pair is where ``beta = Im q/Im F`` and ``alpha = Re q - beta Re F``. On an arc
+beta is monotone, so that a row meets it once. Where F is real, ``alpha + beta F = q`` is a line as soon as q is real as
+well: real poles, and pairs of undamped devices at one frequency.
 """
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
+from zwidth.arrays.circle import ON_CIRCLE, circle, depths
 from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.roots import LoopRoots
 
@@ -98,3 +101,158 @@ def find_dips(w: np.ndarray, values: np.ndarray) -> np.ndarray:
     near = same & (lowest < 0.25 * np.minimum(np.abs(values[:-1]), np.abs(values[1:])))
     k = np.flatnonzero(near)
     return (w[k, None] + step[k, None] * _INSIDE).ravel()
+
+
+# Of |q|: less of an imaginary part than that where Im F vanishes is none.
+_NONE = 1e-11
+# A velocity estimate that turns less than this at z = 1, -1 or a line does not answer there.
+_FLAT = 1e-12
+
+
+class CrossingLine(NamedTuple):
+    """A frequency at which a whole line ``alpha + beta real(F) = q`` puts poles on the circle."""
+
+    w: float
+    q: float
+    f: float
+    q_turn: float  # Im dq/dw
+    f_turn: float
+    poles: int  # 1 at z = 1 and z = -1, else 2
+
+    @property
+    def meeting(self) -> float:
+        """The damping at which the curve meets the line, ``Im q'/Im F'``; NaN where it does not."""
+        return self.q_turn / self.f_turn if abs(self.f_turn) > _FLAT else np.nan
+
+    def leaving(self, beta: np.ndarray) -> np.ndarray:
+        """Poles that leave the circle there as alpha rises; on the row through the meeting, as just above it."""
+        if np.isnan(self.meeting):
+            return np.full(beta.shape, self.poles * np.sign(self.q_turn))
+        return self.poles * np.sign(self.f_turn) * np.where(beta < self.meeting, 1.0, -1.0)
+
+
+def interior_line(loop: LoopRoots, w: float) -> CrossingLine | None:
+    """The line of a zero of Im F at which q is real as well, as for an undamped device and some windows."""
+    at = circle(np.array([w]))
+    if np.min(np.abs(at.before + loop.zeros), initial=1.0) < 1e-9:
+        # q is infinite, not real.
+        return None
+    q, f = loop.required_wall(at), loop.estimate.jet(at)
+    if not abs(q.value[0].imag) <= _NONE * abs(q.value[0]):
+        return None
+    value, turn = float(q.value[0].real), float(q.slope[0].imag)
+    return CrossingLine(w, value, float(f.value[0].real), turn, float(f.slope[0].imag), 2)
+
+
+def circle_zeros(loop: LoopRoots) -> np.ndarray:
+    """Angles of zeros on the circle: of an undamped device, where q is infinite, or of F, where Im F may touch 0."""
+    zeros = np.concatenate([loop.zeros, loop.estimate.zeros])
+    angles = np.angle(1.0 - zeros[np.abs(depths(zeros)) <= ON_CIRCLE])
+    return np.unique(angles[(angles > 0) & (angles < np.pi - 1e-6)])
+
+
+def end_lines(loop: LoopRoots) -> list[CrossingLine]:
+    """The lines of real poles at z = 1 and z = -1; where the device does not move there is none."""
+    lines = []
+    for w in (0.0, np.pi):
+        at = circle(np.array([w]))
+        with np.errstate(all="ignore"):
+            q, f = loop.required_wall(at), loop.estimate.jet(at)
+        numbers = q.value[0].real, f.value[0].real, q.slope[0].imag, f.slope[0].imag
+        infinite = np.any(np.abs(loop.zeros - (2.0 if w else 0.0)) <= ON_CIRCLE)
+        if np.all(np.isfinite(numbers)) and not infinite:
+            q_value, f_value, q_turn, f_turn = (float(n) for n in numbers)
+            lines.append(CrossingLine(w, q_value, f_value, q_turn, f_turn, 1))
+    return lines
+
+
+# How far beyond two neighboring nodes the curve may be between them, of what alpha is a difference of.
+_ROOM, _ROUNDING = 0.02, 1e-6
+
+
+class Arc(NamedTuple):
+    """A part of the curve on which beta is monotone, by its nodes in ascending beta."""
+
+    w: np.ndarray
+    beta: np.ndarray
+    alpha: np.ndarray
+    straight: np.ndarray  # of each step: whether alpha may be interpolated in beta, else both ends' mean counts
+    room: np.ndarray  # of each step: how far alpha may be from that
+    leaving: float  # poles that leave the circle as alpha rises past it: 2, or -2
+
+    @property
+    def first(self) -> float:
+        """Its lowest angle."""
+        return float(min(self.w[0], self.w[-1]))
+
+
+def cut_arcs(
+    loop: LoopRoots,
+    w: np.ndarray,
+    here: CurvePoints,
+    poles: np.ndarray,
+    turns: np.ndarray,
+    limits: dict[float, float],
+) -> list[Arc]:
+    """Cut the curve where beta turns or runs to infinity, and where Im F changes its sign."""
+    ends = np.unique(np.concatenate([list(limits), poles, turns]))
+    at_pole = {float(p) for p in poles}
+    arcs = []
+    for a, b in pairwise(ends.tolist()):
+        inner = (w > a) & (w < b)
+        nodes, curve = w[inner], CurvePoints(*(values[inner] for values in here))
+        if not nodes.size:
+            nodes = np.array([0.5 * (a + b)])
+            curve = curve_at(loop, nodes)
+        rising = np.sum(np.sign(curve.turn)) > 0
+        # As alpha passes the arc a pair leaves where Im(q - beta F) rises with w: told once, by the nodes.
+        leaving = 2.0 if rising == (np.sum(np.sign(curve.fall)) > 0) else -2.0
+        first = _end_value(loop, float(a), at_pole, -1 if rising else 1, limits)
+        last = _end_value(loop, float(b), at_pole, 1 if rising else -1, limits)
+        # The ends have no alpha: next to them every wall is compared with the crossing itself.
+        with np.errstate(all="ignore"):
+            slope = curve.turn / curve.fall**2
+        parts = [nodes, curve.beta, curve.alpha, curve.alpha_slope, slope, curve.size]
+        edges = [(a, b), (first, last), *[(np.nan, np.nan)] * 4]
+        parts = [np.concatenate([[end[0]], part, [end[1]]]) for part, end in zip(parts, edges, strict=True)]
+        if not rising:
+            parts = [part[::-1] for part in parts]
+        # Next to a limit or an extreme rounding may leave a node out of order; without it nothing is lost.
+        beta = parts[1]
+        good = np.maximum.accumulate(beta) == beta
+        good &= np.minimum.accumulate(beta[::-1])[::-1] == beta
+        good[[0, -1]] = True
+        if beta[0] <= beta[-1]:
+            parts = [part[good] for part in parts]
+            arcs.append(Arc(*parts[:3], *_bands(*parts), leaving))
+    return arcs
+
+
+def _bands(
+    w: np.ndarray,
+    beta: np.ndarray,
+    alpha: np.ndarray,
+    alpha_slope: np.ndarray,
+    beta_slope: np.ndarray,
+    size: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Where alpha may be between two nodes: `Arc.straight` and `Arc.room`.
+
+    Where the slope of beta hardly changes over a step, a straight line misses alpha by an eighth of the step times what
+    alpha's slope changes, and by what beta bends; four times that is allowed. Elsewhere, by far more than both ends
+    differ.
+    """
+    with np.errstate(all="ignore"):
+        bend = beta_slope[1:] / beta_slope[:-1]
+        straight = (bend > 0.5) & (bend < 2.0)
+        rise, largest = np.abs(np.diff(alpha)), np.maximum(size[1:], size[:-1])
+        close = 0.5 * np.abs(np.diff(w) * np.diff(alpha_slope)) + np.abs(bend - 1.0) * rise + _ROUNDING * largest
+        return straight, np.where(straight, close, 1.5 * rise + _ROOM * largest)
+
+
+def _end_value(loop: LoopRoots, w: float, at_pole: set[float], side: int, limits: dict[float, float]) -> float:
+    if w in at_pole:
+        return side * np.inf
+    if w in limits:
+        return limits[w] if np.isfinite(limits[w]) else side * np.inf
+    return float(curve_at(loop, np.array([w])).beta[0])

@@ -1,16 +1,21 @@
-"""Rows of any linear loop: the stable intervals of the stiffness at a damping, and labels of many walls."""
+"""Stable intervals of any linear loop, of the stiffness in a row and of the damping in a column; many walls' labels."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.domain import WALL_RANGE
+from zwidth.arrays.roots import bisect, newton
 from zwidth.loops.linear.boundary import Boundary
+from zwidth.loops.linear.curve import curve_at, find_dips, zeros_of
 from zwidth.loops.linear.poles import log_size, poles_less_one
-from zwidth.loops.rigid.boundary_map import copy_rows
+from zwidth.loops.rigid.row_limit import copy_rows
+from zwidth.words.quantities import WALL_RANGE
 
 # Rows whose crossings are laid out at one time.
 _ROWS = 1 << 12
@@ -117,3 +122,185 @@ def _mark_rows(alpha: np.ndarray, ends: BoundIntervals, place: np.ndarray) -> np
             held &= ~copy_rows(np.minimum(start, until)[place], alpha.size)
         stable = held if k == 0 else stable | held
     return stable
+
+
+# How near to an angle where the curve has no point of its own it is looked at, as a share of the way to a node.
+_PROBE = 1e-6
+_MOST_STEPS = 120
+# How far beside an end, as a share of it, walls must have the labels of the intervals that it parts: their rounding is
+# that of a row, which may cross where a column hardly moves.
+_BESIDE = 1e-7
+
+
+def stable_dampings(boundary: Boundary, alpha: float) -> np.ndarray:
+    """Where a column is stable: array (intervals, 2) of beta, ascending.
+
+    Every damping at which the column meets the boundary is found, for alpha is monotone along the curve between two
+    nodes once its extremes are among them; the walls between two such dampings share the label of one of them. An end
+    whose own neighbors contradict that is sought by labels alone.
+    """
+    on_lines = np.array([(line.q - alpha) / line.f for line in boundary.lines if line.f != 0.0])
+    met = np.unique(np.concatenate([_on_curve(boundary, alpha), on_lines]))
+    met = met[np.isfinite(met)]
+    if not np.isfinite(alpha) or not met.size:
+        return np.zeros((0, 2))
+
+    def label(beta: np.ndarray) -> np.ndarray:
+        return label_walls(boundary, np.full(beta.size, alpha), beta)
+
+    reach = np.ptp(met) + np.abs(met).max() + 1.0
+    between = 0.5 * (np.concatenate([[met[0] - reach], met]) + np.concatenate([met, [met[-1] + reach]]))
+    stable = label(between)
+    k = np.flatnonzero(stable[1:] != stable[:-1])
+    room = np.minimum(met[k] - between[k], between[k + 1] - met[k])
+    beside = np.minimum(_BESIDE * np.abs(met[k]), 0.5 * room)
+    wrong = (label(met[k] - beside) != stable[k]) | (label(met[k] + beside) != stable[k + 1])
+    k, low, high = k[wrong], between[:-1][k[wrong]], between[1:][k[wrong]]
+    # Twice: the last digit of a long way is not that of an end near 0.
+    for _ in range(2 if k.size else 0):
+        met[k] = bisect(lambda beta: label(beta) == stable[k], low, high)
+        low, high = met[k] - 1e-12 * (high - low), met[k] + 1e-12 * (high - low)
+    ends = np.concatenate([[-np.inf], met, [np.inf]])
+    return np.stack([ends[:-1][stable], ends[1:][stable]], -1)
+
+
+def _on_curve(boundary: Boundary, alpha: float) -> np.ndarray:
+    loop = boundary.loop
+    # Where the curve has no point of its own: it meets a line there, or runs to infinity in stiffness or damping.
+    limits = dict.fromkeys([0.0, np.pi, *boundary.infinite.tolist()], np.nan)
+    limits |= {line.w: line.q - line.meeting * line.f for line in boundary.lines}
+    slope = curve_at(loop, boundary.w).alpha_slope
+    tops = zeros_of(loop, boundary.w, slope, "alpha_slope")
+    nodes = np.unique(np.concatenate([boundary.w, tops, find_dips(boundary.w, slope)]))
+    pieces, heights = [], []
+    for a, b in pairwise(sorted(limits)):
+        inner = nodes[(nodes > a) & (nodes < b)]
+        inner = inner if inner.size else np.array([0.5 * (a + b)])
+        # Towards an end at infinity the curve is looked at no further than this.
+        probes = a + _PROBE * (inner[0] - a), b - _PROBE * (b - inner[-1])
+        inner = np.concatenate([probes[:1], inner, probes[1:]])
+        pieces.append(np.concatenate([[a], inner, [b]]))
+        heights.append(np.concatenate([[limits[a]], curve_at(loop, inner).alpha, [limits[b]]]))
+    w, above = np.concatenate(pieces), np.concatenate(heights) - alpha
+    k = np.flatnonzero(np.isfinite(above[1:] + above[:-1]) & ((above[1:] > 0) != (above[:-1] > 0)))
+    sign = np.where(above[k + 1] > 0, 1.0, -1.0)
+
+    def rise(at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        curve = curve_at(loop, at)
+        return sign * (curve.alpha - alpha), sign * curve.alpha_slope
+
+    with np.errstate(all="ignore"):
+        return curve_at(loop, newton(rise, w[k], w[k + 1], 0.5 * (w[k] + w[k + 1]), _MOST_STEPS)[0]).beta
+
+
+# Rows between two neighboring corners, as shares of the way; and rows across the whole of the plane.
+_SHARES, _ACROSS = np.array([1e-3, 0.5, 1.0 - 1e-3]), 65
+# Two rows between corners with different ends are halved so often, until a corner that was not seen is between them.
+_HALVINGS = 48
+# A corner is known to such a share, and so many rows may lie within it.
+_NEAR, _MOST_BESIDE = 1e-9, 4
+
+
+class Island(NamedTuple):
+    """A piece of the stable set without soft walls: its extent in stiffness and in damping."""
+
+    stiffness: tuple[float, float]
+    virtual_damping: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class StablePieces:
+    """The stable set of one loop, piece by piece.
+
+    Args:
+        boundary: of the loop.
+        corners: dampings at which the set's edge has ends or turns, or passes from K > 0 to K < 0.
+    """
+
+    boundary: Boundary
+    corners: np.ndarray
+
+    @cached_property
+    def _rows(self) -> tuple[np.ndarray, BoundIntervals]:
+        """Rows with their intervals, so many that between corners neighbors have the same ends."""
+        corners = self.corners
+        rows = (corners[:-1, None] + np.diff(corners)[:, None] * _SHARES).ravel()
+        across = np.linspace(corners[0], corners[-1], _ACROSS + 2)[1:-1] if corners.size else corners
+        rows = np.unique(np.concatenate([rows, across]))
+        rows = rows[self.boundary.is_sound(rows)]
+        found = bound_intervals(self.boundary, rows)
+        for _ in range(_HALVINGS):
+            same = (found.below[1:] == found.below[:-1]).all(1) & (found.above[1:] == found.above[:-1]).all(1)
+            parted = np.searchsorted(corners, rows[1:], side="left") != np.searchsorted(corners, rows[:-1], side="left")
+            middle = 0.5 * (rows[1:] + rows[:-1])
+            new = middle[~same & ~parted & (middle > rows[:-1]) & (middle < rows[1:])]
+            new = new[self.boundary.is_sound(new)]
+            if not new.size:
+                break
+            order = np.argsort(np.append(rows, new))
+            found = join_rows((found, bound_intervals(self.boundary, new)), order)
+            rows = np.append(rows, new)[order]
+        return rows, found
+
+    @cached_property
+    def _labels(self) -> tuple[np.ndarray, np.ndarray]:
+        """The number of the piece of each interval of `_rows`, -1 for none; and the pieces with soft walls."""
+        _, found = self._rows
+        there = found.above >= 0
+        number = np.where(there, np.cumsum(there).reshape(there.shape) - 1, -1)
+        joined = [np.zeros((2, 0), int)]
+        for ends in (found.below, found.above):
+            row, one, other = np.nonzero((ends[:-1, :, None] == ends[1:, None, :]) & (ends[:-1, :, None] >= 0))
+            joined.append(np.stack([number[row, one], number[row + 1, other]]))
+        pairs, count = np.concatenate(joined, 1), int(there.sum())
+        # The least number that each is joined to; a graph of SciPy's would take a third of a second to load.
+        piece, before = np.arange(count), np.full(count, -1)
+        while not np.array_equal(piece, before):
+            before = piece.copy()
+            for one, other in (pairs, pairs[::-1]):
+                np.minimum.at(piece, one, before[other])
+            piece = piece[piece]
+        labels = np.full(there.shape, -1)
+        labels[there] = piece
+        soft = (found.low <= 0) & (found.high > 0)
+        return labels, np.unique(labels[soft])
+
+    def main_intervals(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of the plane, and up to which alpha each is stable in a piece with soft walls; NaN where it is not."""
+        rows, found = self._rows
+        labels, main = self._labels
+        high = np.where(np.isin(labels, main), found.high, -np.inf).max(1, initial=-np.inf)
+        return rows, np.where(np.isfinite(high), high, np.nan)
+
+    def piece_at(self, beta: float, place: int) -> int:
+        """The piece at the point of a row on one column of its crossings, -1 where none is beside it."""
+        rows, found = self._rows
+        after = int(np.searchsorted(rows, beta))
+        # Of a corner two edges tell nearly the same damping, with rows between them.
+        near = range(max(after - _MOST_BESIDE, 0), min(after + _MOST_BESIDE, rows.size))
+        for row in sorted(near, key=lambda row: abs(rows[row] - beta)):
+            met = (found.below[row] == place) | (found.above[row] == place)
+            if met.any() and (row in (after - 1, after) or abs(rows[row] - beta) <= _NEAR * abs(beta)):
+                return int(self._labels[0][row, int(np.argmax(met))])
+        return -1
+
+    def extents(self) -> dict[int, tuple[np.ndarray, np.ndarray]]:
+        """The least and the largest alpha and beta that rows meet in each piece without soft walls."""
+        rows, found = self._rows
+        labels, main = self._labels
+        extents = {}
+        for piece in np.setdiff1d(labels[labels >= 0], main).tolist():
+            row, column = np.nonzero(labels == piece)
+            low, high, beta = found.low[row, column], found.high[row, column], rows[row]
+            extents[piece] = np.array([low.min(), beta.min()]), np.array([high.max(), beta.max()])
+        return extents
+
+    def holds_softly(self, alpha: float, beta: float) -> bool:
+        """Whether a wall is stable in a piece with soft walls."""
+        found = bound_intervals(self.boundary, np.array([beta]))
+        above = found.above[0, (found.low[0] < alpha) & (alpha < found.high[0])]
+        return any(self.is_main(self.piece_at(beta, place)) for place in above.tolist())
+
+    def is_main(self, piece: int) -> bool:
+        """Whether a piece contains soft walls."""
+        return bool(np.isin(piece, self._labels[1]))

@@ -12,7 +12,7 @@ from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.chain import chain_of, flow, rates
 from zwidth.loops.linear.ridge import BoundRidge, Condition
-from zwidth.loops.rigid.delay_classes import classify_delays
+from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status

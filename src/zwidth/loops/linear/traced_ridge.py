@@ -16,17 +16,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from zwidth.arrays.arguments import broadcast_traced
 from zwidth.arrays.circle import circle
-from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import nan_with_nan_slopes
+from zwidth.arrays.evaluate import broadcast_traced
+from zwidth.arrays.xp import is_traced, nan_with_nan_slopes
 from zwidth.loops.linear.chain import Chain, chain_of, required_wall, respond
 from zwidth.loops.linear.ridge import Condition
 from zwidth.loops.linear.slopes import moving_paths
 from zwidth.loops.rigid.exact_points import polish
 from zwidth.loops.rigid.ridge import RidgePoint
+from zwidth.parts.checks import in_periods
 from zwidth.parts.paths import replace_parameters
-from zwidth.parts.span import in_periods
 from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind, Status

@@ -12,9 +12,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import epsilon, namespace, repeat
-from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
-from zwidth.loops.rigid.degrees import Degree
+from zwidth.arrays.xp import epsilon, namespace, nan_with_nan_slopes, repeat
+from zwidth.loops.rigid.device import valid_wall
+from zwidth.loops.rigid.folding import Degree
+from zwidth.loops.rigid.pole_step import Pair
 from zwidth.loops.rigid.polynomial import choose_plant
 from zwidth.words.types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirst
 
@@ -22,24 +23,6 @@ from zwidth.words.types import Array, Radii, RadiiFirst, Reals, Roots, RootsFirs
 _FIRST_STEPS = 9
 # Of the coefficients of N(z), which come from series, of their sum and of the products behind it, in rounding units.
 _ROUNDING = 32.0
-
-
-class Cartesian(NamedTuple):
-    """A complex number by its parts: real arithmetic is faster."""
-
-    re: Array
-    im: Array
-
-    def times(self, other: Cartesian) -> Cartesian:
-        """The product."""
-        return Cartesian(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
-
-    def over(self, other: Cartesian) -> Cartesian:
-        """The quotient."""
-        size = other.re * other.re + other.im * other.im
-        return Cartesian(
-            (self.re * other.re + self.im * other.im) / size, (self.im * other.re - self.re * other.im) / size
-        )
 
 
 class ProductForm(NamedTuple):
@@ -69,51 +52,42 @@ def product_form(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degr
     return ProductForm(degree.poles - 2 - spring, c, tuple(n), alpha, None if spring else beta)
 
 
-def _plus(x: Cartesian, y: Cartesian) -> Cartesian:
-    return Cartesian(x.re + y.re, x.im + y.im)
-
-
-def _power(z: Cartesian, power: int) -> Cartesian:
+def _power(z: Pair, power: int) -> Pair:
     """z^power by repeated squaring."""
     if power == 0:
-        return Cartesian(0.0 * z.re + 1.0, 0.0 * z.im)
+        return Pair(0.0 * z.real + 1.0, 0.0 * z.imag)
     root = _power(z, power // 2)
-    square = root.times(root)
-    return square.times(z) if power % 2 else square
+    square = root * root
+    return square * z if power % 2 else square
 
 
-def evaluate(z: Cartesian, form: ProductForm) -> tuple[Cartesian, Cartesian]:
+def evaluate(z: Pair, form: ProductForm) -> tuple[Pair, Pair]:
     """P(z) and P'(z)."""
-    one, pole = Cartesian(z.re - 1.0, z.im), Cartesian(z.re - form.c, z.im)
-    quadratic = one.times(pole)
-    lag = _power(z, max(form.power - 1, 0))
-    body = z.times(_plus(one, pole))
+    one, pole = z + -1.0, z + -form.c
+    quadratic, body = one * pole, z * (one + pole)
     if form.power:
-        slope = lag.times(Cartesian(form.power * quadratic.re + body.re, form.power * quadratic.im + body.im))
-        value = lag.times(z).times(quadratic)
+        lag = _power(z, form.power - 1)
+        value, slope = lag * z * quadratic, lag * (quadratic * form.power + body)
     else:
-        slope, value = _plus(one, pole), quadratic
-    n = Cartesian(form.n[0] + 0.0 * z.re, 0.0 * z.im)
-    n_slope = Cartesian(0.0 * z.re, 0.0 * z.im)
+        value, slope = quadratic, one + pole
+    zero = Pair(0.0 * z.real, 0.0 * z.imag)
+    n, n_slope = zero + form.n[0], zero
     for coefficient in form.n[1:]:
-        n_slope = _plus(n_slope.times(z), n)
-        n = n.times(z)
-        n = Cartesian(n.re + coefficient, n.im)
+        n_slope = n_slope * z + n
+        n = n * z + coefficient
     if form.beta is None:
-        wall, stiffness = Cartesian(form.alpha, 0.0), 0.0
+        wall, stiffness = Pair(form.alpha, 0.0), 0.0
     else:
         stiffness = form.alpha + form.beta
-        wall = Cartesian(form.alpha * z.re + form.beta * one.re, stiffness * z.im)
-    push = n_slope.times(wall)
-    slope = Cartesian(slope.re + push.re + stiffness * n.re, slope.im + push.im + stiffness * n.im)
-    return _plus(value, n.times(wall)), slope
+        wall = Pair(form.alpha * z.real + form.beta * one.real, stiffness * z.imag)
+    return value + n * wall, slope + n_slope * wall + n * stiffness
 
 
-def rounding(z: Cartesian, form: ProductForm, unit: float) -> Array:
+def rounding(z: Pair, form: ProductForm, unit: float) -> Array:
     """What rounding errors may add up to in P(z)."""
-    xp = namespace(z.re)
+    xp = namespace(z.real)
     # Sums of the parts' sizes are upper bounds of moduli that neither overflow nor underflow.
-    r, one, pole = (xp.abs(z.re - zero) + xp.abs(z.im) for zero in (0.0, 1.0, form.c))
+    r, one, pole = (xp.abs(z.real - zero) + xp.abs(z.imag) for zero in (0.0, 1.0, form.c))
     lagged = r**form.power * one * ((3.0 * form.power + 8.0) * pole + 2.0 * form.c)
     n = form.n[0]
     for coefficient in form.n[1:]:
@@ -131,12 +105,12 @@ def join(re: Array, im: Array) -> Array:
     return join(re, im)
 
 
-def split(z: Array) -> Cartesian:
+def split(z: Array) -> Pair:
     """Real and imaginary parts."""
-    return Cartesian(z.real, z.imag)
+    return Pair(z.real, z.imag)
 
 
-def _differences(z: RootsFirst) -> list[Cartesian]:
+def _differences(z: RootsFirst) -> list[Pair]:
     """From each pole the ones that follow it, nearest in number first."""
     twice, count = namespace(z).concatenate([z, z]), z.shape[0]
     return [split(z - twice[k : k + count]) for k in range(1, count)]
@@ -145,14 +119,13 @@ def _differences(z: RootsFirst) -> list[Cartesian]:
 def _step(z: RootsFirst, form: ProductForm) -> RootsFirst:
     q, *others = _differences(z)
     at = split(z)
-    q_slope = Cartesian(0.0 * at.re + 1.0, 0.0 * at.im)
+    q_slope = Pair(0.0 * at.real + 1.0, 0.0 * at.imag)
     for difference in others:
-        q_slope = _plus(q_slope.times(difference), q)
-        q = q.times(difference)
+        q_slope = q_slope * difference + q
+        q = q * difference
     value, slope = evaluate(at, form)
-    ours, theirs = slope.times(q), value.times(q_slope)
-    step = value.times(q).over(Cartesian(ours.re - theirs.re, ours.im - theirs.im))
-    return join(at.re - step.re, at.im - step.im)
+    step = (value * q).over(slope * q + value * q_slope * -1.0)
+    return join(at.real - step.real, at.imag - step.imag)
 
 
 def _start(form: ProductForm) -> RootsFirst:
@@ -173,19 +146,19 @@ def discs(z: RootsFirst, form: ProductForm) -> tuple[RadiiFirst, Array, Array]:
     """
     xp = namespace(z)
     at, unit = split(z), epsilon(z.real)
-    apart = [xp.sqrt(part.re * part.re + part.im * part.im) for part in _differences(z)]
-    q = 0.0 * at.re + 1.0
+    apart = [xp.sqrt(part.real * part.real + part.imag * part.imag) for part in _differences(z)]
+    q = 0.0 * at.real + 1.0
     for distance in apart:
         q = q * distance
     value, bound = evaluate(at, form)[0], rounding(at, form, unit)
-    size = xp.abs(value.re) + xp.abs(value.im)
+    size = xp.abs(value.real) + xp.abs(value.imag)
     # A thousandth more than N, for the rounding of q.
     within = 1.001 * form.poles * (size + bound) / q
     twice = xp.concatenate([within, within])
     disjoint = xp.isfinite(within)
     for k, distance in enumerate(apart[: form.poles // 2], start=1):
         disjoint = disjoint & (distance > within + twice[k : k + form.poles])
-    settled = size <= bound + unit * (xp.abs(at.re) + xp.abs(at.im)) * q
+    settled = size <= bound + unit * (xp.abs(at.real) + xp.abs(at.imag)) * q
     return within, xp.all(disjoint, axis=0), xp.all(settled, axis=0)
 
 

@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import along, frozen, namespace
-from zwidth.loops.domain import nan_with_nan_slopes, valid_device
+from zwidth.arrays.xp import along, frozen, namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.curve import lobe, spread, wall
-from zwidth.loops.rigid.delay_classes import DelayClasses, classify_delays
+from zwidth.loops.rigid.device import DelayClasses, classify_delays, valid_device
 from zwidth.loops.rigid.needed_damping import directions, needed_damping
 from zwidth.words.types import Array, ArrayLike
 
@@ -86,7 +85,7 @@ def passive_area(delta: ArrayLike, d: ArrayLike) -> Array:
         d: delay in periods, >= 0, whole or not (held). Both broadcast.
 
     Returns:
-        Array of the broadcast shape; NaN out of range (see `loops.domain`).
+        Array of the broadcast shape; NaN out of range (see `loops.rigid.device`).
 
     Numerics:
         Gauss-Legendre quadrature between the kinks of ``needed``: about 1e-14 relative, at a cost that does not grow

@@ -1,18 +1,145 @@
-"""Stability that is never guessed: the verdict in float64 with a proved error bound, then in ball arithmetic."""
+"""Stability that is never guessed: the verdict in float64 with a proved error bound, then in ball arithmetic.
+
+The text is that of `loops.rigid.crossover`; for the points that the floating-point filter leaves open its numbers are
+balls of python-flint (optional) around inputs taken as exact, and the precision doubles until a verdict is certain.
+What no precision decides is a pair of poles exactly on the unit circle. For delta > 0 and alpha > 0 no such point is
+known: c is then transcendental, while alpha, beta, delta and d are rational. For delta = 0 there are such walls (alpha
+= 0, beta = 2, d = 0): they stay undecided.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.domain import wall_status
-from zwidth.loops.rigid import certified_balls
+from zwidth.arrays.xp import horner
 from zwidth.loops.rigid.certified_filter import OPEN, STABLE, UNSTABLE, filter_walls
+from zwidth.loops.rigid.crossover import Lag, Verdict, first_zero, long_verdict, short_verdict
+from zwidth.loops.rigid.device import DeviceTerms, PhiFunctions, discretize, wall_status
 from zwidth.loops.rigid.folding import Points, fold_arguments
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
+
+if TYPE_CHECKING:
+    import flint
+
+
+FIRST_BITS = 128
+_EXTRA_BITS = 64
+
+
+class Decision(NamedTuple):
+    """What is known of one point."""
+
+    stable: bool
+    status: Status
+    bits: int
+
+
+def available() -> bool:
+    """Whether python-flint is installed."""
+    return find_spec("flint") is not None
+
+
+def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> Decision:
+    """Decide one point of the domain, taken as exact: alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
+    edge, bits = alpha == 0, min(FIRST_BITS, max_bits)
+    while True:
+        found = verdict(alpha, beta, delta, d, bits)
+        if found.stable or found.unstable:
+            inside = bool(found.stable)
+            return Decision(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
+        if bits == max_bits:
+            return Decision(False, Status.UNDECIDED, bits)
+        bits = min(2 * bits, max_bits)
+
+
+def verdict(alpha: float, beta: float, delta: float, d: float, bits: int) -> Verdict:
+    """What is certain at one precision."""
+    import flint
+
+    with flint.ctx.workprec(bits):
+        here, wall = device(delta, d, bits), (flint.arb(alpha), flint.arb(beta))
+        return short_verdict(*wall, here) if d < 1 else long_verdict(*wall, int(d), here, _enclose_zero, _take_lag)
+
+
+@lru_cache(maxsize=64)
+def device(delta: float, d: float, bits: int) -> DeviceTerms:
+    """The device of exact delta and d in balls; whole maps share it."""
+    import flint
+
+    # What the rounding of delta (1 - f) loses, the phi-functions multiply.
+    with flint.ctx.workprec(bits + _EXTRA_BITS):
+        x, f = flint.arb(delta), flint.arb(d - int(d))
+        late = _phi(x * (1 - f))
+        p = discretize(x, f if f != 0 else None, _phi)
+        a0 = p.a0 if f != 0 else None
+        at = _phi(x)
+        phis = at.phi1, at.phi2, at.psi, late.phi1, late.psi
+        return DeviceTerms(x, None, f, p.c, p.em, *phis, p.a2, p.a1, a0, p.gap, None)
+
+
+def _phi(x: flint.arb) -> PhiFunctions:
+    """The phi-functions of x >= 0, with as many bits more as the quotients cancel."""
+    import flint
+
+    if x == 0:
+        one, half = flint.arb(1), flint.arb(0.5)
+        return PhiFunctions(one, one, half, half, flint.arb(0))
+    man, exponent = x.mid().man_exp()
+    with flint.ctx.workprec(flint.ctx.prec + 16 + max(0, -3 * (int(exponent) + int(man).bit_length()))):
+        c = (-x).exp()
+        p1 = -(-x).expm1() / x
+        p2, psi = (1 - p1) / x, (p1 - c) / x
+        return PhiFunctions(c, p1, p2, psi, p2 - psi)
+
+
+def _enclose_zero(cubic: tuple[Any, ...]) -> tuple[flint.arb, bool]:
+    """Newton's method on the midpoints, then the signs beside it."""
+    import flint
+
+    mids = [h.mid() for h in cubic]
+    with np.errstate(all="ignore"):
+        guess = first_zero(tuple(map(np.float64, mids)))
+    u = flint.arb(float(guess) if 0 < guess < 2 else 1.0)
+    smallest = flint.arb(2) ** (8 - flint.ctx.prec)
+    slopes = [k * h for k, h in enumerate(mids)][1:]
+    for _ in range(64):
+        step = (horner(u, mids) / horner(u, slopes)).mid()
+        u = (u - step).mid()
+        if not (u > 0 and u < 2):
+            return u, False
+        if abs(step) < u * smallest * 16:
+            break
+    error, slope = abs(horner(u, cubic)), abs(horner(u, slopes))
+    reach = (error * 3 / slope + u * smallest).upper()
+    low, high = u - reach, u + reach
+    found = low > 0 and high < 2 and horner(low, cubic) > 0 and horner(high, cubic) < 0
+    return flint.arb(u, reach), bool(found)
+
+
+def _take_lag(u: flint.arb, whole: int) -> Lag:
+    import flint
+
+    w = (u / 2).sqrt().asin() * 2
+    lag, turn = w * (whole + 0.5), flint.arb.pi()
+    sine, cosine = lag.sin_cos()
+    half = (lag / 2).sin()
+    return Lag(cosine, sine, half * half, lag < turn, w * (whole + 1) > turn)
+
+
+def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`decide` point by point: stable, status, bits."""
+    count = columns[0].size
+    stable, status, bits = np.zeros(count, bool), np.zeros(count, np.int32), np.zeros(count, np.int32)
+    alpha, beta, delta, d = (column.tolist() for column in columns)
+    for index in range(count):
+        stable[index], status[index], bits[index] = decide(alpha[index], beta[index], delta[index], d[index], max_bits)
+    return stable, status, bits
 
 
 class CertifiedResult(NamedTuple):
@@ -28,36 +155,12 @@ def certified_stable(
 ) -> CertifiedResult:
     """Decide whether every pole lies strictly inside the unit circle, for the inputs exactly as given.
 
-    ``stable`` means ``max |z| < 1`` over the zeros of `zwidth.char_poly`, held delay. The verdict is the phase at the
-    one gain crossover, below one period the end of the row; both are sums, products, quotients and roots of the
-    inputs, and are computed with a bound of every rounding (`loops.rigid.certified_filter`). Where the bound
-    leaves the sign open, the same lines run in ball arithmetic (python-flint), doubling the precision.
-
-    Args:
-        alpha: normalized stiffness K T^2/m.
-        beta: normalized virtual damping B T/m.
-        delta: normalized physical damping b T/m, >= 0.
-        d: delay in periods, >= 0, whole or not. All four broadcast; one device (delta and d of size one) is fastest.
-        max_bits: the largest precision of the balls, 64 or more.
-
-    Returns:
-        CertifiedResult of NumPy arrays of the broadcast shape: ``stable``; ``status``; ``bits``, 0 where the filter
-        or a sign decided, otherwise the precision that was needed. ``stable`` is False wherever the status is not OK:
-        ON_BOUNDARY, no pole is outside and at least one exactly on the circle; UNDECIDED, more than ``max_bits`` is
-        needed, or the filter left the point open and the extra ``certified`` is not installed; INVALID_INPUT, NaN,
-        infinite or negative where it must not be; OUT_OF_RANGE, see `loops.domain`.
-
-    Raises:
-        InputError: an argument is no real number, shapes do not broadcast, or ``max_bits`` is below 64.
-
-    Numerics:
-        A label is a theorem about the float64 inputs, provided that ``+ - * /`` and the square root round correctly,
-        as XLA's do unless its fast-math flags are set. The filter decides more than 99.9 % of a map and of scattered
-        points; balls take about 0.1 milliseconds a point. Neither grows with d.
-
-    References:
-        Walton, Marshall 1987 (delays by the phase at unit gain). Rump 1999 (midpoint-radius arithmetic).
-        Johansson 2017 (Arb).
+    A label is a theorem about the float64 inputs, provided that ``+ - * /`` and the square root round correctly, as
+    XLA's do unless its fast-math flags are set. ``stable`` is False wherever the status is not OK: ON_BOUNDARY, no pole
+    is outside and at least one exactly on the circle; UNDECIDED, more than ``max_bits`` (at least 64) is needed, or the
+    filter left the point open and the extra ``certified`` is not installed; or the input is out of range. ``bits`` is 0
+    where the filter or a sign decided. The filter decides more than 99.9 % of a map and of scattered points; balls take
+    about 0.1 ms a point (Walton, Marshall 1987; Rump 1999; Johansson 2017).
 
     Example:
         >>> from zwidth.loops.rigid.certified import certified_stable
@@ -99,8 +202,6 @@ def _settle_points(points: Points, verdict: np.ndarray, max_bits: int) -> tuple[
     status[inside & (verdict == STABLE) & (alpha == 0)] = Status.ON_BOUNDARY
     rest = np.flatnonzero(inside & (verdict == OPEN))
     status[rest] = Status.UNDECIDED
-    if rest.size and certified_balls.available():
-        stable[rest], status[rest], bits[rest] = certified_balls.decide_all(
-            [column[rest] for column in points], max_bits
-        )
+    if rest.size and available():
+        stable[rest], status[rest], bits[rest] = decide_all([column[rest] for column in points], max_bits)
     return stable, status, bits

@@ -1,11 +1,13 @@
-"""The verdict in float64 balls over arrays of walls: the certified method's first step, which settles nearly all.
+"""The verdict in numbers with proved errors: in balls for arrays of walls, in affine forms for boxes of devices.
 
-The text is that of `loops.rigid.crossover`. Here are the numbers that go into it: device, crossover and lag, with
-proved errors. ``u = 2^-53``. No library's exp is trusted.
+The text is that of `loops.rigid.crossover`. Here are the numbers that go into it: device, crossover and lag. Balls are
+the certified method's first step, which settles nearly all walls; affine forms prove that every wall of a box of walls
+and devices is stable, with NumPy's sine, cosine and arcsine trusted to 2^-45. ``u = 2^-53``. No library's exp is
+trusted.
 
 - ``exp``: x = k ln 2 + r with a two-part ln 2, an error of r below 0.8u, Horner's rule on 14 terms below 3u: together
   below 8u. Below x = -700 it is off by 1e-304 at most.
-- `numerics.phi.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have
+- `loops.rigid.device.phi_functions` on it: ``c = exp(-x/2)^2`` is within 17u. Below the switch at 2.5 both series have
   positive terms only, 4u: phi1 and gap are within 14u, phi2 15u, and psi, in which phi1 and gap share the error of the
   exponential, 8u + 12u. Above, where c < 0.083, phi1 is within 5u, phi2 7u, psi 14u, gap 20u. All are within 30u.
 - Held fraction: t = 1 - f is off by u, and x = delta t by 2u. phi1 and phi2 amplify that at most once and psi twice,
@@ -20,16 +22,14 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.balls import TINY, UNIT, Ball
+from zwidth.arrays.balls import TINY, UNIT, Ball, Form, chord
 from zwidth.arrays.evaluate import evaluate_columns
-from zwidth.arrays.phi import phi_functions
-from zwidth.arrays.xla import COSINE, SINE, fit_arcsine, store_once
-from zwidth.arrays.xp import horner, namespace
-from zwidth.loops.domain import WALL_RANGE, wall_status
-from zwidth.loops.rigid.boundary_map import row_limits
+from zwidth.arrays.xp import COSINE, SINE, fit_arcsine, horner, namespace, store_once
 from zwidth.loops.rigid.crossover import Lag, first_zero, long_verdict, short_verdict
-from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, classify_delays, device
+from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, classify_delays, device, phi_functions, wall_status
 from zwidth.loops.rigid.folding import Points, pick_points
+from zwidth.loops.rigid.row_limit import row_limits
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
 
@@ -205,3 +205,93 @@ def has_rows(points: Points) -> bool:
     rows = np.broadcast_shapes(*(array.shape for array in points[1:]))
     apart = all(along == 1 or across == 1 for along, across in zip(points.alpha.shape, rows, strict=True))
     return points.is_dense and apart and points.alpha.size >= 64
+
+
+# Of the phi-functions, slightly negative arguments included.
+_PHI_ERROR = 100.0 * UNIT
+_ARCSINE_ERROR = 2.0**-45
+
+
+def _phi_forms(x: Form) -> tuple[Form, Form, Form]:
+    """c, phi2 and psi: integrals of e^(-x t) over weights, so that all derivatives fall in size with x."""
+    low, high = x.lower(), x.upper()
+    # The series behind them are right for slightly negative arguments too, which a box round 0 has.
+    low = np.where(low > -1.0, low, np.nan)
+    first, last = ((at.c, at.phi2, at.psi) for at in map(functions, (low, high)))
+    size = np.maximum(low, 1e-3)
+    at_low = first[2]
+    bends = (first[0], np.minimum(0.25 * at_low, 2.0 / size**3), np.minimum(at_low, 6.0 / size**4))
+    forms = [
+        chord(x, ends, bend * (1.0 + _PHI_ERROR), _PHI_ERROR)
+        for ends, bend in zip(zip(first, last, strict=True), bends, strict=True)
+    ]
+    return forms[0], forms[1], forms[2]
+
+
+def device_forms(delta: Form, f: Form) -> DeviceTerms:
+    """The devices of boxes, in the form of `loops.rigid.device.held_plant`."""
+    t = 1.0 - f
+    x_t, x_f = delta * t, delta * f
+    (e_t, phi2_t, psi_t), (_, phi2_f, psi_f), (c, phi2, psi) = _phi_forms(x_t), _phi_forms(x_f), _phi_forms(delta)
+    p1_t, p1_f, p1 = phi2_t + psi_t, phi2_f + psi_f, phi2 + psi
+    a1 = t * t * psi_t + t * f * (e_t + p1_t) * p1_f + f * f * phi2_f
+    a2, a0 = t * t * phi2_t, e_t * (f * f * psi_f)
+    return DeviceTerms(delta, None, f, c, delta * p1, p1, phi2, psi, p1_t, psi_t, a2, a1, a0, a2 - a1 + a0, None)
+
+
+def enclose_zero_form(cubic: tuple[Form, Form, Form, Form]) -> tuple[Form, np.ndarray]:
+    """The crossover as a form: first order by the implicit function, proved by the signs of H on both sides of it."""
+    _, h1, h2, h3 = mids = tuple(h.mid for h in cubic)
+    u = first_zero(mids)
+    slope = h1 + u * (2.0 * h2 + 3.0 * u * h3)
+    lin = -(cubic[0].lin + u * (cubic[1].lin + u * (cubic[2].lin + u * cubic[3].lin))) / slope
+    form = Form(u, lin, np.zeros_like(u))
+    left = horner(form, cubic)
+    reach = 2.0 * (np.abs(left.mid) + left.spread) / np.abs(slope) + 8.0 * UNIT * u
+    before, behind = (horner(Form(u + side, lin, 4.0 * UNIT * u), cubic) for side in (-reach, reach))
+    found = (before > 0) & (behind < 0) & (form.mid - form.spread - reach > 0)
+    return Form(u, lin, reach + 8.0 * UNIT * u), found
+
+
+def take_lag_form(u: Form, whole: np.ndarray) -> Lag:
+    """Cosine and sine of ``(n + 1/2) w``: w(u) by its chord, concave for u < 1; then to first order, |sin|'' <= 1."""
+    low, high = u.lower(), u.upper()
+    good = (low > 0) & (high < 1.0)
+    low, high = np.where(good, low, 0.5), np.where(good, high, 0.5)
+    turns = whole + 0.5
+    ends = 2.0 * turns * np.arcsin(np.sqrt(0.5 * low)), 2.0 * turns * np.arcsin(np.sqrt(0.5 * high))
+    square = low * (2.0 - low)
+    angle = chord(u, ends, -turns * (1.0 - low) / (square * np.sqrt(square)), _ARCSINE_ERROR)
+    spread = angle.spread
+    within = good & (angle.mid + spread < np.pi * (1.0 - 1e-15))
+    beyond = good & ((angle.mid - spread) * (whole + 1.0) > np.pi * turns * (1.0 + 1e-15))
+    sine, cosine = np.sin(angle.mid), np.cos(angle.mid)
+    left = angle.rad + 0.5 * spread * spread + 2.0**-45
+    turned = Form(cosine, -sine * angle.lin, left)
+    return Lag(turned, Form(sine, cosine * angle.lin, left), (1.0 - turned) * 0.5, within, beyond)
+
+
+def stable_everywhere(alpha: Form, beta: Form, delta: Form, d: Form) -> np.ndarray:
+    """Whether every wall of each box is proved stable; a delay that crosses a whole number is taken on both sides."""
+    low, high = d.lower(), d.upper()
+    first = np.maximum(np.floor(low), 0.0)
+    stable = (alpha > 0) & (beta + delta > 0) & (high <= first + 2.0)
+    with np.errstate(all="ignore"):
+        stable &= _stable_behind(alpha, beta, delta, d, first)
+        crosses = np.flatnonzero(stable & (high >= first + 1.0))
+        if crosses.size:
+            parts = [Form(x.mid[crosses], x.lin[:, crosses], x.rad[crosses]) for x in (alpha, beta, delta, d)]
+            stable[crosses] &= _stable_behind(parts[0], parts[1], parts[2], parts[3], first[crosses] + 1.0)
+    return stable
+
+
+def _stable_behind(alpha: Form, beta: Form, delta: Form, d: Form, whole: np.ndarray) -> np.ndarray:
+    """The verdict with n = ``whole``; f may leave [0, 1], where only its part inside has a meaning."""
+    here = device_forms(delta, d - whole)
+    short = whole == 0
+    stable = np.zeros(whole.shape, bool)
+    if short.any():
+        stable = short & short_verdict(alpha, beta, here).stable
+    if not short.all():
+        stable |= ~short & long_verdict(alpha, beta, whole, here, enclose_zero_form, take_lag_form).stable
+    return stable

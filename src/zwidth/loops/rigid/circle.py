@@ -20,10 +20,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xla import angle, find_turn
-from zwidth.arrays.xp import epsilon, namespace
-from zwidth.loops.domain import nan_unless, valid_wall
-from zwidth.loops.rigid.plant import held_plant, split_delay, undelayed_plant
+from zwidth.arrays.xp import angle, epsilon, find_turn, namespace, nan_unless
+from zwidth.loops.rigid.device import held_plant, split_delay, undelayed_plant, valid_wall
 from zwidth.words.types import Array
 
 # Steps of the bracketed Newton iteration for the zeros of the cubic.

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import join_shapes, to_caller
+from zwidth.arrays.evaluate import join_shapes, to_caller
 from zwidth.arrays.xp import is_traced, namespace
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array, ArrayLike, Counts, RootsLike

@@ -1,6 +1,6 @@
 """Stable or not in closed form: the loop has one gain crossover, and the lobe of stable walls is compared with there.
 
-Notation, on ``z = e^(j w)`` with ``u = 1 - cos w``, ``y = u/2``, and the plant of `loops.rigid.plant`: P = T + B with
+Notation, on ``z = e^(j w)`` with ``u = 1 - cos w``, ``y = u/2``, and the plant of `loops.rigid.device`: P = T + B with
 
     T = z^(1+n) (z - 1)(z - c)                device and delay, d = n + f
     B = M(z) ((alpha + beta) z - beta)        wall;  M = a2 z + a1 + a0/z
@@ -22,11 +22,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xla import ARCSINE, COSINE, SINE
-from zwidth.arrays.xp import horner, namespace, roots
-from zwidth.loops.domain import WALL_RANGE, within
-from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, DeviceTerms, device
-from zwidth.loops.rigid.row_limit import long_curve, short_curve
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, horner, namespace, roots, within
+from zwidth.loops.rigid.device import ANY, DelayClasses, DeviceTerms, device, long_curve, short_curve
+from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import Array
 
 # From its start the zero of the cubic is within 11 %; each step squares that.

@@ -15,11 +15,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import tree_map
 from zwidth.arrays.roots import bisect
-from zwidth.arrays.xp import frozen, horner, namespace, repeat
-from zwidth.loops.rigid.delay_classes import DelayClasses, DeviceTerms, device
-from zwidth.loops.rigid.plant import Plant
+from zwidth.arrays.xp import frozen, horner, namespace, repeat, tree_map
+from zwidth.loops.rigid.device import DelayClasses, DeviceTerms, Plant, device, short_curve
 from zwidth.loops.rigid.ridge_newton import guess_start, solve
 from zwidth.loops.rigid.row_limit import (
     Angles,
@@ -28,7 +26,6 @@ from zwidth.loops.rigid.row_limit import (
     long_row_point,
     offset,
     open_lobe,
-    short_curve,
     short_place,
     short_row,
     turn_angles,

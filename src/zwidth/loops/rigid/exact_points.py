@@ -23,9 +23,9 @@ import jax
 import jax.numpy as jnp
 import optimistix
 
-from zwidth.arrays.xla import store_once
-from zwidth.loops.domain import device_status, nan_with_nan_slopes, wall_status
+from zwidth.arrays.xp import nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.crossover import stable_kernel
+from zwidth.loops.rigid.device import device_status, wall_status
 from zwidth.loops.rigid.polynomial import FrequencyLoop, Wall, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge_newton import corner, expand_curve
 from zwidth.words.status import RidgeKind, Status

@@ -12,13 +12,10 @@ import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.roots import false_position, follow_root
-from zwidth.arrays.xp import along, epsilon, frozen, namespace
-from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
+from zwidth.arrays.xp import along, epsilon, frozen, namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.crossover import gain_crossover, stable_at
-from zwidth.loops.rigid.delay_classes import ANY, DeviceTerms, device
-from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, modulus
-from zwidth.loops.rigid.open_loop import find_angle, size_and_phase
-from zwidth.loops.rigid.plant import split_delay
+from zwidth.loops.rigid.device import ANY, DeviceTerms, device, split_delay, valid_wall
+from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, find_angle, modulus, size_and_phase
 from zwidth.words.types import Array, ArrayLike
 
 # Steps of false position at most; every sixth one halves the bracket.

@@ -6,19 +6,8 @@ Notation: ``d = n + f``, ``k = n + 1``, ``a = alpha/2``, ``b = beta + alpha/2``,
     N(w) = (A + sqrt(A^2 + kappa R))/2      A = rho (a cot(w/2) sin psi - b cos psi)
                                             R = a^2 + (b^2 - a^2) u/2
 
-the larger root of ``N^2 - A N - kappa R/4 = 0``; for whole d simply A. Let alpha >= 0. Where its supremum is:
-
-1. *beta <= 0: at w = 0.* A is largest there, and for |b| <= a so is R. For b = -a - m < -a the quadratic asks for
-   ``(A(0) - A) N(0) >= kappa m (2 a + m) u/8``, and ``A(0) - A >= m (1 - rho) >= m kappa u/4``, ``N(0) >= 2 a + m``.
-2. *beta > 0: where psi <= pi.* Let w1 be the first w of psi = pi; there ``N = N1 = (rho b + sqrt(b^2 + kappa a^2
-   cos^2(w/2)))/2``. Behind it, sin psi < 0 leaves A <= rho b, and N below the same expression at a larger w, so below
-   N1. For whole d and sin psi >= 0 the w with psi less by 2 pi has the same sine and cosine and a larger cotangent.
-   For a held one with n >= 1 and psi >= 2 pi: if ``a cot(w/2) <= 0.56 b`` the quadratic at N1 is >= 0; if not, N is
-   below N(0) >= a (2 d + 2) - b, by ``cot(w/2) <= cot(pi/(n + 2))``. For n = 0 no such w exists.
-3. *In between there is one peak.* For whole d its condition ``beta/alpha = (1/k) sum_(i<k) i sin(i w)/sin(k w)`` has a
-   right side that grows from w = 0 to pi/k, term by term, since y cot y falls. For held delays that was seen at every
-   one of thousands of directions for each of a hundred delays, not proved.
-
+the larger root of ``N^2 - A N - kappa R/4 = 0``; for whole d simply A. Let alpha >= 0. Its supremum is at w = 0 for
+beta <= 0, else where psi <= pi, at the one peak there (docs/theory/passivity.md, P1 to P3).
 N is homogeneous in (alpha, beta), a polynomial in u under the root, and stationary where ``E = A' + kappa (b^2 - a^2)/
 (8 N)`` vanishes, a prime for d/du.
 """
@@ -30,10 +19,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.roots import newton
-from zwidth.arrays.xla import ARCSINE, COSINE, SINE
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace
-from zwidth.loops.rigid.delay_classes import ANY, DelayClasses
-from zwidth.loops.rigid.plant import split_delay
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace
+from zwidth.loops.rigid.device import ANY, DelayClasses, split_delay
 from zwidth.words.types import Array
 
 # Of the peak, from its fit; of the direction from which it exists, from twice its beta at most.

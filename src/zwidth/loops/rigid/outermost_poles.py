@@ -12,11 +12,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks
-from zwidth.arrays.xla import WIDE
-from zwidth.loops.domain import wall_status
+from zwidth.arrays.xp import WIDE
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
-from zwidth.loops.rigid.delay_classes import classify_delays
+from zwidth.loops.rigid.device import classify_delays, wall_status
 from zwidth.loops.rigid.folding import Points, fold
 from zwidth.loops.rigid.pole_map import Area, follow_poles
 from zwidth.loops.rigid.pole_search import (

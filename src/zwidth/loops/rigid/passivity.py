@@ -1,16 +1,8 @@
 """Passivity of the sampled wall of the rigid loop (Colgate's condition), for any delay.
 
-Per frequency the condition is a lower bound on the physical damping. For whole d, with D = sin((d + 1/2) w)/sin(w/2),
-
-    delta > alpha D/2 - beta cos((d + 1) w)            for every w in (0, pi]
-
-which at d = 0 is eq. (21), ``delta > alpha/2 + |beta|``. For a held delay d = n + f the worst motion also bends when
-the force arrives; with s = sin(w/2) and G = j e^(jw(n + 1/2)) (alpha - 2j beta s e^(jw/2)) the bound becomes
-
-    delta > (-h + sqrt(h^2 + 4 f (1 - f) s^2 |G|^2)) / (4 s),   h = Re{((1 - f) + f e^(jw)) G}
-
-Both are convex and homogeneous in (alpha, beta): one convex set for each delay, whatever the device. Where the bound is
-highest: `loops.rigid.needed_damping`. On a map of one delay it is a polynomial of one variable, the direction.
+Per frequency the condition is a lower bound on the physical damping (docs/theory/passivity.md), convex and homogeneous
+in (alpha, beta): one convex set for each delay, whatever the device. Where the bound is highest:
+`loops.rigid.needed_damping`. On a map of one delay it is a polynomial of one variable, the direction.
 """
 
 from __future__ import annotations
@@ -20,15 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64, check_scalars, to_caller
-from zwidth.arrays.evaluate import FEW, evaluate, evaluate_columns
-from zwidth.arrays.xp import horner, is_traced, namespace
-from zwidth.loops.domain import LONGEST_DELAY, nan_with_nan_slopes, valid_wall
-from zwidth.loops.rigid.degrees import NAMES
-from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
-from zwidth.loops.rigid.folding import fold_arguments, group_by
+from zwidth.arrays.evaluate import FEW, as_float64, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.arrays.xp import horner, is_traced, namespace, nan_with_nan_slopes
+from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, valid_wall
+from zwidth.loops.rigid.folding import NAMES, fold_arguments, group_by
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
 from zwidth.words.errors import InputError
+from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
 
 # Chebyshev terms: the last one is below 1e-16 for every delay.
@@ -153,7 +143,7 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         d: delay in periods, >= 0, whole or not (held). All four broadcast.
 
     Returns:
-        Array of the broadcast shape; NaN where the input is out of range (see `loops.domain`).
+        Array of the broadcast shape; NaN where the input is out of range (see `loops.rigid.device`).
 
     Numerics:
         About 1e-15 of what is needed, at a cost that does not grow with d. Where the condition peaks is proved for

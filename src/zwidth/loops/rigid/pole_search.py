@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xla import angle
-from zwidth.arrays.xp import epsilon, frozen, namespace, repeat
-from zwidth.loops.domain import nan_unless, nan_with_nan_slopes, valid_wall
+from zwidth.arrays.xp import angle, epsilon, frozen, namespace, nan_unless, nan_with_nan_slopes, repeat
 from zwidth.loops.rigid.circle import Loop, count, factor_loop
+from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
 from zwidth.words.types import Array
 

@@ -50,12 +50,19 @@ class Pair:
             return Pair(real, self.real * other.imag + self.imag * other.real)
         return Pair(self.real * other, self.imag * other)
 
+    def over(self, other: Pair) -> Pair:
+        """The quotient."""
+        size = square(other)
+        real = (self.real * other.real + self.imag * other.imag) / size
+        return Pair(real, (self.imag * other.real - self.real * other.imag) / size)
+
     def conjugate(self) -> Pair:
         """The same above the real axis as below."""
         return Pair(self.real, -self.imag)
 
 
-def _square(x: Any) -> Array:
+def square(x: Any) -> Array:
+    """``|x|^2``."""
     return x.real * x.real + x.imag * x.imag
 
 
@@ -140,25 +147,25 @@ def newton_step(re: Array, im: Array, loop: Loop, fractional: bool) -> Step:
     """One step from ``e^(re + j im)``, |im| <= pi."""
     xp = namespace(re, loop.alpha)
     at = value_at(re, im, loop, fractional)
-    norm = _square(at.first)
+    norm = square(at.first)
     by = at.p * at.first.conjugate() * (-1.0 / norm)
     # A polynomial of degree N has a zero within N |P/P'| of any point.
     poles, slope = loop.turns + (3.0 if fractional else 2.0), xp.sqrt(norm)
     doubt = at.rounding / slope
     # Of the step itself what the bend leaves: next to a double pole half of it.
-    bent = _square(by) * xp.sqrt(_square(at.second)) / slope
-    return Step(by.real, by.imag, poles * (xp.sqrt(_square(at.p)) / slope + doubt), doubt + bent)
+    bent = square(by) * xp.sqrt(square(at.second)) / slope
+    return Step(by.real, by.imag, poles * (xp.sqrt(square(at.p)) / slope + doubt), doubt + bent)
 
 
 def halley_step(re: Array, im: Array, loop: Loop, fractional: bool) -> tuple[Array, Array]:
     """The place in the upper half plane to which a step leads, not longer than about the distance between poles."""
     xp = namespace(re, loop.alpha)
     at = value_at(re, im, loop, fractional)
-    back = at.first.conjugate() * (1.0 / _square(at.first))
+    back = at.first.conjugate() * (1.0 / square(at.first))
     by = at.p * back
     bent = by * (at.second * back) * -0.5 + 1.0
-    by = by * bent.conjugate() * (-1.0 / _square(bent))
-    size = xp.sqrt(_square(by)) * (loop.turns + 1.0)
+    by = by * bent.conjugate() * (-1.0 / square(bent))
+    size = xp.sqrt(square(by)) * (loop.turns + 1.0)
     shorter = _LONGEST / xp.maximum(size, _LONGEST)
     return move_pole(re, im, by.real * shorter, by.imag * shorter)
 

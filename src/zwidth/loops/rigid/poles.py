@@ -8,15 +8,15 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.arguments import as_float64
-from zwidth.arrays.evaluate import map_blocks
+from zwidth.arrays.evaluate import as_float64, map_blocks
 from zwidth.arrays.xp import is_traced, namespace, repeat
-from zwidth.loops.domain import LONGEST_DELAY, wall_status
 from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, join, product_form, replace_invalid, split, with_zero
-from zwidth.loops.rigid.degrees import Degree, few_poles, find_degree, map_by_degree
+from zwidth.loops.rigid.device import wall_status
+from zwidth.loops.rigid.folding import Degree, few_poles, find_degree, map_by_degree
+from zwidth.loops.rigid.pole_step import Pair, square
 from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
-from zwidth.words.quantities import MOST_POLES
+from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, Coefficients, Counts, Matrices, Reals, Roots, RootsFirst
 
@@ -74,19 +74,15 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
     def step(z: RootsFirst) -> RootsFirst:
         here = split(z)
         value, slope = evaluate(here, form)
-        still = (slope.re == 0) & (slope.im == 0)
-        by = value.over(slope._replace(re=xp.where(still, 1.0, slope.re)))
-        taken = ~still & (_square(by) < 1e-6 * xp.maximum(_square(here), 1e-6))
-        return join(here.re - xp.where(taken, by.re, 0.0), here.im - xp.where(taken, by.im, 0.0))
+        still = (slope.real == 0) & (slope.imag == 0)
+        by = value.over(Pair(xp.where(still, 1.0, slope.real), slope.imag))
+        taken = ~still & (square(by) < 1e-6 * xp.maximum(square(here), 1e-6))
+        return join(here.real - xp.where(taken, by.real, 0.0), here.imag - xp.where(taken, by.imag, 0.0))
 
     first = xp.moveaxis(z, -1, 0)
     last = repeat(_POLISHING_STEPS, step, first, xp)
-    better = _square(evaluate(split(last), form)[0]) < _square(evaluate(split(first), form)[0])
+    better = square(evaluate(split(last), form)[0]) < square(evaluate(split(first), form)[0])
     return with_zero(xp.moveaxis(xp.where(better, last, first), 0, -1), spring) + spoiled[..., None]
-
-
-def _square(z: Any) -> Array:
-    return z.re * z.re + z.im * z.im
 
 
 def radius_kernel(

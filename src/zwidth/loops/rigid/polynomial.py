@@ -1,6 +1,6 @@
 """The closed loop of device and virtual wall, affine in (alpha, beta).
 
-Held delay d = n + f, with N(z) = a2 z^2 + a1 z + a0 of `loops.rigid.plant`:
+Held delay d = n + f, with N(z) = a2 z^2 + a1 z + a0 of `loops.rigid.device`:
 
     P(z) = z^(2+n) (z - 1)(z - c) + N(z) (alpha z + beta (z - 1))
 
@@ -15,10 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import horner, namespace
-from zwidth.loops.domain import nan_with_nan_slopes, valid_wall
-from zwidth.loops.rigid.degrees import Degree, map_by_degree
-from zwidth.loops.rigid.plant import Plant, held_plant, split_delay, undelayed_plant
+from zwidth.arrays.xp import horner, namespace, nan_with_nan_slopes
+from zwidth.loops.rigid.device import Plant, held_plant, split_delay, undelayed_plant, valid_wall
+from zwidth.loops.rigid.folding import Degree, map_by_degree
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.types import DELAY_MODELS, Array, ArrayLike, Coefficients, Reals
 
@@ -159,11 +158,6 @@ def _limits_at_pi(alpha: Array, beta: Array, finite: Array, omega: Array, whole:
     alpha = xp.where(finite, alpha, -sign * xp.inf)
     beta = xp.where(finite, beta, sign * xp.inf)
     return xp.where(inside, alpha, xp.nan), xp.where(inside, beta, xp.nan)
-
-
-def tilt_at_minus_one(plant: Plant, whole: Array) -> Array:
-    """P(-1) has the stable sign where ``tilt (alpha + 2 beta) < 1`` (held delay); 0 where N(-1) = 0."""
-    return (1.0 - 2.0 * (whole % 2.0)) * 0.5 * plant.gap / (1.0 + plant.c)
 
 
 def check_delay_model(delay_model: str) -> None:

@@ -1,28 +1,173 @@
-"""The stiffest stable wall of the rigid loop, alpha_max(delta, d)."""
+"""The stiffest stable wall of the rigid loop, alpha_max(delta, d), and its slope over strong damping, eq. (22)."""
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple, TypeAlias
+from functools import cache
+from math import factorial
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, namespace
-from zwidth.loops.domain import device_status, nan_unless
-from zwidth.loops.rigid.delay_classes import ANY, DelayClasses, classify_delays
-from zwidth.loops.rigid.plant import Plant, split_delay, undelayed_plant
+from zwidth.arrays.xp import epsilon, horner, namespace, nan_unless, push_forward
+from zwidth.loops.rigid.device import (
+    ANY,
+    DelayClasses,
+    Plant,
+    classify_delays,
+    device_status,
+    held_plant,
+    phi_functions,
+    split_delay,
+    undelayed_plant,
+    valid_device,
+)
 from zwidth.loops.rigid.polynomial import check_delay_model
-from zwidth.loops.rigid.ridge_newton import Ridge, guess_start, is_undelayed
-from zwidth.loops.rigid.ridge_slopes import (
-    alpha_by_lag,
-    alpha_change,
-    differentiable_plant,
-    differentiable_ridge,
-    plant_slopes,
+from zwidth.loops.rigid.ridge_newton import (
+    Ridge,
+    Start,
+    expand_curve,
+    guess_start,
+    is_undelayed,
+    sides,
+    solve,
+    stationarity,
+    wall,
+    wave,
 )
 from zwidth.words.errors import check_choice
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
+
+# -phi2' = gap/x = e^(-x/2) sum_k (k + 1) (x/2)^(2k) / (2k + 3)!, as in `loops.rigid.device`
+_CHI = [(k + 1.0) / factorial(2 * k + 3) for k in range(13)]
+
+
+def _chi(x: Array, gap: Array) -> Array:
+    """``gap/x = -phi2'``, 1/6 at 0; ``psi' = chi - psi`` and ``phi1' = -psi``."""
+    xp = namespace(x)
+    small = x < 2.5
+    half = xp.where(small, 0.5 * x, 0.0)
+    return xp.where(small, xp.exp(-half) * horner(half * half, _CHI), gap / xp.where(small, 1.0, x))
+
+
+def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
+    """The derivatives of `loops.rigid.device.held_plant` in delta and in the fraction."""
+    f, t = fraction, 1.0 - fraction
+    c, e_t = (namespace(delta).exp(-x) for x in (delta, delta * t))
+    at_t, at_f = phi_functions(delta * t), phi_functions(delta * f)
+    chi_t, chi_f = _chi(delta * t, at_t.gap), _chi(delta * f, at_f.gap)
+    # Every term of a1 falls.
+    a2 = -t * t * t * chi_t
+    a1 = t * t * t * (at_t.psi - chi_t) + f * f * f * chi_f
+    a1 = -(a1 + t * f * (e_t * (t * at_f.phi1 + f * at_f.psi) + t * at_t.psi * at_f.phi1 + f * at_t.phi1 * at_f.psi))
+    a0 = -e_t * f * f * (t * at_f.psi + f * (at_f.psi - chi_f))
+    slow, fast = t * at_t.phi1, e_t * f * at_f.phi1
+    zero = 0.0 * c
+    return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
+
+
+def alpha_change(s: Array, plant: Plant, lag: Array, change: Plant, undelayed: bool = False) -> Array:
+    """How alpha moves at a fixed s (1 at a corner) when the plant does."""
+    xp = namespace(s, plant.a2)
+    curve = expand_curve(plant)
+    at = wave(s, lag, undelayed)
+    g1, g2, m, rho = sides(at, curve)
+    y, q, tau, kappa = at.y, at.q, at.tau, at.kappa
+    b, k, dk, sin2 = change.a2 + change.a0, curve.k, change.a2 - change.a0, 4.0 * y * q
+    dm = xp.where(y < 0.5, b * (1.0 - 2.0 * y) + change.a1, 2.0 * b * q - change.gap)
+    # dM conj M = h1 + j h2 sin omega
+    h1, h2 = dm * m + dk * k * sin2, dk * m - dm * k
+    turned = tau * (g1 * h1 - g2 * h2 * sin2) + kappa * (g1 * h2 + g2 * h1)
+    return -4.0 * y * (change.c * (tau * m - kappa * k) + turned / rho) / rho
+
+
+def alpha_by_lag(ridge: Ridge, lag: Array) -> Array:
+    """How alpha moves with the exponent D; -inf at a corner, which the fractional power leaves like -d^(2/3)."""
+    xp = namespace(ridge.s, lag)
+    at = wave(ridge.s, lag, True)
+    slope = -8.0 * at.y * at.half * at.per_sin * (ridge.beta + 0.5 * ridge.alpha)
+    return xp.where(ridge.s >= 1.0, -np.inf, slope)
+
+
+def differentiable_plant(delta: Array, fraction: Array) -> Plant:
+    """`loops.rigid.device.held_plant`, in JAX with its derivatives in closed form."""
+    return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
+
+
+def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
+    """`loops.rigid.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
+    if namespace(plant.a2, lag) is np:
+        return solve(plant, lag, start, delay_model, kind)
+    import jax
+    import jax.numpy as jnp
+
+    ridge = _jax_ridge()(plant, lag, start, delay_model, kind)
+    if delay_model == "held":
+        return ridge
+    # The corner is left as soon as d > 0, alpha like -d^(2/3), omega like -d^(1/3), with infinite slopes.
+    corner = ridge.s >= 1.0
+    fall = jnp.where(corner, jnp.sqrt(jnp.where(corner, lag, 1.0)), 0.0)
+    # Turned by pi d the curve's alpha(q) and beta(q), q = 1 - s^2, become alpha + a1 q - 2 t, beta + b1 q + t, and the
+    # largest alpha has t = -a1 q: it moves by 3 a1 q, beta by (b1 - a1) q.
+    phi1, body = plant.a2 + plant.a1, plant.a1 * (1.0 + plant.a2 * ridge.beta)
+    lean = plant.a2 + plant.c * plant.a1 - plant.a1 * (2.0 * ridge.beta * phi1 + ridge.alpha * plant.a2)
+    share = jax.lax.stop_gradient(jnp.where(corner, (body / lean - 1.0) / 3.0, 0.0))
+    return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - share * fall, omega=ridge.omega - fall)
+
+
+def move_ridge(
+    ridge: Ridge, plant: Plant, lag: Array, change: Plant, lag_change: Array, delay_model: str, kind: DelayClasses
+) -> Ridge:
+    """How the ridge moves when the plant and the lag do; whole periods do not."""
+    xp = namespace(ridge.s, plant.a2)
+    corner = ridge.s >= 1.0
+    undelayed = is_undelayed(delay_model, kind)
+    alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
+    if delay_model == "fractional_power":
+        alpha += xp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
+    else:
+        lag_change = xp.zeros_like(lag)
+    curve = expand_curve(plant)
+    along = (push_forward(expand_curve, (plant,), (change,), xp), lag_change)
+    first = push_forward(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along, xp)
+    _, second = stationarity(ridge.s, curve, lag, undelayed)
+    s = xp.where(corner, 0.0, -first / xp.where(corner, 1.0, second))
+    _, beta = push_forward(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along), xp)
+    root = xp.sqrt(xp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
+    return Ridge(alpha, beta, 2.0 * s / root, s, xp.zeros_like(s))
+
+
+@cache
+def _jax_plant() -> Any:
+    import jax
+
+    function = jax.custom_jvp(held_plant)
+
+    @function.defjvp
+    def rule(primals: tuple, tangents: tuple) -> tuple[Plant, Plant]:
+        (by_delta, by_f), (d_delta, d_f) = plant_slopes(*primals), tangents
+        change = (a * d_delta + b * d_f for a, b in zip(by_delta, by_f, strict=True))
+        return function(*primals), Plant(*change)
+
+    return function
+
+
+@cache
+def _jax_ridge() -> Any:
+    import jax
+
+    function = jax.custom_jvp(solve, nondiff_argnums=(3, 4))
+
+    @function.defjvp
+    def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
+        # The rule calls the function itself and is made of differentiable formulas: hence right to any order.
+        plant, lag, start = primals
+        ridge = function(plant, lag, start, delay_model, kind)
+        return ridge, move_ridge(ridge, plant, lag, tangents[0], tangents[1], delay_model, kind)
+
+    return function
+
 
 RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
@@ -82,12 +227,27 @@ def alpha_max(
         from zwidth.loops.rigid.exact_points import kkt_kernel
 
         return RidgePoint(*evaluate(kkt_kernel, arguments, delay, route="jax"))
-    return evaluate(ridge_kernel, arguments, delay, classify_delays(d))
+    return evaluate(ridge_kernel, arguments, delay, classify_delays(d), slopes=move_point if delay == "held" else None)
 
 
 def ridge_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgePoint:
     """`alpha_max`, elementwise."""
     return _point(*_solve_ridge(delta, d, delay_model, kind)[:2])
+
+
+def move_point(
+    delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY
+) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
+    """`ridge_kernel` of a held delay, and how it moves with delta and d."""
+    ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
+    point, still, arrived = _point(ridge, status), np.zeros_like(lag), converged(ridge)
+
+    def move(change: Plant) -> RidgePoint:
+        alpha, beta, omega, *_ = move_ridge(ridge, plant, lag, change, still, delay_model, kind)
+        return point._replace(**dict(zip(RidgePoint._fields, nan_unless(arrived, alpha, beta, omega), strict=False)))
+
+    by_delta, by_f = plant_slopes(delta, f)
+    return point, (move(by_delta), move(by_f))
 
 
 class RidgeSlopes(NamedTuple):
@@ -161,3 +321,53 @@ def _point(ridge: Ridge, status: Array) -> RidgePoint:
     kind = xp.where(ridge.s >= 1.0, int(RidgeKind.CORNER), int(RidgeKind.SMOOTH))
     alpha, beta, omega = nan_unless(arrived, ridge.alpha, ridge.beta, ridge.omega)
     return RidgePoint(alpha, beta, omega, kind.astype(np.int32), status.astype(np.int32))
+
+
+def stiffness_slope(d: ArrayLike, *, delay: DelayModel = "held") -> Array:
+    """Return the slope of the stiffest stable wall over physical damping, in the limit of strong damping.
+
+    ``g(d) = lim alpha_max(delta, d)/delta`` for ``delta -> infinity``; in SI units ``K_max T/b -> g(d)``. With
+    ``alpha = g delta``, ``beta = h delta`` the loop becomes, for a held delay d = n + f,
+
+        z^(2+n) (z - 1) + ((1 - f) z + f) ((g + h) z - h) = 0
+
+    (whole d: ``z^(2+d) - z^(1+d) + (g + h) z - h = 0``), for the fractional power the latter with z^d for every d.
+    g is the largest one for which some h keeps every zero inside the unit circle.
+
+    Args:
+        d: delay in periods, 0 to 1e5, whole or not; any shape.
+        delay: "held" (exact) or "fractional_power" (the paper's z^(1+d)); the same for whole d.
+
+    Returns:
+        Array of d's shape: 4, 1, 0.631130, 0.465011, 0.369041 for d = 0, 1, 2, 3, 4. NaN where d is NaN, negative,
+        infinite or too long.
+
+    Numerics:
+        About 1e-15 relative. Traceable, with derivatives of every order in d. The held slope is
+        ``4 (1 - 3 d)/(1 - 2 d)^2`` (a corner, with its maximum 4.5 at d = 1/6) up to d = 1/4, ``1/d`` up to d = 1. It
+        is continuous, with a kink at every whole d > 0: derivatives there are those from the right (0 at d = 1,
+        where the one from the left is -1). For finite delta alpha_max has no kink: its derivative in d turns within
+        about 1/delta of a whole d. The fractional power's slope has one kink, at d = 0: its derivative is -inf.
+
+    References:
+        Hulin, Preusche, Hirzinger 2006, eq. (22).
+
+    Example:
+        >>> import zwidth
+        >>> print(f"{zwidth.loops.rigid.ridge.stiffness_slope(2):.6f}")
+        0.631130
+    """
+    check_delay_model(delay)
+    return evaluate(slope_kernel, {"d": d}, delay, classify_delays(d))
+
+
+def slope_kernel(d: Array, delay_model: str, kind: DelayClasses = ANY) -> Array:
+    """`stiffness_slope`, elementwise."""
+    (d,) = nan_unless(valid_device(0.0 * d, d), d)
+    zero = 0.0 * d
+    lag, f = split_delay(d) if delay_model == "held" else (d, zero)
+    # delta N(z) for delta -> infinity: the velocity follows the force at once, e^-delta and its like vanish.
+    plant = Plant(c=zero, em=zero + 1.0, a2=1.0 - f, a1=f, a0=zero, gap=1.0 - 2.0 * f)
+    start = guess_start(zero, d, f, kind, strength=zero + 1.0)._replace(corner=zero)
+    ridge = differentiable_ridge(plant, lag, start, delay_model, kind)
+    return nan_unless(converged(ridge), ridge.alpha)[0]

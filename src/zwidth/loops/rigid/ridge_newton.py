@@ -26,10 +26,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xla import ARCSINE, COSINE, SINE, store_once
-from zwidth.arrays.xp import epsilon, frozen, horner, namespace, repeat
-from zwidth.loops.rigid.delay_classes import ANY, DelayClasses
-from zwidth.loops.rigid.plant import Plant
+from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
+from zwidth.loops.rigid.device import ANY, DelayClasses, Plant
 from zwidth.words.types import Array
 
 

@@ -6,10 +6,9 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.arguments import broadcast, check_scalars, to_caller
-from zwidth.arrays.evaluate import evaluate
+from zwidth.arrays.evaluate import broadcast, check_scalars, evaluate, to_caller
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.rigid.degrees import NAMES
+from zwidth.loops.rigid.folding import NAMES
 from zwidth.loops.rigid.outermost_poles import find_poles, prove_radii
 from zwidth.loops.rigid.pole_search import traced_kernel
 from zwidth.loops.rigid.poles import radius_by_companion

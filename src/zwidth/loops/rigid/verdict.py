@@ -6,23 +6,24 @@ from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.arguments import are_numbers, check_scalars, to_caller
-from zwidth.arrays.evaluate import evaluate, evaluate_columns
+from zwidth.arrays.evaluate import are_numbers, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.xp import is_traced
-from zwidth.loops.domain import wall_status
-from zwidth.loops.rigid.boundary_map import boundary_map
 from zwidth.loops.rigid.crossover import stable_kernel
-from zwidth.loops.rigid.degrees import NAMES
-from zwidth.loops.rigid.delay_classes import classify_delays
-from zwidth.loops.rigid.folding import Points, fold_arguments
-from zwidth.loops.rigid.poles import unstable_poles
+from zwidth.loops.rigid.device import classify_delays, wall_status
+from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments
+from zwidth.loops.rigid.poles import radius_by_companion, unstable_poles
 from zwidth.loops.rigid.polynomial import check_has_poles
+from zwidth.loops.rigid.row_limit import boundary_map
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.status import Method, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
 StabilityMethod: TypeAlias = Literal["auto", "crossover", "companion", "certified"]
 STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
+
+
+# How far eigenvalues may be off where two poles are one: the root of the rounding unit.
+_ROUGH = 2e-8
 
 
 class Stability(NamedTuple):
@@ -79,13 +80,13 @@ def is_stable(
         array([ True,  True, False])
     """
     values = (alpha, beta, delta, d)
-    _check(method, delay)
-    arguments = dict(zip(NAMES, values, strict=True))
-    traced = is_traced(*values)
-    if method in ("auto", "crossover") and (traced or are_numbers(*values)):
+    arguments, numbers = dict(zip(NAMES, values, strict=True)), are_numbers(*values)
+    if not (numbers and method == "auto" and delay == "held"):
+        _check(method, delay)
+    if method in ("auto", "crossover") and (numbers or is_traced(*values)):
         return evaluate(stable_kernel, arguments, classify_delays(d))
     check_scalars(arguments)
-    if traced:
+    if is_traced(*values):
         return _traced(values, method)
     laid = fold_arguments(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
@@ -107,8 +108,9 @@ def decide_stability(
 
     Returns:
         Stability: ``stable``, boolean; ``status``, see `zwidth.Status`: INVALID_INPUT or OUT_OF_RANGE for a point that
-        is not computed, and with method "certified" UNDECIDED or ON_BOUNDARY where no label is given (``stable`` is
-        False there); ``method``, the `Method` that decided. Arrays may be read-only.
+        is not computed, with method "certified" UNDECIDED or ON_BOUNDARY where no label is given (``stable`` is
+        False there), and with "companion" UNDECIDED where the radius is 1 within what eigenvalues tell of a double
+        pole; ``method``, the `Method` that decided. Arrays may be read-only.
 
     Raises:
         InputError: as for `zwidth.is_stable`, and for traced values.
@@ -134,10 +136,6 @@ def decide_stability(
     return to_caller(Stability(*map(laid.spread, (stable, *codes))), values)
 
 
-# Deprecated: the name goes with version 0.2.
-stability_of = decide_stability
-
-
 def _check(method: str, delay_model: str) -> None:
     if delay_model != "held":
         check_has_poles(delay_model)
@@ -157,7 +155,9 @@ def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
     """Labels, what decided them, and statuses where they are not all OK."""
     if method == "companion":
-        return np.asarray(unstable_poles(*points)) == 0, Method.COMPANION, None
+        radius = np.asarray(radius_by_companion(*points))
+        rough = (np.abs(radius - 1.0) < _ROUGH) & (np.asarray(points[0]) != 0)
+        return radius < 1.0, Method.COMPANION, np.where(rough, Status.UNDECIDED, Status.OK)
     if method == "certified":
         # Loaded here: it needs an extra for its last resort.
         from zwidth.loops.rigid.certified import certified_stable

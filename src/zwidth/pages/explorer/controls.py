@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from zwidth.parts.device import Device
-from zwidth.parts.paths import PARTS, find_parts
-from zwidth.parts.spelling import spell_part, spell_scene
+from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
 from zwidth.parts.wall import VirtualWall

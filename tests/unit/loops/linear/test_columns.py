@@ -6,7 +6,7 @@ import pytest
 from independent_scenes import KINDS, closed_loop_matrix, random_scene, random_walls
 
 import zwidth
-from zwidth.loops.linear.columns import stable_dampings
+from zwidth.loops.linear.rows import stable_dampings
 
 
 @pytest.mark.parametrize("seed", range(28))

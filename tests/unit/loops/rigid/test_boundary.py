@@ -16,7 +16,7 @@ from mpmath import mpf
 
 import oracles
 import zwidth
-from zwidth.loops.rigid.delay_classes import device
+from zwidth.loops.rigid.device import device
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 

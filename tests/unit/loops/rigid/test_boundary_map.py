@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from zwidth.loops.rigid import boundary_map as maps
-from zwidth.loops.rigid.boundary_map import row_limits
-from zwidth.loops.rigid.delay_classes import device
-from zwidth.loops.rigid.row_limit import long_lobe, long_row
+from zwidth.loops.rigid import row_limit as maps
+from zwidth.loops.rigid.device import device
+from zwidth.loops.rigid.row_limit import long_lobe, long_row, row_limits
 from zwidth.loops.rigid.verdict import is_stable
 
 ROWS, COLUMNS = 331, 400
@@ -52,7 +51,7 @@ def test_every_layout_is_the_plain_comparison(make, layout):
         limit = np.stack([limit, 0.5 * limit])
         alpha = alpha[None]
     expected = (alpha > 0) & (alpha < limit)
-    assert expected.size >= maps._WORTH_COMPILING
+    assert expected.size >= maps._LARGE
     got = maps._compare(alpha, limit)
     assert got.dtype == bool
     np.testing.assert_array_equal(got, expected)

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from zwidth.arrays import affine
-from zwidth.arrays.phi import phi_functions
-from zwidth.loops.rigid import boxes
+from zwidth.arrays import balls
+from zwidth.loops.rigid import certified_filter
 from zwidth.loops.rigid.certified import certified_stable
+from zwidth.loops.rigid.device import phi_functions
 
 COUNT = 400
 
@@ -17,7 +17,7 @@ def random_boxes(seed, width):
     middle = 10.0 ** random.uniform(-2, 1, (COUNT, 4))
     half = middle * width * random.uniform(0, 1, (COUNT, 4))
     shares = random.choice([-1.0, 1.0, 0.0], (COUNT, 4)) * random.uniform(0.9, 1.0, (COUNT, 4))
-    forms = affine.quantities(middle - half, middle + half)
+    forms = balls.quantities(middle - half, middle + half)
     return forms, (middle + shares * half).T, shares.T
 
 
@@ -54,7 +54,7 @@ def test_the_plant_contains_those_of_its_devices(width):
     _, _, phi2_t, psi_t, _ = phi_functions(a * t)
     _, _, phi2_f, psi_f, _ = phi_functions(a * fraction)
     e_t = np.exp(-a * t)
-    found = boxes.plant(x, f)
+    found = certified_filter.device_forms(x, f)
     assert_contains(found.c, shares, c)
     assert_contains(found.p1, shares, phi2 + psi)
     assert_contains(found.a2, shares, t * t * phi2_t)
@@ -72,9 +72,9 @@ def test_what_is_proved_for_a_box_holds_at_its_points(width):
     beta = random.uniform(-1, 1, count) * (0.5 + delta) / (d + 1)
     middle = np.stack([alpha, delta, d], axis=1)
     low, high = middle * (1 - width), middle * (1 + width)
-    forms = affine.quantities(low, high)
-    damping = affine.Form(beta, np.zeros((3, count)), np.zeros(count))
-    proved = boxes.stable_everywhere(forms[0], damping, forms[1], forms[2])
+    forms = balls.quantities(low, high)
+    damping = balls.Form(beta, np.zeros((3, count)), np.zeros(count))
+    proved = certified_filter.stable_everywhere(forms[0], damping, forms[1], forms[2])
     assert np.mean(proved) > 0.05
     for corner in range(8):
         chosen = np.where([(corner >> k) & 1 for k in range(3)], high, low)
@@ -89,8 +89,8 @@ def test_nothing_is_proved_of_unstable_walls_and_nearly_all_of_stable_points():
     alpha = (0.2 + delta) / (d + 1) ** 2 * 10.0 ** random.uniform(-2, 0.5, count)
     beta = random.uniform(-1, 1, count) * (0.5 + delta) / (d + 1)
     points = np.stack([alpha, beta, delta, d], axis=1)
-    forms = affine.quantities(points, points)
-    proved = boxes.stable_everywhere(*forms)
+    forms = balls.quantities(points, points)
+    proved = certified_filter.stable_everywhere(*forms)
     truth = certified_stable(*points.T).stable
     assert not np.any(proved & ~truth)
     assert np.mean(proved[truth]) > 0.999

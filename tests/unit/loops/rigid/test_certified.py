@@ -12,11 +12,11 @@ from waiting import LONGEST
 
 import zwidth
 from zwidth.arrays.evaluate import FEW
-from zwidth.loops.domain import wall_status
-from zwidth.loops.rigid import certified_balls
+from zwidth.loops.rigid import certified
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.certified_filter import OPEN, SPECIAL, each_code, filter_walls, has_rows
 from zwidth.loops.rigid.crossover import Verdict
+from zwidth.loops.rigid.device import wall_status
 from zwidth.loops.rigid.folding import fold_arguments
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -82,7 +82,7 @@ def test_compiled_and_plain_filters_agree_with_the_labels():
 @pytest.mark.parametrize("d", [0, 1, 2, 4, 8, 0.5, 1.3, 12.9, 20, 100, 500.5])
 @pytest.mark.parametrize("delta", [0.0, 1e-4, 1.0, 50.0, 1e4])
 def test_filter_alone_decides_nearly_all_of_a_map(monkeypatch, delta, d):
-    monkeypatch.setattr(certified_balls, "available", lambda: False)
+    monkeypatch.setattr(certified, "available", lambda: False)
     alpha, beta = random_map(delta, d, 4000, seed=7)
     result = certified_stable(alpha, beta, delta, d)
     assert (result.status == Status.OK).mean() >= 0.999
@@ -234,7 +234,7 @@ def test_without_balls_open_points_are_undecided(monkeypatch):
     points = adversarial()
     chosen = slice(0, 2000)
     columns = [points[name][chosen] for name in NAMES]
-    monkeypatch.setattr(certified_balls, "available", lambda: False)
+    monkeypatch.setattr(certified, "available", lambda: False)
     result = certified_stable(*columns)
     open_ones = result.status == Status.UNDECIDED
     assert 0.02 < open_ones.mean() < 0.2
@@ -243,7 +243,7 @@ def test_without_balls_open_points_are_undecided(monkeypatch):
 
 
 def test_too_little_precision_is_undecided(monkeypatch):
-    monkeypatch.setattr(certified_balls, "verdict", lambda *_: Verdict(False, False))
+    monkeypatch.setattr(certified, "verdict", lambda *_: Verdict(False, False))
     result = certified_stable(0.6, 0.5, 0.0, 0.0, max_bits=256)
     assert (result.status, result.stable, result.bits) == (Status.UNDECIDED, False, 256)
 

@@ -8,7 +8,7 @@ import pytest
 
 import oracles
 from methods.problems import ball_polynomial
-from zwidth.loops.rigid import certified_balls
+from zwidth.loops.rigid import certified
 from zwidth.words.status import Status
 
 flint = pytest.importorskip("flint")
@@ -22,7 +22,7 @@ def test_verdict_is_that_of_the_poles(d, delta):
         with mp.workdps(oracles.digits_for(delta)):
             p = oracles.polynomial(alpha, beta, delta, d)[::-1]
             radius = max(abs(z) for z in mp.polyroots(p, maxsteps=400, asc=True))
-            decision = certified_balls.decide(float(alpha), float(beta), delta, d, 4096)
+            decision = certified.decide(float(alpha), float(beta), delta, d, 4096)
             assert decision.status == Status.OK
             assert decision.stable == (radius < 1)
 
@@ -38,7 +38,7 @@ def test_without_stiffness_the_other_poles_decide(d, delta):
             p = oracles.polynomial(0.0, beta, delta, d)
             r = list(itertools.accumulate(p, lambda total, value: total + value))[:-1]
             radius = max(abs(z) for z in mp.polyroots(r[::-1], maxsteps=400, asc=True))
-        decision = certified_balls.decide(0.0, float(beta), delta, d, 4096)
+        decision = certified.decide(0.0, float(beta), delta, d, 4096)
         assert (decision.status, decision.stable) == (Status.ON_BOUNDARY if radius < 1 else Status.OK, False)
         seen.add(decision.status)
     assert len(seen) == 2
@@ -57,14 +57,14 @@ def test_polynomial_is_the_printed_one(delta, d):
 def test_enclosures_shrink_with_the_precision():
     for delta, d in itertools.product((5e-324, 1e-300, 1e-8, 0.5, 750.0, 1e12), (0.0, 0.5, 1.0 - 2.0**-53, 1.5)):
         for bits in (128, 512):
-            here = certified_balls.device(delta, d, bits)
+            here = certified.device(delta, d, bits)
             assert min(a.rel_accuracy_bits() for a in here if isinstance(a, flint.arb) and a != 0) >= bits - 45
 
 
 @pytest.mark.parametrize("bits", [128, 1024, 4096])
 def test_zeros_on_the_circle_are_never_labelled_by_precision(bits):
     # R = z^2 + 1 is left of P at alpha = 0, beta = 2, without delay and damping.
-    found = certified_balls.verdict(0.0, 2.0, 0.0, 0.0, bits)
+    found = certified.verdict(0.0, 2.0, 0.0, 0.0, bits)
     assert not found.stable
     assert not found.unstable
 
@@ -84,20 +84,20 @@ def curve(n, x):
 
 
 def test_what_is_exactly_on_the_circle_stays_undecided():
-    assert certified_balls.decide(0.0, 2.0, 0.0, 0.0, 512) == (False, Status.UNDECIDED, 512)
+    assert certified.decide(0.0, 2.0, 0.0, 0.0, 512) == (False, Status.UNDECIDED, 512)
     # Poles exactly at +-j, others outside.
-    assert certified_balls.decide(0.0, 2.0, 0.0, 4.0, 512).status == Status.OK
+    assert certified.decide(0.0, 2.0, 0.0, 4.0, 512).status == Status.OK
     for beta in (np.nextafter(2.0, 1.0), np.nextafter(2.0, 3.0)):
         expected = Status.ON_BOUNDARY if beta < 2 else Status.OK
-        assert certified_balls.decide(0.0, float(beta), 0.0, 0.0, 512)[1:] == (expected, 128)
+        assert certified.decide(0.0, float(beta), 0.0, 0.0, 512)[1:] == (expected, 128)
 
 
 def at_precision(alpha, beta, bits):
     """The verdict of a rational wall at delta = 0, d = 1."""
     with flint.ctx.workprec(bits):
         wall = flint.arb(alpha), flint.arb(beta)
-        return certified_balls.long_verdict(
-            *wall, 1, certified_balls.device(0.0, 1.0, bits), certified_balls._enclose_zero, certified_balls._take_lag
+        return certified.long_verdict(
+            *wall, 1, certified.device(0.0, 1.0, bits), certified._enclose_zero, certified._take_lag
         )
 
 

@@ -10,13 +10,12 @@ from mpmath import mp, mpf
 import oracles
 from zwidth.arrays import balls
 from zwidth.arrays.balls import Ball
-from zwidth.loops.rigid import certified_balls, certified_filter
+from zwidth.loops.rigid import certified, certified_filter
 from zwidth.loops.rigid.certified import certified_stable
 from zwidth.loops.rigid.certified_filter import enclose_zero, enclosed_device, exp, functions, take_lag
 from zwidth.loops.rigid.crossover import gain_cubic, long_verdict, short_verdict
-from zwidth.loops.rigid.delay_classes import classify_delays
+from zwidth.loops.rigid.device import classify_delays, long_curve, short_curve
 from zwidth.loops.rigid.folding import Points
-from zwidth.loops.rigid.row_limit import long_curve, short_curve
 
 flint = pytest.importorskip("flint")
 BITS = 400
@@ -70,15 +69,15 @@ def test_every_intermediate_of_the_crossover_is_enclosed(d):
     for index in range(alpha.size):
         with flint.ctx.workprec(BITS):
             x, y = flint.arb(alpha[index]), flint.arb(beta[index])
-            device = certified_balls.device(delta[index], d[index], BITS)
+            device = certified.device(delta[index], d[index], BITS)
             truth = gain_cubic(x, y, device)
             assert escaped(*numbers(here, device), index=index) == 0
             assert escaped(cubic, truth, index) == 0
             if not found[index]:
                 continue
-            root, sure = certified_balls._enclose_zero(truth)
+            root, sure = certified._enclose_zero(truth)
             assert sure
-            exact = certified_balls._take_lag(root, int(d[index]))
+            exact = certified._take_lag(root, int(d[index]))
             assert escaped((u,), (root,), index) == 0
             if exact.within:
                 seen += 1
@@ -93,7 +92,7 @@ def test_every_number_of_a_short_device_is_enclosed(d):
     with np.errstate(all="ignore"):
         here = enclosed_device(DELTAS, np.full(DELTAS.size, d), classify_delays(d))
     for index, delta in enumerate(DELTAS):
-        assert escaped(*numbers(here, certified_balls.device(float(delta), d, 1600)), index=index) == 0
+        assert escaped(*numbers(here, certified.device(float(delta), d, 1600)), index=index) == 0
 
 
 def test_bounds_too_small_are_noticed(monkeypatch):
@@ -101,7 +100,7 @@ def test_bounds_too_small_are_noticed(monkeypatch):
     monkeypatch.setattr(balls, "UNIT", 2.0**-58)
     monkeypatch.setattr(certified_filter, "UNIT", 2.0**-58)
     here = enclosed_device(delta, d, classify_delays(d))
-    assert sum(escaped(*numbers(here, certified_balls.device(delta[i], d[i], BITS)), index=i) for i in range(60)) > 10
+    assert sum(escaped(*numbers(here, certified.device(delta[i], d[i], BITS)), index=i) for i in range(60)) > 10
 
 
 def test_phi_errors_are_as_stated():

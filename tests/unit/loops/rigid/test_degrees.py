@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zwidth.arrays.xp import namespace
-from zwidth.loops.rigid.degrees import Degree, find_degree, groups, map_by_degree
+from zwidth.loops.rigid.folding import Degree, find_degree, groups, map_by_degree
 from zwidth.words.errors import TracedDelayError
 
 DELAYS = np.array([2.0, 0.0, 0.5, 2.0, np.nan, 1e-300, 7.25, 0.0, -1.0, np.inf])

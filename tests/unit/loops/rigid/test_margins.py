@@ -10,7 +10,7 @@ from compiling import QUICKLY
 import zwidth
 from zwidth import modulus_margin
 from zwidth.loops.rigid.crossover import stable_kernel
-from zwidth.loops.rigid.delay_classes import device
+from zwidth.loops.rigid.device import device
 from zwidth.loops.rigid.modulus import squared_distance
 from zwidth.words.errors import InputError
 

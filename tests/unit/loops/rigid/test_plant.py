@@ -8,8 +8,7 @@ import tolerances as tol
 from mpmath import mp, mpf
 
 import oracles
-from zwidth.arrays import phi
-from zwidth.loops.rigid.plant import held_plant, split_delay, undelayed_plant
+from zwidth.loops.rigid.device import held_plant, phi_functions, split_delay, undelayed_plant
 
 FRACTIONS = [0.0, 1e-300, 1e-16, 1e-8, 0.125, 0.25, 0.37, 0.5, 0.75, 0.9, 1 - 2.0**-30, 1 - 2.0**-53]
 DAMPINGS = [0.0, 1e-300, 1e-16, 1e-8, 1e-3, 0.1, 1.0, 2.31, 2.5, 3.0, 8.0, 30.0, 700.0, 1e4, 1e6]
@@ -89,7 +88,7 @@ def transfers(mass, damping, period):
     delta = np.float64(damping * period / mass)
     plant = undelayed_plant(delta)
     gain = period * period / mass
-    velocity = [period / mass * phi.phi1(delta)], [1.0, -plant.c]
+    velocity = [period / mass * phi_functions(delta).phi1], [1.0, -plant.c]
     return velocity, ([gain * plant.a2, gain * plant.a1], [1.0, -(1.0 + plant.c), plant.c])
 
 

@@ -13,9 +13,10 @@ from mpmath.libmp import NoConvergence
 import oracles
 import zwidth
 from zwidth.loops.rigid.aberth import aberth_kernel
-from zwidth.loops.rigid.degrees import map_by_degree
+from zwidth.loops.rigid.folding import map_by_degree
 from zwidth.loops.rigid.poles import _eigenvalues, companion, radius_by_companion, unstable_poles
 from zwidth.words.errors import InputError
+from zwidth.words.status import Status
 
 LABELS = Path(__file__).resolve().parents[3] / "reference" / "labels.npz"
 
@@ -262,3 +263,15 @@ def test_what_cannot_be_asked_for_is_refused():
         zwidth.poles(0.1, 0.1, 0.1, 1, method="eig")  # pyright: ignore[reportArgumentType]
     with pytest.raises(InputError, match="aberth"):
         jax.jit(lambda alpha: zwidth.poles(alpha, 0.1, 0.1, 1, method="aberth"))(0.1)
+
+
+def test_eigenvalues_do_not_claim_what_they_cannot_tell():
+    """Two poles 5e-6 apart, the outer one 1.3e-13 within the circle: eigenvalues are off by some 1e-10."""
+    wall = (1.2216906670092685e-18, 0.0, 2.600792744791581e-13, 0.3)
+    assert zwidth.is_stable(*wall)
+    assert zwidth.decide_stability(*wall, method="companion").status == Status.UNDECIDED
+    # No stiffness: the pole at 1 is known.
+    assert zwidth.decide_stability(0.0, *wall[1:], method="companion").status == Status.OK
+    told = zwidth.decide_stability([0.1, 0.6, 5.0], 0.4, 0.1, 0, method="companion")
+    assert told.stable.tolist() == [True, True, False]
+    assert told.status.tolist() == [Status.OK] * 3

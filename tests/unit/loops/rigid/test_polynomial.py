@@ -10,7 +10,7 @@ from mpmath import mp, mpf
 
 import oracles
 import zwidth
-from zwidth.loops.rigid.degrees import find_degree
+from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.polynomial import affine, choose_plant
 from zwidth.words.errors import InputError, TracedDelayError
 

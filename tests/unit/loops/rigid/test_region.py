@@ -9,8 +9,8 @@ from mpmath import mp
 
 import oracles
 import zwidth
+from zwidth.loops.rigid.boundary import Piece, sample_lobe, stable_region
 from zwidth.loops.rigid.poles import unstable_poles
-from zwidth.loops.rigid.region import Piece, lobe, stable_region
 from zwidth.words.errors import InputError
 
 # Lobe, lobe cut by the line at z = -1, held and whole, weakly and strongly damped.
@@ -126,7 +126,7 @@ def test_a_fractional_power_has_an_outline():
 
 
 def test_the_lobe_is_the_closed_form():
-    omega, alpha, beta = lobe(0.5, 1, points=20)
+    omega, alpha, beta = sample_lobe(0.5, 1, points=20)
     curve = zwidth.boundary(omega, 0.5, 1)
     np.testing.assert_array_equal(alpha, curve.alpha)
     np.testing.assert_array_equal(beta, curve.beta)

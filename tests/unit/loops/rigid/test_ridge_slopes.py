@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.loops.rigid.plant import held_plant
-from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel
-from zwidth.loops.rigid.ridge_slopes import plant_slopes
+from zwidth.loops.rigid.device import held_plant
+from zwidth.loops.rigid.ridge import plant_slopes, ridge_kernel, slopes_kernel
 
 DELTAS = [0.0, 1e-9, 0.1, 1.0, 2.4, 2.6, 10.0, 100.0, 1e4]
 FRACTIONS = [0.0, 1e-8, 0.3, 0.99]
@@ -139,3 +138,62 @@ def test_the_corner_is_left_with_infinite_slopes_of_the_right_sign(delta, beta):
     assert [float(slope) for slope in slopes] == [-np.inf, beta, -np.inf]
     moves = [float(new) - float(old) for new, old in zip(ridge(1e-8), ridge(0.0), strict=True)]
     np.testing.assert_array_equal(np.sign(moves), np.sign([-np.inf, beta, -np.inf]))
+
+
+# Whole and broken delays, the corner of d = 0 on both sides of its take-over, its first and its last device.
+HARD = [(0.0, 0.0), (1e-12, 0.0), (3.6593, 0.0), (3.6594, 0.0), (50.0, 0.0), (1e6, 0.0), (0.0, 1.0), (0.3, 1.0)]
+HARD += [(0.3, 1.5), (1e6, 0.37), (1e-9, 499.5), (2.0, 500.0), (1e6, 500.0), (30.0, 0.01), (-1.0, 1.0), (np.nan, 2.0)]
+
+
+def every_slope(function, delta, d):
+    """d (alpha, beta, omega) by delta and d of one device each."""
+    sides = [
+        jax.jvp(lambda *at: function(*at)[:3], (delta, d), side)[1]
+        for side in ((1.0 + 0 * d, 0 * d), (0 * d, 1.0 + 0 * d))
+    ]
+    return np.array(sides)
+
+
+def test_gradients_at_concrete_devices_are_those_that_are_compiled(x64):
+    """They are formed without the compiler: by complex steps in NumPy through the text that JAX differentiates."""
+    rng = np.random.default_rng(5)
+    delta, d = (
+        np.concatenate([column, drawn])
+        for column, drawn in zip(
+            np.array(HARD).T, (10 ** rng.uniform(-6, 6, 200), rng.choice([0.0, 1.0, 3.0, 0.4, 7.3], 200)), strict=True
+        )
+    )
+    delta, d = jnp.asarray(delta), jnp.asarray(d)
+    concrete = every_slope(zwidth.alpha_max, delta, d)
+    compiled = every_slope(jax.jit(lambda *at: zwidth.alpha_max(*at)[:3]), delta, d)
+    valid = (delta >= 0.0) & np.isfinite(delta)
+    assert np.isfinite(concrete[..., valid]).all()
+    assert np.isnan(concrete[..., ~valid]).all()
+    # Of a device's largest slope: where a damping has ceased to matter, its slopes are differences of equal terms.
+    # A slope of omega grows towards the corner as one over the distance, by which a rounded s is then too rough.
+    size = np.abs(compiled).max(axis=(0, 1))
+    assert (np.abs(concrete - compiled) <= 1e-13 * size * np.maximum(1.0, size))[..., valid].all()
+
+
+def test_a_first_gradient_compiles_no_kernel(x64):
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration_secs, **words: (
+            compiled.append(words.get("fun_name")) if "backend_compile" in event else None
+        )
+    )
+    try:
+        jax.clear_caches()
+        quick = jax.grad(lambda delta: zwidth.alpha_max(delta, 1.25).alpha)(0.3)
+        assert not [name for name in compiled if "by_argument" in str(name) or "plain" in str(name)]
+    finally:
+        jax.monitoring.clear_event_listeners()
+    again = jax.jit(jax.grad(lambda delta: zwidth.alpha_max(delta, 1.25).alpha))(0.3)
+    assert float(quick) == pytest.approx(float(again), rel=1e-13)
+
+
+def test_a_gradient_in_float32_comes_in_float32():
+    with jax.enable_x64(False):
+        slope = jax.grad(lambda delta: zwidth.alpha_max(delta, 1.0).alpha)(jnp.float32(0.3))
+    assert slope.dtype == np.float32
+    assert slope == pytest.approx(float(slopes_kernel(np.float64(0.3), np.float64(1.0), "held").by_delta), rel=1e-6)

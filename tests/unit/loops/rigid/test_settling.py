@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.loops.rigid.response import step_response
-from zwidth.loops.rigid.settling import SETTLING_BAND, settling_time
+from zwidth.loops.rigid.response import SETTLING_BAND, settling_time, step_response
 
 # A light, lightly damped device near its stiffest wall: a run of 100 periods ends inside the band by chance.
 LIGHT = (0.06647088772544794, 0.29085403745877014, 0.014256791346175352, 2.0)

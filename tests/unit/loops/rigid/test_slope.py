@@ -10,7 +10,7 @@ import tolerances as tol
 from compiling import SOON
 
 import zwidth
-from zwidth.loops.rigid.slope import slope_kernel, stiffness_slope
+from zwidth.loops.rigid.ridge import slope_kernel, stiffness_slope
 from zwidth.words.errors import InputError
 from zwidth.words.types import DELAY_MODELS as MODELS
 
