@@ -316,13 +316,9 @@ class FiltersStudy(ComputedStudy):
         table = stack(rows)
         drawn: dict[str, Any] = {"": partial(figures.draw_filters, table)}
         if self.resolution is not None:
-            best = (
-                np.zeros(table["estimate"].size, bool)
-                if self.noise_limit is None
-                else _mark_best(table, self.noise_limit)
-            )
-            table = {**table, "best": best}
-            drawn["_noise"] = partial(figures.draw_filter_noise, table, self.noise_limit or np.nan)
+            limit = np.nan if self.noise_limit is None else self.noise_limit
+            table = {**table, "best": _mark_best(table, limit)}
+            drawn["_noise"] = partial(figures.draw_filter_noise, table, limit)
         return Outcome(table=table, figures=drawn)
 
 

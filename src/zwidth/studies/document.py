@@ -151,12 +151,9 @@ class Config(Strict):
             if not isinstance(name, str):
                 continue
             if name in first:
-                what = problem(
-                    f"got {describe(name)}, the name of studies[{first[name]}] as well",
-                    "results are kept by name, so each study has its own",
-                    "rename one",
-                )
-                yield ("studies", index, "name"), what
+                what = f"got {describe(name)}, the name of studies[{first[name]}] as well"
+                allowed = "results are kept by name, so each study has its own"
+                yield ("studies", index, "name"), problem(what, allowed, "rename one")
             first.setdefault(name, index)
 
 

@@ -189,10 +189,8 @@ class FitStudy(ComputedStudy):
         strange = {"noise": "buzz", "max_delay": "log", "resample": "log"}
         for name, owner in strange.items():
             if name in raw and owner not in raw:
-                yield (
-                    (name,),
-                    problem(f"got {name} without {owner}", f"it belongs to {owner}", "remove it", on_key=True),
-                )
+                what = f"got {name} without {owner}"
+                yield (name,), problem(what, f"it belongs to {owner}", "remove it", on_key=True)
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -223,11 +221,8 @@ class FitStudy(ComputedStudy):
                 allowed = f"it must lie below half the sampling rate, {half}"
                 yield ("buzz", k, "frequency"), problem(what, allowed, "check the frequency, or the period")
         if self.buzz and len({wall.virtual_damping for wall in self.buzz}) < 2:
-            what = "got walls of one damping alone"
-            yield (
-                ("buzz",),
-                problem(what, "m, b and t_d need two", "add a wall of another virtual_damping", on_key=True),
-            )
+            what, remedy = "got walls of one damping alone", "add a wall of another virtual_damping"
+            yield ("buzz",), problem(what, "m, b and t_d need two", remedy, on_key=True)
 
     @property
     def units(self) -> AxisUnits:
@@ -314,12 +309,11 @@ def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
 def _compare(one: DeviceFit, other: DeviceFit) -> str:
     """Whether two fits of one device agree, by how far apart they are in their common covariance."""
     values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
-    apart = values[0] - values[1]
+    away = values[0] - values[1]
     spread = sum((fit.reach / _NORMAL) ** 2 * fit.covariance for fit in (one, other))
     # Exact records would leave nothing to divide by.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
-    far = float(apart @ np.linalg.solve(spread + np.diag(floor), apart))
-    words = (
-        f"squared, they are {plain(far, 3)} apart in units of their errors; 95 % of equal devices stay below {_CHANCE}"
-    )
-    return f"log and buzzing walls agree: {words}" if far <= _CHANCE else f"log and buzzing walls do NOT agree: {words}"
+    far = float(away @ np.linalg.solve(spread + np.diag(floor), away))
+    verdict = "agree" if far <= _CHANCE else "do NOT agree"
+    apart = f"squared, they are {plain(far, 3)} apart in units of their errors"
+    return f"log and buzzing walls {verdict}: {apart}; 95 % of equal devices stay below {_CHANCE}"

@@ -172,11 +172,9 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
         table, bounds = stack(edges), (self.silence, self.widest)
         family = choose_curves(varied)
-        draw = (
-            partial(figures.draw_limit_cycles, arrays, table, bounds)
-            if family is None
-            else partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
-        )
+        draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
+        if family is not None:
+            draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
         low, high = (with_unit(bound, "m", 3) for bound in bounds)
         notes.append(f"buzzing: an amplitude from {low} to {high} in the last quarter of {self.duration}")
         return Outcome(

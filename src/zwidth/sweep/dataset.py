@@ -122,10 +122,8 @@ def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
     dataset = open_dataset(path)
     points = int(np.prod(list(dataset.sizes.values()), dtype=float))
     if points > MAX_CSV_POINTS:
-        raise StoreError(
-            f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; export to netCDF, or select "
-            "a part with zwidth.open_dataset"
-        )
+        remedy = "export to netCDF, or select a part with zwidth.open_dataset"
+        raise StoreError(f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; {remedy}")
     if "device" in dataset.coords:
         labels = [to_cell(str(label)) for label in np.atleast_1d(dataset["device"].values)]
         dataset["device"] = (dataset["device"].dims, np.reshape(labels, dataset["device"].shape))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -82,15 +82,14 @@ CHOICES = {
 CHOICES["coupling"] |= {"motor": "tip, sensor at the motor", "tip": "tip, sensor at the tip"}
 
 
-def _small_device() -> Scene:
-    return Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3), VirtualWall(10e3, 40.0))
+_SMALL_DEVICE = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3), VirtualWall(10e3, 40.0))
 
 
 @dataclass(frozen=True)
 class Controls:
     """A scene with its wall; a normalized one has m = 1 and T = 1, so that K is alpha and B is beta."""
 
-    scene: Scene = field(default_factory=_small_device)
+    scene: Scene = _SMALL_DEVICE
     normalized: bool = False
     scale: tuple[float, float] = (0.1, 1e-3)  # mass and period that a normalized scene takes when it gets units again
 
@@ -233,15 +232,10 @@ def to_yaml(controls: Controls) -> str:
         studies.append({"kind": "step", "name": "response"})
     # JSON is YAML of one line.
     lines = ["version: 1", "name: explored", "scene:"]
-    lines += [f"  {name}: {json.dumps(value)}" for name, value in _section(controls).items()]
+    own = {name: value for name, value in controls.shown().items() if name != "mode"}
+    section = own if controls.normalized else spell_scene(scene)
+    lines += [f"  {name}: {json.dumps(value)}" for name, value in section.items()]
     return "\n".join([*lines, "studies:", *(f"  - {json.dumps(study)}" for study in studies)]) + "\n"
-
-
-def _section(controls: Controls) -> dict[str, Any]:
-    """The scene as a configuration spells it."""
-    if controls.normalized:
-        return {name: value for name, value in controls.shown().items() if name != "mode"}
-    return spell_scene(controls.scene)
 
 
 def to_python(controls: Controls) -> str:
