@@ -135,11 +135,9 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
 
 
 def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]:
-    """The options that describe a scene, which the command gets as ``scene``: a `zwidth.Scene`.
+    """The options that describe a scene, and perhaps its wall, which the command gets as ``scene``: a `zwidth.Scene`.
 
-    Args:
-        wall: whether they include the wall that is judged.
-        required: whether there must be a scene; otherwise ``scene`` is None where no mass is given.
+    Where none is required it is None without any of them.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "mass", "damping", "period", "rate", "delay")
     needed = ("stiffness", "mass") if required else ("stiffness",)

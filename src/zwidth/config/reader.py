@@ -45,11 +45,7 @@ MAX_DEPTH = 20
 
 
 def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Model:
-    """Read a file and check all of it against a model.
-
-    Raises:
-        ConfigFileError: the file cannot be read or has faults.
-    """
+    """Read a file and check all of it against a model; a `ConfigFileError` lists its faults."""
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
     problems = []
@@ -66,11 +62,7 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
-    """Check what a file would hold against a model; a fault then has a field and no place.
-
-    Raises:
-        ConfigFileError: there are faults.
-    """
+    """Check what a file would hold against a model; a fault then has a field and no place."""
     problems: list[LocatedProblem] = []
     found = None
     try:

@@ -89,11 +89,8 @@ def panels(
 ) -> tuple[list[xarray.Dataset], int]:
     """A part of a dataset for each panel, and how many panels are beside each other.
 
-    Args:
-        data: as `prepare` gives it.
-        over: the dimensions that a panel has; the last two others vary from panel to panel.
-        plane: those of them that are drawn as a plane, which resolves so many values and no more.
-        col: the one dimension that varies from panel to panel; all others are at their first value.
+    A panel has the dimensions ``over``, of which those of a ``plane`` resolve so many values and no more. The last two
+    others vary from panel to panel, or ``col`` alone, all others at their first value.
     """
     free = [str(dim) for dim in next(iter(data.data_vars.values())).dims if dim not in over]
     if col is not None:
@@ -179,14 +176,8 @@ def label_contours(
 ) -> None:
     """Write the level of each contour on its longest line where there is room, once.
 
-    The range and the spacing of the axes must be set: where lines are on the page decides on what has room.
-
-    Args:
-        ax: the panel.
-        drawn: its contours.
-        colors: of each contour.
-        shades: what is behind each, which the label covers its line with.
-        others: points (x, y) of further lines and marks, which labels keep away from.
+    The range and the spacing of the axes must be set: where lines are on the page decides on what has room. Each label
+    covers its line with the shade behind it, and keeps away from the points (x, y) of other lines and marks.
     """
     frame = ax.get_window_extent()
     lines = [

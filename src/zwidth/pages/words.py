@@ -184,11 +184,8 @@ def limit_lines(limits: list[Limit]) -> list[str]:
 
 
 def friction_lines(rule: FrictionRule) -> list[str]:
-    parts = []
-    if rule.by_damping is not None:
-        parts.append(f"2 b/T = {with_unit(rule.by_damping, 'N/m')}")
-    if rule.by_friction is not None:
-        parts.append(f"2 f_c/Q = {with_unit(rule.by_friction, 'N/m')}")
+    ends = {"2 b/T": rule.by_damping, "2 f_c/Q": rule.by_friction}
+    parts = [f"{name} = {with_unit(end, 'N/m')}" for name, end in ends.items() if end is not None]
     if rule.stiffness is None:
         parts.append("both are needed for the rule")
     else:

@@ -292,15 +292,10 @@ def file_hash(path: Path) -> str:
 
 
 def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:
-    """What a run keeps so that it can be repeated from its own folder.
+    """What a run keeps so that it can be repeated from its own folder, of a configuration's text without faults.
 
-    Args:
-        text: of a configuration without faults.
-        folder: where the files are that it names.
-
-    Returns:
-        The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the
-        names that the configuration has, those that the text has now. A copy's own name stays as it is.
+    The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the names
+    that the configuration has, those that the text has now. A copy's own name stays as it is.
     """
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}

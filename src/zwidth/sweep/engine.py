@@ -76,14 +76,9 @@ def compute_sweeps(
 ) -> Sweeps:
     """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there (`check_stores`).
 
-    Args:
-        planned: the studies with their plans.
-        folder: held by the caller.
-        about: ``name``, ``description`` and ``config`` of the configuration, for the stores' attributes.
-        shard, workers, scheduler, progress: as in `zwidth.run`.
-
-    Raises:
-        InputError: the scheduler does not answer, or its workers do not see the folder.
+    The folder is held by the caller; ``about`` has name, description and config for the stores' attributes; the options
+    are those of `zwidth.run`. A scheduler that does not answer, or whose workers do not see the folder, is an
+    `InputError`.
     """
     from zwidth.sweep.jobs import perform
 

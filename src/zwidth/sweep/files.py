@@ -46,11 +46,7 @@ def hopeless(error: BaseException | None) -> bool:
 
 
 def check_folder(folder: Path) -> None:
-    """Refuse a folder for results that cannot be made or written, as far as can be told without writing.
-
-    Raises:
-        InputError: a file is in its place or in its path, or it is read-only.
-    """
+    """Refuse a folder for results that cannot be made or written, as far as can be told without writing."""
     nearest = existing(folder)
     if not nearest.is_dir():
         where = "is a file" if nearest == folder.absolute() else f"cannot be made, for {nearest} is a file"

@@ -36,11 +36,7 @@ _UNKNOWN_TO_FILE_SYSTEM = frozenset({errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSU
 
 @contextmanager
 def holding(folder: Path, shard: tuple[int, int] | None = None) -> Iterator[None]:
-    """Hold a folder of results while the block runs; the folder is made where it is missing.
-
-    Args:
-        folder: the folder.
-        shard: (i, n), which shares the folder with the other shards of n.
+    """Hold a folder of results, made where it is missing, while the block runs; a shard (i, n) shares it with others.
 
     Raises:
         StoreBusyError: another run holds it; the message has the folder, the holder and the remedy.

@@ -218,12 +218,7 @@ def _model(longest: float) -> str:
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
-    """Refuse, before any work, what cannot fit on the disk or in memory; ``begun`` studies have their disk space.
-
-    Raises:
-        InputError: the folder cannot be made or written.
-        ResourceError: it does not fit; the message has the numbers and the remedy.
-    """
+    """Refuse, before any work, what cannot fit on the disk or in memory; ``begun`` studies have their disk space."""
     check_folder(folder)
     if not plans:
         return

@@ -301,11 +301,7 @@ class SweepStudy(_Parts, _Swept):
                 yield error
 
     def make_scene(self, values: dict[str, float]) -> Scene:
-        """The scene at a point of the grid, from the parameters that the axes give.
-
-        Raises:
-            InputError: the parts refuse the values.
-        """
+        """The scene at a point of the grid, from the parameters that the axes give."""
         given = dict(values)
         period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
         delay = given.pop("delay", 0.0) * (period if self.axes.delay_in_periods else 1.0)

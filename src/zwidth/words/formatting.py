@@ -132,11 +132,7 @@ def short(value: float) -> str:
 
 
 def read_rows(file: Path, most_bytes: int) -> tuple[list[tuple[int, list[str]]], str]:
-    """The row of names and those below that hold something, each with the number of its line; and what separates cells.
-
-    Raises:
-        InputError: it is no file of UTF-8 text that is small enough, or its quotes are wrong.
-    """
+    """The row of names and those below that hold something, each with its line; and what separates cells."""
     # A pipe would be waited for.
     if not file.is_file():
         raise InputError(f"{file}: {'it is no file' if file.exists() else 'no such file'}; check the path")

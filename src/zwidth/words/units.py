@@ -143,11 +143,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
 def read_quantity(
     value: Any, dimension: Dimension, allowed: Range = ANY, *, periods: bool = False
 ) -> tuple[float, str]:
-    """A quantity that the model is computed for, in its base unit or, where allowed, in "periods"; and which of them.
-
-    Raises:
-        UnusableValueError: it is no number, has another unit, or is out of range.
-    """
+    """A quantity that the model is computed for, in its base unit or, where allowed, in "periods"; and which."""
     amount, unit = _parse(value, dimension, periods=periods)
     check_range(amount, allowed, unit)
     least, most = SI_RANGE

@@ -112,11 +112,7 @@ class Controls:
         return found | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
-        """New controls with some values as the page shows them.
-
-        Raises:
-            InputError: a name or a value is not one that the page has, or a part refuses it.
-        """
+        """New controls with some values as the page shows them; what it does not have is an `InputError`."""
         new = self
         for name, value in shown.items():
             if name in CHOICES:
@@ -135,11 +131,7 @@ class Controls:
         return new.check()
 
     def check(self) -> Controls:
-        """The same, if the page can follow them.
-
-        Raises:
-            InputError: the loop has too many poles.
-        """
+        """The same, if the page can follow so many poles."""
         # Where parts refuse only together, as a cut-off beyond half the sampling rate, the loop does.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
@@ -191,12 +183,7 @@ def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Co
 
 
 def read_controls(path: Path | None) -> Controls:
-    """The scene of a configuration, or of the one that a run folder has recorded; without either, a small device.
-
-    Raises:
-        InputError: there is no scene, or none that the page can show.
-        ConfigError: the configuration has faults.
-    """
+    """The scene of a configuration, or of the one that a run folder has recorded; without either, a small device."""
     if path is None:
         return Controls()
     if path.is_dir():
