@@ -20,9 +20,17 @@ from typing import Any
 
 from zwidth.config.reader import find_values
 from zwidth.sweep.engine import refuse_changes, refuse_versions
-from zwidth.sweep.files import check_folder, digest, hidden_beside, is_plain_name, remove_quietly, versions, write_whole
-from zwidth.sweep.lock import FOLDER as LOCKS
-from zwidth.sweep.lock import held_briefly
+from zwidth.sweep.files import (
+    LOCKS,
+    check_folder,
+    digest,
+    held_briefly,
+    hidden_beside,
+    is_plain_name,
+    remove_quietly,
+    versions,
+    write_whole,
+)
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import StoreError, StoreExistsError
 from zwidth.words.formatting import describe

@@ -17,8 +17,7 @@ from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
-from zwidth.sweep.files import hopeless
-from zwidth.sweep.lock import holding
+from zwidth.sweep.files import holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy

@@ -61,7 +61,7 @@ class Outcome:
 class ComputedStudy(Study):
     """A study whose results are tables, figures and texts: a kind is such a class, its model and its computation.
 
-    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``points`` and ``extent`` for the
+    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``sizes`` for the
     plan, and `compute`. `zwidth.studies.register` makes it known.
     """
 
