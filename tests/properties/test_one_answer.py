@@ -190,8 +190,8 @@ def highest_questions(wall: Wall) -> Iterator[Question]:
         tops["alpha_max"] = zwidth.alpha_max(scene.delta, scene.d).alpha * scene.units.stiffness
     yield Question("K_max", tops, SAME)
     if top.status == Status.OK:
-        ends = scene.stable_stiffness(top.virtual_damping).reshape(-1, 2)[:, 1]
-        reached = ends[np.abs(ends / top.stiffness - 1) <= WEDGE]
+        starts, ends = scene.stable_stiffness(top.virtual_damping).reshape(-1, 2).T / top.stiffness
+        reached = ends[(np.abs(ends - 1) <= WEDGE) & (ends - starts > WEDGE)] * top.stiffness
         if reached.size:
             yield Question("K_max ends its row", {"max_stiffness": top.stiffness, "stable_stiffness": reached[0]}, SAME)
             below = bool(scene.is_stable(top.stiffness * (1 - 1e-7), top.virtual_damping))

@@ -51,15 +51,36 @@ def namespace(*values: Any) -> Any:
     return np
 
 
-def repeat(steps: int, step: Callable[[State], State], state: State, xp: Any) -> State:
-    """Apply ``step`` so many times: a loop of the compiler in JAX, whose length does not add to the time to compile."""
+def repeat(
+    steps: int,
+    step: Callable[[State], State],
+    state: State,
+    xp: Any,
+    arrived: Callable[[State, State], bool] = lambda old, new: False,
+) -> State:
+    """Apply ``step`` so many times: a loop of the compiler in JAX, whose length does not add to the time to compile.
+
+    In NumPy no longer than until ``arrived(old, new)`` says that further steps change nothing.
+    """
     if xp is np:
         for _ in range(steps):
-            state = step(state)
+            old, state = state, step(state)
+            if arrived(old, state):
+                break
         return state
     from jax.lax import fori_loop
 
     return fori_loop(0, steps, lambda _, state: step(state), state)
+
+
+def apply_each(function: Callable[[Any], State], values: Sequence[Any], xp: Any) -> list[State]:
+    """A function of each value: JAX traces and compiles it once for all of them."""
+    if xp is np:
+        return [function(value) for value in values]
+    import jax
+
+    results = jax.vmap(function)(jax.tree.map(lambda *parts: xp.stack(parts), *values))
+    return [jax.tree.map(lambda leaf, k=k: leaf[k], results) for k in range(len(values))]
 
 
 def frozen(values: State, xp: Any) -> State:

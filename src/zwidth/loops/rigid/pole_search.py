@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import angle, epsilon, frozen, namespace, nan_unless, nan_with_nan_slopes, repeat
+from zwidth.arrays.xp import angle, apply_each, epsilon, frozen, namespace, nan_unless, nan_with_nan_slopes, repeat
 from zwidth.loops.rigid.circle import Loop, count, factor_loop
 from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
@@ -87,11 +87,13 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
 def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
     """The slow pole and the pair, after so many steps from their starts."""
 
-    def step(state: Any) -> Any:
-        slow_re, slow_im, re, im = state
-        return (*halley_step(slow_re, slow_im, loop, fractional), *halley_step(re, im, loop, fractional))
+    xp = namespace(loop.alpha)
 
-    return repeat(steps, step, (*_slow_pole(loop), *_pair(loop, fractional)), namespace(loop.alpha))
+    def follow(start: tuple[Array, Array]) -> tuple[Array, Array]:
+        return repeat(steps, lambda at: halley_step(*at, loop, fractional), start, xp)
+
+    slow, pair = apply_each(follow, [_slow_pole(loop), _pair(loop, fractional)], xp)
+    return (*slow, *pair)
 
 
 def candidate(loop: Loop, fractional: bool) -> tuple[Array, Array]:
@@ -129,7 +131,8 @@ def quick_kernel(alpha: Array, beta: Array, delta: Array, d: Array, tolerance: A
 
 def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Array:
     """Whether two counts prove that the radius is ``e^log_r`` within a relative tolerance."""
-    above, below = (count(log_r + by, loop, fractional) for by in (tolerance, -tolerance))
+    sides = [log_r + tolerance, log_r - tolerance]
+    above, below = apply_each(lambda side: count(side, loop, fractional), sides, namespace(log_r, loop.alpha))
     return above.full & above.sure & ~below.full & below.sure
 
 
@@ -153,8 +156,9 @@ def search(tolerance: Array, loop: Loop, fractional: bool, low: Array | None = N
     _, radius = repeat(halvings, step, (0.0 * high + _SMALLEST if low is None else low, high), xp)
     best, im = np.inf, 0.0 * radius
     # On that circle the pole is at a crossover or at one of the ends.
-    for place in (0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings):
-        within = newton_step(radius, place, loop, fractional).within
+    places = [0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings]
+    distances = apply_each(lambda place: newton_step(radius, place, loop, fractional).within, places, xp)
+    for place, within in zip(places, distances, strict=True):
         im, best = xp.where(within < best, place, im), xp.minimum(within, best)
     at = repeat(_POLISHING, lambda at: halley_step(*at, loop, fractional), (radius, im), xp)
     found = certify_pole(*at, tolerance, loop, fractional, False)
@@ -170,16 +174,19 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     from jax.lax import cond
 
     xp = namespace(alpha, beta, delta, d)
-    still = factor_loop(*frozen((alpha, beta, delta, d), xp), fractional)
+    loop = factor_loop(alpha, beta, delta, d, fractional)
+    still = frozen(loop, xp)
     eps = epsilon(still.c)
     found = certify_pole(*candidate(still, fractional), eps**0.58, still, fractional, False)
     late = cond(found.proved.all(), lambda: found, lambda: search(eps**0.58, still, fractional))
     start, im, simple, _ = frozen(Found(*(xp.where(found.proved, *pair) for pair in zip(found, late, strict=True))), xp)
-    loop, re = factor_loop(alpha, beta, delta, d, fractional), start
+
+    def step(at: tuple[Array, Array]) -> tuple[Array, Array]:
+        by = newton_step(*at, loop, fractional)
+        return at[0] + by.re, at[1] + by.im
+
     # Each step doubles the order to which the derivatives are right: two make first and second ones exact.
-    for _ in range(2):
-        step = newton_step(re, im, loop, fractional)
-        re, im = re + step.re, im + step.im
+    re, _ = repeat(2, step, (start, im), xp)
     known = simple | has_bound(start, eps**0.25, still, fractional)
     (change,) = nan_unless(simple, re - start)
     value = frozen(xp.where(simple, re, start), xp)
