@@ -197,13 +197,7 @@ def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
 def figures_of(
     data: xarray.Dataset, axes: Mapping[str, str] | None = None, edges: Edges | None = None
 ) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The name of each figure of a sweep, or of a part of one, and what draws it.
-
-    Args:
-        data: the sweep, or the part.
-        axes: the parameters to draw over, by what they are; chosen from the sweep where left out.
-        edges: the exact outlines of its walls, of `zwidth.runs.draw`.
-    """
+    """The name of each figure of a sweep, or of a part of one, and what draws it, over axes by what they are."""
     given = dict(axes or {})
     # A store lists its variables in any order.
     for name in OUTPUTS:

@@ -32,18 +32,10 @@ IMPORTING = Lock()
 Update = dict[str, Any]
 # A message holds some dozen numbers.
 _LONGEST_MESSAGE = 4000
-_COLUMNS = {
+_POINTS = ("edge", "passive", "ridge", "best", "wall", "poles", "nyquist", "crossover", "step")
+_COLUMNS = dict.fromkeys(_POINTS, ("x", "y")) | {
     "area": ("xs", "ys"),
-    "edge": ("x", "y"),
     "contours": ("xs", "ys", "x", "y", "text"),
-    "passive": ("x", "y"),
-    "ridge": ("x", "y"),
-    "best": ("x", "y"),
-    "wall": ("x", "y"),
-    "poles": ("x", "y"),
-    "nyquist": ("x", "y"),
-    "crossover": ("x", "y"),
-    "step": ("x", "y"),
     "contact": ("x", "position", "force"),
 }
 # What hangs on the device and takes its time: another device's is taken away at once.
