@@ -15,13 +15,10 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
-from yaml.emitter import Emitter
 from yaml.parser import Parser
 from yaml.reader import Reader
-from yaml.representer import SafeRepresenter
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
-from yaml.serializer import Serializer
 
 from zwidth.config.device_table import files_relative_to
 from zwidth.config.faults import (
@@ -169,16 +166,10 @@ for _tag, _pattern, _first in (
     _Resolver.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
 
 
-class _Dumper(Emitter, Serializer, SafeRepresenter, _Resolver):
+class _Dumper(yaml.SafeDumper):
     """PyYAML's, with quotes around what the core schema would take for a number."""
 
-    def __init__(self, stream: Any, default_style: Any = None, default_flow_style: Any = None, **options: Any) -> None:
-        emitting = ("canonical", "indent", "width", "allow_unicode", "line_break")
-        Emitter.__init__(self, stream, **{name: options[name] for name in emitting})
-        serializing = ("encoding", "explicit_start", "explicit_end", "version", "tags")
-        Serializer.__init__(self, **{name: options[name] for name in serializing})
-        SafeRepresenter.__init__(self, default_style, default_flow_style, options["sort_keys"])
-        _Resolver.__init__(self)
+    yaml_implicit_resolvers = _Resolver.yaml_implicit_resolvers
 
     def ignore_aliases(self, data: Any) -> bool:
         """Write everything out."""

@@ -124,11 +124,8 @@ def content(path: Path) -> bytes:
 
 def checksum(path: Path) -> int:
     """The CRC-32 of a file; -1, which is none, where there is no file or nothing in it."""
-    total = -1
-    with suppress(FileNotFoundError, IsADirectoryError, NotADirectoryError), open(path, "rb") as stream:
-        while block := stream.read(1 << 22):
-            total = zlib.crc32(block, max(total, 0))
-    return total
+    data = content(path)
+    return zlib.crc32(data) if data else -1
 
 
 def digest(value: Any) -> str:
