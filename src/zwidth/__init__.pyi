@@ -53,10 +53,10 @@ from .parts.wall import VirtualWall as VirtualWall
 from .runs import run as run
 from .scenes.answers import to_control as to_control
 from .scenes.assessment import Assessment as Assessment
+from .scenes.assessment import Limit as Limit
 from .scenes.assessment import assess as assess
 from .scenes.assessment import assess_many as assess_many
-from .scenes.limits import Limit as Limit
-from .scenes.limits import limits_of as limits_of
+from .scenes.assessment import limits_of as limits_of
 from .scenes.robust import Interval as Interval
 from .scenes.robust import RobustStiffness as RobustStiffness
 from .scenes.robust import RobustWall as RobustWall

@@ -98,6 +98,8 @@ def is_wrong(now: Any, later: Any, arguments: dict[str, Any]) -> bool:
         return not still
     if kind == MotionKind.DECAYING:
         return not (still or later.amplitude < now.amplitude) or then in (MotionKind.GROWING, MotionKind.DIVERGED)
+    if kind == MotionKind.RESTLESS:
+        return still or then in (MotionKind.REST, MotionKind.DECAYING)
     if kind == MotionKind.GROWING:
         return not later.amplitude > now.amplitude
     if kind == MotionKind.STEADY:
@@ -147,8 +149,9 @@ def test_a_longer_motion_belies_no_label():
     ]
     assert [label for label in labels if label.wrong] == []
     assert not any(label.label == MotionKind.UNCLEAR for label in labels if label.kind == "linear")
-    # Half of the walls are unstable: bounces on these have no order that could be shown.
-    assert sum(label.label == MotionKind.UNCLEAR for label in labels) <= 0.5 * len(labels)
+    # Half of the walls are unstable: whether one of these with friction ever sticks for good is not shown.
+    assert sum(label.label == MotionKind.UNCLEAR for label in labels) <= 0.25 * len(labels)
+    assert not any(label.label == MotionKind.UNCLEAR for label in labels if label.kind == "contact and encoder")
 
 
 if __name__ == "__main__":

@@ -66,10 +66,10 @@ class Ball:
 
     __radd__ = __add__
 
-    def __sub__(self, other: Any) -> Ball:
-        return self + (-as_ball(other))
+    def __sub__(self, other: Any) -> Any:
+        return self + (-other)
 
-    def __rsub__(self, other: Any) -> Ball:
+    def __rsub__(self, other: Any) -> Any:
         return (-self) + other
 
     def __mul__(self, other: Any) -> Ball:
@@ -142,7 +142,7 @@ def _total(*parts: Any) -> Any:
     return total
 
 
-class Form:
+class Form(Ball):
     """How a quantity depends on the uncertain ones of a box: ``mid + sum_i lin_i e_i + r``, |e_i| <= 1, |r| <= rad.
 
     One e_i stands for each uncertain quantity (affine arithmetic: Comba, Stolfi 1993). What depends on the same one
@@ -150,26 +150,20 @@ class Form:
     Over arrays: ``mid`` and ``rad`` of shape (boxes,), ``lin`` of shape (quantities, boxes).
     """
 
-    __slots__ = ("lin", "mid", "rad")
-    __array_ufunc__ = None
+    __slots__ = ("lin",)
 
     def __init__(self, mid: Any, lin: Any, rad: Any):
-        self.mid, self.lin, self.rad = mid, lin, rad
+        super().__init__(mid, rad)
+        self.lin = lin
 
     @property
-    def spread(self) -> np.ndarray:
-        """The distance from ``mid`` that no value exceeds."""
+    def radius(self) -> np.ndarray:
         return INFLATED * (np.abs(self.lin).sum(axis=0) + self.rad)
-
-    def lower(self) -> np.ndarray:
-        """A number below every value."""
-        end = self.mid - self.spread
-        return end - 2.0 * (UNIT * np.abs(end) + TINY)
 
     def upper(self) -> np.ndarray:
         """A number above every value."""
-        end = self.mid + self.spread
-        return end + 2.0 * (UNIT * np.abs(end) + TINY)
+        end = self.mid + self.radius
+        return end + 2.0 * _rounding(end)
 
     def __neg__(self) -> Form:
         return Form(-self.mid, -self.lin, self.rad)
@@ -183,12 +177,6 @@ class Form:
         return Form(mid, lin, self.rad + other.rad + rounding)
 
     __radd__ = __add__
-
-    def __sub__(self, other: Any) -> Form:
-        return self + (-other)
-
-    def __rsub__(self, other: Any) -> Form:
-        return (-self) + other
 
     def __mul__(self, other: Any) -> Form:
         if not isinstance(other, Form):
@@ -221,14 +209,6 @@ class Form:
         low = np.where(low > 0, low, np.nan)
         root = np.sqrt(low)
         return chord(self, (root, np.sqrt(high)), -0.25 / (low * root), 2.0 * UNIT)
-
-    def __gt__(self, other: Any) -> Any:
-        difference = self if isinstance(other, int | float) and other == 0 else self - other
-        return difference.mid > difference.spread
-
-    def __lt__(self, other: Any) -> Any:
-        difference = self if isinstance(other, int | float) and other == 0 else self - other
-        return difference.mid < -difference.spread
 
 
 def quantities(low: np.ndarray, high: np.ndarray) -> list[Form]:

@@ -15,7 +15,7 @@ import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import cache
 from typing import Any, Literal, TypeAlias
 
@@ -209,7 +209,7 @@ def evaluate_columns(
         shape = (_length(parts),)
         return tree_map(lambda leaf: leaf if np.ndim(leaf) > 1 else np.array(np.broadcast_to(leaf, shape)), result)
 
-    return at_once(*columns) if count <= few else map_blocks(at_once, columns, few)
+    return at_once(*columns) if count <= few else map_blocks(at_once, columns, few, within=nullcontext)
 
 
 def _plain(leaf: Any) -> Any:
@@ -317,7 +317,11 @@ def _compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...], strip: 
 
 
 def map_blocks(
-    function: Callable[..., Any], columns: Sequence[np.ndarray], block: int, threads: int | None = None
+    function: Callable[..., Any],
+    columns: Sequence[np.ndarray],
+    block: int,
+    threads: int | None = None,
+    within: Callable[[], Any] = compute_concretely,
 ) -> Any:
     """Apply a function of columns to equally long ones, block by block on every processor; NumPy arrays come back.
 
@@ -331,7 +335,7 @@ def map_blocks(
     flagged = [(column, column.size == 1 < count) for column in columns]
 
     def run(start: int) -> Any:
-        with compute_concretely():
+        with within():
             parts = (column if shared else _piece(column, start, size) for column, shared in flagged)
             return tree_map(np.asarray, function(*parts))
 

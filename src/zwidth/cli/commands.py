@@ -45,8 +45,7 @@ def cli() -> None:
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""
-    from zwidth.scenes.assessment import assess
-    from zwidth.scenes.limits import friction_rule, limits_of
+    from zwidth.scenes.assessment import assess, friction_rule, limits_of
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
     result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}

@@ -28,7 +28,7 @@ from zwidth.figures.motion import draw_motion, draw_step
 from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.parts.wall import resolve_wall
-from zwidth.scenes.limits import passive_edge
+from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError

@@ -21,8 +21,7 @@ from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
 from zwidth.fitting.scenes import with_cutoff
 from zwidth.loops.rigid.device import held_plant, split_delay
 from zwidth.loops.rigid.ridge import plant_slopes
-from zwidth.parts.estimate import Estimate
-from zwidth.parts.velocity import Velocity
+from zwidth.parts.velocity import Estimate, Velocity
 
 # Newton's steps towards w, the longest of them as a share of w, the last one's share (it squares), and the share
 # beyond which w was not found.

@@ -24,10 +24,9 @@ from zwidth.loops.linear.margins import linear_margins
 from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
 from zwidth.loops.linear.poles import is_marginal, log_size, poles_less_one
 from zwidth.loops.linear.poles import spectral_radius as linear_radius
-from zwidth.loops.linear.ridge import BoundRidge, find_ridge
+from zwidth.loops.linear.ridge import BoundRidge, SceneSensitivities, differentiate, differentiate_rigid, find_ridge
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
-from zwidth.loops.linear.slopes import SceneSensitivities, differentiate, differentiate_rigid
 from zwidth.loops.rigid.boundary import boundary_point, stable_region
 from zwidth.loops.rigid.margins import Margins, margins
 from zwidth.loops.rigid.outermost_poles import outermost_poles

@@ -14,8 +14,7 @@ from zwidth.words.formatting import plain, short, tell_apart, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
 
 if TYPE_CHECKING:
-    from zwidth.scenes.assessment import Assessment, Intervals
-    from zwidth.scenes.limits import FrictionRule, Limit
+    from zwidth.scenes.assessment import Assessment, FrictionRule, Intervals, Limit
     from zwidth.scenes.scene import Scene
 
 # A margin is a difference of dampings; a smaller share of them is their rounding.
@@ -212,7 +211,7 @@ def coded_period_notes(scene: Scene) -> list[str]:
 
 def scene_notes(scene: Scene) -> list[str]:
     """What is remarkable of a scene beside its verdict."""
-    from zwidth.scenes.limits import describe_islands
+    from zwidth.scenes.assessment import describe_islands
 
     return [*coded_period_notes(scene), *describe_islands(scene)]
 

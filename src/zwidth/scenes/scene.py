@@ -11,7 +11,7 @@ import numpy as np
 from zwidth.arrays.evaluate import as_float64
 from zwidth.loops.linear.border import Outline, outlines
 from zwidth.loops.linear.curve import curve_at
-from zwidth.loops.linear.slopes import SceneSensitivities
+from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device

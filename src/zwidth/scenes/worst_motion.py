@@ -14,7 +14,7 @@ import numpy as np
 
 from zwidth.loops.linear.passivity import PassivityCondition, needed_damping
 from zwidth.parts.checks import check_whole
-from zwidth.parts.estimate import Estimate
+from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import one_wall
 from zwidth.words.status import Status

@@ -10,9 +10,8 @@ import numpy as np
 
 from zwidth.arrays.evaluate import compute_concretely, processors
 from zwidth.loops.linear.chain import Chain, chain_of
-from zwidth.parts.estimate import Estimate
 from zwidth.parts.paths import Parts, replace_parameters
-from zwidth.parts.velocity import FOAW, BackwardDifference
+from zwidth.parts.velocity import FOAW, BackwardDifference, Estimate
 from zwidth.simulation.flow import Mechanics, mechanics
 from zwidth.simulation.lanes import (
     Course,
@@ -140,12 +139,12 @@ def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, course: Co
 
         outside = Given(given.start_position, given.start_velocity * period, drawn, history, durations)
         with compute_concretely():
-            state, readings, reading, frame = run_lanes(lanes, options, course, outside, rings)
+            state, sensed, reading, frame = run_lanes(lanes, options, course, outside, rings)
             last, steady = lanes.push + np.zeros(places.size), given.noise == 0
             if history is not None:
                 # A hand that still moves in the tail moves on.
                 last, steady = last + history[-1], steady & np.all(history[-course.tail :] == history[-1], axis=0)
-            outlook = foresee(lanes, options, state, last, steady, readings, course.periods)
+            outlook = foresee(lanes, options, state, last, steady, sensed, course.periods)
         found = state, reading, frame
         return to_si(found, given, outlook, instants, period, mass, names, course)
 

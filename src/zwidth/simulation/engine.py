@@ -140,7 +140,7 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     going = given.k < ends[-1]
     old = state._replace(summary=state.summary._replace(extent=summary.extent, turns=summary.turns))
     after = jax.tree.map(partial(jnp.where, going), after, old)
-    return after, (reading, frames) if options.record else (reading.measured,)
+    return after, (sensed, (reading, frames) if options.record else None)
 
 
 def _summarize(
@@ -183,7 +183,7 @@ def compile_block(options: Options) -> Any:
 def run_lanes(
     lanes: Lanes, options: Options, course: Course, given: Given, rings: tuple[int, int]
 ) -> tuple[State, np.ndarray, Reading | None, Frame | None]:
-    """The last state, the last readings, and what is recorded along a first axis of periods (and of substeps)."""
+    """The last state, the last positions, and what is recorded along a first axis of periods (and of substeps)."""
     edges = course.periods - course.tail * np.arange(WINDOWS, -1, -1) // WINDOWS
     state: Any = jax.tree.map(jnp.asarray, begin(lanes, given.position, given.velocity, rings))
     lanes, ends = jax.tree.map(jnp.asarray, lanes), jnp.asarray(edges)
@@ -203,10 +203,9 @@ def run_lanes(
     behind = -course.periods % BLOCK
     kept = jax.tree.map(lambda *parts: np.concatenate(parts), *recorded)
     kept = jax.tree.map(lambda part: part[: len(part) - behind], kept)
-    if not options.record:
-        return state, kept[0][-CYCLE:], None, None
-    reading, frame = kept
-    return state, reading.measured[-CYCLE:], reading, frame
+    sensed, recording = kept
+    reading, frame = recording or (None, None)
+    return state, sensed[-CYCLE:], reading, frame
 
 
 def _cut(values: np.ndarray | None, first: int, rest: float, shape: tuple[int, ...]) -> np.ndarray:

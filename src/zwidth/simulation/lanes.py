@@ -12,8 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.state_space import estimate_matrices
-from zwidth.parts.estimate import Estimate
-from zwidth.parts.velocity import FOAW
+from zwidth.parts.velocity import FOAW, Estimate
 from zwidth.simulation.flow import Flow, Mechanics, digit_flow, flow
 from zwidth.words.errors import InputError
 from zwidth.words.types import Array

@@ -14,6 +14,9 @@ from zwidth.simulation.lanes import Lanes, Options
 
 # Squarings of a map, at most; rounding hides slower motions.
 _SQUARINGS = 36
+# Eigenvalues that nothing is left of after so many steps and two for every number of the state, which share of a state
+# is nothing, what surely lies inside of the unit circle, and how long a motion is followed at most.
+_FAST, _EXACT, _NOTHING, _INSIDE, _LONGEST = 0.5, 32, 1e-10, 1.0 - 1e-10, 1024
 
 
 class LoopMap(NamedTuple):
@@ -32,6 +35,7 @@ class LaneGroup(NamedTuple):
     lanes: Any  # `Lanes` of numbers along the first axis
     plant: np.ndarray  # (lanes, m, m + 2): the bodies' map, and by the force before and after its change
     held: np.ndarray  # (lanes, m, m)
+    halfway: np.ndarray  # (lanes, m, m + 1): the bodies' map until the force changes
     state: np.ndarray  # (lanes, n)
     push: np.ndarray
     late: int
@@ -46,19 +50,22 @@ def _rows(part: Any, at: np.ndarray) -> np.ndarray:
     return part[at] if len(part) > 1 else np.broadcast_to(part, (at.size, *part.shape[1:]))
 
 
-def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> np.ndarray:
-    """The bodies' map over a period, from the map of each piece of it."""
+def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The bodies' map over a period and until the force changes, from the map of each piece of it."""
     change = _rows(lanes.pieces.change, at)
     size = change.shape[-2]
     whole = np.concatenate([np.eye(size), np.zeros((size, 2))], 1)
-    whole = np.broadcast_to(whole, (at.size, size, size + 2))
+    whole = halfway = np.broadcast_to(whole, (at.size, size, size + 2))
     for j in range(options.substeps):
         for piece in range(options.pieces):
             part = change[:, j, piece]
-            whole = whole + part[..., :-1] @ whole
             # Of two pieces the first feels the older command.
-            whole[..., size if piece + 1 < options.pieces else size + 1] += part[..., -1]
-    return whole
+            newer = piece + 1 == options.pieces
+            force = np.eye(size + 2)[size + newer]
+            whole = whole + part[..., :-1] @ whole + part[..., -1:] * force
+            if not newer:
+                halfway = halfway + part[..., :-1] @ halfway + part[..., -1:] * force
+    return whole, halfway[..., :-1]
 
 
 def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int, at: np.ndarray) -> LaneGroup:
@@ -81,7 +88,7 @@ def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int,
         pieces=lanes.pieces,
         digits=lanes.digits,
     )
-    plant = _compose(lanes, options, at)
+    plant, halfway = _compose(lanes, options, at)
     size = plant.shape[1]
     held = plant[..., :size]
     if options.friction:
@@ -90,7 +97,7 @@ def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int,
         held = np.eye(size) + _rows(lanes.digits.change[1, 0], at)[..., :-1]
         held = held @ (np.eye(size) - force[..., :, None] * motion[..., None, :])
     return LaneGroup(
-        own, plant, held, np.concatenate(parts, 1), push[at], late, window, size, program.filtered.shape[0]
+        own, plant, held, halfway, np.concatenate(parts, 1), push[at], late, window, size, program.filtered.shape[0]
     )
 
 
@@ -137,28 +144,67 @@ def lay_loop(group: LaneGroup, seen: bool, touching: bool, held: bool) -> LoopMa
     return LoopMap(A, pushed, misread, command, misled)
 
 
-def square(A: np.ndarray, weigh: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """How many squarings shrink a map by half, negative where they show that it grows, 0 where neither; and P.
+def square(A: np.ndarray) -> np.ndarray:
+    """How many squarings shrink a map by half, negative where they show that it grows, 0 where neither.
 
-    ``trace A^N > n`` needs an eigenvalue outside of the unit circle, ``|A^N| < 1`` needs none. P is the sum of
-    ``(A^k)^T A^k``: ``d^T P d`` falls from sample to sample.
+    ``trace A^N > n`` needs an eigenvalue outside of the unit circle, ``|A^N| < 1`` needs none.
     """
     count, n = A.shape[:2]
-    found, P = np.zeros(count, int), np.broadcast_to(np.eye(n), A.shape).copy()
-    left = np.arange(count)
-    power = A
+    found, left, power = np.zeros(count, int), np.arange(count), A
     for j in range(1, _SQUARINGS + 1):
-        if weigh:
-            P[left] += power.mT @ P[left] @ power
         power = power @ power
-        small = np.abs(power).sum(-1).max(-1) < (1e-17 if weigh else 0.5)
+        small = np.abs(power).sum(-1).max(-1) < 0.5
         large = np.abs(np.trace(power, axis1=1, axis2=2)) > n
         found[left[small]], found[left[large]] = j, -j
         going = ~(small | large)
         left, power = left[going], power[going]
         if not left.size:
             break
-    return found, P
+    return found
+
+
+def bound_rows(
+    A: np.ndarray, state: np.ndarray, rows: np.ndarray, signed: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The least and the most that rows of a state that A moves ever are, and whether the signed rows stay above 0.
+
+    The first steps as they are; then no row is further from 0 than the sum of what the slow eigenvectors add to it,
+    ``|g v| |c| |eigenvalue|^k``, which falls. By then the others, shift registers among them, have no share. A row
+    stays above 0 if the slowest adds more to it than all others. NaN where the state does not decay.
+    """
+    values, vectors = np.linalg.eig(A)
+    slow, inside = np.abs(values) > _FAST, np.abs(values).max(-1) < _INSIDE
+    vectors = np.where(slow[:, None], vectors, 0.0)
+    nothing, count = _NOTHING * np.abs(state).max(-1), rows.shape[1]
+    every = np.concatenate([rows, signed], 1)
+    first = np.einsum("lrn,ln->lr", every, state)
+    low, high, state = _follow(A, state, every, first, first, _EXACT + 2 * A.shape[1])
+    adjoint = vectors.conj().mT
+    normal = adjoint @ vectors + ~slow[..., None] * np.eye(A.shape[1])
+    share = solve_lanes(normal, adjoint @ state[..., None])
+    rest = np.abs(state - np.real(vectors @ share)[..., 0]).max(-1)
+    parts = every @ vectors * share.mT
+    most = np.abs(parts).sum(-1)
+    slowest = np.take_along_axis(parts, np.argmax(np.abs(values), -1)[:, None, None], -1)[..., 0]
+    above = np.all(((low > 0) & (2.0 * np.real(slowest) > most * (1 + 1e-9)))[:, count:], axis=1)
+    # Equal eigenvalues have too few eigenvectors: those motions are followed until nothing is left of them.
+    own = np.flatnonzero(inside & ~(rest <= nothing))
+    low[own], high[own], left = _follow(A[own], state[own], every[own], low[own], high[own], _LONGEST)
+    most[own], above[own], rest[own] = 0.0, False, np.abs(left).max(-1)
+    most = np.where((inside & (rest <= nothing))[:, None], most, np.nan)
+    low, high = np.minimum(low, -most), np.maximum(high, most)
+    return low[:, :count], high[:, :count], above
+
+
+def _follow(
+    A: np.ndarray, state: np.ndarray, rows: np.ndarray, low: np.ndarray, high: np.ndarray, steps: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The least and the most of rows on so many steps, with what they were before, and the state behind these."""
+    for _ in range(steps if len(A) else 0):
+        state = np.einsum("lnm,lm->ln", A, state)
+        now = np.einsum("lrn,ln->lr", rows, state)
+        low, high = np.minimum(low, now), np.maximum(high, now)
+    return low, high, state
 
 
 def solve_lanes(A: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -173,38 +219,30 @@ def solve_lanes(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def take(group: LaneGroup, own: np.ndarray) -> LaneGroup:
-    lanes, at = group.lanes, np.flatnonzero(own)
+    """Some lanes of a group, by their places or a mask."""
 
-    def pick(part: Any) -> Any:
-        return part[at] if isinstance(part, np.ndarray) else part
+    def pick(parts: Any) -> Any:
+        return parts._replace(
+            **{name: part[own] for name, part in parts._asdict().items() if isinstance(part, np.ndarray)}
+        )
 
-    own_lanes = lanes._replace(
-        **{name: pick(part) for name, part in lanes._asdict().items()},
-    )
-    own_lanes = own_lanes._replace(
-        motor=type(lanes.motor)(*map(pick, lanes.motor)), estimator=type(lanes.estimator)(*map(pick, lanes.estimator))
-    )
-    return group._replace(
-        lanes=own_lanes,
-        **{name: getattr(group, name)[at] for name in ("plant", "held", "state", "push")},
-    )
+    lanes = pick(group.lanes)._replace(motor=pick(group.lanes.motor), estimator=pick(group.lanes.estimator))
+    return pick(group)._replace(lanes=lanes)
 
 
-def find_kept(group: LaneGroup, loop: LoopMap, seen: bool, wall: bool, held: bool) -> tuple[np.ndarray, np.ndarray]:
-    """What the map keeps, and of which lanes: the place of a held body, or a shift of bodies that no spring returns."""
+def find_kept(group: LaneGroup, seen: bool, held: bool) -> np.ndarray:
+    """What the maps of lanes keep: the place of a held body, a shift of bodies that no spring returns, or 0."""
     n, m = group.state.shape[1], group.bodies
+    kept = np.zeros((len(group.state), n))
     if held:
-        place = np.zeros((len(group.state), n))
-        place[:, :m] = group.lanes.place[:, 0]
-        return place, np.ones(len(group.state), bool)
-    loose = np.all(group.lanes.rate[:, :, 0] == 0, axis=1)
-    shift = np.zeros((len(group.state), n))
-    shift[:, 0] = 1.0
+        kept[:, :m] = group.lanes.place[:, 0]
+        return kept
+    kept[:, 0] = 1.0
     if seen:
         # Readings shift with it, and what a filter of them settles on.
-        shift[:, n - group.late - 1 - group.window : n - group.late - 1] = 1.0
+        kept[:, n - group.late - 1 - group.window : n - group.late - 1] = 1.0
         if not group.window and group.filter:
             own = np.eye(group.filter) - group.lanes.estimator.A
-            shift[:, m : m + group.filter] = solve_lanes(own, group.lanes.estimator.B[..., None])[..., 0]
-        loose &= group.lanes.alpha == 0
-    return shift, loose
+            kept[:, m : m + group.filter] = solve_lanes(own, group.lanes.estimator.B[..., None])[..., 0]
+    loose = np.all(group.lanes.rate[:, :, 0] == 0, axis=1)
+    return kept * (loose & (~np.bool_(seen) | (group.lanes.alpha == 0)))[:, None]

@@ -12,13 +12,25 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.simulation.lanes import Lanes, Options
-from zwidth.simulation.maps import LaneGroup, LoopMap, find_kept, gather, lay_loop, solve_lanes, square, take
+from zwidth.simulation.maps import (
+    LaneGroup,
+    LoopMap,
+    bound_rows,
+    find_kept,
+    gather,
+    lay_loop,
+    solve_lanes,
+    square,
+    take,
+)
 from zwidth.simulation.period import round_to
 
 # Samples that a cycle of readings is looked for in, how much longer than simulated a drift must not matter.
-CYCLE, _LONG = 512, 1e3
+CYCLE, _LONG = 256, 1e3
 # What bounds between samples have room for.
 _ROOM = 2.0
+# How near, in steps of the encoder, a motion must come to where it was a cycle ago.
+_AGAIN = 0.1
 
 
 class Outlook(NamedTuple):
@@ -31,60 +43,11 @@ class Outlook(NamedTuple):
     pace: np.ndarray  # periods in which the linear loop decays by half or grows by as much; infinite if neither
 
 
-class _Rest(NamedTuple):
-    """Where a map leads, and how far from there it can still go."""
-
-    stable: np.ndarray
-    state: np.ndarray
-    deviation: np.ndarray
-    map: np.ndarray  # of deviations
-    P: np.ndarray
-    drift: np.ndarray  # a period
-    left: np.ndarray  # the functional that stays as it is, 0 without one
-
-    def bound(self, rows: np.ndarray) -> np.ndarray:
-        """The most that rows times the deviation can ever be, (lanes, rows)."""
-        return self.reach(rows, self.deviation)
-
-    def reach(self, rows: np.ndarray, d: np.ndarray) -> np.ndarray:
-        weights = np.einsum("lrn,lrn->lr", rows, solve_lanes(self.P, rows.mT).mT)
-        return np.sqrt(np.maximum(weights * np.einsum("ln,lnm,lm->l", d, self.P, d)[:, None], 0.0))
-
-
-def _find_rest(loop: LoopMap, constant: np.ndarray, state: np.ndarray, kept: np.ndarray | None, held: bool) -> _Rest:
-    """Where ``s -> A s + constant`` leads; ``kept`` is a state that the map keeps, or if held what keeps its value."""
-    A, n = loop.A, loop.A.shape[1]
-    unity = np.eye(n)
-    if kept is None:
-        right, left = np.zeros(state.shape), np.zeros(state.shape)
-        inner = unity - A
-    else:
-        unit = np.broadcast_to(kept / np.sum(kept * kept, -1, keepdims=True), state.shape)
-        inner = (
-            unity - A + unit[..., :, None] * kept[..., None, :]
-            if held
-            else unity - A + kept[..., :, None] * unit[..., None, :]
-        )
-        if held:
-            left = np.broadcast_to(kept, state.shape)
-            right = solve_lanes(inner, unit[..., None])[..., 0]
-        else:
-            right = np.broadcast_to(kept, state.shape)
-            left = solve_lanes(inner.mT, unit[..., None])[..., 0]
-    inner = unity - A + right[..., :, None] * left[..., None, :]
-    drift = np.einsum("ln,ln->l", left, constant)
-    level = np.einsum("ln,ln->l", left, state)
-    rest = solve_lanes(inner, (constant - right * drift[:, None] + right * level[:, None])[..., None])[..., 0]
-    moves = A - right[..., :, None] * left[..., None, :]
-    found, P = square(moves, weigh=True)
-    return _Rest(found > 0, rest, state - rest, moves, P, drift, left)
-
-
 @np.errstate(all="ignore")
 def foresee(
     lanes: Lanes, options: Options, state: Any, push: np.ndarray, known: np.ndarray, sensed: np.ndarray, periods: int
 ) -> Outlook:
-    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, what was last read.
+    """What can be proved of lanes; ``known``, of which a proof is tried, ``sensed``, the last positions.
 
     A motion near the end of the range of floats overflows, and nothing is proved of it.
     """
@@ -113,120 +76,134 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
     touching = np.broadcast_to(state.program.touching, state.body.x.shape[1:])[at] | bilateral
     stuck = dry & (state.body.slip[at] == 0)
     loop = lay_loop(group, True, True, False)
-    squarings, _ = square(loop.A)
-    pace = np.where(squarings == 0, np.inf, np.exp2(np.abs(squarings)))
+    squarings = square(loop.A)
     unstable = squarings < 0
     linear = exact & bilateral & endless & ~dry & pulling
-    found = {
-        "settles": linear & (squarings > 0),
-        "grows": linear & unstable,
-        "repeats": linear & (squarings == 0),
+    settles = linear & (squarings > 0)
+    # The decisions in force; what slips on feels a constant friction.
+    modes = np.stack([exact & touching, touching, stuck], 1)
+    slip = np.where(dry, state.body.slip[at], 0.0)
+    other = ~linear & ((squarings > 0) | stuck | ~modes[:, 0]) & ((slip == 0) | (group.bodies == 2))
+    # Who is pushed on no spring comes back.
+    other &= touching | stuck | (group.push <= 0) | np.any(lanes.rate[:, :, 0] != 0, axis=1)
+    rubbed = group._replace(push=group.push - slip * motor.coulomb)
+    for seen, wall, held in np.unique(modes[other], axis=0):
+        own = other & (modes == (seen, wall, held)).all(1)
+        part = take(rubbed, own)
+        settles[own] = _settles(part, (seen, wall, held), slip[own], bilateral[own], pulling[own], periods)
+    repeats = linear & (squarings == 0)
+    own = ~exact & ~dry & ~settles
+    if own.any() and not group.filter:
+        repeats[own] = _repeats(take(group, own), bilateral[own], pulling[own], sensed[:, own], periods)
+    grows = linear & unstable
+    own = ~linear & unstable & bilateral & endless & pulling & ~settles
+    if own.any():
+        grows[own] = _outgrows(take(group, own), LoopMap(*(part[own] for part in loop)), periods)
+    return {
+        "settles": settles,
+        "grows": grows,
+        "repeats": repeats,
         "restless": _is_restless(group, unstable, bilateral, dry),
-        "pace": pace,
+        "pace": np.where(squarings == 0, np.inf, np.exp2(np.abs(squarings))),
     }
-    rest = ~found["settles"] & ~found["grows"]
-    for held in (False, True):
-        for wall in (False, True):
-            for seen in (False, True):
-                own = rest & (stuck == held) & (dry == held) & (touching == wall)
-                own &= (exact & wall) == seen
-                if own.any():
-                    part = take(group, own)
-                    found["settles"][own] = _settles(part, seen, wall, held, bilateral[own], pulling[own], periods)
-    own = ~exact & ~dry & pulling & np.isinf(motor.max_rate) & ~found["settles"] & (bilateral | (group.filter == 0))
-    if own.any():
-        found["repeats"][own] = _repeats(take(group, own), bilateral[own], sensed[:, own], periods)
-    own = ~linear & unstable & bilateral & endless & pulling & ~found["settles"]
-    if own.any():
-        found["grows"][own] = _outgrows(take(group, own), LoopMap(*(part[own] for part in loop)), periods)
-    return found
 
 
 def _settles(
-    group: LaneGroup, seen: bool, wall: bool, held: bool, bilateral: np.ndarray, pulling: np.ndarray, periods: int
-) -> np.ndarray:
-    """Whether no decision changes any more: the wall is kept or left for good, the reading stays, no limit is met."""
-    lanes = group.lanes
-    loop = lay_loop(group, seen, wall, held)
-    reading = round_to(lanes.resolution, group.state[:, 0])
-    constant = loop.pushed * group.push[:, None] + (0.0 if seen else loop.misread * reading[:, None])
-    kept, loose = find_kept(group, loop, seen, wall, held)
-    settled = np.zeros(len(reading), bool)
-    for keeps, which in ((None, ~loose), (kept, loose)):
-        if not which.any():
-            continue
-        own, at = take(group, which), np.flatnonzero(which)
-        part = LoopMap(*(piece[at] for piece in loop))
-        keeps = None if keeps is None else keeps[at]
-        settled[at] = _stays(
-            own, part, constant[at], keeps, (seen, wall, held), bilateral[at], pulling[at], reading[at], periods
-        )
-    return settled
-
-
-def _stays(
     group: LaneGroup,
-    loop: LoopMap,
-    constant: np.ndarray,
-    kept: np.ndarray | None,
     mode: tuple[bool, bool, bool],
+    slip: np.ndarray,
     bilateral: np.ndarray,
     pulling: np.ndarray,
-    reading: np.ndarray,
     periods: int,
 ) -> np.ndarray:
+    """Whether no decision changes any more: the wall is kept or left for good, the reading stays, no limit is met."""
     seen, wall, held = mode
     lanes, motor, m, late = group.lanes, group.lanes.motor, group.bodies, group.late
-    n, sent = group.state.shape[1], group.state.shape[1] - group.late - 1
-    rest = _find_rest(loop, constant, group.state, kept, held)
+    n = group.state.shape[1]
+    sent, quantum = n - late - 1, lanes.resolution
+    loop = lay_loop(group, seen, wall, held)
+    reading = round_to(quantum, group.state[:, 0])
+    constant = loop.pushed * group.push[:, None] + (0.0 if seen else loop.misread * reading[:, None])
+    # Where the map leads, apart from what it keeps: ``left`` times the state stays, or drifts, along ``right``.
+    kept = find_kept(group, seen, held)
+    length = np.sum(kept * kept, -1, keepdims=True)
+    unit = kept / np.where(length > 0, length, 1.0)
+    inner = np.eye(n) - (loop.A if held else loop.A.mT)
+    dual = solve_lanes(inner + unit[..., None] * kept[:, None], unit[..., None])[..., 0]
+    right, left = (dual, kept) if held else (kept, dual)
+    both = right[..., None] * left[:, None]
+    drift, level = (np.einsum("ln,ln->l", left, part) for part in (constant, group.state))
+    goal = constant + right * (level - drift)[:, None]
+    rest = solve_lanes(np.eye(n) - loop.A + both, goal[..., None])[..., 0]
+
     position = np.broadcast_to(np.eye(n)[0], group.state.shape)
-    change = loop.command - np.eye(n)[sent]
-    rows = [position, loop.command, change]
+    rows = [position, loop.command, loop.command - np.eye(n)[sent]]
     # The force on the held body, by the commands that act within the period.
     motion = np.roll(lanes.place[:, 0], m // 2, -1)
     pull = np.zeros(group.state.shape)
     pull[:, :m] = np.einsum("lm,lmk->lk", motion, lanes.rate[..., :-1])
-    for age in (late, late + 1):
-        row = pull + (np.eye(n)[sent + age - 1] if age else loop.command)
-        rows.append(row)
+    rows += [pull + (np.eye(n)[sent + age - 1] if age else loop.command) for age in (late, late + 1)]
     rows = np.stack(rows, 1)
     fixed = np.zeros((len(reading), len(rows[0])))
     if not seen:
         fixed[:, 1] = fixed[:, 2] = loop.misled * reading
         if not late:
             fixed[:, 3] = fixed[:, 1]
-    ends = np.einsum("lrn,ln->lr", rows, rest.state) + fixed
-    spread = rest.bound(rows)
+    ends = np.einsum("lrn,ln->lr", rows, rest) + fixed
+    settled = np.isfinite(ends).all(-1)
+    if not bilateral.all():
+        # Where the map leads to another side of the wall there is nothing to bound.
+        settled &= bilateral | (ends[:, 0] > 0) if wall else bilateral | (drift <= 0)
+    # A body that slips on keeps its velocity's sign, at the samples and where the force changes between them.
+    signed = np.zeros((len(reading), 2, n))
+    signed[:, 0, m // 2], signed[:, 1, :m] = 1.0, group.halfway[:, m // 2, :m]
+    signed[:, 1, sent + late] = group.halfway[:, m // 2, m]
+    low, high = np.full(ends.shape, np.nan), np.full(ends.shape, np.nan)
+    above = np.zeros(len(reading), bool)
+    low[settled], high[settled], above[settled] = bound_rows(
+        (loop.A - both)[settled],
+        (group.state - rest)[settled],
+        rows[settled],
+        (signed * slip[:, None, None])[settled],
+    )
+    # Or what is left could not turn the force of friction: that takes more than twice of it.
+    left = np.maximum(np.abs(low), np.abs(high))[:, 3:].max(-1) <= 1e-9 * motor.static
+    settled &= above | left | (slip == 0)
     # Forces that came before count as they are.
-    slack = 1e-9 * (np.abs(ends) + spread)
-    low, high = ends - spread - slack, ends + spread + slack
-    scale = np.abs(group.state).max(-1) + np.abs(rest.state).max(-1)
-    good = rest.stable & np.isfinite(spread).all(-1)
-    far = np.abs(rest.drift) * _LONG * periods
-    quantum = lanes.resolution
+    slack = 1e-9 * (np.abs(ends) + np.maximum(high, -low))
+    low, high = ends + low - slack, ends + high + slack
+    scale = np.abs(group.state).max(-1) + np.abs(rest).max(-1)
+    settled &= np.isfinite(low + high).all(-1)
+    far = np.abs(drift) * _LONG * periods
     if not seen and wall:
-        good &= (low[:, 0] - far > reading - 0.5 * quantum) & (high[:, 0] + far < reading + 0.5 * quantum)
+        settled &= (low[:, 0] - far > reading - 0.5 * quantum) & (high[:, 0] + far < reading + 0.5 * quantum)
     if not held:
-        good &= far <= 1e-9 * scale if kept is not None else True
+        settled &= far <= 1e-9 * scale
     if not wall:
         side = high[:, 0] + far <= np.where(quantum > 0, 0.5 * quantum * (1 - 1e-9), 0.0)
-        if m == 2 and kept is not None:
+        if m == 2 and not held:
             # Nothing stops one body on no spring that is outside and moves on, and is pushed, away from the wall.
             away = np.concatenate([group.state[:, :2], group.push[:, None], group.state[:, sent:]], 1)
-            side |= np.all(away <= 0, axis=1)
-    elif seen:
-        side = low[:, 0] > 0
+            side |= np.all(away <= 0, axis=1) & (length[:, 0] > 0)
     else:
-        side = reading > 0
-    good &= bilateral | side
-    limits = (high[:, 1] <= motor.max_force) & (low[:, 1] >= -motor.max_force)
-    limits &= (high[:, 2] <= motor.max_rate) & (low[:, 2] >= -motor.max_rate)
-    limits &= pulling | (high[:, 1] <= 0)
-    good &= limits | (not wall)
+        side = low[:, 0] > 0 if seen else reading > 0
+    settled &= bilateral | side
+    least, most = -motor.max_force, np.where(pulling, motor.max_force, np.minimum(motor.max_force, 0.0))
+    if held and m == 2:
+        # The only body does not move: it feels the commands on their way, and at last those within the limits.
+        waiting = group.state[:, sent:]
+        low = np.minimum(waiting.min(1), np.clip(low[:, 1], least, most))
+        high = np.maximum(waiting.max(1), np.clip(high[:, 1], least, most))
+        strongest = np.maximum(np.abs(low + group.push), np.abs(high + group.push))
+        return settled & (strongest <= motor.static * (1 - 1e-9))
+    if wall:
+        settled &= np.all((low[:, 1:3] >= np.stack([least, -motor.max_rate], 1)), axis=1)
+        settled &= np.all((high[:, 1:3] <= np.stack([most, motor.max_rate], 1)), axis=1)
     if held:
-        force = np.abs(ends[:, 3:] + group.push[:, None]) + _ROOM * spread[:, 3:]
-        good &= np.all(force <= motor.static[:, None] * (1 - 1e-9), axis=1)
-    return good
+        wide = np.maximum(high - ends, ends - low)[:, 3:]
+        force = np.abs(ends[:, 3:] + group.push[:, None]) + _ROOM * wide
+        settled &= np.all(force <= motor.static[:, None] * (1 - 1e-9), axis=1)
+    return settled
 
 
 def _is_restless(group: LaneGroup, unstable: np.ndarray, bilateral: np.ndarray, dry: np.ndarray) -> np.ndarray:
@@ -266,53 +243,62 @@ def _outgrows(group: LaneGroup, loop: LoopMap, periods: int) -> np.ndarray:
     return (part * growth > _ROOM * shoved) & (growth * periods > 0.05)
 
 
-def _repeats(group: LaneGroup, bilateral: np.ndarray, sensed: np.ndarray, periods: int) -> np.ndarray:
-    """Whether the readings repeat for good: the motion draws near to one that repeats, too near for a change."""
-    lanes, motor = group.lanes, group.lanes.motor
-    quantum = lanes.resolution
-    reading = np.floor(sensed / quantum + 0.5)
-    memory = group.window + group.late + 2
-    length = np.zeros(quantum.size, int)
-    for span in range(1, (len(reading) - memory) // 2):
-        (likely,) = np.nonzero((reading[-1] == reading[-1 - span]) & (length == 0))
-        ends = reading[-memory:, likely] == reading[-memory - span : -span, likely]
-        likely = likely[ends.all(0)]
-        same = reading[-span - memory :, likely] == reading[-2 * span - memory : -span, likely]
-        length[likely[same.all(0)]] = span
-    found = np.zeros(quantum.size, bool)
-    at = np.flatnonzero(length)
+def _repeats(
+    group: LaneGroup, bilateral: np.ndarray, pulling: np.ndarray, sensed: np.ndarray, periods: int
+) -> np.ndarray:
+    """Whether the readings repeat for good: the motion draws near to one that repeats, too near for a change.
+
+    Without a filter readings alone decide the commands, whatever the motor's limits: two motions of equal readings
+    differ by what the bodies make of it.
+    """
+    found = np.zeros(len(bilateral), bool)
+    counts = sensed / group.lanes.resolution
+    reading, memory = np.floor(counts + 0.5), group.window + group.late + 2
+    # A cycle holds a change of the reading, and comes nearest to where it began.
+    lasted = np.argmax(reading[::-1] != reading[-1], axis=0)
+    spans = np.arange(memory, len(counts) - memory)
+    if not spans.size:
+        return found
+    last = len(counts) - 1 - memory
+    far = np.abs(counts[last : memory - 1 : -1] - counts[-1])
+    far += np.abs(counts[last - 1 : memory - 2 : -1] - counts[-2])
+    far[(lasted == 0) | (spans[:, None] < lasted)] = np.inf
+    nearest = far.min(0)
+    at = np.flatnonzero(nearest < _AGAIN)
+    length = memory + np.argmax(far[:, at] <= 2.0 * nearest[at] + 1e-9, axis=0)
+    longest_first = np.argsort(-length)
+    at, length = at[longest_first], length[longest_first]
     if not at.size:
         return found
-    own = take(group, length > 0)
-    loop, left = lay_loop(own, False, True, False), lay_loop(own, False, False, False)
-    bilateral, reading, length, quantum = bilateral[at], reading[:, at], length[at], quantum[at]
-    most = np.broadcast_to(motor.max_force, found.shape)[at]
-    state, room = own.state, np.full(at.size, np.inf)
-    for j in range(length.max()):
-        going = j < length
-        now = reading[len(reading) - length + j % length, np.arange(at.size)]
-        touching = bilateral | (now > 0)
-        A = np.where(touching[:, None, None], loop.A, left.A)
-        misread = np.where(touching[:, None], loop.misread, left.misread)
-        step = np.einsum("lnm,lm->ln", A, state) + misread * (now * quantum)[:, None]
-        step += loop.pushed * own.push[:, None]
-        inside = np.abs(step[:, -own.late - 1]) <= most
-        near = np.where(inside, 0.5 - np.abs(state[:, 0] / quantum - now), -1.0)
-        room = np.where(going, np.minimum(room, near), room)
-        state = np.where(going[:, None], step, state)
-    gap = state - own.state
-    kept, loose = find_kept(own, loop, False, True, False)
-    for keeps, which in ((None, ~loose), (kept, loose)):
-        if which.any():
-            part = LoopMap(*(piece[which] for piece in loop))
-            rest = _find_rest(part, 0.0 * gap[which], gap[which], None if keeps is None else keeps[which], False)
-            position = np.zeros((which.sum(), 1, gap.shape[1]))
-            position[:, 0, 0] = 1.0
-            # Differences of cycles add up to e - G^j e: G the map of a cycle, (1 - G) e the first.
-            pairs = zip(rest.map, length[which], strict=True)
-            cycles = np.stack([np.linalg.matrix_power(moves, span) for moves, span in pairs])
-            whole = solve_lanes(np.eye(gap.shape[1]) - cycles, rest.deviation[..., None])[..., 0]
-            total = 2.0 * rest.reach(position, whole)[:, 0]
-            drift = np.abs(np.einsum("ln,ln->l", rest.left, gap[which])) * periods * 20.0 / length[which]
-            found[at[which]] = rest.stable & (total + drift < room[which] * quantum[which])
+    group, reading = take(group, at), reading[:, at]
+    lanes, motor, m, window, late = group.lanes, group.lanes.motor, group.bodies, group.window, group.late
+    # The readings of one more cycle, and what the program makes of them.
+    past = len(reading)
+    again = reading[past - length + np.arange(length[0])[:, None] % length, np.arange(at.size)]
+    reading = np.concatenate([reading, again]) * lanes.resolution
+    entering = (reading[past:] - reading[past - window : -window]) / window if window else reading[past:]
+    wanted = -(lanes.alpha * reading[past:] + lanes.beta * lanes.estimator.D * entering)
+    wanted = np.where(bilateral[at] | (again > 0), wanted, 0.0)
+    most = np.where(pulling[at], motor.max_force, np.minimum(motor.max_force, 0.0))
+    commands = np.concatenate([group.state[:, : -late - 2 : -1].T, np.clip(wanted, -motor.max_force, most)])
+    if np.isfinite(motor.max_rate).any():
+        for j in range(late + 1, len(commands)):
+            commands[j] = np.clip(commands[j], commands[j - 1] - motor.max_rate, commands[j - 1] + motor.max_rate)
+    kinds = range(late + 1)
+    change = [np.abs(commands[length + j, np.arange(at.size)] - commands[j]) for j in kinds]
+    same = np.max(change, axis=0) <= 1e-9 * np.abs(commands).max(0)
+    moves, before, after = group.plant[..., :m], group.plant[..., m].T, group.plant[..., m + 1].T
+    body, room = group.state[:, :m].T.copy(), np.full(at.size, 0.5)
+    for j in range(length[0]):
+        own = slice(np.count_nonzero(length > j))
+        room[own] = np.minimum(room[own], 0.5 - np.abs(body[0, own] / lanes.resolution[own] - again[j, own]))
+        forces = before[:, own] * (commands[j, own] + group.push[own])
+        forces += after[:, own] * (commands[j + 1, own] + group.push[own])
+        body[:, own] = np.einsum("lnm,ml->nl", moves[own], body[:, own]) + forces
+    values, vectors = np.linalg.eig(moves)
+    share = solve_lanes(vectors, (body.T - group.state[:, :m])[..., None])[..., 0]
+    # Differences of cycles add up along each eigenvector, or for as long as a motion may last.
+    times = np.minimum(2.0 / np.abs(1.0 - values ** length[:, None]), (_LONG * periods / length)[:, None])
+    sum_ = np.sum(np.abs(vectors[:, 0] * share) * times, axis=-1)
+    found[at] = same & (np.abs(values).max(-1) <= 1.0 + 1e-12) & (sum_ < room * lanes.resolution)
     return found

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class MotionKind(IntEnum):
-    """How a motion ends, by the two halves of its tail."""
+    """What becomes of a motion: each proved, or `UNCLEAR` (docs/theory/simulation.md, T7)."""
 
     REST = 0
     DECAYING = 1
@@ -25,10 +25,11 @@ class MotionKind(IntEnum):
     DIVERGED = 4
     UNCLEAR = 5
     INVALID = 6
+    RESTLESS = 7
 
 
-# A tail this small beside the widest motion is at rest; windows this much alike are steady, halves hold so many swings.
-_AT_REST, _STILL, _ALIKE, _ABOUT, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 0.05, 2, 1e100
+# A tail this small beside the widest motion is at rest; halves this much alike are steady, and hold so many swings.
+_AT_REST, _STILL, _ALIKE, _SWINGS, _BEYOND = 1e-9, 8, 0.02, 2, 1e100
 # Who halves in so many times the periods has changed by 2 % after 20 times as many.
 _FOR_GOOD = 4000.0
 
@@ -85,9 +86,9 @@ class Motion:
         energy_given: the most that the wall has given beyond what it took, at any sample, in J, at least 0.
         outcome: a code of `zwidth.MotionKind`, what becomes of the motion, the hand pushing on as in the tail
             (docs/theory/simulation.md, T7). Proved: REST, no body moves more than 1e-9 of the widest motion in the
-            tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider. STEADY: it goes on,
-            its readings repeat, or it has no place to rest and the tail's windows are alike by 5 % and the encoder's
-            steps. DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
+            tail's second half, nor will; DECAYING, it comes to rest; GROWING, it gets ever wider; STEADY, it goes on as
+            it is; RESTLESS, it never comes to rest, for there is no place where it could, and ``trend`` says how its
+            width changes; DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
             within a period than are followed.
     """
@@ -162,17 +163,12 @@ def classify(known: Any, outlook: Any, blur: np.ndarray, course: Any) -> np.ndar
     swinging = np.stack([known.turns[1 : half + 1].sum(0), known.turns[half + 1 :].sum(0)]).min(0) >= _SWINGS
     swinging &= ~still
 
-    def alike(wide: np.ndarray, share: float) -> np.ndarray:
-        return np.ptp(wide, axis=0) <= share * wide.max(0) + blur
-
-    slow, quick = outlook.pace > _FOR_GOOD * course.periods, outlook.pace <= course.periods
+    alike = np.ptp(whole[:, 0], axis=0) <= _ALIKE * whole[:, 0].max(0) + blur
+    slow = outlook.pace > _FOR_GOOD * course.periods
     linear = slow & (outlook.settles | outlook.grows)
-    # Bounces without order may look alike in halves, hardly in every window.
-    even = alike(high[:, 0] - low[:, 0], _ABOUT)
-    lasting = swinging & (outlook.repeats | alike(whole[:, 0], _ALIKE) & linear | even & outlook.restless & quick)
-    rising = whole[1, 0] >= whole[0, 0]
-    kind = np.full(first.shape, MotionKind.UNCLEAR)
-    growing = outlook.grows & ~still & (rising | (outlook.pace <= 2 * course.periods))
+    lasting = swinging & (outlook.repeats | (alike & linear))
+    growing = outlook.grows & ~still & ((whole[1, 0] >= whole[0, 0]) | (outlook.pace <= 2 * course.periods))
+    kind = np.where(outlook.restless & (second > _AT_REST * known.widest), MotionKind.RESTLESS, MotionKind.UNCLEAR)
     kind = np.where(growing, MotionKind.GROWING, kind)
     kind = np.where(outlook.settles, np.where(still, MotionKind.REST, MotionKind.DECAYING), kind)
     kind = np.where(lasting, MotionKind.STEADY, kind)

@@ -18,8 +18,7 @@ from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.response import decay_time
 from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.assessment import Assessment, assess, name_kind
-from zwidth.scenes.limits import describe_islands
+from zwidth.scenes.assessment import Assessment, assess, describe_islands, name_kind
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall, choose_damping
 from zwidth.studies.boundary import outline

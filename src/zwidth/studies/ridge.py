@@ -19,7 +19,7 @@ from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
-from zwidth.scenes.limits import passive_edge
+from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import CurvesStudy, Outcome, Table
 from zwidth.words.status import RidgeKind, Status

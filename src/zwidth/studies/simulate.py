@@ -241,18 +241,19 @@ def describe_end(motion: Motion, k: int) -> str:
         return _WORDS[end]
     velocity, contact = motion.velocity[k], motion.contact[k]
     tail = max(contact.size // 4, 1)
-    if not contact[-tail:].any():
+    if not contact[-tail:].any() and end is not MotionKind.RESTLESS:
         return "gone from the wall"
     amplitude, frequency = float(motion.amplitude[k]), float(motion.frequency[k])
-    if end is MotionKind.UNCLEAR:
+    if end in (MotionKind.UNCLEAR, MotionKind.RESTLESS):
         hits = np.flatnonzero(contact[1:] & ~contact[:-1]) + 1
         if hits.size > 1:
             speeds = velocity.reshape(contact.size, -1)[hits, 0]
             first, last = (with_unit(float(speed), "m/s", 3) for speed in speeds[[0, -1]])
             change = "growing" if speeds[-1] > speeds[0] else "decaying"
             return f"bounces {change}, the first of {hits.size} impacts at {first} and the last at {last}"
+    if end is MotionKind.UNCLEAR:
         return "too few swings at the end to tell how it goes on"
-    if end is not MotionKind.STEADY:
+    if end not in (MotionKind.STEADY, MotionKind.RESTLESS):
         return _WORDS[end]
     rate = f" at {with_unit(frequency, 'Hz', 3)}" if np.isfinite(frequency) else ""
     return f"buzzing{rate}, amplitude {with_unit(amplitude, 'm', 3)}"

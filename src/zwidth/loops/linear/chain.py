@@ -24,8 +24,8 @@ from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.xp import namespace
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.rigid.device import Plant, held_plant, undelayed_plant
-from zwidth.parts.estimate import Estimate
 from zwidth.parts.paths import Parts
+from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 
 # Stiffer links than this, in units of the first mass over T^2, move so fast that e^A keeps no digits.

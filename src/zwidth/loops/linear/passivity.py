@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.circle import Jet, circle, lag_jet, product_jet
-from zwidth.parts.estimate import Estimate
+from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
 _NODES, _ROUNDS, _MOST = 129, 80, 1 << 18

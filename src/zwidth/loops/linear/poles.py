@@ -17,7 +17,7 @@ import numpy as np
 from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, closed_loop_roots
 from zwidth.loops.rigid.counting import count_poles
 from zwidth.loops.rigid.poles import companion
-from zwidth.parts.estimate import Estimate
+from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import MOST_POLES
 from zwidth.words.types import Array

@@ -16,7 +16,7 @@ import numpy as np
 
 from zwidth.arrays.circle import ON_CIRCLE, CirclePoints, Jet, circle, depths, lag_jet, product_jet
 from zwidth.loops.rigid.polynomial import Affine
-from zwidth.parts.estimate import Estimate
+from zwidth.parts.velocity import Estimate
 from zwidth.words.types import Array
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.chain import Chain, sampled
-from zwidth.parts.estimate import Estimate
+from zwidth.parts.velocity import Estimate
 
 
 class Matrices(NamedTuple):

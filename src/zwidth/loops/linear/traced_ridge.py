@@ -20,8 +20,7 @@ from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import broadcast_traced
 from zwidth.arrays.xp import is_traced, nan_with_nan_slopes
 from zwidth.loops.linear.chain import Chain, chain_of, required_wall, respond
-from zwidth.loops.linear.ridge import Condition
-from zwidth.loops.linear.slopes import moving_paths
+from zwidth.loops.linear.ridge import Condition, moving_paths
 from zwidth.loops.rigid.exact_points import polish
 from zwidth.loops.rigid.ridge import RidgePoint
 from zwidth.parts.checks import in_periods

@@ -247,9 +247,9 @@ def enclose_zero_form(cubic: tuple[Form, Form, Form, Form]) -> tuple[Form, np.nd
     lin = -(cubic[0].lin + u * (cubic[1].lin + u * (cubic[2].lin + u * cubic[3].lin))) / slope
     form = Form(u, lin, np.zeros_like(u))
     left = horner(form, cubic)
-    reach = 2.0 * (np.abs(left.mid) + left.spread) / np.abs(slope) + 8.0 * UNIT * u
+    reach = 2.0 * (np.abs(left.mid) + left.radius) / np.abs(slope) + 8.0 * UNIT * u
     before, behind = (horner(Form(u + side, lin, 4.0 * UNIT * u), cubic) for side in (-reach, reach))
-    found = (before > 0) & (behind < 0) & (form.mid - form.spread - reach > 0)
+    found = (before > 0) & (behind < 0) & (form.mid - form.radius - reach > 0)
     return Form(u, lin, reach + 8.0 * UNIT * u), found
 
 
@@ -262,7 +262,7 @@ def take_lag_form(u: Form, whole: np.ndarray) -> Lag:
     ends = 2.0 * turns * np.arcsin(np.sqrt(0.5 * low)), 2.0 * turns * np.arcsin(np.sqrt(0.5 * high))
     square = low * (2.0 - low)
     angle = chord(u, ends, -turns * (1.0 - low) / (square * np.sqrt(square)), _ARCSINE_ERROR)
-    spread = angle.spread
+    spread = angle.radius
     within = good & (angle.mid + spread < np.pi * (1.0 - 1e-15))
     beyond = good & ((angle.mid - spread) * (whole + 1.0) > np.pi * turns * (1.0 + 1e-15))
     sine, cosine = np.sin(angle.mid), np.cos(angle.mid)

@@ -52,18 +52,6 @@ def find_degree(d: float) -> Degree:
     return Degree(whole, bool(d != whole))
 
 
-def groups(d: np.ndarray) -> Iterator[tuple[Degree, np.ndarray]]:
-    """The degrees that occur in a flat array of delays (the smallest if it is empty), each with its positions."""
-    # What is beyond the range of the model becomes NaN, and must not decide the length of all others.
-    defined = np.where((d >= 0) & (d <= LONGEST_DELAY), d, 0.0)
-    # Twice the whole part, plus one where a fraction remains, orders the degrees.
-    code = 2.0 * np.floor(defined) + (defined != np.floor(defined))
-    # One degree is the common case, and to sort a million codes takes as long as some kernels.
-    alike = code.size == 0 or code.min() == code.max()
-    for value in (code[:1] if code.size else [0.0]) if alike else np.unique(code):
-        yield Degree(int(value // 2), bool(value % 2)), np.flatnonzero(code == value)
-
-
 def map_by_degree(
     kernel: Callable[..., Any], values: tuple[ArrayLike, ...], *static: Any, lead: bool = False, route: Route = "auto"
 ) -> Any:
@@ -83,9 +71,12 @@ def map_by_degree(
         delays = arrays[-1]
     shape = arrays[0].shape
     columns = [array.reshape(-1) for array in arrays]
+    # What is beyond the range of the model must not decide the length of all others.
+    defined = np.broadcast_to(np.where((delays >= 0) & (delays <= LONGEST_DELAY), delays, 0.0), shape).reshape(-1)
+    whole = np.floor(defined)
     parts, places = [], []
-    for degree, index in groups(np.broadcast_to(delays, shape).reshape(-1)):
-        picked = columns if index.size == columns[0].size else [column[index] for column in columns]
+    for code, picked, place in group_by(tuple(columns), 2.0 * whole + (defined != whole)):
+        degree = Degree(int(code // 2), bool(code % 2))
         if traced or route == "numpy":
             with np.errstate(all="ignore"):
                 parts.append(kernel(*picked, degree, *static))
@@ -93,7 +84,7 @@ def map_by_degree(
             # In coefficients; a power of two.
             weight = 1 << max(0, degree.poles.bit_length() - 4)
             parts.append(evaluate_columns(kernel, picked, degree, *static, weight=weight))
-        places.append(index)
+        places.append(np.arange(columns[0].size)[place])
     order = np.argsort(np.concatenate(places), kind="stable")
 
     def gather(*leaves: Any) -> Any:
@@ -223,7 +214,8 @@ def group_by(arrays: tuple[np.ndarray, ...], key: np.ndarray) -> Iterator[tuple[
     listed one by one.
     """
     key = fold(key)
-    values = np.unique(key)
+    # One value is the common case, and of no points it is 0.
+    values = np.unique(key) if key.size else np.zeros(1)
     varying = [axis for axis, length in enumerate(key.shape) if length > 1]
     if values.size == 1:
         yield values[0], arrays, ...

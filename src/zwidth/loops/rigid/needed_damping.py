@@ -207,15 +207,8 @@ def needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY
     return scale * xp.where(rises, xp.where(ends.reaches_pi, ends.at_pi, height), ends.at_zero)
 
 
-class Directions(NamedTuple):
-    """``beta/alpha`` between which the peak lies inside (0, pi): below at w = 0, above at w = pi."""
-
-    first: Array
-    last: Array
-
-
-def directions(d: Array) -> Directions:
-    """The `Directions` of a delay; ``last`` is infinite from f = 2/9 on."""
+def directions(d: Array) -> tuple[Array, Array]:
+    """``beta/alpha`` between which the peak lies inside (0, pi): below at w = 0, above at w = pi (f < 2/9 only)."""
     xp = namespace(d)
     delay = describe_delay(d)
     f, k, _ = delay
@@ -228,4 +221,4 @@ def directions(d: Array) -> Directions:
     ends = (k == 1) & (9.0 * f < 2.0)
     below = xp.where(ends, f, 0.0)
     last = 2.0 * below / (1.0 - 6.0 * below + xp.sqrt(1.0 - 4.0 * below))
-    return Directions(first, xp.where(ends, last, xp.inf))
+    return first, xp.where(ends, last, xp.inf)

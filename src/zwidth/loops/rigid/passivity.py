@@ -47,7 +47,7 @@ class PassiveTable(NamedTuple):
 
     f: float
     at_zero: float  # the slope in alpha of what is needed at w = 0, for whole d
-    first: float  # `Directions`
+    first: float  # of the `directions`
     width: float
     last: float  # in the variable of the polynomial
     limit: float  # the same, infinite where there is none
@@ -65,9 +65,9 @@ def table(d: float) -> PassiveTable:
     Between its directions ``needed/(beta + (width - first) alpha)`` is analytic in ``x/(x + width alpha)``, ``x = beta
     - first alpha``, up to beta = infinity; its Chebyshev series falls by a factor of 4 a term, for every delay.
     """
-    turn = directions(np.float64(d))
+    first, last_turn = directions(np.float64(d))
     width = 0.5 * (d + 0.5)
-    span = turn.last - turn.first
+    span = last_turn - first
     last = span / (span + width) if np.isfinite(span) else 1.0
     # Whole turns taken off in whole numbers: an angle of 30 pi would leave half of them without their last digits.
     turns = np.outer(np.arange(_TERMS), 2 * np.arange(_TERMS) + 1) % (4 * _TERMS)
@@ -75,7 +75,7 @@ def table(d: float) -> PassiveTable:
     node = cosines[1]
     place = 0.5 * last * (node + 1.0)
     alpha = 1.0 - place
-    beta = turn.first * alpha + place * width
+    beta = first * alpha + place * width
     with np.errstate(all="ignore"):
         needed = needed_damping(alpha, beta, np.full(_TERMS, d), classify_delays(d))
     # place width + alpha width is the width.
@@ -84,7 +84,7 @@ def table(d: float) -> PassiveTable:
     # By powers, whose coefficients fall as well: Clenshaw's sum loses two digits towards the ends.
     powers = np.polynomial.chebyshev.cheb2poly(terms)
     limit = float(last) if np.isfinite(span) else np.inf
-    return PassiveTable(d - np.floor(d), d + 0.5, float(turn.first), width, float(last), limit, powers.tolist())
+    return PassiveTable(d - np.floor(d), d + 0.5, float(first), width, float(last), limit, powers.tolist())
 
 
 def _map_kernel(alpha: Array, beta: Array, delta: Array, *known: Any) -> Array:

@@ -14,8 +14,7 @@ from zwidth.loops.linear.curve import end_lines
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
-from zwidth.scenes.assessment import Assessment
-from zwidth.scenes.limits import passive_edge
+from zwidth.scenes.assessment import Assessment, passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
 from zwidth.words.formatting import plain

@@ -20,8 +20,7 @@ from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls, to_python, to_yaml
 from zwidth.pages.words import check_lines, list_slopes
 from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.assessment import Assessment, assess
-from zwidth.scenes.limits import limits_of
+from zwidth.scenes.assessment import Assessment, assess, limits_of
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
 

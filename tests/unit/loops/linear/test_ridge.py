@@ -10,8 +10,7 @@ from waiting import LONGEST
 
 import zwidth
 from zwidth import Butterworth, Coupling, Device, LowPass, Operator, Scene, Status, Timing, WindowedDifference
-from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge
-from zwidth.loops.linear.slopes import moving_paths
+from zwidth.loops.linear.ridge import BoundRidge, Condition, find_ridge, moving_paths
 from zwidth.words.errors import InputError, TracedDelayError
 from zwidth.words.status import RidgeKind
 

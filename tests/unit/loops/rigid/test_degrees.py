@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from zwidth.arrays.xp import namespace
-from zwidth.loops.rigid.folding import Degree, find_degree, groups, map_by_degree
+from zwidth.loops.rigid.folding import Degree, find_degree, map_by_degree
 from zwidth.words.errors import TracedDelayError
 
 DELAYS = np.array([2.0, 0.0, 0.5, 2.0, np.nan, 1e-300, 7.25, 0.0, -1.0, np.inf])
@@ -35,11 +35,12 @@ def test_a_delay_an_ulp_from_a_whole_number_keeps_its_fraction():
     assert find_degree(500) == Degree(500, False)
 
 
-def test_every_point_is_in_one_group():
-    found = list(groups(DELAYS))
-    assert sorted(np.concatenate([index for _, index in found])) == list(range(DELAYS.size))
-    for degree, index in found:
-        assert all(degree == find_degree(d) for d in DELAYS[index])
+def test_every_point_has_the_degree_of_its_delay():
+    def kernel(alpha, beta, delta, d, degree):
+        return alpha + degree.whole, alpha + degree.fractional
+
+    found = map_by_degree(kernel, (0.0, 0.0, 0.0, DELAYS))
+    np.testing.assert_array_equal(np.stack(found, -1), [find_degree(d) for d in DELAYS])
 
 
 def test_points_come_back_to_their_places():

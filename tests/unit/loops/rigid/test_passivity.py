@@ -250,7 +250,7 @@ def directions_to_judge(random, d):
     """beta/alpha at all angles, near the two turns of the peak, and of both signs."""
     turn = directions(np.float64(d))
     ratios = [*(10 ** random.uniform(-3, 4, 3) * (d + 0.1)), -(10 ** random.uniform(-3, 3))]
-    for edge in (turn.first, turn.last):
+    for edge in turn:
         if 0 < edge < np.inf:
             ratios += [edge * (1 + sign * 10 ** random.uniform(-9, -1)) for sign in (-1, 1)]
     return np.array(ratios)
