@@ -11,7 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import angle, apply_each, epsilon, frozen, namespace, nan_unless, nan_with_nan_slopes, repeat
+from zwidth.arrays.xp import (
+    angle,
+    apply_each,
+    epsilon,
+    frozen,
+    namespace,
+    nan_unless,
+    nan_with_nan_slopes,
+    repeat,
+    store_once,
+)
 from zwidth.loops.rigid.circle import Loop, count, factor_loop
 from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
@@ -174,7 +184,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     from jax.lax import cond
 
     xp = namespace(alpha, beta, delta, d)
-    loop = factor_loop(alpha, beta, delta, d, fractional)
+    loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
     still = frozen(loop, xp)
     eps = epsilon(still.c)
     found = certify_pole(*candidate(still, fractional), eps**0.58, still, fractional, False)
