@@ -109,7 +109,7 @@ def _find_poles(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.where(larger, re, re[::-1]), np.where(larger, im, im[::-1])
 
 
-class _Followed(NamedTuple):
+class _GroupOfCell(NamedTuple):
     """The group about one start that is to be followed in each cell, of one pole or of two."""
 
     groups: tuple[Group, ...]
@@ -117,7 +117,7 @@ class _Followed(NamedTuple):
     best: np.ndarray  # which of the groups
 
     @classmethod
-    def of(cls, accuracy: float, *groups: Group) -> _Followed:
+    def of(cls, accuracy: float, *groups: Group) -> _GroupOfCell:
         """The groups that need the least order."""
         wanted = accuracy, accuracy * _FINER
         shares = [group.error * (group.disk / (1.0 - group.disk)) for group in groups]
@@ -143,7 +143,7 @@ class _Followed(NamedTuple):
         low = self._choose("low")
         return low - share * (self._choose("re") - low)
 
-    def is_apart(self, other: _Followed) -> np.ndarray:
+    def is_apart(self, other: _GroupOfCell) -> np.ndarray:
         """Whether no pole is in both groups."""
         places = [np.exp(choice._choose("re") + 1j * choice._choose("im")) for choice in (self, other)]
         return np.abs(places[0] - places[1]) > sum(
@@ -184,7 +184,7 @@ class _Level:
         loop = factor_loop(alpha, beta, self.area.delta[places[0]], self.area.d[places[0]], fractional)
         cells = Cells(loop, *half)
         re, im = _find_poles(loop, fractional)
-        one = _Followed.of(self.accuracy, enclose(1, re[0], im[0], cells, fractional))
+        one = _GroupOfCell.of(self.accuracy, enclose(1, re[0], im[0], cells, fractional))
         written = self._try([[one]], places, cells, fractional)
         left = _fill(np.flatnonzero(~written))
         if left.size:
@@ -196,7 +196,7 @@ class _Level:
                 enclose(2, *find_middle(re, im, twice.loop, fractional), twice, fractional),
             )
             larger, other = (
-                _Followed.of(self.accuracy, *(pick(group, part) for group in groups))
+                _GroupOfCell.of(self.accuracy, *(pick(group, part) for group in groups))
                 for part in (slice(left.size), slice(left.size, None))
             )
             written[left] = self._try([[larger], [larger, other]], places[:, left], own, fractional)
@@ -210,7 +210,9 @@ class _Level:
             for axis, place in zip(self.axes, (column, row), strict=True)
         ]
 
-    def _try(self, proposals: list[list[_Followed]], places: np.ndarray, cells: Cells, fractional: bool) -> np.ndarray:
+    def _try(
+        self, proposals: list[list[_GroupOfCell]], places: np.ndarray, cells: Cells, fractional: bool
+    ) -> np.ndarray:
         """Write the cells in which groups are known and hold the outermost pole whatever the wall (C4, C5)."""
         wanted, indices, radii = [], [], []
         for followed in proposals:
@@ -235,7 +237,7 @@ class _Level:
             written |= proved
         return written
 
-    def _follow(self, choice: _Followed, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
+    def _follow(self, choice: _GroupOfCell, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
         """Write the groups of some cells, in batches of one kind."""
         for poles, group in enumerate(choice.groups, 1):
             for k, order in enumerate(ORDERS):
