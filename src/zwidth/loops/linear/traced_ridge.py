@@ -48,11 +48,7 @@ class Structure(NamedTuple):
 
 
 def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
-    """What is static of a scene when these parameters move.
-
-    Raises:
-        TracedDelayError: how many whole periods the delay has depends on a traced value.
-    """
+    """What is static of a scene when these parameters move; how many whole periods the delay has must be."""
     delay, period = scene.timing.delay, scene.timing.period
     undelayed = isinstance(delay, float) and delay == 0.0
     if is_traced(delay, period) and not undelayed:

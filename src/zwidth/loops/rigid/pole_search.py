@@ -94,6 +94,11 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     return xp.maximum(0.5 * xp.log(body * wall / (sizes[0] * sizes[1])) / turns, -1.0), im
 
 
+def both_starts(loop: Loop, fractional: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """The slow pole and the first pair of the ring, roughly."""
+    return _slow_pole(loop), _pair(loop, fractional)
+
+
 def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
     """The slow pole and the pair, after so many steps from their starts."""
 
@@ -102,7 +107,7 @@ def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, 
     def follow(start: tuple[Array, Array]) -> tuple[Array, Array]:
         return repeat(steps, lambda at: halley_step(*at, loop, fractional), start, xp)
 
-    slow, pair = apply_each(follow, [_slow_pole(loop), _pair(loop, fractional)], xp)
+    slow, pair = apply_each(follow, both_starts(loop, fractional), xp)
     return (*slow, *pair)
 
 
