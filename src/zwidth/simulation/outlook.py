@@ -223,8 +223,9 @@ def _is_restless(group: LaneGroup, unstable: np.ndarray, bilateral: np.ndarray, 
     inside &= (quantum == 0) | (count != 0) | (off > 0)
     inside |= ~bilateral & (place <= 0)
     outside = bilateral | (push > 0.5 * spring * quantum)
-    # At the motor's limit it may leave for good or rest where the limit lets it.
-    return (alpha > 0) & ~dry & inside & outside & (np.abs(push) < most) & np.isfinite(place)
+    # At the motor's limit it may leave for good or rest where the limit lets it; nothing stops who is pushed harder.
+    bound = (alpha > 0) & ~dry & inside & outside & (np.abs(push) < most) & np.isfinite(place)
+    return bound | (loose & (np.abs(push) > (most + lanes.motor.static) * (1 + 1e-9)))
 
 
 def _outgrows(group: LaneGroup, loop: LoopMap, periods: int) -> np.ndarray:
