@@ -83,7 +83,7 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
     # The decisions in force; what slips on feels a constant friction.
     modes = np.stack([exact & touching, touching, stuck], 1)
     slip = np.where(dry, state.body.slip[at], 0.0)
-    other = ~linear & ((squarings > 0) | stuck | ~modes[:, 0]) & ((slip == 0) | (group.bodies == 2))
+    other = ~(linear & (squarings != 0)) & ~(unstable & modes[:, 0] & ~stuck) & ((slip == 0) | (group.bodies == 2))
     # Who is pushed on no spring comes back.
     other &= touching | stuck | (group.push <= 0) | np.any(lanes.rate[:, :, 0] != 0, axis=1)
     rubbed = group._replace(push=group.push - slip * motor.coulomb)
@@ -91,7 +91,7 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
         own = other & (modes == (seen, wall, held)).all(1)
         part = take(rubbed, own)
         settles[own] = _settles(part, (seen, wall, held), slip[own], bilateral[own], pulling[own], periods)
-    repeats = linear & (squarings == 0)
+    repeats = linear & (squarings == 0) & ~settles
     own = ~exact & ~dry & ~settles
     if own.any() and not group.filter:
         repeats[own] = _repeats(take(group, own), bilateral[own], pulling[own], sensed[:, own], periods)

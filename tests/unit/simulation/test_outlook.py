@@ -146,11 +146,56 @@ def test_who_pushes_harder_than_motor_and_friction_goes_on():
 
 def test_who_creeps_while_it_slips_comes_to_rest():
     """Overdamped and rubbed, the device slips one way for good, and so it does in 20 times as many periods."""
-    given = {"start_position": -1e-3, "push": np.linspace(0.2, 2.0, 40), "coulomb": 0.1, "static": 0.12}
+    push = np.concatenate([np.linspace(0.2, 2.0, 30), np.linspace(-2.0, -0.6, 30)])
+    given = {"start_position": -1e-3, "push": push, "coulomb": 0.1, "static": 0.12}
     now = SCENE.simulate(200.0, 30.0, **given, periods=300)
     later = SCENE.simulate(200.0, 30.0, **given, periods=6000)
     settles = np.isin(now.outcome, [CODES.REST, CODES.DECAYING])
     turned = (np.sign(later.velocity[:, 300:]) * np.sign(now.velocity[:, -1:]) < 0).any(1)
-    assert settles.sum() > 20
+    assert settles[:30].sum() > 15
+    assert settles[30:].sum() > 15
     assert not np.any(settles & turned)
     assert np.all(later.amplitude[settles] < 1e-9)
+
+
+VELOCITIES = {"difference": zwidth.BackwardDifference(), "low pass": zwidth.LowPass(cutoff=80.0)}
+
+
+@pytest.mark.parametrize("name", VELOCITIES)
+def test_a_damper_without_a_spring_comes_to_rest_where_it_is(name):
+    """No place is asked for: the device coasts by ``m v/(b + B)``, and readings shift with it."""
+    scene = SCENE.replace(velocity=VELOCITIES[name])
+    now = scene.simulate(0.0, [5.0, 8.0], start_position=2e-3, start_velocity=0.05, periods=60)
+    later = scene.simulate(0.0, [5.0, 8.0], start_position=2e-3, start_velocity=0.05, periods=6000)
+    assert now.outcome.tolist() == [CODES.DECAYING] * 2
+    assert later.outcome.tolist() == [CODES.REST] * 2
+    np.testing.assert_allclose(later.position[:, -1], 2e-3 + 0.1 * 0.05 / (2.0 + np.array([5.0, 8.0])), rtol=0.05)
+
+
+def test_a_held_body_is_let_go_by_what_swings_behind_it():
+    """Friction holds the motor; the tip's swing falls slowly, and breaks it loose in some of these."""
+    coupled = zwidth.Scene(zwidth.Device(0.1, 2.0, zwidth.Coupling(0.05, 5e3, 0.5)), zwidth.Timing(1e-3, 1e-3))
+    given = {"start_velocity": 0.2, "coulomb": np.linspace(0.05, 6.0, 120)}
+    now = coupled.simulate(2e3, 5.0, **given, periods=60)
+    later = coupled.simulate(2e3, 5.0, **given, periods=1500)
+    loose = ~later.sticking[:, 60:].all(1)
+    settles = np.isin(now.outcome, [CODES.REST, CODES.DECAYING])
+    assert settles.sum() > 5
+    assert loose.sum() > 5
+    assert not np.any(settles & loose)
+    assert np.mean(settles | loose) > 0.25
+
+
+def test_readings_that_are_said_to_repeat_do_so():
+    periods, wall = 1200, (0.6 * float(TOP.stiffness), float(TOP.virtual_damping))
+    given = {"start_position": 1e-3, "resolution": np.geomspace(3e-6, 1e-4, 80), "max_force": 20.0, "max_rate": 2e4}
+    now = SCENE.simulate(*wall, **given, periods=periods, record=False)
+    later = SCENE.simulate(*wall, **given, periods=8 * periods)
+    counts = np.round(later.measured / given["resolution"][:, None]).astype(int)
+    cyclic = np.array(
+        [any(np.array_equal(row[periods:], row[periods - p : -p]) for p in range(2, 250)) for row in counts]
+    )
+    steady = now.outcome == CODES.STEADY
+    assert steady.sum() > 20
+    assert not np.any(steady & ~cyclic)
+    assert np.mean(steady[cyclic]) > 0.5
