@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 import zwidth
-from zwidth.fitting.moving import PARTS, Recording, Recordings
+from zwidth.fitting.moving import Recording, Recordings
 
 PERIOD, SKIP = 1e-3, 22
 NAMES = ("mass", "damping", "delay", "friction")
@@ -141,7 +141,7 @@ def glide(place: float, speed: float, push: float, lasts: float, delta: float, f
 def bound_errors(made: Made) -> dict[str, float]:
     """Least standard errors by Cramer and Rao, of the model that is fitted; nothing where it cannot be told."""
     mass, damping, delay, friction, offset = made.truth
-    model = Recordings((Recording(made.force, made.position[SKIP:], SKIP),), PARTS)
+    model = Recordings((Recording(made.force, made.position[SKIP:], SKIP),))
     g = PERIOD**2 / mass
     # At 0 the slope of friction is not seen.
     theta = np.array([g, damping * PERIOD / mass, delay / PERIOD, 0, 0, g * offset, g * max(friction, 1e-12)])

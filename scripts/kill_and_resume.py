@@ -31,9 +31,8 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.sweep.dataset import open_dataset
+from zwidth.sweep.dataset import open_dataset, verify
 from zwidth.sweep.store import Store, find_stores
-from zwidth.sweep.verify import verify
 
 # Two families, numbers and truth values; a second or two of work in some thirty chunks.
 CONFIG = """\

@@ -172,7 +172,7 @@ def test_verify_names_a_damaged_chunk_and_resume_repairs_it_alone(config, finish
 
 
 def test_a_chunk_that_fails_is_named_and_the_exit_code_is_1(config, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("zwidth.sweep.chunks.perform", failing_on_2)
+    monkeypatch.setattr("zwidth.sweep.jobs.perform", failing_on_2)
     assert main_of("run", config, "--out", tmp_path / "out") == 1
     out, err = capsys.readouterr()
     assert "7 of 8 chunks done" in out

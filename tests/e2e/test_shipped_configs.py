@@ -8,8 +8,7 @@ import pytest
 
 import zwidth
 from zwidth.runs.draw import Drawing, draw_stores
-from zwidth.sweep.export import to_csv, to_netcdf
-from zwidth.sweep.verify import verify
+from zwidth.sweep.dataset import to_csv, to_netcdf, verify
 from zwidth.words.errors import InputError
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"

@@ -81,7 +81,7 @@ import json, zwidth
 from click.testing import CliRunner
 from zwidth.cli import cli
 from zwidth.pages.explorer.controls import CHOICES, SLIDERS, Controls
-from zwidth.pages.explorer.recipes import to_python, to_yaml
+from zwidth.pages.explorer.controls import to_python, to_yaml
 from zwidth.studies.document import config_json_schema
 
 def say(*arguments):

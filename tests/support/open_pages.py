@@ -7,9 +7,7 @@ from typing import Any
 
 from bokeh.document import Document
 
-from zwidth.cli.explore import check_lines, slope_lines
 from zwidth.pages.explorer.controls import Controls
-from zwidth.pages.explorer.details import Words
 from zwidth.pages.explorer.page import Page
 
 
@@ -32,7 +30,7 @@ def open_page(controls: Controls) -> Any:
     """A page whose ``texts`` hold what it has told, and whose ``queue`` what it wants computed."""
     queue: Any = Queue()
     texts: dict[str, Any] = {}
-    opened: Any = Page(Document(), controls, Words(check_lines, slope_lines), queue)
+    opened: Any = Page(Document(), controls, queue)
     opened.answer.on_change("data", lambda _, __, data: texts.update(json.loads(data["json"][0])))
     # There is no loop: what is handed over is taken at once.
     opened._hand_over = opened._take

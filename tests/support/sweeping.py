@@ -17,8 +17,8 @@ from zwidth import run
 from zwidth.cli import main
 from zwidth.studies.document import Config
 from zwidth.sweep import plan
-from zwidth.sweep.chunks import perform
 from zwidth.sweep.dataset import open_dataset
+from zwidth.sweep.jobs import perform
 from zwidth.sweep.store import find_stores
 from zwidth.sweep.study import SweepStudy
 
@@ -79,7 +79,7 @@ def sweep_of(described) -> SweepStudy:
 
 def run_sweeps(config, out, *, perform=None, **options):
     """Run a configuration, its chunks computed by ``perform``; returns what became of those of all its sweeps."""
-    with patch("zwidth.sweep.chunks.perform", perform) if perform else nullcontext():
+    with patch("zwidth.sweep.jobs.perform", perform) if perform else nullcontext():
         result = run(config, out=out, **options)
     sweeps = result.sweeps.values()
     counts = {name: sum(getattr(sweep, name) for sweep in sweeps) for name in ("computed", "skipped", "total")}

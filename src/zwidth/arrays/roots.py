@@ -1,4 +1,4 @@
-"""Zeros of functions of one unknown, elementwise, one text for NumPy and JAX.
+"""Zeros and integrals of functions of one unknown, elementwise, one text for NumPy and JAX.
 
 The number of steps is fixed, so that no point of a batch waits for another, and none depends on those beside it.
 """
@@ -155,10 +155,19 @@ def follow_root(function: Function, root: Array, usable: Callable[[Array, Array]
         return root
     import jax
 
-    root = frozen(root, xp)
-    for _ in range(2):
+    def step(root: Array) -> Array:
         value, slope = jax.jvp(function, (root,), (xp.ones_like(root),))
-        step = value / xp.where(slope == 0, 1.0, slope)
-        taken = usable(*frozen((slope, step), xp))
-        root = root - xp.where(taken, value / xp.where(taken, slope, 1.0), 0.0)
-    return root
+        taken = usable(*frozen((slope, value / xp.where(slope == 0, 1.0, slope)), xp))
+        return root - xp.where(taken, value / xp.where(taken, slope, 1.0), 0.0)
+
+    return repeat(2, step, frozen(root, xp), xp)
+
+
+def integrate(function: Callable[[Array], Array], low: Array, high: Array, nodes: int) -> Array:
+    """The integral of a function of points along a new last axis."""
+    xp = namespace(low)
+    node, weight = (along(values, low) for values in np.polynomial.legendre.leggauss(nodes))
+    width = high - low
+    points = low[..., None] + width[..., None] * (0.5 * (node + 1.0))
+    # Of no width: the values are finite and do not matter.
+    return 0.5 * width * xp.sum(function(points) * weight, axis=-1)

@@ -51,22 +51,18 @@ def main(arguments: list[str] | None = None) -> None:
         # The reader of a pipe, `head` say, has gone: nothing is wrong.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(0)
-    except OSError as error:
-        if os.environ.get("ZWIDTH_TRACEBACK"):
-            raise
-        click.echo(f"zwidth: {_describe_refusal(error)}", err=True)
-        sys.exit(_EXIT_FAILED)
     except Exception as error:
         if os.environ.get("ZWIDTH_TRACEBACK"):
             raise
-        click.echo(f"zwidth: {type(error).__name__}: {error} (set ZWIDTH_TRACEBACK=1 for the traceback)", err=True)
+        click.echo(f"zwidth: {_describe(error)}", err=True)
         sys.exit(_EXIT_FAILED)
 
 
-def _describe_refusal(error: OSError) -> str:
-    """What the system refused: the file, why, and what helps."""
-    from zwidth.sweep.files.whole import REMEDIES
+def _describe(error: Exception) -> str:
+    """What went wrong; of what the system refused the file, why, and what helps."""
+    if not isinstance(error, OSError):
+        return f"{type(error).__name__}: {error} (set ZWIDTH_TRACEBACK=1 for the traceback)"
+    from zwidth.sweep.files import REMEDIES
 
     what = ": ".join(str(part) for part in (error.filename, error.strerror or error) if part)
-    remedy = REMEDIES.get(error.errno or 0)
-    return f"{what}; {remedy}" if remedy else what
+    return "; ".join(filter(None, (what, REMEDIES.get(error.errno or 0))))

@@ -1,17 +1,29 @@
-"""The group of commands, and those for one wall: thin shells over the library, which they import only when they run."""
+"""The group of commands, and those for a device, a file or a page: thin shells over the library, imported on call."""
 
 from __future__ import annotations
 
+import json
 import math
+import re
+import textwrap
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import click
 
 from zwidth import __version__
-from zwidth.cli import words
-from zwidth.cli.options import friction_option, json_option, resolution_option, scene_options
+from zwidth.cli.options import json_option, quantity_type, scene_options
+from zwidth.pages import words
+from zwidth.pages.words import row
+from zwidth.words.errors import InputError, ZwidthError, check_choice
 from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
+
+_COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
+_PACKAGE = Path(__file__).resolve().parents[1]
+# A table that a configuration reads from its own folder.
+_TABLE = re.compile(r"csv: *([\w.-]+\.csv)")
 
 
 @click.group(
@@ -28,29 +40,24 @@ def cli() -> None:
 
 @cli.command()
 @scene_options(wall=True, required=True)
-@friction_option
-@resolution_option
+@click.option("--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N.")
+@click.option("--resolution", type=quantity_type("m", POSITIVE), help="One step Q of the position sensor, in m.")
 @json_option
 def check(scene: Any, friction: float | None, resolution: float | None, as_json: bool) -> None:
     """Judge one wall: stable, passive, how far from the boundary, and what limits the device."""
     from zwidth.scenes.assessment import assess, friction_rule, limits_of
 
     verdict, limits, notes = assess(scene), limits_of(scene), words.scene_notes(scene)
-    rule = None
+    result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
+    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
+    if as_json:
+        result["islands"] = [island._asdict() for island in scene.islands()]
     if friction is not None or resolution is not None:
         device = {"damping": scene.damping, "period": scene.timing.period}
         rule = friction_rule(**device, friction=friction, resolution=resolution)
-    if as_json:
-        result = verdict.as_dict() | {"limits": [limit._asdict() for limit in limits], "notes": notes}
-        result["islands"] = [island._asdict() for island in scene.islands()]
-        if rule is not None:
-            result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
-        words.print_json(result)
-        return
-    lines = words.verdict_lines(scene, verdict) + words.limit_lines(limits)
-    lines += words.friction_lines(rule) if rule is not None else []
-    for line in [*lines, *(words.row("note", note) for note in notes)]:
-        click.echo(line)
+        result["friction_rule"] = rule._asdict() | {"stiffness": rule.stiffness}
+        lines += words.friction_lines(rule)
+    words.tell(result, lines + words.note_lines(notes), as_json)
 
 
 @cli.command()
@@ -65,13 +72,7 @@ def check(scene: Any, friction: float | None, resolution: float | None, as_json:
     help="How a delay that is not whole is modelled.",
 )
 @json_option
-def ridge(
-    delta: float | None,
-    d: float | None,
-    scene: Any,
-    delay_model: str,
-    as_json: bool,
-) -> None:
+def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as_json: bool) -> None:
     """Print the stiffest stable wall of a device.
 
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
@@ -100,31 +101,28 @@ def ridge(
         "omega": float(wall.frequency * (2.0 * math.pi * scene.timing.period)),
         "kind": kind,
     }
-    slopes, notes = [], []
+    lines = [
+        row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"),
+        row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
+        row("beta", f"{result['beta']:.12g}"),
+    ]
     if not normalized:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene)
-        result |= {
-            "stiffness_max": float(wall.stiffness),
-            "virtual_damping": float(wall.virtual_damping),
-            "frequency": float(wall.frequency),
+        found = wall.stiffness, wall.virtual_damping, wall.frequency
+        named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
+        result |= named | {
             "sensitivities": {slope.name: slope.as_dict() for slope in slopes},
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
-    if as_json:
-        words.print_json(result)
-        return
-    for line in [] if normalized else words.scene_lines(scene):
-        click.echo(line)
-    click.echo(words.row("normalized", f"delta = {plain(result['delta'])}, d = {plain(result['d'])}"))
-    click.echo(words.row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"))
-    click.echo(words.row("beta", f"{result['beta']:.12g}"))
-    if not normalized:
-        click.echo(words.row("K_max", with_unit(result["stiffness_max"], "N/m")))
-        click.echo(words.row("B", with_unit(result["virtual_damping"], "N s/m")))
-        click.echo(words.row("frequency", with_unit(result["frequency"], "Hz")))
-    for line in [*(slope.line() for slope in slopes), *(words.row("note", note) for note in notes)]:
-        click.echo(line)
+        labels = zip(("K_max", "B", "frequency"), named.values(), ("N/m", "N s/m", "Hz"), strict=True)
+        lines = [
+            *words.scene_lines(scene),
+            *lines,
+            *(row(label, with_unit(value, unit)) for label, value, unit in labels),
+        ]
+        lines += [*(slope.line() for slope in slopes), *words.note_lines(notes)]
+    words.tell(result, lines, as_json)
 
 
 @cli.command()
@@ -133,3 +131,162 @@ def schema() -> None:
     from zwidth.studies.document import config_json_schema
 
     words.print_json(config_json_schema())
+
+
+@cli.command()
+@click.argument("name", required=False)
+@json_option
+def devices(name: str | None, as_json: bool) -> None:
+    """List devices with published numbers; with a NAME, every number of one and its source.
+
+    A dash stands where nothing is published. Rotary devices have an inertia in kg m^2 and a damping in N m s/rad.
+    """
+    from zwidth.parts.devices import DEVICES, Published, find_device
+
+    chosen = DEVICES if name is None else (find_device(name),)
+    if as_json:
+        click.echo(json.dumps([device.as_dict() for device in chosen], indent=1, allow_nan=False))
+        return
+    if name is not None:
+        device = chosen[0]
+        click.echo(f"{device.title} ({device.motion})")
+        for quantity, number in device.numbers.items():
+            note = f" ({number.note})" if number.note else ""
+            click.echo(row(quantity, f"{_amount(number)}{note}; {number.source}"))
+        return
+
+    def cell(number: Published | None) -> str:
+        return "-" if number is None else _amount(number)
+
+    lines = [("name", *(column.replace("_", " ") for column in _COLUMNS))]
+    lines += [(device.name, *(cell(getattr(device, column)) for column in _COLUMNS)) for device in chosen]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    for line in lines:
+        click.echo("  ".join(text.ljust(width) for text, width in zip(line, widths, strict=True)).rstrip())
+
+
+def _amount(number: tuple[float, str, str, str]) -> str:
+    """A number with its unit; inertias and counts without a prefix."""
+    value, unit = number[:2]
+    if unit == "counts":
+        return f"{value:g} counts"
+    # A prefix on "kg m^2" would be a second one.
+    return f"{value:g} {unit}" if unit == "kg m^2" else with_unit(value, unit, 3)
+
+
+def _complete(context: click.Context, parameter: click.Parameter, begun: str) -> list[str]:
+    return [name for name in find_examples() if name.startswith(begun)]
+
+
+@cli.command()
+@click.argument("name", required=False, shell_complete=_complete)
+@click.option(
+    "--example",
+    metavar="EXAMPLE",
+    shell_complete=_complete,
+    help="The example to begin with.  [default: NAME's, else quickstart]",
+)
+@click.option("--list", "listing", is_flag=True, help="List the examples.")
+def init(name: str | None, example: str | None, listing: bool) -> None:
+    """Write an example configuration NAME.yaml, to run and to change.
+
+    No file is ever replaced. Without a NAME the file is named after the example.
+    """
+    known = find_examples()
+    if listing:
+        width = max(map(len, known))
+        for each, path in known.items():
+            words = textwrap.wrap(describe_example(path.read_text(encoding="utf-8")), 96 - width)
+            click.echo(f"{each:<{width}}  " + f"\n{'':<{width}}  ".join(words))
+        return
+    example = example or (name if name in known else "quickstart")
+    check_choice("--example", example, tuple(known))
+    name = (name or example).removesuffix(".yaml")
+    if not re.fullmatch("[a-z0-9_-]{1,64}", name):
+        raise InputError(f"NAME: got {name!r}; write 1 to 64 of a-z, 0-9, _ and -, as in my_device")
+    text = known[example].read_text(encoding="utf-8")
+    # The schema's place is known in a checkout alone, and each configuration has results of its own.
+    text = re.sub(r"\A# yaml-language-server:.*\n(?:#\n)?", "", text)
+    text = re.sub(r"(?m)^name: .*$", f"name: {name}", text, count=1)
+    files = {Path(f"{name}.yaml"): text}
+    files |= {
+        Path(table): known[example].with_name(table).read_text(encoding="utf-8") for table in _TABLE.findall(text)
+    }
+    # A table that is there as it would be written serves as it is.
+    wanted = {file: text for file, text in files.items() if file.suffix == ".yaml" or not _holds(file, text)}
+    for file in wanted:
+        if file.exists() or file.is_symlink():
+            raise InputError(f"{file}: is there already and stays as it is; give another NAME, or move it away")
+    for file, content in wanted.items():
+        with open(file, "x", encoding="utf-8") as stream:
+            stream.write(content)
+        click.echo(f"wrote {file}")
+    click.echo(f"run it with: zwidth run {name}.yaml   (results go to runs/{name})")
+
+
+def _holds(file: Path, text: str) -> bool:
+    return file.is_file() and file.read_bytes() == text.encode("utf-8")
+
+
+def find_examples() -> dict[str, Path]:
+    """The example configurations by name: those of the package, or of the checkout that it is imported from."""
+    packaged = _PACKAGE / "examples"
+    folder = packaged if packaged.is_dir() else _PACKAGE.parents[1] / "configs"
+    found = {file.stem: file for file in sorted(folder.glob("*.yaml"))}
+    if not found:
+        raise ZwidthError(f"init: {packaged} holds no examples; install zwidth again")
+    return found
+
+
+def describe_example(text: str) -> str:
+    comments = [line.lstrip("# ") for line in text.splitlines() if line.startswith("#")][1:]
+    sentence = re.match(r".*?[.?](?= |$)", " ".join(line for line in comments if line))
+    assert sentence is not None, "every example says what it is"
+    return sentence.group()
+
+
+@cli.command()
+@click.argument("path", metavar="[CONFIG|DIR]", required=False, type=click.Path(exists=True, path_type=Path))
+@click.option("--port", type=click.IntRange(0, 65535), default=0, help="Port on this machine.  [default: any free one]")
+@click.option("--no-browser", is_flag=True, help="Print the address and open no browser.")
+def explore(path: Path | None, port: int, no_browser: bool) -> None:
+    """Open a page with sliders for device, timing and wall, on which the stable walls follow.
+
+    It starts from the scene of a CONFIG file, or of the run in DIR. The server is for this machine alone and asks for
+    the token in its address. Ctrl-C ends it.
+    """
+    import threading
+    import webbrowser
+
+    from zwidth.words.errors import InputError
+
+    try:
+        from zwidth.pages.explorer.server import Explorer
+    except ModuleNotFoundError as error:
+        if (error.name or "").partition(".")[0] not in ("bokeh", "tornado"):
+            raise
+        raise InputError("explore: bokeh is not installed; pip install 'zwidth[explore]'") from error
+    from zwidth.pages.explorer.controls import read_controls
+
+    explorer = Explorer(read_controls(path), port)
+    click.echo(f"{explorer.address}  (Ctrl-C ends it)")
+    if not no_browser:
+        # A browser in the terminal would keep the server waiting for its own page.
+        threading.Thread(target=webbrowser.open, args=(explorer.address,), daemon=True).start()
+    explorer.run()
+    click.echo("stopped")
+
+
+@cli.command()
+@click.argument("folder", metavar="DIR", type=click.Path(path_type=Path))
+@click.option("--out", type=click.Path(path_type=Path), help="The file.  [default: DIR/report.html]")
+@json_option
+def report(folder: Path, out: Path | None, as_json: bool) -> None:
+    """Write the run in DIR as one HTML file: figures, slices of its maps, methods, versions, configuration.
+
+    The file needs no server and no network.
+    """
+    from zwidth.pages.report.page import write_report
+
+    file = write_report(folder, out)
+    click.echo(json.dumps({"file": str(file), "bytes": file.stat().st_size}) if as_json else f"wrote {file}")

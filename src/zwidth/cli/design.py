@@ -9,7 +9,7 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
-from zwidth.cli.words import print_json, row
+from zwidth.pages.words import row, tell
 from zwidth.words.formatting import plain, with_unit
 
 _FINDS = {
@@ -76,11 +76,7 @@ def design(
         if not scene.parts_beyond and distribution == "uniform" and all(name in _BOX for name, _ in tolerances):
             found["every_device"], words = _prove(scene, dict(tolerances))
             lines += words
-    if as_json:
-        print_json(found)
-        return
-    for line in lines:
-        click.echo(line)
+    tell(found, lines, as_json)
 
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
@@ -157,11 +153,6 @@ def _prove(scene: Any, shares: dict[str, float]) -> tuple[dict[str, Any], list[s
         "virtual_damping": float(wall.virtual_damping),
         "stiffness_max": float(best.stiffness),
     }
-    lines = [
-        row(
-            "proved for every one",
-            f"K = {with_unit(float(wall.stiffness), 'N/m')} at B = {with_unit(float(wall.virtual_damping), 'N s/m')}; "
-            f"{with_unit(float(best.stiffness), 'N/m')}, each with a B of its own",
-        )
-    ]
-    return result, lines
+    stiffness, damping, most = map(with_unit, result.values(), ("N/m", "N s/m", "N/m"))
+    text = f"K = {stiffness} at B = {damping}; {most}, each with a B of its own"
+    return result, [row("proved for every one", text)]

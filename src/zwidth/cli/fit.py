@@ -10,7 +10,7 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, json_option, number_or_text, quantity_type, read_share, velocity_options
-from zwidth.cli.words import print_json, row
+from zwidth.pages.words import row, tell
 from zwidth.words.errors import InputError, UnusableValueError
 from zwidth.words.quantities import POSITIVE
 
@@ -68,19 +68,9 @@ _SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 
 @cli.command()
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
-@click.option(
-    "--buzz",
-    "walls",
-    type=_WALL,
-    multiple=True,
-    help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.",
-)
+@click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
 @click.option("--period", type=quantity_type("s", POSITIVE), help="T, in s; of logs in place of --time.")
-@click.option(
-    "--noise",
-    type=_SHARE,
-    help="Relative noise of K and f of buzzing walls, as 2%.",
-)
+@click.option("--noise", type=_SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
 @click.option("--time", help="Column of the time: its header, or HEADER:ms. Found by its name where left out.")
 @click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts, :deg.")
 @click.option("--force", help="Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.")
@@ -152,16 +142,12 @@ def fit(
         source = " and ".join(log.name for log in logs)
     if figure is not None:
         _draw(found, source, points, units, figure)
-    if as_json:
-        print_json({**found.as_dict(), "units": units._asdict()})
-        return
     if as_yaml:
-        click.echo("\n".join(write_scene(found, source, units)))
-        return
-    for label, text in describe_fit(found, source, units):
-        click.echo(row(label, text))
-    if figure is not None:
-        click.echo(row("wrote", str(figure)))
+        lines = write_scene(found, source, units)
+    else:
+        lines = [row(*each) for each in describe_fit(found, source, units)]
+        lines += [row("wrote", str(figure))] if figure is not None else []
+    tell({**found.as_dict(), "units": units._asdict()}, lines, as_json)
 
 
 def _draw(found: DeviceFit, source: str, points: tuple[Any, ...], units: AxisUnits, file: Path) -> None:

@@ -1,24 +1,76 @@
-"""Options that several commands share: quantities, and those that describe a scene."""
+"""Options that several commands share, quantities and those of a scene, with doubts of values that no device has."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
 from functools import wraps
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
-from zwidth.words.quantities import ANY, CHOICES, NOT_NEGATIVE, OF_PARTS, PARAMETERS, Range
+from zwidth.parts.checks import Span
+from zwidth.words.formatting import short
+from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_PARTS, PARAMETERS, Range
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
 
+# What devices have, by what kind of quantity it is, from and up to in its SI unit. An inertia of a rotary device, in
+# kg m^2, is far below any mass.
+_PLAUSIBLE = {
+    "mass": (1e-9, 20.0),
+    "damping": (0.0, 1e4),
+    "stiffness": (0.0, 1e7),
+    "spring": (0.0, 1e9),
+    "period": (1e-6, 0.2),
+    "rate": (5.0, 1e6),
+    "delay": (0.0, 5.0),
+    "cutoff": (0.05, 1e6),
+    "time_constant": (1e-7, 5.0),
+}
+# Kinds of quantities with another name.
+_OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
+# The slips: the same number with another unit, or as another quantity.
+_SLIPS = {
+    "mass": (("{flag} '{value} g'", "mass", 1e-3),),
+    "damping": (("{flag} '{value} mN s/m'", "damping", 1e-3),),
+    "stiffness": (("a thousandth of it, with kN/m or N/mm counted once", "stiffness", 1e-3),),
+    "period": (("{flag} '{value} ms'", "period", 1e-3), ("--rate '{value} Hz'", "rate", 1.0)),
+    "rate": (("{flag} '{value} kHz'", "rate", 1e3), ("--period '{value} s'", "period", 1.0)),
+    "delay": (("{flag} '{value} ms'", "delay", 1e-3), ("{flag} '{value} us'", "delay", 1e-6)),
+    "time_constant": (("{flag} '{value} ms'", "time_constant", 1e-3),),
+    "cutoff": (("{flag} '{value} kHz'", "cutoff", 1e3),),
+}
 Command: TypeAlias = Callable[..., Any]
 
 # By path in a scene, as in configuration files, one part after the other.
 _PART_NAMES = tuple(dict.fromkeys(path.partition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.partition(".")[0]))
+
+
+def doubts_of(given: dict[str, Any]) -> list[str]:
+    """A line for every value, by path, that lies far from what any device has; it is taken all the same."""
+    lines = []
+    for path, value in given.items():
+        unit, name = FIELDS[path].unit if path in FIELDS else "", path.rpartition(".")[2]
+        kind = name if name in _PLAUSIBLE and path != "coupling.stiffness" else _OF_UNIT.get(unit, "")
+        number = value.value if isinstance(value, Span) and value.unit == "s" else value
+        if isinstance(number, int | float) and kind in _PLAUSIBLE and not _is_plausible(kind, number):
+            flag = "--" + path.replace(".", "-").replace("_", "-")
+            meant = [
+                text.format(flag=flag, value=short(number))
+                for text, other, scale in _SLIPS.get(kind, ())
+                if _is_plausible(other, number * scale)
+            ]
+            remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
+            lines.append(f"{flag} is {short(number)} {unit}, far from any device; {remedy}")
+    return lines
+
+
+def _is_plausible(kind: str, value: float) -> bool:
+    low, high = _PLAUSIBLE[kind]
+    return value == 0 or low <= abs(value) <= high
 
 
 class Parsed(click.ParamType):
@@ -70,7 +122,6 @@ def flag_of(path: str) -> str:
 
 
 def _add_option(command: Command, path: str, required: bool = False) -> Command:
-    """The option of a parameter or of a choice."""
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:
@@ -84,49 +135,36 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
 
 
 def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]:
-    """The options that describe a scene, which the command gets as ``scene``: a `zwidth.Scene`.
+    """The options that describe a scene, and perhaps its wall, which the command gets as ``scene``: a `zwidth.Scene`.
 
-    Args:
-        wall: whether they include the wall that is judged.
-        required: whether there must be a scene; otherwise ``scene`` is None where no mass is given.
+    Where none is required it is None without any of them.
     """
     bare = (*(("stiffness", "virtual_damping") if wall else ()), "mass", "damping", "period", "rate", "delay")
+    needed = ("stiffness", "mass") if required else ("stiffness",)
+    return _take_options("scene", (*bare, *_PARTS), needed, lambda given: build_scene(given, required))
+
+
+def _take_options(
+    name: str, paths: Sequence[str], needed: Sequence[str], make: Callable[[dict[str, Any]], Any]
+) -> Callable[[Command], Command]:
+    """The options of some parameters, of which the command gets what is made, under a name."""
 
     def decorate(function: Command) -> Command:
         @wraps(function)
-        def with_scene(**given: Any) -> Any:
-            named = {path: given.pop(path.replace(".", "__")) for path in (*bare, *_PARTS)}
-            scene = build_scene({path: value for path, value in named.items() if value is not None}, required)
-            return function(scene=scene, **given)
+        def with_made(**given: Any) -> Any:
+            named = {path: given.pop(path.replace(".", "__")) for path in paths}
+            return function(**{name: make({path: each for path, each in named.items() if each is not None})}, **given)
 
-        command = with_scene
-        for path in reversed((*bare, *_PARTS)):
-            command = _add_option(command, path, required=path == "stiffness" or (required and path == "mass"))
+        command = with_made
+        for path in reversed(paths):
+            command = _add_option(command, path, required=path in needed)
         return command
 
     return decorate
 
 
-def velocity_options(function: Command) -> Command:
-    """The options of a velocity estimate alone, which the command gets as ``velocity``."""
-    paths = [path for path in _PARTS if path.startswith("velocity.")]
-
-    @wraps(function)
-    def with_velocity(**given: Any) -> Any:
-        named = {path.partition(".")[2]: given.pop(path.replace(".", "__")) for path in paths}
-        return function(
-            velocity=_velocity({name: value for name, value in named.items() if value is not None}), **given
-        )
-
-    command = with_velocity
-    for path in reversed(paths):
-        command = _add_option(command, path)
-    return command
-
-
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
-    from zwidth.cli.doubts import doubts_of
     from zwidth.parts.device import Device
     from zwidth.parts.paths import PARTS
     from zwidth.parts.timing import Timing
@@ -141,19 +179,16 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     for line in doubts_of(given):
         click.echo(f"zwidth: {line}", err=True)
 
-    def part(name: str) -> dict[str, Any]:
-        return {path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
-
-    def own(*names: str) -> dict[str, Any]:
+    def some(*names: str) -> dict[str, Any]:
         return {name: given[name] for name in names if name in given}
 
     try:
-        parts = {name: _make_part(name, kind, part(name)) for name, kind in PARTS.items() if part(name)}
+        parts = {name: _make_part(name, kind, own) for name, kind in PARTS.items() if (own := _own(given, name))}
         scene = Scene(
-            Device(**own("mass", "damping")),
-            Timing(**own("period", "rate", "delay")),
+            Device(**some("mass", "damping")),
+            Timing(**some("period", "rate", "delay")),
             VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
-            velocity=_velocity(part("velocity")),
+            velocity=_make_velocity(given),
         ).replace(**parts)
         scene.check_parts()
         return scene
@@ -177,9 +212,15 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
     return kind(**given)
 
 
-def _velocity(given: dict[str, Any]) -> Any:
+def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
+    """What is given of one part, by the names of its fields."""
+    return {path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
+
+
+def _make_velocity(options: dict[str, Any]) -> Any:
     from zwidth.parts.velocity import ESTIMATES
 
+    given = _own(options, "velocity")
     kind = given.pop("kind", None)
     if kind is None:
         low = {"cutoff", "time_constant"} & set(given)
@@ -195,9 +236,6 @@ def _velocity(given: dict[str, Any]) -> Any:
 
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
-friction_option = click.option(
-    "--friction", type=quantity_type("N", NOT_NEGATIVE), help="Coulomb friction f_c of the device, in N."
-)
-resolution_option = click.option(
-    "--resolution", type=quantity_type("m", Range(0.0, low_open=True)), help="One step Q of the position sensor, in m."
+velocity_options = _take_options(
+    "velocity", [path for path in _PARTS if path.startswith("velocity.")], (), _make_velocity
 )

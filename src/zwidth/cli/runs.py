@@ -1,11 +1,13 @@
-"""Runs on the command line: ``run``, ``verify``, ``export`` and ``figures``."""
+"""Runs on the command line: ``run`` with its progress, ``verify``, ``export``, ``figures`` and ``bench``."""
 
 from __future__ import annotations
 
 import re
 import shlex
 import signal
-from collections.abc import Iterator
+import sys
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,12 +16,15 @@ import click
 
 from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, json_option
-from zwidth.cli.words import print_json
+from zwidth.pages.words import print_json
+from zwidth.words.formatting import plain
 
 if TYPE_CHECKING:
-    from zwidth.runs.result import RunResult
+    from zwidth.runs.run import RunResult, StudyEvent
+    from zwidth.sweep.engine import Progress
 
 _EXIT_FAILED = 1
+_SECONDS_BETWEEN_LINES = 10.0
 
 
 def _read_shard(text: str) -> tuple[int, int]:
@@ -74,7 +79,7 @@ def run(path: Path, dry_run: bool, **options: Any) -> None:
     Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
     Ctrl-C keeps what is done; --resume goes on.
     """
-    from zwidth.cli.progress import reporter
+    from zwidth.cli.runs import reporter
     from zwidth.runs.run import run as run_studies
 
     if dry_run:
@@ -185,7 +190,7 @@ def verify(folder: Path, as_json: bool) -> None:
 
     Exit code 1 where something is damaged or missing; `zwidth run --resume` repairs it.
     """
-    from zwidth.sweep.verify import verify as verify_stores
+    from zwidth.sweep.dataset import verify as verify_stores
 
     found = verify_stores(folder)
     if as_json:
@@ -208,7 +213,7 @@ def export(folder: Path, netcdf: Path | None, table: Path | None) -> None:
     """Write a sweep, a store or a folder DIR with one, as netCDF or CSV."""
     if netcdf is None and table is None:
         raise click.UsageError("give --netcdf FILE or --csv FILE")
-    from zwidth.sweep.export import to_csv, to_netcdf
+    from zwidth.sweep.dataset import to_csv, to_netcdf
     from zwidth.sweep.store import find_store
 
     missing = len(find_store(folder).missing())
@@ -257,3 +262,115 @@ def figures(folder: Path, at: tuple[tuple[str, str], ...], out: Path | None, as_
         print_json({"files": [str(file) for file in files]})
     if not files:
         raise SystemExit(_EXIT_FAILED)
+
+
+@cli.command()
+@click.option("--quick", is_flag=True, help="Few delays and small maps: less than a minute instead of some.")
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("runs/bench"),
+    show_default=True,
+    help="Folder of bench.json, bench.md, summary.txt and the picture pareto.png.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace the results of an earlier run in that folder.")
+@json_option
+def bench(quick: bool, out: Path, overwrite: bool, as_json: bool) -> None:
+    """Measure speed against error of every method, beside NumPy, JAX and python-control.
+
+    It needs a checkout of the project, whose benchmarks/methods it runs, and for the errors the extra "test".
+    """
+    from zwidth.words.errors import ResourceError
+
+    # Beside the package's sources; nothing of it is installed with a wheel.
+    folder = Path(__file__).parents[3] / "benchmarks"
+    if not (folder / "methods").is_dir():
+        raise ResourceError(
+            "bench: needs a checkout of the project, with its folder benchmarks/; there: scripts/setup test, then "
+            ".venv/bin/zwidth bench"
+        )
+    sys.path.insert(0, str(folder))
+    from methods.report import run
+
+    run(quick, out, overwrite, as_json)
+
+
+@contextmanager
+def reporter() -> Iterator[Callable[[StudyEvent], None]]:
+    """A callback for `zwidth.run` that tells on stderr how far it is."""
+    if not sys.stderr.isatty():
+        yield _Lines()
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import Progress as Bar
+
+    console = Console(stderr=True)
+    columns = (
+        SpinnerColumn(),
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TaskProgressColumn(),
+        TextColumn("{task.fields[state]}"),
+        TimeElapsedColumn(),
+    )
+    with Bar(*columns, console=console, transient=True) as bar:
+        shown = bar.add_task("starting", total=None, state="")
+
+        def show(event: StudyEvent) -> None:
+            description = f"{event.name} ({event.kind})"
+            if event.progress is not None:
+                done, total = event.progress.points, event.progress.total_points
+                bar.update(shown, description=description, completed=done, total=total, state=_state(event.progress))
+            elif event.result is None:
+                bar.update(shown, description=description, completed=event.index - 1, total=event.total, state="")
+            else:
+                bar.update(shown, completed=event.index, total=event.total, state="")
+                for line in _lines(event):
+                    console.print(line, markup=False, highlight=False)
+
+        yield show
+
+
+class _Lines:
+    """Plain lines; of chunks, at most one in a while."""
+
+    def __init__(self) -> None:
+        self.last = time.monotonic()
+
+    def __call__(self, event: StudyEvent) -> None:
+        progress = event.progress
+        if progress is None:
+            for line in _lines(event) if event.result else ():
+                click.echo(line, err=True)
+            return
+        now = time.monotonic()
+        last = progress.chunks == progress.total_chunks
+        if last or progress.error or now - self.last >= _SECONDS_BETWEEN_LINES:
+            self.last = now
+            done = f"{progress.chunks}/{progress.total_chunks} chunks"
+            click.echo(f"{event.name:<20} {done}  {_state(progress)}", err=True)
+
+
+def _lines(event: StudyEvent) -> Iterator[str]:
+    """One finished study: its number, name, time and files, and its notes."""
+    result = event.result
+    assert result is not None, "an event at the end of a study has its result"
+    state = f"{len(result.files)} files{', kept' if result.state == 'kept' else ''}"
+    if result.sweep is not None:
+        state = f"{result.sweep.computed + result.sweep.skipped}/{result.sweep.total} chunks"
+    if result.state == "failed":
+        state = "failed"
+    number = f"[{event.index:>{len(str(event.total))}}/{event.total}]"
+    yield f"{number} {event.name:<20} {event.kind:<10} {result.seconds:6.1f} s  {state}"
+    for note in result.notes:
+        yield f"      note: {note}"
+
+
+def _state(progress: Progress) -> str:
+    left = progress.seconds_left
+    text = f"{plain(progress.rate, 3)} points/s"
+    if left == left and left > 0:
+        hours, rest = divmod(round(left), 3600)
+        text += f", {hours}:{rest // 60:02}:{rest % 60:02} left"
+    return text

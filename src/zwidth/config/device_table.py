@@ -13,12 +13,10 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.axes import Entry, in_one_unit, read_entries
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
-from zwidth.config.values import quantity_of
-from zwidth.words.cells import read_rows, split_title
+from zwidth.config.values import Entry, in_one_unit, quantity_of, read_entries
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, from_cell, resembling, suggestion
+from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.units import looks_like_number
 
@@ -57,11 +55,9 @@ class DeviceTable:
 
     @property
     def size(self) -> int:
-        """How many rows there are."""
         return len(next(iter(self.columns.values())))
 
     def values(self, name: str) -> np.ndarray:
-        """One column as float64."""
         return np.array(self.columns[name], dtype=np.float64)
 
     def spelling(self) -> dict[str, Any]:
@@ -234,7 +230,6 @@ def _read_cell(entry: Entry, cell: str, unit: str, place: str) -> float:
 
 
 def _make_schema() -> dict[str, Any]:
-    """The JSON Schema of a table."""
     column = {"type": "array", "minItems": 1, "items": {"type": ["number", "string"]}}
     labels = {"type": "array", "minItems": 1, "items": {"type": "string"}}
     names = {"type": "object", "additionalProperties": {"type": "string"}}

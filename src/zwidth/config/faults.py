@@ -105,7 +105,6 @@ def problems_of(error: ValidationError | PydanticCustomError, *above: str) -> li
 
 
 def unlisted(value: Any, names: Sequence[str]) -> PydanticCustomError:
-    """The problem of a value that is none of a few names."""
     allowed = f"allowed {'is' if len(names) == 1 else 'are'} {listing(names)}"
     return problem(f"got {describe(value)}", allowed, suggestion(value, names, "write one of these"))
 

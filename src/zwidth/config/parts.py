@@ -21,10 +21,9 @@ from pydantic import (
 from pydantic_core import CoreSchema
 from pydantic_core.core_schema import no_info_wrap_validator_function
 
-from zwidth.config.axes import read_entries
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict, describe_parameter, find_kind
-from zwidth.config.values import Quantity
+from zwidth.config.values import Quantity, read_entries
 from zwidth.parts.checks import find_range
 from zwidth.parts.paths import PARTS
 from zwidth.parts.velocity import ESTIMATES, FOAW
@@ -52,7 +51,6 @@ class PartSection(Strict):
     part: ClassVar[Any]
 
     def to_part(self) -> Any:
-        """The part of the scene."""
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 

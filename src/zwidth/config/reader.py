@@ -15,13 +15,10 @@ from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
-from yaml.emitter import Emitter
 from yaml.parser import Parser
 from yaml.reader import Reader
-from yaml.representer import SafeRepresenter
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
-from yaml.serializer import Serializer
 
 from zwidth.config.device_table import files_relative_to
 from zwidth.config.faults import (
@@ -42,15 +39,10 @@ _Model = TypeVar("_Model", bound=BaseModel)
 MAX_FILE_BYTES = 2**20
 MAX_NODES = 50_000
 MAX_DEPTH = 20
-MAX_ALIAS_NODES = 1000
 
 
 def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Model:
-    """Read a file and check all of it against a model.
-
-    Raises:
-        ConfigFileError: the file cannot be read or has faults.
-    """
+    """Read a file and check all of it against a model; a `ConfigFileError` lists its faults."""
     file = os.fsdecode(path)
     tree = _Tree(file, _read_text(file))
     problems = []
@@ -67,11 +59,7 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
 
 
 def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
-    """Check what a file would hold against a model; a fault then has a field and no place.
-
-    Raises:
-        ConfigFileError: there are faults.
-    """
+    """Check what a file would hold against a model; a fault then has a field and no place."""
     problems: list[LocatedProblem] = []
     found = None
     try:
@@ -118,7 +106,6 @@ def find_values(text: str, key: str) -> list[tuple[str, int, int]]:
 
 
 def _fail(file: str, place: tuple[int, int] | None, *parts: str, path: FieldPath = ()) -> ConfigFileError:
-    """An error with a single fault."""
     line, column = place or (None, None)
     return ConfigFileError.of([Fault(file, line, column, dotted(path), *parts)])
 
@@ -179,16 +166,10 @@ for _tag, _pattern, _first in (
     _Resolver.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"(?:{_pattern})\\Z"), _first)
 
 
-class _Dumper(Emitter, Serializer, SafeRepresenter, _Resolver):
+class _Dumper(yaml.SafeDumper):
     """PyYAML's, with quotes around what the core schema would take for a number."""
 
-    def __init__(self, stream: Any, default_style: Any = None, default_flow_style: Any = None, **options: Any) -> None:
-        emitting = ("canonical", "indent", "width", "allow_unicode", "line_break")
-        Emitter.__init__(self, stream, **{name: options[name] for name in emitting})
-        serializing = ("encoding", "explicit_start", "explicit_end", "version", "tags")
-        Serializer.__init__(self, **{name: options[name] for name in serializing})
-        SafeRepresenter.__init__(self, default_style, default_flow_style, options["sort_keys"])
-        _Resolver.__init__(self)
+    yaml_implicit_resolvers = _Resolver.yaml_implicit_resolvers
 
     def ignore_aliases(self, data: Any) -> bool:
         """Write everything out."""
@@ -207,7 +188,7 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         self.keys: dict[FieldPath, tuple[int, int]] = {}
         self.scalars: dict[FieldPath, tuple[str, int, int]] = {}  # as written, with the ends in the text
         self.faults: list[Fault] = []
-        self._nodes = self._alias_nodes = 0
+        self._nodes = 0
         self._anchors: dict[str, list[yaml.Event]] = {}
         self._unfinished: dict[str, list[yaml.Event]] = {}
         try:
@@ -274,10 +255,7 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         self.values.setdefault(path, _mark_place(event.start_mark))
         if isinstance(event, yaml.AliasEvent):
             return self._read(path, iter(self._recall(event, path)), in_alias=True)
-        if in_alias:
-            self._count_alias_node(path)
-        else:
-            self._count_node(event, path, path)
+        self._count_node(event, path, path, in_alias)
         anchor = None if in_alias else event.anchor
         if anchor is not None:
             if anchor in self._anchors or anchor in self._unfinished:
@@ -310,9 +288,9 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
     def _invalid(self, event: yaml.Event, what: str, remedy: str) -> ConfigFileError:
         return _fail(self.file, _mark_place(event.start_mark), "not valid YAML", what, remedy)
 
-    def _count_node(self, event: Any, path: FieldPath, field: FieldPath) -> None:
+    def _count_node(self, event: Any, path: FieldPath, field: FieldPath, in_alias: bool) -> None:
         """Refuse one that is too many, and its tag; PyYAML itself has no limits."""
-        place = _mark_place(event.start_mark)
+        place = self.values[path] if in_alias else _mark_place(event.start_mark)
         self._nodes += 1
         if self._nodes > MAX_NODES:
             what, allowed = "too many values", f"at most {MAX_NODES} values a file"
@@ -320,15 +298,9 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
         if len(path) >= MAX_DEPTH:
             what, allowed = "the values are nested too deeply", f"at most {MAX_DEPTH} levels"
             raise _fail(self.file, place, what, allowed, "use fewer levels", path=path)
-        if event.tag is not None:
+        if event.tag is not None and not in_alias:
             # A fault of its own; the value is read as if it were not there.
             self._add_fault(place, field, f"got the tag {describe(event.tag)}", "tags are not used", "remove the tag")
-
-    def _count_alias_node(self, path: FieldPath) -> None:
-        self._alias_nodes += 1
-        if self._alias_nodes > MAX_ALIAS_NODES or len(path) > MAX_DEPTH:
-            what, allowed = "too many values by alias", f"aliases may stand for at most {MAX_ALIAS_NODES} values"
-            raise _fail(self.file, self.values[path], what, allowed, "write them out", path=path)
 
     def _add_fault(self, place: tuple[int, int], path: FieldPath, *parts: str) -> None:
         self.faults.append(Fault(self.file, *place, dotted(path), *parts))
@@ -341,7 +313,7 @@ class _Tree(Reader, Scanner, Parser, _Resolver):
             place, key = _mark_place(event.start_mark), None
             if isinstance(event, yaml.ScalarEvent):
                 if not in_alias:
-                    self._count_node(event, path, (*path, event.value))
+                    self._count_node(event, path, (*path, event.value), in_alias)
                     self._anchors |= {event.anchor: [event]} if event.anchor else {}
                 key = self._read_scalar(event)
                 what = f"got the key {describe(key)}"

@@ -48,11 +48,8 @@ class _OneKind(Strict):
             return super().unknown(name)
         if name in PART_NAMES:
             allowed = f"{cls.what} that is normalized has no parts: their keys are in SI units"
-            return (
-                f"got {name!r} after normalized keys",
-                allowed,
-                "write mass, damping and period in place of delta and d",
-            )
+            remedy = "write mass, damping and period in place of delta and d"
+            return f"got {name!r} after normalized keys", allowed, remedy
         kind, other = ("physical", "normalized") if name in _NORMALIZED else ("normalized", "physical")
         return (
             f"{other} key, after {kind} ones",
@@ -138,10 +135,8 @@ class _PhysicalPlant(_Parts, _Mass):
             value = float(getattr(numbers, name))
             if not within(np.float64(value), (least, most)):
                 what = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(value)}"
-                allowed = (
-                    f"{name} must be at most {most:g}" if not least else f"{name} must be 0 or {least:g} to {most:g}"
-                )
-                yield (field,), problem(what, allowed, "check the units and the mass")
+                bounds = f"0 or {least:g} to {most:g}" if least else f"at most {most:g}"
+                yield (field,), problem(what, f"{name} must be {bounds}", "check the units and the mass")
 
     @property
     def parts_beyond(self) -> tuple[str, ...]:
@@ -347,13 +342,9 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
         return wall.alpha, wall.beta
     if isinstance(device, NormalizedDevice):
         raise InputError("wall: got one in SI units for a normalized device; give alpha and beta")
+    own = {"stiffness": wall.stiffness, "virtual_damping": wall.virtual_damping}
     with np.errstate(over="ignore"):
-        plain = normalize(
-            mass=device.moving_mass,
-            period=device.period,
-            stiffness=wall.stiffness,
-            virtual_damping=wall.virtual_damping,
-        )
+        plain = normalize(mass=device.moving_mass, period=device.period, **own)
     return float(plain.alpha), float(plain.beta)
 
 
@@ -369,9 +360,8 @@ def _as_either(raw: Any, physical: type[Any], normalized: type[Any]) -> Any:
         return raw
     if not isinstance(raw, dict):
         keys = f"{listing(physical.model_fields)} or, normalized, {listing(normalized.model_fields)}"
-        raise problem(
-            f"got {describe(raw)}", f"{physical.what} is a mapping with the keys {keys}", "write 'key: value' lines"
-        )
+        allowed = f"{physical.what} is a mapping with the keys {keys}"
+        raise problem(f"got {describe(raw)}", allowed, "write 'key: value' lines")
     return (normalized if is_normalized(raw) else physical).model_validate(raw)
 
 
@@ -381,7 +371,6 @@ AnyWall: TypeAlias = PhysicalWall | NormalizedWall
 
 
 def read_scene(raw: Any) -> AnyScene:
-    """A scene of either kind."""
     return _as_either(raw, PhysicalScene, NormalizedScene)
 
 

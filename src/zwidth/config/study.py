@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import Annotated, Any, ClassVar, Literal, TypeVar, get_args
 
@@ -143,9 +144,14 @@ class Study(Strict):
         return super().missing(name)
 
     @property
+    def sizes(self) -> dict[str, int]:
+        """How many there are, by name, of what is combined with each other; or a kind says `points` and `extent`."""
+        return {}
+
+    @property
     def points(self) -> int:
         """About how many points are computed."""
-        raise NotImplementedError
+        return math.prod(self.sizes.values())
 
     @property
     def nbytes(self) -> int:
@@ -155,7 +161,7 @@ class Study(Strict):
     @property
     def extent(self) -> str:
         """What the number of points consists of, for messages."""
-        raise NotImplementedError
+        return f"{' x '.join(self.sizes) or 'one point'} = {' x '.join(map(str, self.sizes.values())) or 1}"
 
     def limits(self) -> Iterable[LocatedProblem]:
         if self.points <= MAX_POINTS and self.nbytes <= MAX_BYTES:

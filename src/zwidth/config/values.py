@@ -1,23 +1,37 @@
-"""Single values of a configuration: numbers, whole numbers, quantities with a unit, and lengths of time."""
+"""Values of a configuration: numbers, quantities with a unit, lengths of time, and axes.
+
+An axis is written as one number, a list, ``{linear: {start, stop, num}}`` or ``{log: {start, stop, num}}``.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
-from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
-from pydantic_core import CoreSchema, core_schema
+import numpy as np
+from pydantic import BeforeValidator, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError, create_model
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 
-from zwidth.config.faults import problem, raise_problems
+from zwidth.config.faults import LocatedProblem, problem, problems_of, raise_problems, validation_error
+from zwidth.config.fields import Strict, repeated
 from zwidth.parts.checks import Span, read_span
-from zwidth.words.formatting import describe
+from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
 from zwidth.words.units import PERIOD_WORDS, check_range, find_dimension, looks_like_number, read_quantity, to_float
 
 _NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
+LONGEST_AXIS = 10_000_000
+"""More values than any result could use, few enough to be laid out in memory."""
+
+Entry: TypeAlias = Callable[[Any], float]
+"""Reads one value of an axis, or raises a problem."""
+
+_FORMS = "a number, a list of numbers, {linear: {start, stop, num}} or {log: {start, stop, num}}"
+_SPACINGS = {"linear": np.linspace, "log": np.geomspace}
 
 
 def _number(allowed: Range, remedy: str) -> Callable[[Any], float]:
@@ -76,7 +90,6 @@ class Quantity:
 
     @cached_property
     def read(self) -> Callable[[Any], Any]:
-        """What reads a value, or raises a problem."""
         if self.periods:
             return raise_problems(lambda value: read_span(value, self.allowed))
         if self.unit == "1":
@@ -86,7 +99,6 @@ class Quantity:
 
     @property
     def schema(self) -> dict[str, Any]:
-        """Its JSON Schema."""
         if self.unit != "1":
             return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()))
         low, high, low_open, high_open = self.allowed
@@ -105,7 +117,6 @@ class Quantity:
 
 
 def quantity_of(name: str) -> Quantity:
-    """That of a parameter."""
     parameter = PARAMETERS[name]
     return Quantity(parameter.unit, parameter.allowed, parameter.whole, name == "delay")
 
@@ -126,3 +137,171 @@ def describe_entry(unit: str, *more: str) -> dict[str, Any]:
         "examples": [dimension.example],
         "anyOf": [{"type": "number"}, {"type": "string", "pattern": pattern}],
     }
+
+
+@dataclass(frozen=True)
+class Axis:
+    """The values that one quantity takes; none of them twice."""
+
+    form: str  # how it is written: "number", "list", "linear" (equal steps) or "log" (equal ratios)
+    entries: tuple[float, ...]  # the number, the numbers of the list in its order, or the two ends, both included
+    size: int  # how many values there are, known without laying them out
+    in_periods: bool = False  # whether the values are delays in sampling periods
+
+    def values(self) -> np.ndarray:
+        if self.form in _SPACINGS:
+            return _SPACINGS[self.form](*self.entries, self.size)
+        return np.array(self.entries, dtype=np.float64)
+
+    @property
+    def largest(self) -> float:
+        return max(self.entries)
+
+    def spelling(self) -> Any:
+        """The axis as a configuration file writes it."""
+        written = [f"{value!r} periods" if self.in_periods else value for value in self.entries]
+        if self.form in _SPACINGS:
+            return {self.form: {"start": written[0], "stop": written[1], "num": self.size}}
+        return written if self.form == "list" else written[0]
+
+
+class _Spacing(Strict):
+    """Base of the mappings below ``linear`` and ``log``."""
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        return "an axis of equal steps or ratios has start, stop and num", f"add {name!r}"
+
+    def limits(self) -> list[LocatedProblem]:
+        start, stop, num = (getattr(self, name) for name in ("start", "stop", "num"))
+        if start == stop:
+            where = "start and stop must differ"
+            return [(("stop",), problem(f"got {short(stop)}, as start", where, "write a number alone"))]
+        if not math.isfinite(stop - start):
+            allowed = "the distance from start to stop must be finite"
+            return [(("stop",), problem(f"got {short(stop)}", allowed, "bring the ends closer together"))]
+        # Neighbors must differ in float64, or the axis would hold one value twice.
+        if num > 1 and abs(stop - start) / (num - 1) <= 4 * np.spacing(max(abs(start), abs(stop))):
+            return [(("num",), problem(f"got {num}", "the steps are below float64's resolution", "lower num"))]
+        return []
+
+
+def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bool = True) -> tuple[float, ...]:
+    """The entries of a list, each read by ``entry``; all faults are reported with their positions."""
+    if not raw:
+        raise problem("got an empty list", "an axis has at least one value", "fill the list")
+    found = list(repeated(raw, "remove it")) if distinct else []
+    entries = []
+    for index, value in enumerate(raw):
+        try:
+            entries.append(entry(value))
+        except PydanticCustomError as error:
+            found.append(((index,), error))
+    if distinct and not found:
+        # Two spellings of one value, as 1 ms and 0.001.
+        found = list(repeated(entries, "remove it"))
+    if found:
+        raise validation_error("axis", found)
+    return tuple(entries)
+
+
+def in_one_unit(read: Callable[[Any], Span]) -> tuple[Entry, set[str]]:
+    """Read lengths of time that are all in seconds or all in sampling periods; and the unit that those read have."""
+    units: set[str] = set()
+
+    def entry(raw: Any) -> float:
+        value, unit = read(raw)
+        if units - {unit}:
+            allowed = "the delays of an axis are all in seconds or all in periods"
+            raise problem(f"got {describe(raw)}", allowed, f"write all of them in {next(iter(units))}")
+        units.add(unit)
+        return value
+
+    return entry, units
+
+
+@dataclass(frozen=True)
+class AxisOf:
+    """Makes an `Axis` one of a quantity: read, checked, spelled and described in the schema."""
+
+    quantity: Quantity
+
+    @property
+    def _forms(self) -> dict[str, Quantity]:
+        """What the ends of equal steps and of equal ratios are: those need values of one sign."""
+        low, high, low_open, high_open = self.quantity.allowed
+        positive = Range(max(low, 0.0), high, low_open or low <= 0.0, high_open)
+        return {"linear": self.quantity, "log": replace(self.quantity, allowed=positive)}
+
+    def read(self, raw: Any) -> Axis:
+        if isinstance(raw, Axis):
+            return raw
+        form, ends = "number", raw
+        if isinstance(raw, list | tuple):
+            form = "list"
+        elif isinstance(raw, dict):
+            if len(raw) != 1:
+                raise problem(f"got {describe(raw)}", f"an axis is {_FORMS}", "keep one of these forms")
+            ((form, ends),) = raw.items()
+            if form not in self._forms:
+                remedy = suggestion(form, self._forms, "write one of these forms")
+                unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
+                raise validation_error("axis", [((form,), unknown)])
+        quantity = self._forms.get(form, self.quantity)
+        entry, units = in_one_unit(quantity.read) if quantity.periods else (quantity.read, set())
+        if quantity.whole:
+            # 5.0 is 5, as a store spells the ends of equal steps.
+            entry = _accept_whole_floats(entry)
+        if form in self._forms:
+            try:
+                spaced = _model_spacing(form, entry).model_validate(ends)
+            except ValidationError as error:
+                raise validation_error("axis", problems_of(error, form)) from None
+            entries, size = (spaced.start, spaced.stop), spaced.num
+        else:
+            entries = read_entries(ends, entry) if form == "list" else (entry(ends),)
+            size = len(entries)
+        axis = Axis(form, entries, size, "periods" in units)
+        missed = [value for value in axis.values().tolist() if not value.is_integer()] if quantity.whole else []
+        if missed:
+            allowed = "every value is a whole number"
+            raise problem(f"got {short(missed[0])} as one of the steps", allowed, "change num, or write a list")
+        return axis
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        spelling = core_schema.plain_serializer_function_ser_schema(lambda axis: axis.spelling())
+        return core_schema.no_info_plain_validator_function(self.read, serialization=spelling)
+
+    def __get_pydantic_json_schema__(self, schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
+        def mapping(**properties: dict[str, Any]) -> dict[str, Any]:
+            required = list(properties)
+            return {"type": "object", "properties": properties, "required": required, "additionalProperties": False}
+
+        count = {"type": "integer", "minimum": 2, "maximum": LONGEST_AXIS}
+        ends = {form: quantity.schema for form, quantity in self._forms.items()}
+        keyed = [mapping(**{form: mapping(start=end, stop=end, num=count)}) for form, end in ends.items()]
+        entry = self.quantity.schema
+        listed = {"type": "array", "items": entry, "minItems": 1, "uniqueItems": True}
+        return {"description": f"An axis: {_FORMS}.", "anyOf": [entry, listed, *keyed]}
+
+
+def _model_spacing(form: str, entry: Entry) -> Any:
+    """The mapping below ``linear`` or ``log`` for ends that ``entry`` reads."""
+    end = Annotated[float, BeforeValidator(entry)]
+    count = Annotated[int, Quantity(allowed=Range(2, LONGEST_AXIS), whole=True)]
+    model = create_model(form, __base__=_Spacing, start=(end, ...), stop=(end, ...), num=(count, ...))
+    model.what = f"an axis with {form!r}"
+    return model
+
+
+def _accept_whole_floats(entry: Entry) -> Entry:
+    return lambda raw: entry(int(raw) if isinstance(raw, float) and raw.is_integer() else raw)
+
+
+def axis_of(name: str) -> AxisOf:
+    return AxisOf(quantity_of(name))
+
+
+AnyAxis = Annotated[Axis, AxisOf(Quantity())]
+DeltaAxis = Annotated[Axis, axis_of("delta")]
+DelayAxis = Annotated[Axis, axis_of("d")]

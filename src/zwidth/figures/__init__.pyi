@@ -1,26 +1,26 @@
 """Every name of `zwidth.figures`, once."""
 
 from . import plot as plot
-from .boundary import draw_boundary as draw_boundary
+from .alpha_beta import draw_boundary as draw_boundary
+from .alpha_beta import draw_map as draw_map
 from .curves import draw_curves as draw_curves
 from .curves import draw_outlines as draw_outlines
+from .design import draw_filter_noise as draw_filter_noise
+from .design import draw_filters as draw_filters
+from .design import draw_requirement as draw_requirement
 from .device_fit import draw_device_fit as draw_device_fit
-from .filters import draw_filter_noise as draw_filter_noise
-from .filters import draw_filters as draw_filters
 from .limit_cycle import draw_limit_cycle_curves as draw_limit_cycle_curves
 from .limit_cycle import draw_limit_cycles as draw_limit_cycles
 from .motion import draw_energy as draw_energy
 from .motion import draw_motion as draw_motion
 from .motion import draw_phase_plane as draw_phase_plane
-from .passivity_cost import draw_passivity_cost as draw_passivity_cost
+from .motion import draw_step as draw_step
+from .over_damping import draw_passivity_cost as draw_passivity_cost
+from .over_damping import draw_ridge as draw_ridge
+from .over_damping import draw_slope as draw_slope
+from .over_damping import draw_zero_stiffness as draw_zero_stiffness
 from .plane import draw_plane as draw_plane
-from .recommendation import draw_recommendation as draw_recommendation
-from .requirement import draw_requirement as draw_requirement
-from .ridge import draw_ridge as draw_ridge
-from .slope import draw_slope as draw_slope
-from .stability_map import draw_map as draw_map
+from .stable_set import draw_recommendation as draw_recommendation
 from .stable_set import draw_stable_set as draw_stable_set
-from .step import draw_step as draw_step
 from .style import house_style as house_style
 from .style import save as save
-from .zero_stiffness import draw_zero_stiffness as draw_zero_stiffness

@@ -8,7 +8,7 @@ import numpy as np
 
 from zwidth.figures import grid, style
 from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
-from zwidth.figures.region import agrees, draw_region, fit_axes
+from zwidth.figures.stable_set import agrees, draw_region, fit_axes
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, WALL
 
@@ -78,15 +78,11 @@ def draw_curves(
 
 def find_family(data: xarray.Dataset) -> tuple[str, str] | None:
     """The output whose contours are the boundaries of walls, and the parameter each of whose values has one."""
-    name = next((name for name in (*SMOOTH, "stable") if name in data and _has_walls(data, name)), None)
+    planes = {name: grid.choose_axes(data, name) for name in (*SMOOTH, "stable") if name in data}
+    name = next((name for name, axes in planes.items() if len(axes) == 2 and axes[1] in WALL), None)
     dims = [dim for dim in grid.list_varied(data, name) if dim not in WALL] if name else []
     first = next((dim for dim in ("delta", "damping", *reversed(dims)) if dim in dims), None)
     return (name, first) if name and first else None
-
-
-def _has_walls(data: xarray.Dataset, name: str) -> bool:
-    dims = grid.choose_axes(data, name)
-    return len(dims) == 2 and dims[1] in WALL
 
 
 @style.house_style()
@@ -132,7 +128,6 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
 def _name_colors(
     axes: np.ndarray, names: list[str], colors: list[Any], *, outside: bool, title: str | None = None
 ) -> None:
-    """Which color is which."""
     longest = max(10 if "$" in name else len(name) for name in names)
     columns = max(1, min(len(names), 6, _LINE // max(longest, 1)))
     handles = [style.line(name, color=color) for name, color in zip(names, colors, strict=True) if name]

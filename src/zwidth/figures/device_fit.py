@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import style
-from zwidth.figures.region import MARKS, mark_wall, name_axes
+from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import Table, curves, select
 from zwidth.words.formatting import header
 
@@ -141,7 +141,6 @@ def _put_above(ax: Axes, handles: Any = None) -> None:
 
 
 def _draw_onsets(ax: Axes, walls: Table) -> None:
-    """How far walls that buzzed lie from the fit."""
     buzzing = select(walls, kind="buzzing")
     damping, unit = _column(buzzing, "virtual_damping")
     for name, marker, color in (("stiffness", "o", style.VERMILION), ("frequency", "s", style.BLUE)):
@@ -157,27 +156,17 @@ def _draw_onsets(ax: Axes, walls: Table) -> None:
     _put_above(ax)
 
 
-class _Scales(NamedTuple):
-    """Factors and units of the axes of walls."""
-
-    stiffness: float
-    spring: str
-    damping: float
-    damper: str
-
-
 def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     """The stable walls: B over K."""
     (every, spring), (high, _) = _column(walls, "stiffness"), _column(boundary, "stiffness_high")
     dampings, damper = _column(boundary, "virtual_damping")
-    stiffness, spring = style.si_unit(every, spring)
-    damping, damper = style.si_unit(dampings, damper)
-    to = _Scales(stiffness, spring, damping, damper)
+    to_spring, spring = style.si_unit(every, spring)
+    to_damper, damper = style.si_unit(dampings, damper)
     handles = []
     for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
         own, source = vars(fit), style.literal(fit.fitted_to)
-        K, low, up = (_column(own, name)[0] * to.stiffness for name in ("stiffness", "stiffness_low", "stiffness_high"))
-        B = _column(own, "virtual_damping")[0] * to.damping
+        K, low, up = (_column(own, name)[0] * to_spring for name in ("stiffness", "stiffness_low", "stiffness_high"))
+        B = _column(own, "virtual_damping")[0] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
         # Up to where it meets K = 0.
         ends = np.flatnonzero(K > 0)
@@ -185,42 +174,39 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
         ax.fill_betweenx(B[shown], 0.0, K[shown], color=shade, alpha=0.08, linewidth=0.0, zorder=1)
         ax.plot(K[shown], B[shown], color=color, linestyle=dash, label=f"boundary, {source}", zorder=3)
         handles.append(style.line(f"boundary with its 95 % band, {source}", dash, color=color))
-    handles += _mark_walls(ax, walls, to)
-    ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to.stiffness)
+    handles += _mark_walls(ax, walls, (to_spring, spring), (to_damper, damper))
+    ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
     # Room for the legend.
-    highest = float(dampings.max()) * to.damping
+    highest = float(dampings.max()) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
-    name_axes(ax, to.spring, to.damper)
+    name_axes(ax, spring, damper)
     ax.legend(handles=handles, loc="upper right")
 
 
-def _mark_walls(ax: Axes, walls: Table, to: _Scales) -> list[Any]:
-    """The stiffest walls, those to set, and those that buzzed; returns entries of a legend."""
+def _mark_walls(ax: Axes, walls: Table, stiffness: tuple[float, str], damping: tuple[float, str]) -> list[Any]:
+    """The stiffest walls, those to set, and those that buzzed, in such units; returns entries of a legend."""
     handles, kinds = [], {}
     for kind in ("stiffest", "set", "buzzing"):
         found = select(walls, kind=kind)
-        kinds[kind] = (
-            found,
-            _column(found, "stiffness")[0] * to.stiffness,
-            _column(found, "virtual_damping")[0] * to.damping,
-        )
+        K, B = _column(found, "stiffness")[0] * stiffness[0], _column(found, "virtual_damping")[0] * damping[0]
+        kinds[kind] = found, K, B
     for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "wall to set")):
         _, K, B = kinds[kind]
         mark_wall(ax, (K, B), kind, kind=mark)
         if K.size:
-            text = f": $K = {K[0]:.3g}$ {to.spring}, $B = {B[0]:.3g}$ {to.damper}" if K.size == 1 else ""
+            text = f": $K = {K[0]:.3g}$ {stiffness[1]}, $B = {B[0]:.3g}$ {damping[1]}" if K.size == 1 else ""
             handles.append(style.line(words + text, "", color=style.BLACK, **MARKS[mark]))
     if not kinds["set"][1].size:
         handles.append(style.line("no wall to set: a doubt, or none holds", ""))
     found, K, B = kinds["buzzing"]
     if K.size:
         look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}
-        reach = 1.96 * _column(found, "stiffness_error")[0] * to.stiffness
+        reach = 1.96 * _column(found, "stiffness_error")[0] * stiffness[0]
         ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
         middle = float(np.max(kinds["stiffest"][2]))
-        for stiffness, damping, heard in zip(K, B, _column(found, "frequency")[0], strict=True):
+        for x, y, heard in zip(K, B, _column(found, "frequency")[0], strict=True):
             # Outside of the stable walls.
-            place = (11, -10) if damping < middle else (11, 5)
-            ax.annotate(f"{heard:.3g} Hz", (stiffness, damping), xytext=place, color=style.VERMILION, **_TEXT)
+            place = (11, -10) if y < middle else (11, 5)
+            ax.annotate(f"{heard:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)
         handles.append(style.line("began to buzz at this frequency", "", **look))
     return handles

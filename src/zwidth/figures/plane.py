@@ -13,9 +13,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, MaxNLocator
 
-from zwidth.figures import grid, region, style
-from zwidth.figures.contours import label_contours
-from zwidth.figures.stability_map import SHADES
+from zwidth.figures import grid, stable_set, style
+from zwidth.figures.alpha_beta import SHADES
+from zwidth.figures.grid import label_contours
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OUTPUTS, Output
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     import xarray
 
 # Gives the outlines of the "stable" and the "passive" walls of a panel, in its units and stiffness first.
-Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, region.Outlines]]"
+Edges: TypeAlias = "Callable[[xarray.Dataset], Mapping[str, stable_set.Outlines]]"
 
 _MISSING = "#D9D9D9"
 # Numbers whose contour is the boundary of the stable walls, smoother than that of truth values.
@@ -121,7 +121,7 @@ def panel_grid(given: style.AnyAxes | None, count: int, columns: int) -> np.ndar
     return style.panels(given, count, width, height, columns, sharex=True, sharey=True)
 
 
-def find_outlines(part: xarray.Dataset, edges: Edges | None) -> dict[str, region.Outlines]:
+def find_outlines(part: xarray.Dataset, edges: Edges | None) -> dict[str, stable_set.Outlines]:
     """The exact outlines of a panel (y, x), with x first; none where nobody knows them."""
     dims = [str(dim) for dim in reversed(next(iter(part.data_vars.values())).dims)]
     found = edges(part) if edges else {}
@@ -129,7 +129,9 @@ def find_outlines(part: xarray.Dataset, edges: Edges | None) -> dict[str, region
     return {name: [(points[:, ::turn], hole) for points, hole in each] for name, each in found.items()}
 
 
-def _draw_panel(ax: Axes, part: xarray.Dataset, name: str, norm: Any, outlines: Mapping[str, region.Outlines]) -> Any:
+def _draw_panel(
+    ax: Axes, part: xarray.Dataset, name: str, norm: Any, outlines: Mapping[str, stable_set.Outlines]
+) -> Any:
     x, y = (part[dim].values for dim in reversed(part[name].dims))
     output = OUTPUTS[name]
     ax.set_facecolor(_MISSING)
@@ -159,13 +161,12 @@ def _draw_cells(ax: Axes, part: xarray.Dataset, values: Any, **look: Any) -> Any
 
 
 def _find_peak(part: xarray.Dataset) -> list[float] | None:
-    """The stiffest stable wall, where it lies within the panel."""
     peaks = {str(name)[: -len("_peak")]: float(value) for name, value in part.items() if str(name).endswith("_peak")}
     inside = (part[dim].min() <= value <= part[dim].max() for dim, value in peaks.items())
     return list(peaks.values()) if peaks and all(inside) else None
 
 
-def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[str, region.Outlines]) -> Any:
+def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[str, stable_set.Outlines]) -> Any:
     """Stable and passive walls as areas, each with its boundary."""
     image = None
     x, y = (part[dim].values for dim in reversed(part[name].dims))
@@ -177,7 +178,7 @@ def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[s
         smooth, level = np.ma.masked_invalid(part[edge].values), boundary_level(edge)
         # Where a part is missing, its cells are all that says where.
         whole = min(smooth.shape) > 1 and shown.count() == smooth.count() == shown.size
-        exact = whole and each in outlines and region.agrees(outlines[each], x, y, shown.data > 0.5)
+        exact = whole and each in outlines and stable_set.agrees(outlines[each], x, y, shown.data > 0.5)
         outside = "white" if image is None else (0, 0, 0, 0)
         shades = ListedColormap([outside, outside if whole else SHADES[each]])
         image = _draw_cells(ax, part, shown, cmap=shades, vmin=0, vmax=1)
@@ -194,10 +195,10 @@ def _draw_regions(ax: Axes, part: xarray.Dataset, name: str, outlines: Mapping[s
     return image
 
 
-def _draw_outline(ax: Axes, outlines: region.Outlines, dash: Any, shade: Any = "none") -> None:
+def _draw_outline(ax: Axes, outlines: stable_set.Outlines, dash: Any, shade: Any = "none") -> None:
     """The boundary where it is known, and what lies within."""
     look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.3, "linestyle": dash, "zorder": 2.2}
-    region.draw_region(ax, region.fit_axes(outlines, ax), shade, under=1.5, label="exact edge", **look)
+    stable_set.draw_region(ax, stable_set.fit_axes(outlines, ax), shade, under=1.5, label="exact edge", **look)
 
 
 def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float, dash: Any = style.SOLID) -> Any:
@@ -208,7 +209,7 @@ def _draw_line(ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, level: float
 
 
 def _draw_contours(
-    ax: Axes, part: xarray.Dataset, name: str, values: Any, norm: Any, outlines: Mapping[str, region.Outlines]
+    ax: Axes, part: xarray.Dataset, name: str, values: Any, norm: Any, outlines: Mapping[str, stable_set.Outlines]
 ) -> None:
     """Labelled contours where a number is good, and the bold one at which it ceases to be."""
     x, y = (part[dim].values for dim in reversed(part[name].dims))
@@ -232,7 +233,7 @@ def _draw_contours(
 
 
 def _draw_edge(
-    ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, name: str, outlines: Mapping[str, region.Outlines]
+    ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, name: str, outlines: Mapping[str, stable_set.Outlines]
 ) -> list[np.ndarray]:
     """The edge of what is stable or passive, exactly where it is known; returns its lines."""
     output = OUTPUTS[name]
@@ -241,9 +242,9 @@ def _draw_edge(
     known = outlines.get("passive" if name == "passivity_margin" else "stable")
     good = values < output.center if output.below else values > output.center
     good = good if output.look == "diverging" else ~np.ma.getmaskarray(values)
-    if known is not None and region.agrees(known, x, y, np.ma.filled(good, False)):
+    if known is not None and stable_set.agrees(known, x, y, np.ma.filled(good, False)):
         _draw_outline(ax, known, style.SOLID)
-        return [points for points, _ in region.fit_axes(known, ax)]
+        return [points for points, _ in stable_set.fit_axes(known, ax)]
     drawn = _draw_line(ax, x, y, values, output.center) if output.look == "diverging" else None
     return drawn.get_paths()[0].to_polygons(closed_only=False) if drawn else []
 
@@ -266,7 +267,6 @@ def _levels(values: Any, output: Output, norm: Any) -> np.ndarray:
 
 
 def _draw_corners(ax: Axes, x: np.ndarray, y: np.ndarray, part: xarray.Dataset) -> None:
-    """Hatch where the stiffest wall is a corner of the stable region."""
     if "kind" not in part or min(x.size, y.size) < 2 or not (part["kind"] == 1).any():
         return
     corner = (part["kind"].values == 1).astype(float)
@@ -281,7 +281,6 @@ def _colors(output: Output) -> Any:
 
 
 def _norm(parts: list[xarray.Dataset], name: str) -> Any:
-    """The colors of all panels alike."""
     output = OUTPUTS[name]
     low, high = _range(parts, name) or (0.0, 1.0)
     if output.look == "diverging":
@@ -296,13 +295,11 @@ def _norm(parts: list[xarray.Dataset], name: str) -> Any:
 
 
 def _range(parts: list[xarray.Dataset], name: str) -> tuple[float, float] | None:
-    """The least and the largest finite value in all panels."""
     finite = np.concatenate([part[name].values[np.isfinite(part[name].values)] for part in parts])
     return (float(finite.min()), float(finite.max())) if finite.size else None
 
 
 def _explain(axes: np.ndarray, parts: list[xarray.Dataset], name: str, image: Any, *, outside: bool) -> None:
-    """The legend, and the colors of numbers."""
     handles: list[Any] = []
     output = OUTPUTS[name]
     if output.look == "truth":

@@ -24,9 +24,8 @@ from matplotlib.patches import Circle
 from zwidth.arrays.evaluate import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import scale_axis
-from zwidth.figures.motion import draw_motion
+from zwidth.figures.motion import draw_motion, draw_step
 from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls, trace_outlines
-from zwidth.figures.step import draw_step
 from zwidth.figures.table import stack
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.assessment import passive_edge

@@ -171,25 +171,16 @@ def name_heights(ax: Axes, names: Sequence[str], ends: Sequence[float], colors: 
     spec = ax.get_subplotspec()
     rows = spec.get_gridspec().nrows if spec else 1
     places = spread(heights, 0.18 * rows / figure_of(ax).get_figheight())
+    look: dict[str, Any] = {"xycoords": "axes fraction", "fontsize": 8, "va": "center", "annotation_clip": False}
     for name, place, color in zip(names, places, colors, strict=True):
-        ax.annotate(
-            name,
-            (1.015, place),
-            xycoords="axes fraction",
-            color=color,
-            fontsize=8,
-            va="center",
-            annotation_clip=False,
-        )
+        ax.annotate(name, (1.015, place), color=color, **look)
 
 
 def line(label: str, dash: Any = SOLID, width: float | None = None, color: str = GRAY, **keywords: Any) -> Line2D:
-    """An entry of a legend."""
     return Line2D([], [], color=color, linestyle=dash, linewidth=width, label=label, **keywords)
 
 
 def dash_of(curve: Any) -> Any:
-    """The line style of a curve's delay model."""
     return SOLID if curve.delay_model == "held" else DASHED
 
 
@@ -200,7 +191,6 @@ def delay_model_handles(found: Sequence[Any]) -> list[Line2D]:
 
 
 def figure_of(drawn: AnyAxes | Figure) -> Figure:
-    """The figure that Axes belong to."""
     figure = drawn if isinstance(drawn, Figure) else np.asarray(drawn, dtype=object).flat[0].get_figure(root=True)
     assert isinstance(figure, Figure), "an Axes belongs to a figure"
     return figure

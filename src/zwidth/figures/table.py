@@ -23,7 +23,6 @@ class Table(Protocol):
 
 
 def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:
-    """The rows that have the wanted values in some columns."""
     columns = {str(name): np.asarray(table[name]) for name in table}
     for name, value in wanted.items():
         keep = columns[name] == value
@@ -34,13 +33,8 @@ def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:
 def curves(table: Table, *keys: str, **wanted: object) -> list[Any]:
     """The curves that lie below each other in a table: rows in a row that share the values of ``keys``.
 
-    Args:
-        table: columns by name.
-        keys: names of columns that are constant along a curve.
-        wanted: values of further columns; other rows are left out.
-
-    Returns:
-        For each curve its columns as attributes: single values of the keys, arrays of the others.
+    Each has its columns as attributes: single values of the keys, arrays of the others. Rows without the wanted values
+    are left out.
     """
     columns = select(table, **wanted)
     changes = [columns[key][1:] != columns[key][:-1] for key in keys]

@@ -14,9 +14,8 @@ import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.log import fit_log
-from zwidth.words.cells import read_rows, split_title
 from zwidth.words.errors import InputError, UnusableValueError
-from zwidth.words.formatting import describe, suggestion, with_unit
+from zwidth.words.formatting import describe, read_rows, split_title, suggestion, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
 

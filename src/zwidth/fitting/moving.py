@@ -91,32 +91,41 @@ def _glide(push: np.ndarray, length: np.ndarray, delta: float, v0: float) -> Pie
 
 def _rub(push: np.ndarray, length: np.ndarray, delta: float, v0: float, friction: float) -> Pieces:
     kinds = [(h, exp(-delta * h), -expm1(-delta * h) / delta if delta else h) for h in length[:2].tolist()]
-    ends, befores, ways, afters = [], [], [], []
     v, way = v0, float(np.sign(v0))
+    # Where it moves on in which direction, and where it turned from which one and when.
+    ends, begun, ways, turns, times, olds = [0.0] * push.size, [0], [way], [], [], []
+    rub = way * friction
     for k, a in enumerate(push.tolist()):
-        h, c, rate = kinds[k % 2]
-        before = h
-        if way == 0.0 and abs(a) > friction:
+        if way == 0.0:
+            if not abs(a) > friction:
+                continue
             way = 1.0 if a > 0 else -1.0
-        ways.append(way)
-        if way:
-            pull = a - way * friction
-            end = c * v + rate * pull
-            if end * way <= 0.0 and pull * way < 0.0 and h > 0.0:
-                before = -v / pull
-                before = min(log1p(delta * before) / delta if delta else before, h)
-                if abs(a) > friction:
-                    way, rest = -way, h - before
-                    end = (-expm1(-delta * rest) / delta if delta else rest) * (a - way * friction)
-                else:
-                    way, end = 0.0, 0.0
-            v = end
-        ends.append(v)
-        befores.append(before)
-        afters.append(way)
+            rub = way * friction
+            begun.append(k)
+            ways.append(way)
+        h, c, rate = kinds[k % 2]
+        pull = a - rub
+        v = c * v + rate * pull
+        if v * way <= 0.0 and pull * way < 0.0 and h > 0.0:
+            before = -(ends[k - 1] if k else v0) / pull
+            before = min(log1p(delta * before) / delta if delta else before, h)
+            turns.append(k)
+            times.append(before)
+            olds.append(way)
+            if abs(a) > friction:
+                way, rest = -way, h - before
+                rub = way * friction
+                v = (-expm1(-delta * rest) / delta if delta else rest) * (a - rub)
+            else:
+                way, v = 0.0, 0.0
+            begun.append(k)
+            ways.append(way)
+        ends[k] = v
     start, end = np.array([v0, *ends[:-1]]), np.array(ends)
-    way, way_after = np.array(ways), np.array(afters)
-    return Pieces(start, end, way != way_after, np.array(befores), way, way_after, way == 0, way_after == 0)
+    way_after = np.repeat(ways, np.diff([*begun, push.size]))
+    turned, before, at = np.zeros(push.shape, bool), length.copy(), way_after.copy()
+    turned[turns], before[turns], at[turns] = True, times, olds
+    return Pieces(start, end, turned, before, at, way_after, at == 0, way_after == 0)
 
 
 def _follow(
@@ -193,10 +202,13 @@ def _recur(factor: np.ndarray, added: np.ndarray, begin: float | np.ndarray) -> 
 
 @dataclass(frozen=True)
 class Recordings:
-    """Several logs of one device; theta is ``(g, delta, d)``, for each log x0 and v0, then o and c where asked for."""
+    """Several logs of one device; theta is ``(g, delta, d)``, for each log x0 and v0, then o and c."""
 
     logs: tuple[Recording, ...]
-    parts: tuple[str, ...]
+
+    def begin(self, count: int) -> Recordings:
+        """Of each log so many first positions."""
+        return Recordings(tuple(log.begin(count) for log in self.logs))
 
     @property
     def measured(self) -> np.ndarray:
@@ -206,62 +218,26 @@ class Recordings:
     @property
     def size(self) -> int:
         """How many numbers theta has."""
-        return 3 + 2 * len(self.logs) + len(self.parts)
+        return 5 + 2 * len(self.logs)
+
+    @property
+    def speeds(self) -> np.ndarray:
+        """Where in theta the first speeds are."""
+        return 4 + 2 * np.arange(len(self.logs))
+
+    @property
+    def largest(self) -> float:
+        """The largest force commanded."""
+        return max(float(np.abs(log.force).max()) for log in self.logs)
 
     def predict(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives in theta."""
-        extras = {name: float(theta[self.find(name)]) for name in self.parts}
         places, slopes = [], []
-        for k, log in enumerate(self.logs):
-            own = [3 + 2 * k, 4 + 2 * k]
-            moved = log.move(*map(float, theta[:3]), *map(float, theta[own]), **extras)
+        for speed, log in zip(self.speeds, self.logs, strict=True):
+            into = [0, 1, 2, speed - 1, speed, -2, -1]
+            moved = log.move(*theta[into].tolist())
             slope = np.zeros((log.position.size, self.size))
-            into = [0, 1, 2, *own, *(self.find(name) for name in self.parts)]
-            slope[:, into] = moved.slopes[:, [0, 1, 2, 3, 4, *(5 + PARTS.index(name) for name in self.parts)]]
+            slope[:, into] = moved.slopes
             places.append(moved.position)
             slopes.append(slope)
         return np.concatenate(places), np.concatenate(slopes)
-
-    def find(self, part: str) -> int:
-        """Where a part's number stands in theta."""
-        return 3 + 2 * len(self.logs) + self.parts.index(part)
-
-    def try_delays(self, delta: float, longest: float) -> list[float]:
-        """Sums of squares left without friction by this damping and delays of 0, 1, ... periods.
-
-        One motion serves all: begun so much earlier, it differs by its start and by what a constant force does.
-        """
-        count = int(longest) + 1
-        more = count - 1
-        early = [Recording(log.force, np.zeros(log.position.size + more), log.skip - more) for log in self.logs]
-        theta = np.zeros(self.size)
-        theta[1] = delta
-        slopes = Recordings(tuple(early), self.parts).predict(theta)[1]
-        linear = [k for k in range(self.size) if k not in (1, 2)]
-        ends = np.cumsum([log.position.size for log in early])
-        squares = []
-        for d in range(count):
-            rows = [np.arange(end - log.position.size, end) - d for end, log in zip(ends, self.logs, strict=True)]
-            squares.append(_combine(slopes[np.concatenate(rows)][:, linear], self.measured)[1])
-        return squares
-
-    def project(self, delta: float, d: float) -> np.ndarray:
-        """The best theta without friction for this damping and delay."""
-        theta = np.zeros(self.size)
-        theta[:3] = 0.0, delta, d
-        linear = [k for k in range(self.size) if k not in (1, 2)]
-        theta[linear] = _combine(self.predict(theta)[1][:, linear], self.measured)[0]
-        return theta
-
-
-# What a log may ask for beside mass, damping and delay, as `Recording.move` names it.
-PARTS = ("offset", "friction")
-
-
-def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, float]:
-    """Least squares to half of the digits, which are enough to start from, and its sum of squares."""
-    sizes = np.linalg.norm(columns, axis=0)
-    scaled = columns / np.where(sizes > 0, sizes, 1.0)
-    values = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ wanted, rcond=None)[0]
-    rest = wanted - scaled @ values
-    return values / np.where(sizes > 0, sizes, 1.0), float(rest @ rest)

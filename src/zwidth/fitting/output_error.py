@@ -6,25 +6,31 @@ a log that hardly shows them cannot tell: left out by a criterion, they moved da
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from zwidth.fitting.encoder import MeasurementNoise
-from zwidth.fitting.moving import PARTS, Recording, Recordings
+from zwidth.fitting.moving import Recording, Recordings
 
-# Dampings b T/m that are started from, how far delays of starts lie apart, in periods, and how many of the best.
-_DELTAS, _APART, _STARTS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0), 2, 3
-# Friction as shares of the largest force that are followed from below, by so many steps each; how many are kept; and
-# the least that is looked for, for at 0 its slope is not seen.
-_FRICTIONS, _FOLLOWED, _LEVELS, LEAST = np.geomspace(1e-3, 0.5, 8), 3, 3, 1e-12
-# So many positions of each log choose the starts, and so many the best of these.
-_GLIMPSE, _BEGINNING = 1200, 2500
-# Promised reductions of the squares that end the search, end it among starts, and excuse a corner; steps; how they are
-# damped.
-_ARRIVED, _CLOSE, _NEARLY, _STEPS = 1e-12, 1e-9, 1e-6, 100
+# Dampings b T/m and frictions as shares of the largest force that are started from; the least friction that is looked
+# for, for at 0 its slope is not seen.
+_DELTAS = (3e-4, 3e-3, 0.02, 0.1, 0.4, 1.5, 5.0)
+_FRICTIONS, LEAST = np.array([0.003, 0.006, 0.012, 0.025, 0.05, 0.1, 0.2, 0.35]), 1e-12
+# Without friction so many starts are followed whose delays lie so far apart, in periods.
+_STARTS, _APART = 3, 2
+# So many first positions of each log tell the starts, and their mean over so many the first speed.
+_GLIMPSE, _FIRST = 600, 4
+# So many first positions choose so many of the starts, each followed by so many steps, or to this promised reduction.
+_ROUNDS, _FOLLOWED, _NEAR = ((300, 4), (600, 3), (1200, 2), (2500, 1)), 12, 1e-3
+# Promised reductions of the squares that end the search, and excuse a corner; steps; how they are damped.
+_ARRIVED, _NEARLY, _STEPS = 1e-12, 1e-6, 100
 _EASY, _LIGHT, _STUBBORN = 1e-4, 1e-6, 1e12
+# A mass that slides back by less than this share of its way may do so for the noise alone.
+_BACK = 0.1
+# Squares of standard errors: of friction that none is compared with, and of rivals that are excluded.
+_CLOSE_BY, _EXCLUDED = 900.0, 25.0
 # Standard deviations of the noise that a slide is lost in.
 _WITHIN = 3.0
 # Columns worse conditioned than this do not tell the numbers apart; a relative error this small is rounding.
@@ -42,6 +48,7 @@ class FittedModel:
     squares: float
     arrived: bool
     resolution: float
+    rivals: tuple[FittedModel, ...] = ()
 
     @property
     def count(self) -> int:
@@ -98,11 +105,21 @@ class FittedModel:
         """Whether the positions do not tell friction from a constant force."""
         return bool(self.inverse[1][-2:].all())
 
-    def explains_as_well(self, other: FittedModel) -> bool:
-        """Whether another model leaves less by no more than one number more would by chance, or than rounding."""
+    def lag_behind(self, other: FittedModel) -> float:
+        """By how much its squares are more than another model's, in squares of standard errors.
+
+        By chance the other takes up what noise there is along their difference, of an encoder at rest a lot.
+        """
         floor = self.count * (_ROUNDING * float(np.abs(self.model.measured).max())) ** 2
         ratio = max(self.squares, floor) / max(other.squares, floor)
-        return self.count * np.log(ratio) < np.log(self.count)
+        apart = (other.moved[0] - self.moved[0])[:, None]
+        size = float(np.sum(apart**2))
+        alike = float(self.noise.spread(apart)[0, 0]) / (self.noise.variance * size) if size > 0 else 1.0
+        return self.count * np.log(ratio) / max(1.0, alike)
+
+    def explains_as_well(self, other: FittedModel) -> bool:
+        """Whether another model leaves less by no more than one number more would by chance, or than rounding."""
+        return self.lag_behind(other) < np.log(self.count)
 
     @cached_property
     def excess(self) -> float:
@@ -123,82 +140,134 @@ class FittedModel:
 
     @cached_property
     def covariance(self) -> np.ndarray:
-        """Of theta: exact slopes, the encoder's correlated errors, and what else spreads the residuals; NaN if open."""
+        """Of theta: exact slopes, the encoder's correlated errors, what else spreads the residuals, and the rivals.
+
+        NaN of what is open. Where squares rise less towards a rival than slopes say, as beyond a corner, the errors
+        that way are as large as to leave it as many standard errors away as its squares do.
+        """
         columns, sizes = self.columns
         # Not by the products of columns, which keep half of the digits.
         inverse, blind = self.inverse
         triangle = inverse @ inverse.T
         whole = self.excess * (triangle @ self.noise.spread(columns) @ triangle) / np.outer(sizes, sizes)
         whole[blind], whole[:, blind] = np.nan, np.nan
+        for rival in self.rivals:
+            known = ~blind & np.diag(whole > 0)
+            scales, block = np.sqrt(np.diag(whole)[known]), np.ix_(known, known)
+            away = (rival.theta - self.theta)[known]
+            steps = away / scales
+            told = float(steps @ np.linalg.lstsq(whole[block] / np.outer(scales, scales), steps, rcond=None)[0])
+            found = max(rival.lag_behind(self) / self.excess, 1.0)
+            if found < min(told, _EXCLUDED):
+                whole[block] += (1.0 / found - 1.0 / told) * np.outer(away, away)
         return whole
 
 
 def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: float) -> FittedModel:
     """The device of the least squares, with a constant force and friction."""
-    model = Recordings(recordings, PARTS)
-    pushed = _choose(Recordings(recordings, PARTS[:1]), _start(recordings, longest), longest)
-    # The least friction that is looked for, behind a theta without.
-    pushed = np.append(pushed, LEAST * abs(pushed[0]) * find_largest(model))
-    both = _fit(model, _choose(model, _start_rubbing(model, pushed, longest), longest), longest, resolution)
-    # A mass that slides one way only and then rests: how much is of which stays open, and one of them is none.
-    rubbed = both.theta.copy()
-    rubbed[-2:] = 0.0, rubbed[-1] + abs(rubbed[-2])
-    for theta, none in ((rubbed, rubbed.size - 2), (pushed, rubbed.size - 1)):
-        simple = _fit(model, theta, longest, resolution, (none,))
-        if simple.leaves_open and simple.explains_as_well(both):
-            return simple
-    return both
+    model = Recordings(recordings)
+    best = _fit(model, _follow(model, _start(model, longest), longest), longest, resolution)
+    # Of a mass that slides one way only, and rests before or after, how much is of which stays open: one of them is
+    # none. Beside that device others fit that slide back a little within the noise.
+    steps = np.diff(best.moved[0])
+    way = float(np.sign(steps.sum()))
+    if -np.sum(steps, where=way * steps < 0) * way < _BACK * np.abs(steps).sum():
+        g, pull = best.theta[0], best.theta[-2] - way * best.theta[-1]
+        parts, none = ((pull, LEAST * abs(g) * model.largest), -1) if way * pull > 0 else ((0.0, -way * pull), -2)
+        start = np.append(best.theta[:-2], parts)
+        rival = _fit(model, start, longest, resolution, (none,))
+        if rival.leaves_open and rival.explains_as_well(best):
+            return rival
+        # Towards such a corner steps may hardly end.
+        if rival.arrived and not best.arrived and rival.lag_behind(best) < 1.0:
+            best = rival
+    # Without friction nothing rests: beyond that corner the squares may rise less than the slopes say.
+    if best.theta[-1] ** 2 < _CLOSE_BY * best.covariance[-1, -1]:
+        none = best.theta - np.nan_to_num(best.covariance[:, -1]) * best.theta[-1] / best.covariance[-1, -1]
+        none[-1] = LEAST * abs(none[0]) * model.largest
+        gliding = FittedModel(model, *_settle(model, none, longest, (-1,)), resolution)
+        if best.explains_as_well(gliding):
+            return replace(best, rivals=(gliding,))
+        return replace(gliding, rivals=(best,))
+    return best
 
 
-def find_largest(model: Recordings) -> float:
-    """The largest force commanded."""
-    return max(float(np.abs(log.force).max()) for log in model.logs)
+def _start(model: Recordings, longest: float) -> list[np.ndarray]:
+    """The best without friction, and for every friction the best of a grid over damping and delay; by the beginnings.
+
+    All else is linear there, for all speeds grow with g. One motion serves all delays: begun so much earlier.
+    """
+    model = model.begin(_GLIMPSE)
+    base, most = np.zeros(model.size), int(longest)
+    early = Recordings(
+        tuple(Recording(log.force, np.zeros(log.position.size + most), log.skip - most) for log in model.logs)
+    )
+    ends = np.cumsum([log.position.size for log in early.logs])
+    rows = np.concatenate([np.arange(end - log.position.size, end) for end, log in zip(ends, model.logs, strict=True)])
+
+    def search() -> list[tuple[float, float, int]]:
+        """The sums of squares of dampings and delays, the least first."""
+        columns = [(delta, _answer(early, delta, 0.0, base)) for delta in _DELTAS]
+        return sorted(
+            (_combine(each[rows - d], model.measured)[1], delta, d) for delta, each in columns for d in range(most + 1)
+        )
+
+    def start(delta: float, d: float) -> np.ndarray:
+        values = _combine(_answer(model, delta, d, base), model.measured)[0]
+        return np.array([values[0], delta, d, *(values[0] * base[3:-1] + values[1:]), abs(values[0]) * base[-1]])
+
+    apart: list[tuple[float, int]] = []
+    for _, delta, d in search():
+        if all(abs(d - other) > _APART or delta != of for of, other in apart):
+            apart.append((delta, d))
+    glides = [_refine(model, start(*one), longest, (-1,), arrived=_NEAR) for one in apart[:_STARTS]]
+    starts = [min(glides, key=lambda found: found[1])[0]]
+    # From there on with the speeds and the constant force that were found.
+    firsts = [log.position[: 2 * _FIRST].reshape(2, -1).mean(1) for log in model.logs]
+    base[model.speeds] = np.diff(firsts)[:, 0] / _FIRST / starts[0][0]
+    base[-2] = starts[0][-2] / starts[0][0]
+    for friction in _FRICTIONS * model.largest:
+        base[-1] = friction
+        starts.append(start(*search()[0][1:]))
+    return starts
 
 
-def _start(recordings: tuple[Recording, ...], longest: float) -> list[np.ndarray]:
-    """The best of a grid over damping and delay, where the rest is linear; by the beginnings of the logs."""
-    model = Recordings(tuple(log.begin(_GLIMPSE) for log in recordings), PARTS[:1])
-    grid = [(squares, delta, d) for delta in _DELTAS for d, squares in enumerate(model.try_delays(delta, longest))]
-    starts: list[tuple[float, int]] = []
-    for _, delta, d in sorted(grid):
-        if all(abs(d - other) > _APART or delta != of for of, other in starts):
-            starts.append((delta, d))
-    return [model.project(*start) for start in starts[:_STARTS]]
+def _answer(model: Recordings, delta: float, d: float, base: np.ndarray) -> np.ndarray:
+    """Positions where g is 1 and the first speeds, o and c are as in ``base``, and their slopes in x0, v0 and o."""
+    places, slopes = model.predict(np.array([1.0, delta, d, *base[3:]]))
+    return np.column_stack([places, slopes[:, 3:-1]])
 
 
-def _start_rubbing(model: Recordings, pushed: np.ndarray, longest: float) -> list[np.ndarray]:
-    """Next to no friction, and the best of ever more friction, each found from the one before."""
-    model = Recordings(tuple(log.begin(_BEGINNING) for log in model.logs), PARTS)
-    theta, largest = pushed, find_largest(model)
-    found = [(float(np.sum((model.measured - model.predict(theta)[0]) ** 2)), theta)]
-    for share in _FRICTIONS:
-        theta = theta.copy()
-        theta[-1] = abs(theta[0]) * largest * share
-        theta, squares, _ = _refine(model, theta, longest, (theta.size - 1,), _FOLLOWED)
-        found.append((squares, theta))
-    return [theta for _, theta in sorted(found, key=lambda start: start[0])[:_LEVELS]]
+def _combine(columns: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, float]:
+    """Least squares to half of the digits, which are enough to start from, and its sum of squares."""
+    sizes = np.linalg.norm(columns, axis=0)
+    scaled = columns / np.where(sizes > 0, sizes, 1.0)
+    values = np.linalg.lstsq(scaled.T @ scaled, scaled.T @ wanted, rcond=None)[0]
+    rest = wanted - scaled @ values
+    return values / np.where(sizes > 0, sizes, 1.0), float(rest @ rest)
 
 
-def _choose(model: Recordings, starts: list[np.ndarray], longest: float) -> np.ndarray:
-    """The start that leads to the least squares of the logs' beginnings, and where it leads to, nearly."""
-    first = Recordings(tuple(log.begin(_BEGINNING) for log in model.logs), model.parts)
-    found = (_refine(first, start, longest, (), arrived=_CLOSE) for start in starts)
-    return min(found, key=lambda found: found[1])[0]
+def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.ndarray:
+    """The best start, followed through ever longer beginnings: few turns and rests make hardly a false optimum."""
+    for count, kept in _ROUNDS:
+        part = model.begin(count)
+        found = [_refine(part, start, longest, (), _FOLLOWED, _NEAR) for start in starts]
+        starts = [theta for theta, *_ in sorted(found, key=lambda found: found[1])[:kept]]
+    return starts[0]
 
 
 def _fit(
     model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
 ) -> FittedModel:
     """Least squares from a start, or at rest where that is as good."""
-    best = _settle(model, start, longest, held)
-    still = _rest(model, *best[:2])
+    best = FittedModel(model, *_settle(model, start, longest, held), resolution)
+    still = _rest(best)
     if still is not None:
-        resting = _settle(model, still, longest, held)
+        resting = FittedModel(model, *_settle(model, still, longest, held), resolution)
         # A start at rest needs one number less.
-        count = model.measured.size
-        if not best[2] or count * np.log(resting[1] / best[1]) < np.log(count):
-            best = resting
-    return FittedModel(model, *best, resolution)
+        if not best.arrived or resting.explains_as_well(best):
+            return resting
+    return best
 
 
 def _settle(
@@ -214,17 +283,17 @@ def _settle(
     return best
 
 
-def _rest(model: Recordings, theta: np.ndarray, squares: float) -> np.ndarray | None:
+def _rest(fitted: FittedModel) -> np.ndarray | None:
     """Without the first speeds that friction stops within the noise: they hardly move the positions; None without any.
 
     Beside such a speed the position's derivative is next to 0, and steps towards the best one hardly end.
     """
-    speeds = 4 + 2 * np.arange(len(model.logs))
-    if PARTS[1] not in model.parts or not theta[-1] > 0:
-        return None
-    slid = theta[speeds] ** 2 / (2.0 * theta[-1])
-    idle = (slid > 0) & (slid < _WITHIN * np.sqrt(squares / model.measured.size))
-    still = theta.copy()
+    speeds, (_, delta, *_, friction) = fitted.model.speeds, fitted.theta
+    speed = np.abs(fitted.theta[speeds])
+    # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
+    slid = speed**2 / (2.0 * friction + delta * speed)
+    idle = (slid > 0) & (slid < _WITHIN * np.sqrt(fitted.variance))
+    still = fitted.theta.copy()
     still[speeds[idle]] = 0.0
     return still if idle.any() else None
 
@@ -245,8 +314,7 @@ def _refine(
     low, high = np.full(start.size, -np.inf), np.full(start.size, np.inf)
     # A little beyond 0 the model goes on, so that an optimum at 0 is no corner.
     low[1], low[2], high[1], high[2] = -5.0 / count, -1.0, 50.0, longest
-    if PARTS[1] in model.parts:
-        low[-1] = LEAST * abs(start[0]) * find_largest(model)
+    low[-1] = LEAST * abs(start[0]) * model.largest
     low[list(held)] = high[list(held)] = start[list(held)]
     theta, measured, damping = np.clip(start, low, high), model.measured, _EASY
     place, slopes = model.predict(theta)

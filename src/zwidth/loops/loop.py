@@ -46,12 +46,7 @@ _MOST_PIECES = 50
 
 
 class Variants:
-    """One scene after the other, each a search.
-
-    Args:
-        scene: the nominal one.
-        drawn: of each parameter that varies, by its dotted path, as many values as there are variants.
-    """
+    """One scene after the other, each a search; of each parameter that varies one value a variant, by dotted path."""
 
     searched = True
 

@@ -1,21 +1,22 @@
-"""Figures from the store of a sweep: which of its variables are drawn, over what, and at which values of the rest."""
+"""Figures from the store of a sweep: which of its variables are drawn, over what, within which exact edges."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
 from zwidth.figures.curves import draw_curves, draw_outlines, find_family
 from zwidth.figures.grid import choose_axes, list_varied
 from zwidth.figures.plane import draw_plane
+from zwidth.figures.stable_set import Outlines
 from zwidth.figures.style import save, style_sheet
-from zwidth.runs.edges import Edges, make_edges
+from zwidth.studies.ridge import find_edges
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.store import SUFFIX, Store, find_stores
 from zwidth.words.errors import InputError, StoreError
@@ -25,10 +26,65 @@ from zwidth.words.quantities import OUTPUTS, VARIABLES
 if TYPE_CHECKING:
     import xarray
 
+Edges: TypeAlias = Callable[["xarray.Dataset"], dict[str, Outlines]]
+
+_PLANES = ({"alpha", "beta"}, {"stiffness", "virtual_damping"})
 FOLDER = "figures"
 
 # Fewer values than this along both axes are curves rather than a surface.
 _SURFACE = 6
+
+
+def make_edges(store: Store) -> Edges:
+    """What gives the outlines of the stable and the passive walls of a part of a sweep, at one device and delay.
+
+    The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
+    plane of walls, and where nothing is proved, there are none.
+    """
+    grid = store.grid
+    at_device = cache(lambda place: _outline(store, place))
+
+    def edges(part: xarray.Dataset) -> dict[str, Outlines]:
+        walls = {str(dim) for dim in part.dims}
+        if walls not in _PLANES:
+            return {}
+        places = []
+        for dim in grid.device_dims:
+            if dim not in part.coords:
+                places.append(0)
+            elif dim == "device":
+                labels = [str(label) for label in grid.coordinates()["device"][1]]
+                places.append(labels.index(str(part["device"].values)))
+            else:
+                value = float(part[dim]) / part[dim].attrs["factor"]
+                places.append(int(np.argmin(np.abs(np.asarray(grid.coordinates()[dim][1]) - value))))
+        factors = [
+            part[dim].attrs["factor"] for dim in sorted(walls, key=lambda dim: dim not in ("alpha", "stiffness"))
+        ]
+        found = at_device(tuple(places))
+        return {name: [(points * factors, hole) for points, hole in outlines] for name, outlines in found.items()}
+
+    return edges
+
+
+def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
+    slices = tuple(slice(k, k + 1) for k in place)
+    try:
+        if store.study.with_parts:
+            parameters = store.grid.scene_block(slices).parameters
+            scene = store.study.make_scene({name: float(values[0]) for name, values in parameters.items()})
+            pieces = scene.stable_region()
+            return {"stable": [(np.stack([one.stiffness, one.virtual_damping], -1), one.hole) for one in pieces]}
+        block = store.grid.block(slices)
+        delta, d = float(block.delta[0]), float(block.d[0])
+        found = find_edges(delta, d)
+    except InputError:
+        return {}
+    units = np.ones(2)
+    if block.mass.size:
+        rate = float(block.mass[0] / block.period[0])
+        units = np.array([rate / float(block.period[0]), rate])
+    return {name: [(points * units, hole) for points, hole in outlines] for name, outlines in found.items()}
 
 
 @dataclass(frozen=True)
@@ -128,7 +184,6 @@ def _check_axes(axes: Mapping[str, str], slices: Mapping[Path, xarray.Dataset]) 
 
 
 def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
-    """Why nothing of a sweep is drawn."""
     # A store lists its dimensions in any order.
     varied = [name for name in ("device", *VARIABLES) if data.sizes.get(name, 0) > 1]
     missing = ", ".join(name for name in axes.values() if name not in varied)
@@ -142,13 +197,7 @@ def _explain_absence(data: xarray.Dataset, axes: Mapping[str, str]) -> str:
 def figures_of(
     data: xarray.Dataset, axes: Mapping[str, str] | None = None, edges: Edges | None = None
 ) -> Iterator[tuple[str, Callable[[], Any]]]:
-    """The name of each figure of a sweep, or of a part of one, and what draws it.
-
-    Args:
-        data: the sweep, or the part.
-        axes: the parameters to draw over, by what they are; chosen from the sweep where left out.
-        edges: the exact outlines of its walls, of `zwidth.runs.edges`.
-    """
+    """The name of each figure of a sweep, or of a part of one, and what draws it, over axes by what they are."""
     given = dict(axes or {})
     # A store lists its variables in any order.
     for name in OUTPUTS:

@@ -15,14 +15,22 @@ import shutil
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
-from zwidth.sweep.files.lock import FOLDER as LOCKS
-from zwidth.sweep.files.lock import held_briefly
-from zwidth.sweep.files.provenance import digest, versions
-from zwidth.sweep.files.whole import check_folder, hidden_beside, is_plain_name, remove_quietly, write_whole
-from zwidth.sweep.resume import refuse_changes, refuse_versions
+from zwidth.config.reader import find_values
+from zwidth.sweep.engine import refuse_changes, refuse_versions
+from zwidth.sweep.files import (
+    LOCKS,
+    check_folder,
+    digest,
+    held_briefly,
+    hidden_beside,
+    is_plain_name,
+    remove_quietly,
+    versions,
+    write_whole,
+)
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import StoreError, StoreExistsError
 from zwidth.words.formatting import describe
@@ -38,6 +46,7 @@ _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
 
 # As `hidden_beside` calls what is not finished.
 _HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
+_KEY = "csv"
 
 
 class Record:
@@ -50,19 +59,15 @@ class Record:
         self._read()
 
     def _read(self) -> None:
+        where, remedy = self.folder / RUN_FILE, "choose another folder with --out DIR, or remove it"
         try:
-            content = json.loads((self.folder / RUN_FILE).read_text(encoding="utf-8"))
+            content = json.loads(where.read_text(encoding="utf-8"))
         except (FileNotFoundError, NotADirectoryError):
             return
         except (OSError, ValueError) as error:
-            raise StoreError(
-                f"{self.folder / RUN_FILE}: cannot be read ({error}); choose another folder with --out DIR, or remove "
-                "it"
-            ) from error
+            raise StoreError(f"{where}: cannot be read ({error}); {remedy}") from error
         if not isinstance(content, dict) or not isinstance(content.get("studies"), list):
-            raise StoreError(
-                f"{self.folder / RUN_FILE}: no record of a run; choose another folder with --out DIR, or remove it"
-            )
+            raise StoreError(f"{where}: no record of a run; {remedy}")
         seal = content.pop(_SEAL, None)
         if seal is not None and digest(content) != seal:
             self.damaged = True
@@ -71,16 +76,14 @@ class Record:
                 content["studies"] = [{**entry, "state": "open"} for entry in content["studies"] if _names_files(entry)]
         fault = _find_fault(content)
         if fault:
-            raise StoreError(f"{self.folder / RUN_FILE}: {fault}; choose another folder with --out DIR, or remove it")
+            raise StoreError(f"{where}: {fault}; {remedy}")
         self.content = content
 
     @property
     def exists(self) -> bool:
-        """Whether the folder holds a run."""
         return bool(self.content)
 
     def entry(self, name: str) -> dict[str, Any] | None:
-        """What is recorded of a study."""
         return next((entry for entry in self.content.get("studies", ()) if entry.get("name") == name), None)
 
     def check_free(self, config: str, *, overwrite: bool, going_on: bool) -> None:
@@ -140,7 +143,6 @@ class Record:
         refuse_versions(where, self.content.get("versions", {}))
 
     def start(self, **about: Any) -> None:
-        """Write down what the run is about, before its first study."""
         about |= {"format": RUN_FORMAT, "started": datetime.now(UTC).isoformat(timespec="seconds")}
         about |= {"precision": "float64", "versions": versions(*_PACKAGES)}
         self._update({**about, "started": self.content.get("started", about["started"])})
@@ -288,7 +290,6 @@ def _belongs_to_runs(name: str) -> bool:
 
 
 def file_hash(path: Path) -> str:
-    """The SHA-256 of a file; empty where there is none, or a link to one."""
     try:
         if path.is_symlink():
             return ""
@@ -296,3 +297,47 @@ def file_hash(path: Path) -> str:
             return hashlib.file_digest(stream, "sha256").hexdigest()
     except OSError:
         return ""
+
+
+def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[str, str]]:
+    """What a run keeps so that it can be repeated from its own folder, of a configuration's text without faults.
+
+    The text with the names of the copies; the copies' bytes by their names in the folder of inputs; and, by the names
+    that the configuration has, those that the text has now. A copy's own name stays as it is.
+    """
+    files: dict[str, bytes] = {}
+    names: dict[str, str] = {}
+    places = sorted(find_values(text, _KEY), key=lambda place: place[1])
+    for name, _, _ in places:
+        if name not in names and (folder / name).is_file():
+            copy = _choose_name(name, files)
+            files[copy] = (folder / name).read_bytes()
+            names[name] = f"{INPUTS}/{copy}"
+    for name, first, last in reversed(places):
+        if name in names:
+            text = f"{text[:first]}{names[name]}{text[last:]}"
+    return text, files, names
+
+
+def _choose_name(name: str, taken: dict[str, bytes]) -> str:
+    """A name that any file system and YAML take as it is; files of one name in different folders are told apart."""
+    plain = re.sub(r"[^A-Za-z0-9._-]", "_", PurePath(name).name)
+    stem, suffix = PurePath(plain).stem, PurePath(plain).suffix
+    number = 1
+    # Some file systems do not tell cases apart.
+    while plain.lower() in {each.lower() for each in taken}:
+        number += 1
+        plain = f"{stem}-{number}{suffix}"
+    return plain
+
+
+def rename_inputs(value: Any, names: dict[str, str]) -> Any:
+    """A configuration's JSON with the names of the copies."""
+    if isinstance(value, list):
+        return [rename_inputs(item, names) for item in value]
+    if not isinstance(value, dict):
+        return value
+    return {
+        key: names.get(item, item) if key == _KEY and isinstance(item, str) else rename_inputs(item, names)
+        for key, item in value.items()
+    }

@@ -1,4 +1,4 @@
-"""The one run: every study of a configuration computed, written and drawn, into one folder."""
+"""The one run: studies of a configuration computed, written and drawn into one folder, and what it tells of itself."""
 
 from __future__ import annotations
 
@@ -7,23 +7,18 @@ import os
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
 
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
-from zwidth.runs.inputs import gather_inputs, rename_inputs
-from zwidth.runs.record import RUN_FILE, Record
-from zwidth.runs.result import ProgressCallback, RunResult, StudyEvent, StudyResult
+from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
-from zwidth.sweep.engine import Progress, check_stores, compute_sweeps
-from zwidth.sweep.files.lock import holding
-from zwidth.sweep.files.whole import hopeless
+from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
+from zwidth.sweep.files import holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
-from zwidth.sweep.resume import remove, store_path
 from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError
@@ -32,13 +27,66 @@ AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
-class Computation:
-    """What a run computes as a whole: a study that is no sweep."""
+class StudyResult:
+    """How one study went.
+
+    Its state is "done"; "kept", where an earlier run had done it; "failed"; or "open", a sweep of which chunks are left
+    to do, by another shard or because the run was stopped.
+    """
 
     name: str
     kind: str
-    inputs: dict[str, Any]  # what the results follow from, besides the releases
-    compute: Callable[[], Outcome]
+    state: Literal["done", "kept", "failed", "open"]
+    seconds: float = 0.0  # the sweeps of a run are computed together
+    files: tuple[str, ...] = ()  # written in the run's folder; a sweep's is its store
+    notes: tuple[str, ...] = ()  # what a reader of the results must know, such as points without an answer
+    answer: tuple[str, ...] = ()  # what was found, where a line or two can say it
+    error: str = ""  # type and message of what went wrong
+    exception: Exception | None = field(default=None, repr=False, compare=False)  # of a study that is no sweep
+    sweep: SweepResult | None = None
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run."""
+
+    folder: Path
+    studies: tuple[StudyResult, ...]  # how each of them went, those that are sweeps last
+    seconds: float
+    repaired: tuple[str, ...] = ()  # files and chunks that were damaged or missing, and that were made again
+    hopeless: str = ""  # the error that ended the run early, for nothing else would have escaped it, as a full disk
+    interrupted: bool = False  # whether somebody stopped the run, with Ctrl-C; what was done by then is kept
+    lost: str = ""  # why a cluster could not go on, its scheduler having died say; what was done by then is kept
+
+    @property
+    def failed(self) -> tuple[StudyResult, ...]:
+        """The studies that lack results because something went wrong."""
+        return tuple(study for study in self.studies if study.state == "failed")
+
+    @property
+    def sweeps(self) -> dict[str, SweepResult]:
+        """The sweeps by their names."""
+        return {study.name: study.sweep for study in self.studies if study.sweep is not None}
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything that this run was to do is done."""
+        return not (self.failed or self.interrupted or self.hopeless or self.lost)
+
+
+@dataclass(frozen=True)
+class StudyEvent:
+    """The start or the end of a study, or a chunk of a sweep."""
+
+    index: int  # number of the study, from 1
+    total: int  # how many there are
+    name: str
+    kind: str
+    result: StudyResult | None = None  # how it went, when it ends
+    progress: Progress | None = None  # how far the sweeps are, after a chunk
+
+
+ProgressCallback: TypeAlias = Callable[[StudyEvent], None]
 
 
 def run(
@@ -109,8 +157,9 @@ def run(
     text, files, names = gather_inputs(text, config.folder)
     shown = Path("runs", config.name) if out is None else Path(os.fsdecode(out))
     folder, clock = Path(os.path.abspath(shown)), time.perf_counter()
-    pieces = _list_computations(config, names) if shard is None or shard[0] == 1 else []
-    planned = [(study, make_plan(study, memory=memory)) for study in _list_sweeps(config)]
+    pieces = [study for study in config.studies if isinstance(study, ComputedStudy)]
+    pieces = pieces if shard is None or shard[0] == 1 else []
+    planned = [(study, make_plan(study, memory=memory)) for study in config.studies if isinstance(study, SweepStudy)]
     if planned:
         check_installed()
     # What does not fit, or not belong there, is refused before anything is made.
@@ -120,24 +169,23 @@ def run(
     with holding(folder, shard):
         record = Record(folder)
         record.check_free(text, overwrite=overwrite, going_on=going_on)
-        inputs = {piece.name: piece.inputs for piece in pieces} | {one.name: _spell(one) for one, _ in planned}
+        inputs = _list_inputs(config, names)
         if overwrite:
             record.clear()
             for study, _ in planned:
                 remove(folder, study)
-        record.check_same(inputs)
+        record.check_same({study.name: inputs[study.name] for study in (*pieces, *(one for one, _ in planned))})
         check_stores([study for study, _ in planned], folder, going_on=going_on)
         if shard is None:
             record.sweep_up()
-        job = _Run(record, progress or (lambda event: None), len(pieces) + len(planned))
+        job = _Run(config, record, inputs, progress or (lambda event: None), len(pieces) + len(planned))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
         record.start(name=config.name, description=config.description, config_sha256=digest)
         record.keep_config(text, files)
         job.do(pieces)
         about = {"name": config.name, "description": config.description, "config": _spell(config)}
         if planned and not job.over:
-            options = {"shard": shard, "workers": workers, "scheduler": scheduler}
-            job.sweep(planned, about, **options)
+            job.sweep(planned, about, shard=shard, workers=workers, scheduler=scheduler)
     seconds = time.perf_counter() - clock
     ends = job.hopeless, job.interrupted, job.lost
     return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), *ends)
@@ -156,10 +204,10 @@ def plan_run(config: AnyConfig, *, memory: int = MEMORY) -> list[Study | Plan]:
 class _Run:
     """A run of so many studies on its way; its folder is held, and ``tell`` is called with every event."""
 
-    def __init__(self, record: Record, tell: ProgressCallback, total: int) -> None:
-        self.record = record
-        self.tell = tell
-        self.total = total
+    def __init__(
+        self, config: Config, record: Record, inputs: dict[str, Any], tell: ProgressCallback, total: int
+    ) -> None:
+        self.config, self.record, self.inputs, self.tell, self.total = config, record, inputs, tell, total
         self.results: list[StudyResult] = []
         self.repaired = [f"{RUN_FILE} is damaged"] if record.damaged else []
         self.hopeless = self.lost = ""
@@ -167,66 +215,56 @@ class _Run:
 
     @property
     def over(self) -> bool:
-        """Whether nothing more is to be begun."""
         return bool(self.hopeless) or self.interrupted
 
-    def do(self, pieces: list[Computation]) -> None:
+    def do(self, pieces: list[ComputedStudy]) -> None:
         """Compute what is not done yet; whatever goes wrong is recorded, for the others do not depend on it."""
-        for index, piece in enumerate(pieces, start=1):
-            entry = self.record.entry(piece.name)
-            faults = self.record.faults(piece.name)
+        for index, study in enumerate(pieces, start=1):
+            event = StudyEvent(index, self.total, study.name, study.kind_name())
+            entry = self.record.entry(study.name)
+            faults = self.record.faults(study.name)
             if entry is not None and entry["state"] == "done" and not faults:
                 files, answer = (tuple(entry.get(name, ())) for name in ("files", "answer"))
-                self.results.append(StudyResult(piece.name, piece.kind, "kept", files=files, answer=answer))
-                self.tell(StudyEvent(index, self.total, piece.name, piece.kind, self.results[-1]))
+                self.results.append(StudyResult(study.name, event.kind, "kept", files=files, answer=answer))
+                self.tell(replace(event, result=self.results[-1]))
                 continue
-            self.repaired += [f"{piece.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
+            self.repaired += [f"{study.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
             try:
-                self.tell(StudyEvent(index, self.total, piece.name, piece.kind))
-                self.results.append(self._compute(piece))
-                self.tell(StudyEvent(index, self.total, piece.name, piece.kind, self.results[-1]))
+                self.tell(event)
+                self.results.append(self._compute(study))
+                self.tell(replace(event, result=self.results[-1]))
             except KeyboardInterrupt:
                 self.interrupted = True
             if self.over:
                 return
 
-    def _compute(self, piece: Computation) -> StudyResult:
-        clock = time.perf_counter()
-        entry = {"name": piece.name, "kind": piece.kind, "state": "failed", "inputs": piece.inputs}
-        notes: tuple[str, ...] = ()
-        answer: tuple[str, ...] = ()
+    def _compute(self, study: ComputedStudy) -> StudyResult:
+        clock, outcome = time.perf_counter(), Outcome()
+        entry = {"name": study.name, "kind": study.kind_name(), "state": "failed", "inputs": self.inputs[study.name]}
+        alone = sum(type(other) is type(study) for other in self.config.studies) == 1
         error: Exception | None = None
-        with self.record.staging(piece.name) as stage:
+        with self.record.staging(study.name) as stage:
             try:
-                outcome = piece.compute()
-                notes, answer = outcome.notes, outcome.answer
-                outcome.write(stage, piece.name)
+                outcome = study.compute(self.config.scene, alone)
+                outcome.write(stage, study.name)
             except Exception as caught:
                 error = caught
-            entry |= {"seconds": round(time.perf_counter() - clock, 3), "notes": list(notes), "answer": list(answer)}
-            entry |= {"error": _describe_error(error), "state": "failed" if error else "done"}
+            told = {"notes": list(outcome.notes), "answer": list(outcome.answer), "error": _describe_error(error)}
+            entry |= {"seconds": round(time.perf_counter() - clock, 3), **told, "state": "failed" if error else "done"}
             try:
                 self.record.keep(stage, entry)
             except Exception as caught:
                 error = error or caught
-                before = self.record.entry(piece.name) or {}
+                before = self.record.entry(study.name) or {}
                 entry |= {"error": _describe_error(error), "state": "failed", "files": before.get("files", {})}
                 with suppress(OSError):
                     self.record.note(entry)
         if error is not None and hopeless(error):
             self.hopeless = _describe_error(error)
-        kept = self.record.entry(piece.name)
-        return StudyResult(
-            piece.name,
-            piece.kind,
-            "failed" if error else "done",
-            time.perf_counter() - clock,
-            tuple(kept["files"]) if kept else (),
-            notes,
-            answer,
-            _describe_error(error),
-            error,
-        )
+        kept = self.record.entry(study.name) or {"files": ()}
+        state, seconds, files = "failed" if error else "done", time.perf_counter() - clock, tuple(kept["files"])
+        about = study.name, study.kind_name(), state, seconds, files
+        return StudyResult(*about, outcome.notes, outcome.answer, _describe_error(error), error)
 
     def sweep(self, planned: list[tuple[SweepStudy, Plan]], about: dict[str, Any], **options: Any) -> None:
         """Compute the sweeps, all together, so that workers are started once."""
@@ -243,7 +281,7 @@ class _Run:
 
         for study, _ in planned:
             # Named before it is made: what a killed run leaves is its own.
-            self.record.note(_sweep_entry(study, "open"))
+            self.record.note(self._spell_sweep(study, "open"))
         try:
             sweeps = compute_sweeps(planned, self.record.folder, about, progress=follow, **options)
         except KeyboardInterrupt:
@@ -259,39 +297,30 @@ class _Run:
             error = next(iter(sweep.failed.values()), sweeps.lost)
             seconds = time.perf_counter() - clock
             if not self.hopeless:
-                self.record.note({**_sweep_entry(study, state), "seconds": round(seconds, 3), "error": error})
+                self.record.note({**self._spell_sweep(study, state), "seconds": round(seconds, 3), "error": error})
             files = (sweep.store.name,)
             result = StudyResult(study.name, "sweep", state, seconds, files, error=error, sweep=sweep)
             self.results.append(result)
             self.tell(StudyEvent(number[study.name], self.total, study.name, "sweep", result))
 
+    def _spell_sweep(self, study: SweepStudy, state: str) -> dict[str, Any]:
+        """What the record says of a sweep; its store knows by itself which of its files are whole."""
+        files = {store_path(Path(), study).name: None}
+        return {"name": study.name, "kind": "sweep", "state": state, "inputs": self.inputs[study.name], "files": files}
 
-def _sweep_entry(study: SweepStudy, state: str) -> dict[str, Any]:
-    """What the record says of a sweep; its store knows by itself which of its files are whole."""
-    files = {store_path(Path(), study).name: None}
-    return {"name": study.name, "kind": "sweep", "state": state, "inputs": _spell(study), "files": files}
 
+def _list_inputs(config: Config, names: dict[str, str]) -> dict[str, dict[str, Any]]:
+    """What the results of each study follow from, besides the releases.
 
-def _list_computations(config: Config, names: dict[str, str]) -> list[Computation]:
-    """The studies that are computed as a whole.
-
-    Their inputs name the copies of files that the run keeps, so that it may go on from its own folder.
+    Files are named by the copies of them that the run keeps, so that it may go on from its own folder.
     """
-    pieces = []
+    found = {study.name: _spell(study) for study in config.studies}
     for study in config.studies:
         if isinstance(study, ComputedStudy):
-            alone = sum(type(other) is type(study) for other in config.studies) == 1
-            inputs = rename_inputs(_spell(study), names)
+            found[study.name] = rename_inputs(found[study.name], names)
             if study.reads_scene and config.scene is not None:
-                inputs["scene"] = _spell(config.scene)
-            pieces.append(
-                Computation(study.name, study.kind_name(), inputs, partial(study.compute, config.scene, alone))
-            )
-    return pieces
-
-
-def _list_sweeps(config: Config) -> list[SweepStudy]:
-    return [study for study in config.studies if isinstance(study, SweepStudy)]
+                found[study.name]["scene"] = _spell(config.scene)
+    return found
 
 
 def _spell(model: Any) -> dict[str, Any]:
@@ -300,7 +329,6 @@ def _spell(model: Any) -> dict[str, Any]:
 
 
 def _read_config(config: AnyConfig) -> tuple[Config, str]:
-    """A configuration and its text."""
     if isinstance(config, Mapping):
         config = read_mapping(config, Config)
     if isinstance(config, Config):

@@ -254,17 +254,12 @@ def _grid(low: np.ndarray, high: np.ndarray, count: int) -> np.ndarray:
     return np.array(list(product(*axes)))
 
 
-class _Proof(NamedTuple):
-    """Whether a statement holds for a whole box; otherwise the centers of parts for which it could not be proved."""
-
-    holds: bool
-    open: np.ndarray
-
-
-def _prove(stiffness: float, damping: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray) -> _Proof:
+def _prove(
+    stiffness: float, damping: Callable[[np.ndarray], np.ndarray], low: np.ndarray, high: np.ndarray
+) -> tuple[bool, np.ndarray]:
     """Prove that (K, ``damping`` of the part's central device) is stable on every device of every part of a box.
 
-    It ends as soon as the wall is not stable on the center of a part: no cutting would help.
+    It ends as soon as the wall is not stable on the center of a part: no cutting would help. Such centers come second.
     """
     waiting = [(low[None], high[None])]
     looked_at = 0
@@ -276,13 +271,13 @@ def _prove(stiffness: float, damping: Callable[[np.ndarray], np.ndarray], low: n
         spring, delta, d = _normalize_devices(centers)
         fails = ~np.asarray(is_stable(stiffness / spring, wall / spring / centers[:, 2], delta, d))
         if fails.any() or looked_at > _MOST_PARTS:
-            return _Proof(False, centers[fails])
+            return False, centers[fails]
         mass, friction, period, delay = quantities(lows, highs)
         ratio = period / mass
         proved = stable_everywhere(period * ratio * stiffness, ratio * wall, friction * ratio, delay / period)
         lows, highs = _halve_boxes(lows[~proved], highs[~proved])
         waiting += [(lows[i : i + _AT_ONCE], highs[i : i + _AT_ONCE]) for i in range(0, len(lows), _AT_ONCE)]
-    return _Proof(True, np.empty((0, 4)))
+    return True, np.empty((0, 4))
 
 
 def _halve_boxes(lows: np.ndarray, highs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -305,12 +300,14 @@ def _worst(low: np.ndarray, high: np.ndarray) -> tuple:
     for tolerance in (_TOLERANCE, *_LOOSER):
         for _ in range(_ROUNDS):
             target = float(_stiffest(_devices(share[None], low, high))[0]) * (1.0 - tolerance)
-            proof = _prove(target, lambda centers, k=target: 0.5 * np.add(*_stable_dampings(k, centers)), low, high)
-            if proof.holds:
+            holds, failing = _prove(
+                target, lambda centers, k=target: 0.5 * np.add(*_stable_dampings(k, centers)), low, high
+            )
+            if holds:
                 proved, status = target, Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED
-            if proof.holds or not len(proof.open):
+            if holds or not len(failing):
                 break
-            starts = np.concatenate([share[None], _shares(proof.open, low, high)])
+            starts = np.concatenate([share[None], _shares(failing, low, high)])
             share = _lowest(_stiffest, starts, low, high)
         if proved > 0:
             break
@@ -344,11 +341,11 @@ def _wall(low: np.ndarray, high: np.ndarray) -> tuple:
         for _ in range(_ROUNDS):
             stiffness = limit * (1.0 - tolerance)
             damping = middle(stiffness)
-            proof = _prove(stiffness, lambda centers, b=damping: np.full(len(centers), b), low, high)
-            if proof.holds:
+            holds, failing = _prove(stiffness, lambda centers, b=damping: np.full(len(centers), b), low, high)
+            if holds:
                 status = Status.OK if tolerance == _TOLERANCE else Status.UNDECIDED
                 return stiffness, damping, limit, status
-            if not len(proof.open):
+            if not len(failing):
                 break
 
             def row_end(candidates: np.ndarray, damping: float = damping) -> np.ndarray:
@@ -356,7 +353,7 @@ def _wall(low: np.ndarray, high: np.ndarray) -> tuple:
                 ends = boundary_point(delta, d, beta=damping / spring / candidates[:, 2])
                 return np.where(ends.status == Status.OK, np.asarray(ends.alpha) * spring, 0.0)
 
-            found = _lowest(row_end, _shares(proof.open, low, high), low, high)
+            found = _lowest(row_end, _shares(failing, low, high), low, high)
             devices = np.concatenate([devices, _devices(found, low, high)[None]])
             limit, middle = _best_wall(devices)
     return np.nan, np.nan, limit, Status.UNDECIDED

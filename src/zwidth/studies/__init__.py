@@ -1,4 +1,4 @@
-"""Kinds of studies, one a module: what its configuration says, and how it is computed.
+"""Kinds of studies: what the configuration of each says, and how it is computed.
 
 A new kind is a subclass of `ComputedStudy` given to `register`; the command line finds those that an installed package
 names in the entry points ``zwidth.studies``.

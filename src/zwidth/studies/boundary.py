@@ -1,24 +1,34 @@
-"""The boundary study, over alpha and beta or, for alpha -> 0, over delta and beta."""
+"""Stable walls as outlines: the boundary study, over alpha and beta or delta and beta, and several devices compared."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
 from itertools import product
-from typing import Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
+from pydantic import WrapValidator
 
 from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.scenes import AnyScene, PhysicalDevice, is_with_parts
+from zwidth.config.fields import members, repeated
+from zwidth.config.parts import list_parts
+from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene, is_with_parts
 from zwidth.config.study import DelayModels, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
-from zwidth.studies.outcome import CurvesStudy, Outcome, add_si_of_scene, share_of_device
-from zwidth.studies.passivity import passive_intervals, passive_outlines
-from zwidth.studies.ridge import needed_models, ridge_table
+from zwidth.studies.outcome import (
+    ComputedStudy,
+    CurvesStudy,
+    Outcome,
+    add_si_of_scene,
+    csv_text,
+    share_of_device,
+    summarize_stiffest,
+)
+from zwidth.studies.ridge import needed_models, passive_intervals, passive_outlines, ridge_table
 from zwidth.words.quantities import WALL_RANGE
 from zwidth.words.types import DelayModel
 
@@ -27,6 +37,8 @@ Plane: TypeAlias = Literal["alpha_beta", "delta_beta"]
 # Samples of a boundary over frequency; only an estimate of a result's size rests on it.
 _POINTS_PER_CURVE = 1000
 _RIDGE_POINTS = 101
+# An outline has some hundreds of points, of which an estimate of the size may rest on.
+_POINTS_PER_OUTLINE = 1000
 
 
 @register
@@ -106,11 +118,9 @@ class BoundaryStudy(CurvesStudy):
 
     @property
     def points(self) -> int:
-        """About a thousand frequencies a curve; over delta, one point."""
         return super().points * (_POINTS_PER_CURVE if self.plane == "alpha_beta" else 1)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """One boundary for every delta, d and delay model, or that of a device with parts, as a table and a figure."""
         if self.device is not None and self.device.parts_beyond:
             return outline_device(self.device, self.device.label or self.name)
         deltas, delays = self.delta.values(), self.d.values()
@@ -163,3 +173,66 @@ def stable_intervals(deltas: np.ndarray, delays: np.ndarray, delay: DelayModel) 
     shared = {"delay_model": delay, "delta": deltas, "beta_lower": -deltas}
     rows = zip(delays, np.asarray(upper), strict=True)
     return [{"curve": "stable", "d": d, **shared, "beta_upper": row} for d, row in rows]
+
+
+@register
+class CompareStudy(ComputedStudy):
+    """The stable walls of several devices in one figure, and the stiffest wall of each in a table."""
+
+    method = "Closed forms; with parts, signed crossings of the boundary curve and the highest point of each edge."
+    from_scene = ()
+    takes_parts = True
+    point_bytes = 64
+
+    kind: Literal["compare"]
+
+    devices: Annotated[tuple[LabeledDevice, ...], WrapValidator(members("devices"))]
+    """Devices in SI units, each with a label; what one of them leaves out is the scene's."""
+
+    @classmethod
+    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
+        devices = raw.get("devices")
+        if not isinstance(scene, PhysicalScene) or not isinstance(devices, list | tuple):
+            return raw
+        return {**raw, "devices": [_complete(device, scene) for device in devices]}
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        for place, what in repeated([device.label for device in self.devices], "rename one"):
+            yield ("devices", *place, "label"), what
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"devices": len(self.devices)}
+
+    @property
+    def points(self) -> int:
+        return super().points * _POINTS_PER_OUTLINE
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        rows, outlines, walls = [], [], []
+        for device in self.devices:
+            label, loop = device.label, device.to_scene()
+            top = loop.max_stiffness()
+            pieces = list(trace_outlines(loop, label=label))
+            islands = sum(piece["piece"] == "island" for piece in pieces)
+            rows.append({"label": label, **summarize_stiffest(top), "islands": islands})
+            outlines += pieces
+            walls.append({"label": label, "wall": "stiffest", **tabulate_walls(loop, *top[:2])})
+        bare = [row["label"] for row in rows if row["kind"] == "none"]
+        table = stack(outlines)
+        return Outcome(
+            table=stack(rows),
+            figures={"": partial(figures.draw_stable_set, table, stack(walls))} if table else {},
+            documents={f"{self.name}_outlines.csv": csv_text(table)},
+            notes=tuple(f"{label}: no wall is stable" for label in bare),
+        )
+
+
+def _complete(device: Any, scene: PhysicalScene) -> Any:
+    """A device's mapping with what the scene knows and it leaves out; anything else as it is."""
+    if not isinstance(device, dict):
+        return device
+    supplied = {"mass": scene.mass, "damping": scene.damping, "delay": scene.delay, **list_parts(scene)}
+    supplied |= {} if {"period", "rate"} & set(device) else {"period": scene.period}
+    return {**supplied, **device}

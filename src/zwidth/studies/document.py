@@ -144,7 +144,6 @@ class Config(Strict):
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        """Two studies of one name."""
         studies = raw.get("studies")
         first: dict[str, int] = {}
         for index, study in enumerate(studies if isinstance(studies, list | tuple) else ()):
@@ -152,12 +151,9 @@ class Config(Strict):
             if not isinstance(name, str):
                 continue
             if name in first:
-                what = problem(
-                    f"got {describe(name)}, the name of studies[{first[name]}] as well",
-                    "results are kept by name, so each study has its own",
-                    "rename one",
-                )
-                yield ("studies", index, "name"), what
+                what = f"got {describe(name)}, the name of studies[{first[name]}] as well"
+                allowed = "results are kept by name, so each study has its own"
+                yield ("studies", index, "name"), problem(what, allowed, "rename one")
             first.setdefault(name, index)
 
 

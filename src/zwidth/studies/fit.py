@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
@@ -27,7 +27,7 @@ from zwidth.fitting.device_fit import DeviceFit
 from zwidth.fitting.evidence import gather_evidence
 from zwidth.fitting.words import LINEAR, ROTARY, AxisUnits, describe_fit, write_scene
 from zwidth.parts.velocity import BackwardDifference
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text
+from zwidth.studies.outcome import ComputedStudy, Outcome, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, plain, with_unit
 from zwidth.words.quantities import POSITIVE
@@ -90,7 +90,6 @@ class LogSection(Strict):
             yield ("sha256",), problem(what, "it is the file that was fitted before", "remove sha256 if it may change")
 
     def read(self, period: float | None) -> LoggedMotion:
-        """The columns; raises `InputError`."""
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
         return read_log(find_file(self.csv), columns, resolution=self.resolution, period=period)
 
@@ -105,7 +104,6 @@ def _digest(name: Any) -> str:
 
 
 def _read_logs(raw: Any, handler: Any) -> Any:
-    """One log, or a list of them."""
     if isinstance(raw, str):
         raise problem(f"got {describe(raw)}", "a log is a CSV file and its columns", "write {csv: NAME.csv}")
     if isinstance(raw, dict):
@@ -191,10 +189,8 @@ class FitStudy(ComputedStudy):
         strange = {"noise": "buzz", "max_delay": "log", "resample": "log"}
         for name, owner in strange.items():
             if name in raw and owner not in raw:
-                yield (
-                    (name,),
-                    problem(f"got {name} without {owner}", f"it belongs to {owner}", "remove it", on_key=True),
-                )
+                what = f"got {name} without {owner}"
+                yield (name,), problem(what, f"it belongs to {owner}", "remove it", on_key=True)
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -225,15 +221,11 @@ class FitStudy(ComputedStudy):
                 allowed = f"it must lie below half the sampling rate, {half}"
                 yield ("buzz", k, "frequency"), problem(what, allowed, "check the frequency, or the period")
         if self.buzz and len({wall.virtual_damping for wall in self.buzz}) < 2:
-            what = "got walls of one damping alone"
-            yield (
-                ("buzz",),
-                problem(what, "m, b and t_d need two", "add a wall of another virtual_damping", on_key=True),
-            )
+            what, remedy = "got walls of one damping alone", "add a wall of another virtual_damping"
+            yield ("buzz",), problem(what, "m, b and t_d need two", remedy, on_key=True)
 
     @property
     def units(self) -> AxisUnits:
-        """SI units of the axis."""
         return ROTARY if any(motion.rotary for motion in self._motions) else LINEAR
 
     @property
@@ -246,9 +238,10 @@ class FitStudy(ComputedStudy):
         return sum(motion.position.size for motion in self._motions) + len(self.buzz or ())
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The fits as a table, their evidence as tables and a figure, and a configuration of each fitted device."""
         fits, units = self._fit(), self.units
-        evidence = _gather(fits, units)
+        gathered = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
+        below = {name: stack([tables[name] for tables in gathered]) for name in ("boundary", "walls")}
+        evidence = {**gathered[0], **below}
         documents = {f"{self.name}_{name}.csv": csv_text(table) for name, table in evidence.items()}
         for each in fits:
             middle = f"_{each.name}" if len(fits) > 1 else ""
@@ -299,13 +292,6 @@ _DEVICE = ("m", "J", "b", "t_d", "friction")
 _LABELS = ("m", "J", "b", "t_d", "K_max", "set", "no wall", "fitted to")
 
 
-def _gather(fits: Sequence[_Fitted], units: AxisUnits) -> dict[str, Table]:
-    """What the fits rest on."""
-    found = [gather_evidence(each.fit, each.source, each.points, units) for each in fits]
-    below = {name: stack([tables[name] for tables in found]) for name in ("boundary", "walls")}
-    return {**found[0], **below}
-
-
 def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
     """One row: every number with its standard error and its 95 % interval."""
     fit = each.fit
@@ -323,12 +309,11 @@ def _tabulate(each: _Fitted, units: AxisUnits) -> dict[str, Any]:
 def _compare(one: DeviceFit, other: DeviceFit) -> str:
     """Whether two fits of one device agree, by how far apart they are in their common covariance."""
     values = [np.array([fit.mass, fit.damping, fit.delay]) for fit in (one, other)]
-    apart = values[0] - values[1]
+    away = values[0] - values[1]
     spread = sum((fit.reach / _NORMAL) ** 2 * fit.covariance for fit in (one, other))
     # Exact records would leave nothing to divide by.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
-    far = float(apart @ np.linalg.solve(spread + np.diag(floor), apart))
-    words = (
-        f"squared, they are {plain(far, 3)} apart in units of their errors; 95 % of equal devices stay below {_CHANCE}"
-    )
-    return f"log and buzzing walls agree: {words}" if far <= _CHANCE else f"log and buzzing walls do NOT agree: {words}"
+    far = float(away @ np.linalg.solve(spread + np.diag(floor), away))
+    verdict = "agree" if far <= _CHANCE else "do NOT agree"
+    apart = f"squared, they are {plain(far, 3)} apart in units of their errors"
+    return f"log and buzzing walls {verdict}: {apart}; 95 % of equal devices stay below {_CHANCE}"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from functools import partial
 from typing import Annotated, Any, ClassVar, Literal, get_type_hints
@@ -11,20 +10,18 @@ import numpy as np
 from pydantic import WrapValidator, create_model
 
 from zwidth import figures
-from zwidth.config.axes import Axis, AxisOf, axis_of
-from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.fields import Strict, members
+from zwidth.config.fields import Strict, members, repeated
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
-from zwidth.config.values import Quantity
+from zwidth.config.values import Axis, AxisOf, Quantity, axis_of
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_WHOLE, MotionKind
 from zwidth.studies.outcome import Outcome, csv_text
-from zwidth.studies.simulate import SimulatedStudy, check_circumstances
+from zwidth.studies.simulate import Circumstances, SimulatedStudy, check_circumstances
 from zwidth.words.formatting import header, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 from zwidth.words.status import Status
@@ -84,12 +81,10 @@ class CycleAxes(Strict):
 
     @property
     def given(self) -> dict[str, Axis]:
-        """The axes that there are."""
         return {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
 
     @property
     def varied(self) -> dict[str, Axis]:
-        """Those with several values."""
         return {name: axis for name, axis in self.given.items() if axis.size > 1}
 
     def lay_out(self) -> dict[str, np.ndarray]:
@@ -125,11 +120,9 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        labels = [each.label for each in self.conditions]
+        for place, what in repeated([each.label for each in self.conditions], "rename one"):
+            yield ("conditions", *place, "label"), what
         for index, condition in enumerate(self.conditions):
-            if condition.label in labels[:index]:
-                what = f"got {condition.label!r} twice"
-                yield ("conditions", index, "label"), problem(what, "each label once", "rename one")
             for name in self.axes.given:
                 if getattr(condition, name, None) is not None:
                     what = "given twice, here and as an axis"
@@ -147,7 +140,6 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
                     yield (("conditions", index, *path) if own else path), what
 
     def list_circumstances(self) -> list[Circumstances]:
-        """The circumstances of every condition."""
         common = {name: getattr(self, name) for name in Circumstances.model_fields}
         owns = [{name: getattr(each, name) for name in common} for each in self.conditions]
         return [
@@ -156,16 +148,10 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         ]
 
     @property
-    def extent(self) -> str:
-        sizes = " x ".join(f"{axis.size} {name}" for name, axis in self.axes.varied.items())
-        return f"conditions x walls = {len(self.conditions)} x {sizes}"
-
-    @property
-    def points(self) -> int:
-        return len(self.conditions) * math.prod(axis.size for axis in self.axes.varied.values())
+    def sizes(self) -> dict[str, int]:
+        return {"conditions": len(self.conditions)} | {name: axis.size for name, axis in self.axes.varied.items()}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """What becomes of every wall, as arrays with a first axis of conditions, and how much of them stays silent."""
         axes, varied = self.axes.lay_out(), self.axes.varied
         labels = [each.label for each in self.conditions]
         found: dict[str, list[np.ndarray]] = {name: [] for name in (*_OUTPUTS, "linearly_stable")}
@@ -186,11 +172,9 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         arrays |= {header(name, units.get(name, "1")): np.stack(values) for name, values in found.items()}
         table, bounds = stack(edges), (self.silence, self.widest)
         family = choose_curves(varied)
-        draw = (
-            partial(figures.draw_limit_cycles, arrays, table, bounds)
-            if family is None
-            else partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
-        )
+        draw = partial(figures.draw_limit_cycles, arrays, table, bounds)
+        if family is not None:
+            draw = partial(figures.draw_limit_cycle_curves, arrays, table, bounds, family)
         low, high = (with_unit(bound, "m", 3) for bound in bounds)
         notes.append(f"buzzing: an amplitude from {low} to {high} in the last quarter of {self.duration}")
         return Outcome(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from typing import Annotated, Literal, TypeAlias
 
@@ -10,20 +9,19 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.axes import AnyAxis, DelayAxis, DeltaAxis
 from zwidth.config.fields import members
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import HeldOnly, register
-from zwidth.figures.region import Outlines
+from zwidth.config.values import AnyAxis, DelayAxis, DeltaAxis
+from zwidth.figures.stable_set import Outlines
 from zwidth.loops.rigid.passivity import is_passive
 from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import is_stable
 from zwidth.studies.outcome import ComputedStudy, Outcome, add_si_of_scene, share_of_device
-from zwidth.studies.passivity import find_edges
+from zwidth.studies.ridge import find_edges
 
 MapOutput: TypeAlias = Literal["stable", "spectral_radius", "passive"]
 
-_OUTPUT_BYTES = {"stable": 1, "spectral_radius": 8, "passive": 1}
 _TYPES = {"stable": np.bool_, "spectral_radius": np.float64, "passive": np.bool_}
 _FUNCTIONS = {"stable": is_stable, "spectral_radius": spectral_radius, "passive": is_passive}
 
@@ -57,28 +55,18 @@ class MapStudy(ComputedStudy):
     """How a delay that is not whole is modeled; poles exist in the model 'held' only."""
 
     @property
-    def shape(self) -> tuple[int, int, int, int]:
-        """Sizes of alpha, beta, delta and d."""
-        return self.alpha.size, self.beta.size, self.delta.size, self.d.size
-
-    @property
-    def extent(self) -> str:
-        return f"alpha x beta x delta x d = {' x '.join(str(size) for size in self.shape)}"
-
-    @property
-    def points(self) -> int:
-        return math.prod(self.shape)
+    def sizes(self) -> dict[str, int]:
+        return {name: getattr(self, name).size for name in ("alpha", "beta", "delta", "d")}
 
     @property
     def nbytes(self) -> int:
         # And a status code a point.
-        return self.points * (1 + sum(_OUTPUT_BYTES[name] for name in self.outputs))
+        return self.points * (1 + sum(np.dtype(_TYPES[name]).itemsize for name in self.outputs))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The outputs on the grid, as arrays, and a figure of each."""
         alpha, beta, delta, d = (axis.values() for axis in (self.alpha, self.beta, self.delta, self.d))
         share = share_of_device(self.delta, self.d, scene)
-        outputs = {name: np.empty(self.shape, dtype=_TYPES[name]) for name in self.outputs}
+        outputs = {name: np.empty(tuple(self.sizes.values()), dtype=_TYPES[name]) for name in self.outputs}
         # One plane at a time: the columns that broadcasting lays out are several times as large as the results.
         for delta_index, d_index in np.ndindex(delta.size, d.size):
             place = (slice(None), slice(None), delta_index, d_index)

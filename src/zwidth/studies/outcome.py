@@ -13,11 +13,11 @@ import numpy as np
 from pydantic import WrapValidator
 
 from zwidth import figures
-from zwidth.config.axes import Axis, DelayAxis, DeltaAxis
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members
 from zwidth.config.scenes import AnyDevice, AnyScene, PhysicalDevice, PhysicalScene, WallField
 from zwidth.config.study import Study
+from zwidth.config.values import Axis, DelayAxis, DeltaAxis
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.scenes.assessment import name_kind
 from zwidth.scenes.stiffest import StiffestWall
@@ -61,7 +61,7 @@ class Outcome:
 class ComputedStudy(Study):
     """A study whose results are tables, figures and texts: a kind is such a class, its model and its computation.
 
-    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``points`` and ``extent`` for the
+    A subclass has a field ``kind`` of one literal, the fields of its configuration, ``sizes`` for the
     plan, and `compute`. `zwidth.studies.register` makes it known.
     """
 
@@ -91,17 +91,9 @@ class CurvesStudy(ComputedStudy):
     """Delay in periods, an axis; the scene's where left out."""
 
     @property
-    def models(self) -> int:
-        """How many delay models are computed."""
-        return len(getattr(self, "delay_models", ("held",)))
-
-    @property
-    def extent(self) -> str:
-        return f"delta x d x delay models = {self.delta.size} x {self.d.size} x {self.models}"
-
-    @property
-    def points(self) -> int:
-        return self.delta.size * self.d.size * self.models
+    def sizes(self) -> dict[str, int]:
+        models = getattr(self, "delay_models", ("held",))
+        return {"delta": self.delta.size, "d": self.d.size, "delay models": len(models)}
 
 
 class WallsStudy(ComputedStudy):
@@ -165,7 +157,6 @@ def _find_owner(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Phy
 
 
 def summarize_stiffest(wall: StiffestWall) -> dict[str, Any]:
-    """A stiffest wall as columns of a table."""
     found = dict(zip(SI_COLUMNS, map(float, wall[:2]), strict=True))
     return {**found, "frequency_Hz": float(wall.frequency), "kind": name_kind(wall)}
 

@@ -61,28 +61,6 @@ class Sharpened:
 
 
 def published_numbers() -> list[Comparison]:
-    """Compare every number that the paper prints with the computed one."""
-    return [
-        *_compare_undamped(),
-        *_example(),
-        *_factors(),
-        Comparison(_LINE, "section V, remark 3", "2.3", line_appears()),
-    ]
-
-
-def _ridge(delta: float, d: float) -> tuple[float, float]:
-    point = alpha_max(delta, d)
-    return float(point.alpha), float(point.beta)
-
-
-def _compare_undamped() -> list[Comparison]:
-    """Remark 4: K_max T^2/m without physical damping."""
-    printed = ((0, "eq. (24)", "0.6863"), (1, "eq. (25)", "0.1445"))
-    return [Comparison(f"alpha_max(delta = 0, d = {d})", where, text, _ridge(0.0, d)[0]) for d, where, text in printed]
-
-
-def _example() -> list[Comparison]:
-    """Section VIII: the normalized damping, 75 % of the maximum stiffness and the damping at the maximum."""
     deltas = [float(normalize(mass=MASS, damping=damping, period=PERIOD).delta) for damping in DAMPINGS]
     ridge = [_ridge(delta, DELAY_FACTOR) for delta in deltas]
     columns = (
@@ -90,21 +68,26 @@ def _example() -> list[Comparison]:
         ("0.75 alpha_max", ("0.108", "0.149", "0.656"), [STIFFNESS_FRACTION * alpha for alpha, _ in ridge]),
         ("beta at alpha_max", ("0.425", "0.416", "0.388"), [beta for _, beta in ridge]),
     )
-    return [
-        Comparison(f"{name}, b = {damping:g} N s/m", "section VIII", text, computed)
-        for name, printed, found in columns
-        for damping, text, computed in zip(DAMPINGS, printed, found, strict=True)
-    ]
-
-
-def _factors() -> list[Comparison]:
-    """Section VIII: how much stiffer damping makes the wall, and how much stiffer it is than in practice."""
     undamped, damped = (STIFFNESS_FRACTION * _ridge(delta, DELAY_FACTOR)[0] for delta in (0.0, 1.0))
-    stiffness = undamped * MASS / PERIOD**2
+    over_practice = undamped * MASS / PERIOD**2 / MASSIE_SALISBURY
     return [
+        # Remark 4: K_max T^2/m without physical damping.
+        Comparison("alpha_max(delta = 0, d = 0)", "eq. (24)", "0.6863", _ridge(0.0, 0)[0]),
+        Comparison("alpha_max(delta = 0, d = 1)", "eq. (25)", "0.1445", _ridge(0.0, 1)[0]),
+        *(
+            Comparison(f"{name}, b = {damping:g} N s/m", "section VIII", text, computed)
+            for name, printed, found in columns
+            for damping, text, computed in zip(DAMPINGS, printed, found, strict=True)
+        ),
         Comparison("stiffness for b = 100 N s/m over that for b = 0", "section VIII", "6", damped / undamped),
-        Comparison("stiffness for b = 0 over 3.5 kN/m", "section VIII", "3", stiffness / MASSIE_SALISBURY),
+        Comparison("stiffness for b = 0 over 3.5 kN/m", "section VIII", "3", over_practice),
+        Comparison(_LINE, "section V, remark 3", "2.3", line_appears()),
     ]
+
+
+def _ridge(delta: float, d: float) -> tuple[float, float]:
+    point = alpha_max(delta, d)
+    return float(point.alpha), float(point.beta)
 
 
 def line_appears() -> float:
@@ -176,7 +159,6 @@ def sharpened_numbers() -> list[Sharpened]:
 
 
 def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
-    """The report for machines."""
     example: dict[str, Any] = {
         "mass_kg": MASS,
         "period_s": PERIOD,
@@ -195,7 +177,6 @@ def as_json(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
 
 
 def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
-    """The report for readers."""
     agreeing = sum(row.agrees for row in printed)
     lines = [
         "# The paper's numbers, computed",
@@ -208,7 +189,7 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
         "| quantity | where | printed | computed | agrees |",
         "|---|---|---|---|---|",
         *(
-            f"| {row.quantity} | {row.where} | {row.printed} | {_digits(row.computed)} "
+            f"| {row.quantity} | {row.where} | {row.printed} | {row.computed:{'#' if row.computed else ''}.10g} "
             f"| {'yes' if row.agrees else '**NO**'} |"
             for row in printed
         ),
@@ -226,11 +207,6 @@ def as_markdown(printed: list[Comparison], sharpened: list[Sharpened]) -> str:
     return "\n".join(lines)
 
 
-def _digits(value: float) -> str:
-    """Ten significant digits; zero as it is."""
-    return f"{value:.10g}" if value == 0 else f"{value:#.10g}"
-
-
 @register
 class PublishedStudy(ComputedStudy):
     """Every number that the paper prints beside the computed one."""
@@ -241,15 +217,10 @@ class PublishedStudy(ComputedStudy):
     kind: Literal["published"]
 
     @property
-    def extent(self) -> str:
-        return "the numbers of the paper"
-
-    @property
-    def points(self) -> int:
-        return 100
+    def sizes(self) -> dict[str, int]:
+        return {"numbers of the paper": 22}
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Compare every printed number with the computed one, as text and as JSON."""
         printed, sharpened = published_numbers(), sharpened_numbers()
         return Outcome(
             documents={

@@ -23,7 +23,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall, choose_damping
 from zwidth.studies.boundary import outline
 from zwidth.studies.outcome import Outcome, Table, add_si_columns
-from zwidth.studies.passivity import passive_outlines
+from zwidth.studies.ridge import passive_outlines
 from zwidth.studies.step import ResponseStudy
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
@@ -68,7 +68,6 @@ class RecommendStudy(ResponseStudy):
         return ((self.device, None),)
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """Recommend a wall, judge it, and write both down as text and JSON, with a table and a figure."""
         stem, label = "recommendation" if alone else f"{self.name}_recommendation", self.device.label or self.name
         bare, share = self.device.to_scene(), self.stiffness_fraction
         top, verdict, notes = bare.max_stiffness(), None, describe_islands(bare)
@@ -108,7 +107,6 @@ class RecommendStudy(ResponseStudy):
 
 
 def _outline_rigid(device: PhysicalDevice) -> Table:
-    """The stable and the passive walls of a rigid device."""
     edge = outline(device.delta, device.d, "held")
     passive = passive_outlines(np.array([device.delta]), np.array([device.d]), device.own_share)
     return add_si_columns(stack([edge, *passive]), device)
@@ -175,7 +173,6 @@ def _find_ends(best: dict[str, Any]) -> tuple[float, float]:
 
 
 def _describe(scene: Scene, found: dict[str, Any]) -> str:
-    """The recommendation for a reader."""
     best, most, device = found["recommended"], found["maximum"], scene.device
 
     def spell(value: float | None, unit: str = "") -> str:

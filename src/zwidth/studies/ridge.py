@@ -1,8 +1,9 @@
-"""The stiffest stable wall over delta, and the ridge study."""
+"""The stiffest stable and the stiffest passive wall over delta, and the studies of both."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import partial
 from typing import Any, Literal
 
@@ -10,9 +11,16 @@ import numpy as np
 
 from zwidth import figures
 from zwidth.config.scenes import AnyScene
-from zwidth.config.study import DelayModels, register
+from zwidth.config.study import DelayModels, HeldOnly, register
+from zwidth.figures.stable_set import Outlines
 from zwidth.figures.table import stack
+from zwidth.loops.rigid.boundary import stable_region
+from zwidth.loops.rigid.passivity import passive_stiffness_slope
 from zwidth.loops.rigid.ridge import alpha_max, stiffness_slope
+from zwidth.parts.device import Device
+from zwidth.parts.timing import Timing
+from zwidth.scenes.assessment import passive_edge
+from zwidth.scenes.scene import Scene
 from zwidth.studies.outcome import CurvesStudy, Outcome, Table
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import DelayModel
@@ -39,7 +47,6 @@ class RidgeStudy(CurvesStudy):
     """Show the small deltas in a panel of their own, as fig. 10 of the paper does."""
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The maximum stiffness over delta, as a table and a figure."""
         parts, notes = [], []
         for model, delays in needed_models(self.delay_models, self.d.values()):
             part, remarks = ridge_table(self.delta.values(), delays, model)
@@ -83,3 +90,58 @@ def slope_table(table: Table) -> Table:
     d = np.union1d(np.linspace(0.0, longest, longest * _SLOPE_SAMPLES + 1), table["d"])
     models = dict.fromkeys(table["delay_model"].tolist())
     return stack({"delay_model": model, "d": d, "slope": stiffness_slope(d, delay=model)} for model in models)
+
+
+@register
+class PassivityStudy(CurvesStudy):
+    """What passivity costs: the largest passive and the largest stable stiffness over delta."""
+
+    method = "Colgate's condition at its worst frequency, for the exact delay, to 1e-12 of its terms."
+    from_scene = ("delta", "d", "delay_model")
+
+    kind: Literal["passivity"]
+
+    delay_model: HeldOnly = "held"
+    """How a delay that is not whole is modeled; passivity is known for the model 'held'."""
+
+    def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
+        ridge, notes = ridge_table(self.delta.values(), self.d.values(), self.delay_model)
+        table = {name: ridge[name] for name in ("d", "delta", "alpha_max", "beta")}
+        slopes = [passive_stiffness_slope(d) for d in self.d.values().tolist()]
+        for name, slope in zip(("alpha_max_passive", "beta_passive"), zip(*slopes, strict=True), strict=True):
+            table[name] = np.repeat(slope, self.delta.size) * table["delta"]
+        return Outcome(table=table, figures={"": partial(figures.draw_passivity_cost, table)}, notes=tuple(notes))
+
+
+def unit_outline(d: float) -> tuple[np.ndarray, np.ndarray]:
+    """alpha and beta of the passive set's edge for delta = 1, from the smallest beta to the largest."""
+    return passive_edge(Scene(Device(1.0, 1.0), Timing(1.0, d)))
+
+
+def find_edges(delta: float, d: float) -> dict[str, Outlines]:
+    """Where the stable and the passive walls of a rigid device end, normalized."""
+    found = stable_region(delta, d)
+    edges: dict[str, Outlines] = {"stable": [(np.stack([found.alpha, found.beta], -1), False)]}
+    if delta > 0:
+        edges["passive"] = [(delta * np.stack(unit_outline(d), -1), False)]
+    return edges
+
+
+def passive_outlines(deltas: np.ndarray, delays: np.ndarray, share: float = 1.0) -> Iterator[dict[str, Any]]:
+    """The edge of the passive set of every device that has damping, as columns; without it nothing is passive.
+
+    ``share`` is the part of the damping that is the device's own: a hand's does not count.
+    """
+    for d in delays:
+        alpha, beta = unit_outline(float(d))
+        for delta in deltas[share * deltas > 0]:
+            yield {"curve": "passive", "d": d, "delta": delta, "delay_model": "held",
+                   "alpha": share * delta * alpha, "beta": share * delta * beta}  # fmt: skip
+
+
+def passive_intervals(deltas: np.ndarray, delays: np.ndarray) -> Iterator[dict[str, Any]]:
+    """The virtual damping that is passive for alpha -> 0, over delta, as columns."""
+    for d in delays:
+        _, beta = unit_outline(float(d))
+        yield {"curve": "passive", "d": d, "delay_model": "held", "delta": deltas,
+               "beta_lower": deltas * beta[0], "beta_upper": deltas * beta[-1]}  # fmt: skip

@@ -1,31 +1,38 @@
-"""The simulate study: motions of a device on virtual walls over time."""
+"""The simulate study: motions of a device on virtual walls over time, under the circumstances of `zwidth.simulate`."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import partial
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from zwidth import figures
-from zwidth.config.axes import Axis, AxisOf
-from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import LocatedProblem, problem
-from zwidth.config.parts import NO_LINEAR_FORM, locate_refusal
+from zwidth.config.fields import Strict
+from zwidth.config.parts import NO_LINEAR_FORM, SimulatedVelocityField, locate_refusal
 from zwidth.config.scenes import AnyScene, AnyWall, PhysicalDevice, PhysicalWall, SimulatedDevice
 from zwidth.config.study import HeldOnly, register
-from zwidth.config.values import Quantity
+from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity
 from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import SI_COLUMNS, stack
+from zwidth.parts.checks import Span
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
+from zwidth.simulation.simulate import Contact
 from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text, si_scales
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header, with_unit
-from zwidth.words.quantities import POSITIVE, Range
+from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, Range
 
+Length = Annotated[float, Quantity("m", NOT_NEGATIVE)]
+Friction = Annotated[float, Quantity("N", NOT_NEGATIVE)]
+Seed = Annotated[int, Quantity(allowed=NOT_NEGATIVE, whole=True)]
+
+LONGEST = 1_000_000
+"""Periods that one motion may take."""
 Fractions = Annotated[Axis, AxisOf(Quantity(allowed=POSITIVE))]
 
 # What the program makes of a sample stays until the next one.
@@ -37,6 +44,76 @@ _WORDS = {
     MotionKind.DIVERGED: "growing without end",
     MotionKind.INVALID: "not followed to its end",
 }
+
+
+class Circumstances(Strict):
+    """How a device meets a wall: start, push, contact, and what motor, encoder, bearings and clock add."""
+
+    duration: Duration = Span(1000.0, "periods")
+    """Length of the motion, in s or in periods."""
+
+    velocity: SimulatedVelocityField | None = None
+    """How the velocity is estimated; as the device has it where left out."""
+
+    start_position: Annotated[float, Quantity("m")] = 0.0
+    """Where the motion starts, in m or with a unit; the wall's surface is at 0 and positive is into the wall."""
+
+    start_velocity: Annotated[float, Quantity("m/s")] = 0.0
+    """Its velocity there, in m/s or with a unit."""
+
+    push: Annotated[float, Quantity("N")] = 0.0
+    """Constant force of the hand on the device, in N or with a unit."""
+
+    contact: Contact = "bilateral"
+    """Where the wall acts: on both sides of its surface, where positions are positive, or there and never pulling."""
+
+    resolution: Length = 0.0
+    """One count of the encoder, in m or with a unit."""
+
+    noise: Length = 0.0
+    """Standard deviation of the measured position, in m or with a unit."""
+
+    coulomb: Friction = 0.0
+    """Dry friction while the device slips, in N or with a unit."""
+
+    static: Friction | None = None
+    """Dry friction that holds the device, at least coulomb, which it is where left out."""
+
+    max_force: Annotated[float, Quantity("N", POSITIVE)] | None = None
+    """The most that the motor gives, in N or with a unit; no limit where left out."""
+
+    max_rate: Annotated[float, Quantity("N/s", POSITIVE)] | None = None
+    """The fastest that the command changes, in N/s or with a unit; no limit where left out."""
+
+    jitter: Delay = Span(0.0, "s")
+    """Samples are late by random times up to this, in s or in periods, below one period."""
+
+    seed: Seed = 0
+    """Whole number that decides the random numbers."""
+
+    def find_clashes(self, period: float) -> Iterable[LocatedProblem]:
+        """Values that do not go together, or not with this sampling period."""
+        if self.static is not None and self.static < self.coulomb:
+            what = f"got {self.static:g} N, below coulomb, {self.coulomb:g} N"
+            yield ("static",), problem(what, "what holds is at least the friction while slipping", "raise it")
+        if not self.jitter.seconds(period) < period:
+            what = f"got {self.jitter}"
+            yield ("jitter",), problem(what, "a sample is late by less than one period", "write '0.2 periods'")
+        if not 1 <= round(self.duration.periods(period)) <= LONGEST:
+            what = f"got {self.duration}, which is {self.duration.periods(period):.4g} periods"
+            yield ("duration",), problem(what, f"1 to {LONGEST} periods", "change the duration")
+
+    def count_periods(self, period: float) -> int:
+        return max(1, round(self.duration.periods(period)))
+
+    def place(self, scene: Scene) -> Scene:
+        """The scene with the velocity estimate of these circumstances."""
+        return scene if self.velocity is None else scene.replace(velocity=self.velocity.to_part())
+
+    def options(self, period: float) -> dict[str, Any]:
+        names = [name for name in Circumstances.model_fields if name not in ("duration", "velocity", "jitter")]
+        given = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        return {**given, "periods": self.count_periods(period), "jitter": self.jitter.seconds(period)}
 
 
 class SimulatedStudy(ComputedStudy):
@@ -89,7 +166,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
 
     @property
     def count(self) -> int:
-        """How many motions there are."""
         return self.stiffness_fraction.size if self.stiffness_fraction is not None else len(self.walls or ())
 
     @property
@@ -102,7 +178,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         return int(self.count * min(self.duration.periods(self.device.period), 1e15) * self.substeps)
 
     def list_walls(self, scene: Scene) -> list[tuple[str, float, float]]:
-        """Each wall by its name, stiffness and virtual damping."""
         if self.stiffness_fraction is not None:
             top = scene.max_stiffness()
             stiffness, damping = float(top.stiffness), float(top.virtual_damping)
@@ -114,7 +189,6 @@ class SimulateStudy(WallsStudy, SimulatedStudy, Circumstances):
         return [(name_wall(*wall), *wall) for wall in walls]
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The motions, as tables and figures, and in words how each ends."""
         placed = self.place(self.device.to_scene())
         walls = self.list_walls(placed)
         stiffness, damping = np.array([wall[1:] for wall in walls]).T

@@ -164,7 +164,6 @@ class StepStudy(WallsStudy, ResponseStudy):
         return tuple((self.devices[k % len(self.devices)], walls[k % len(walls)]) for k in range(count))
 
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
-        """The responses, as a table and a figure."""
         physical = all(isinstance(device, PhysicalDevice) for device in self.devices)
         parts, notes = [], []
         for number, (device, given) in enumerate(self.pairs(), start=1):

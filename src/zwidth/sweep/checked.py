@@ -11,7 +11,7 @@ import numpy as np
 from zarr.core.buffer.core import default_buffer_prototype
 from zarr.storage import LocalStore
 
-from zwidth.sweep.files.whole import content
+from zwidth.sweep.files import content
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
 from zwidth.words.errors import StoreError
@@ -39,7 +39,6 @@ class CheckedStore(LocalStore):
 
     @property
     def complete(self) -> bool:
-        """Whether every chunk was done."""
         return not self._missing
 
     def get_sync(
@@ -77,7 +76,6 @@ class CheckedStore(LocalStore):
         return data
 
     def _task_of(self, name: str) -> Task | None:
-        """The chunk to which a file belongs."""
         variable, *place = name.split("/")
         family = next((one for one in self._kept.plan.families if variable in one.variables), None)
         if family is None or place[:1] != ["c"]:

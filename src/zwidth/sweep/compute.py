@@ -7,7 +7,7 @@ batches of two sizes, may round differently.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from itertools import product
 from typing import TypeAlias
@@ -59,7 +59,6 @@ def in_pieces(function: Callable[..., tuple[np.ndarray, ...]], columns: Columns,
 
 
 def _devices(block: Block) -> dict[str, np.ndarray]:
-    """What belongs to devices."""
     alpha, beta, _, kind, status = in_pieces(
         lambda *columns: tuple(alpha_max(*columns)), (block.delta, block.d), _PIECE
     )
@@ -77,7 +76,6 @@ def _devices(block: Block) -> dict[str, np.ndarray]:
 
 
 def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str, np.ndarray]:
-    """What belongs to walls."""
     shape = (block.delta.size, block.alpha.shape[1], block.beta.shape[1])
     found: dict[str, np.ndarray] = {}
     unproved = False
@@ -85,7 +83,7 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
         if block.plane.alpha.shape[1] * block.plane.beta.shape[1] >= _SMALLEST_PLANE:
             radius, proved, rate = _radius_planes(accuracy, block)
         else:
-            radius, proved, rate = _by_device(partial(_radius_columns, accuracy), block, shape, _all_devices, leaves=3)
+            radius, proved, rate = _by_device(partial(_radius_columns, accuracy), block, shape, leaves=3)
         found["spectral_radius"], unproved = radius, proved == 0
         # Of the rate, not of the radius: that rounds to 1 where the decay is slow.
         found["decay_rate"] = rate / block.period[:, None, None] if block.period.size else rate
@@ -94,13 +92,13 @@ def _walls(outputs: tuple[str, ...], block: Block, accuracy: float) -> dict[str,
         found["settling_time"] = periods * block.period[:, None, None] if block.period.size else periods
     if MARGIN_OUTPUTS & set(outputs):
         compute = partial(_margins, "delay_margin" in outputs, "modulus_margin" in outputs)
-        found |= dict(zip(_MARGINS, _by_device(compute, block, shape, _all_devices, leaves=4), strict=True))
+        found |= dict(zip(_MARGINS, _by_device(compute, block, shape, leaves=4), strict=True))
         if block.period.size:
             found["delay_margin"] = found["delay_margin"] * block.period[:, None, None]
     if "stable" in outputs:
         found["stable"] = _stable(block, shape)
     if {"passive", "passivity_margin"} & set(outputs):
-        (margin,) = _by_device(_passivity, block, shape, _delays)
+        (margin,) = _by_device(_passivity, block, shape, one_delay=True)
         found |= {"passivity_margin": margin, "passive": margin > 0}
     found["status"] = _status(outputs, found, unproved, block, shape)
     return found
@@ -113,7 +111,6 @@ def _status(
     block: Block,
     shape: tuple[int, ...],
 ) -> np.ndarray:
-    """Why each wall has its values."""
     status = np.full(shape, Status.OK, dtype=np.uint8)
     status[unproved] = Status.NOT_CONVERGED
     for name in outputs:
@@ -164,13 +161,14 @@ def _by_device(
     function: Callable[[Columns], Columns],
     block: Block,
     shape: tuple[int, ...],
-    grouped: Callable[[np.ndarray], Iterator[np.ndarray]],
     leaves: int = 1,
+    one_delay: bool = False,
 ) -> Columns:
-    """Apply a function of columns to the walls of a block, group by group of devices; it gives so many arrays."""
+    """Apply a function of columns, of one delay or of all of them, to the walls of a block; it gives so many arrays."""
     results = tuple(np.empty(shape) for _ in range(leaves))
     rows = min(shape[1], max(1, _LAID_OUT // shape[2]))
-    for group in grouped(block.d):
+    delays, which = np.unique(block.d if one_delay else np.zeros(block.d.size), return_inverse=True)
+    for group in (np.flatnonzero(which == index) for index in range(delays.size)):
         step = max(1, _LAID_OUT // (rows * shape[2]))
         for start, row in product(range(0, group.size, step), range(0, shape[1], rows)):
             devices, alphas = group[start : start + step], slice(row, row + rows)
@@ -214,16 +212,6 @@ def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Columns:
     return in_pieces(of_piece, columns, _PIECE)
 
 
-def _all_devices(d: np.ndarray) -> Iterator[np.ndarray]:
-    yield np.arange(d.size)
-
-
 def _passivity(columns: Columns) -> Columns:
     *walls, d = columns
     return in_pieces(lambda *piece: (margin_at_one_delay(*piece, d=float(d[0])),), tuple(walls), _WALL_PIECE)
-
-
-def _delays(d: np.ndarray) -> Iterator[np.ndarray]:
-    """Devices of one delay."""
-    values, which = np.unique(d, return_inverse=True)
-    return (np.flatnonzero(which == index) for index in range(values.size))

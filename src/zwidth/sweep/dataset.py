@@ -1,16 +1,35 @@
-"""The results of a sweep as a dataset."""
+"""The results of a sweep: as a dataset, in other formats, and verified file by file."""
 
 from __future__ import annotations
 
+import json
 import os
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.sweep.store import FILES, SEAL, check_installed, find_store, name_checksums, silence_zarr
+from zwidth.sweep.files import hidden_beside
+from zwidth.sweep.store import (
+    FILES,
+    SEAL,
+    Store,
+    check_installed,
+    find_store,
+    find_stores,
+    name_checksums,
+    silence_zarr,
+)
+from zwidth.words.errors import StoreError, StoreExistsError
+from zwidth.words.formatting import header, to_cell
+from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, VARIABLES
 
 if TYPE_CHECKING:
     import xarray
+
+MAX_CSV_POINTS = 1_000_000
 
 
 def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
@@ -59,3 +78,138 @@ def open_dataset(path: str | os.PathLike[str]) -> xarray.Dataset:
         dataset = dataset.assign_coords(device=("device", labels, dataset["device"].attrs))
     dataset.attrs = {key: value for key, value in attributes.items() if key not in (SEAL, FILES, "coordinates")}
     return dataset.assign_attrs(complete=int(checked.complete))
+
+
+def to_netcdf(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
+    """Write the results of a sweep into one netCDF-4 file, chunk by chunk.
+
+    Args:
+        path: as for `open_dataset`.
+        file: the file to make; truth values become bytes, and what is nested in the attributes JSON.
+
+    Raises:
+        StoreError: as `open_dataset`.
+        StoreExistsError: the file exists.
+    """
+    target = _free_place(file)
+    dataset = open_dataset(path)
+    packed = {name: {"zlib": True, "complevel": 1} for name, variable in dataset.data_vars.items() if variable.ndim}
+    for variable in (dataset, *dataset.variables.values()):
+        variable.attrs = {key: _plain_attribute(value) for key, value in variable.attrs.items()}
+    with hidden_beside(target) as partial:
+        # One thread: the HDF5 library is not made for several, and lets only one of them in at a time.
+        import dask
+
+        with dask.config.set(scheduler="synchronous"):  # pyright: ignore[reportPrivateImportUsage]
+            dataset.to_netcdf(partial, engine="h5netcdf", encoding=packed)
+        os.replace(partial, target)
+
+
+def to_csv(path: str | os.PathLike[str], file: str | os.PathLike[str]) -> None:
+    """Write the results of a small sweep as a table, one row a point, all parameters and outputs in columns.
+
+    Columns in SI units carry their unit, as ``stiffness_N_per_m``; those of normalized quantities none.
+
+    Args:
+        path: as for `open_dataset`.
+        file: the file to make.
+
+    Raises:
+        StoreError: as `open_dataset`, or more than a million points.
+        StoreExistsError: the file exists.
+    """
+    target = _free_place(file)
+    dataset = open_dataset(path)
+    points = int(np.prod(list(dataset.sizes.values()), dtype=float))
+    if points > MAX_CSV_POINTS:
+        remedy = "export to netCDF, or select a part with zwidth.open_dataset"
+        raise StoreError(f"{os.fspath(path)}: {points} points, a table may have {MAX_CSV_POINTS}; {remedy}")
+    if "device" in dataset.coords:
+        labels = [to_cell(str(label)) for label in np.atleast_1d(dataset["device"].values)]
+        dataset["device"] = (dataset["device"].dims, np.reshape(labels, dataset["device"].shape))
+    rows = dataset if dataset.sizes else dataset.expand_dims("point")
+    with hidden_beside(target) as partial:
+        # What a folder lists first differs from one machine to the next; a table has one order.
+        table = rows.to_dataframe(dim_order=sorted(map(str, rows.sizes), key=_place))
+        table = table[sorted(map(str, table.columns), key=_place)]
+        units = {name: str(values.attrs.get("units", "")) for name, values in rows.variables.items()}
+        table.columns = [header(name, units[name]) for name in table.columns]
+        table.index.names = [header(str(name), units.get(name, "")) for name in table.index.names]
+        table.to_csv(partial, index=bool(dataset.sizes))
+        os.replace(partial, target)
+
+
+_ORDER = (*VARIABLES, *OUTPUTS)
+
+
+def _place(name: str) -> int:
+    """Where a variable stands in the declared order; others come last."""
+    return _ORDER.index(name) if name in _ORDER else len(_ORDER)
+
+
+def _plain_attribute(value: Any) -> Any:
+    if isinstance(value, list) and all(isinstance(item, int) for item in value):
+        return np.array(value, dtype=np.int64 if max(value, default=0) > NOT_COMPUTED else np.uint8)
+    return json.dumps(value) if value is None or isinstance(value, dict | list) else value
+
+
+def _free_place(file: str | os.PathLike[str]) -> Path:
+    target = Path(os.fsdecode(file))
+    if target.exists():
+        raise StoreExistsError(f"{target} exists already; choose another name or remove it")
+    return target
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What a store holds, and in which state."""
+
+    path: Path
+    chunks: int = 0  # how many it is to have
+    done: int = 0  # how many of them are marked as done
+    damaged: tuple[str, ...] = ()  # chunks and files that are not what was written, each with what is wrong
+    error: str = ""  # why the store cannot be read at all; empty where it can
+
+    @property
+    def ok(self) -> bool:
+        """Whether everything is there and undamaged."""
+        return not self.error and not self.damaged and self.done == self.chunks
+
+
+def verify(
+    path: str | os.PathLike[str], *, progress: Callable[[int, int], None] | None = None
+) -> tuple[Verification, ...]:
+    """Read every file of one store, or of all stores in a folder, and compare its checksum.
+
+    Args:
+        path: a store ``<study>.zarr`` or the folder of a run.
+        progress: called with the number of chunks read and their total, store by store.
+
+    Returns:
+        One `Verification` a store. Nothing is changed: a run with ``resume`` repairs what is damaged.
+
+    Raises:
+        StoreError: there is no store.
+    """
+    folder = Path(os.fsdecode(path))
+    stores = find_stores(folder)
+    if not stores:
+        raise StoreError(f"{folder}: holds no store of a sweep; name the folder of a run, or a store in it")
+    return tuple(_verify_store(store, progress or (lambda done, total: None)) for store in stores)
+
+
+def _verify_store(path: Path, progress: Callable[[int, int], None]) -> Verification:
+    store = Store(path)
+    try:
+        tasks = list(store.plan.tasks())
+        damaged = [f"{name} is damaged or missing" for name in store.damaged_files()]
+    except StoreError as error:
+        return Verification(path, error=str(error))
+    done = 0
+    for number, task in enumerate(tasks, start=1):
+        if store.is_done(task):
+            done += 1
+            fault = store.fault_of(task)
+            damaged += [f"{store.plan.describe(task)}: {fault}"] if fault else []
+        progress(number, len(tasks))
+    return Verification(path, len(tasks), done, tuple(damaged))

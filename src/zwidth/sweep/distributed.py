@@ -24,6 +24,7 @@ _SILENT_SECONDS = 15
 _NO_WORKER_SECONDS = 600
 # Enough to keep every worker busy, few enough that a scheduler never holds a whole sweep.
 _AHEAD = 4
+_KILLED = "KilledWorker"
 _GONE = "does not answer any more, or has started again"
 
 
@@ -53,19 +54,19 @@ def connected(address: str) -> Iterator[Client]:
 def _terminal_without_logs() -> Iterator[None]:
     """Take distributed's own handlers off the terminal: what matters of its log is said in one line of ours."""
     names = [name for name in logging.root.manager.loggerDict if name.split(".")[0] in ("distributed", "tornado")]
+    terminal = (sys.stderr, sys.__stderr__)
     before = {logging.getLogger(name): logging.getLogger(name).handlers for name in (*names, "asyncio")}
     for logger, handlers in before.items():
         # With no handler at all Python itself would write to the terminal.
-        logger.handlers = [logging.NullHandler(), *(one for one in handlers if not _writes_to_terminal(one))]
+        logger.handlers = [
+            logging.NullHandler(),
+            *(one for one in handlers if getattr(one, "stream", None) not in terminal),
+        ]
     try:
         yield
     finally:
         for logger, handlers in before.items():
             logger.handlers = handlers
-
-
-def _writes_to_terminal(handler: logging.Handler) -> bool:
-    return isinstance(handler, logging.StreamHandler) and handler.stream in (sys.stderr, sys.__stderr__)
 
 
 def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[Finished]:
@@ -80,16 +81,12 @@ def on_cluster(jobs: list[Job], client: Client, perform: Perform) -> Generator[F
     """
     given_up = []
     for finished in _submit_jobs(client, jobs, perform):
-        if finished.error and _tells_of_death(finished.error):
+        if finished.error.startswith(_KILLED):
             given_up.append(finished.job)
         else:
             yield finished
     for job in given_up:
         yield from _submit_jobs(client, [job], perform)
-
-
-def _tells_of_death(error: str) -> bool:
-    return error.startswith("KilledWorker")
 
 
 def _submit_jobs(client: Client, jobs: list[Job], perform: Perform) -> Generator[Finished]:
@@ -139,7 +136,6 @@ def _ask_for_threads(client: Client) -> dict[str, int]:
 
 
 def _perform_there(perform: Perform, path: str, family: str, index: int) -> None:
-    """What a worker does."""
     if not os.path.isdir(path):
         from distributed import get_worker
 
@@ -154,6 +150,6 @@ def _describe_error(job: Job, error: Any) -> Finished:
     """What dask says of a task that it could not do, in words of ours where its worker died."""
     if isinstance(error, _BlindWorkerError):
         raise error
-    if type(error).__name__ == "KilledWorker":
-        return Finished(job, "KilledWorker: its worker died every time it was tried")
+    if type(error).__name__ == _KILLED:
+        return Finished(job, f"{_KILLED}: its worker died every time it was tried")
     return describe_failure(job, error)

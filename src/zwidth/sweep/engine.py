@@ -1,21 +1,26 @@
-"""The engine: sweeps chunk by chunk, in this process, in workers or on a cluster."""
+"""The engine: stores made, or found and repaired, then computed chunk by chunk: here, in workers or on a cluster."""
 
 from __future__ import annotations
 
 import math
+import shutil
 import time
-from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process
+from zwidth.sweep.files import differences, digest, versions
+from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process, in_workers
 from zwidth.sweep.plan import Plan, Task
-from zwidth.sweep.resume import check_same, new_store, remove_partials, repair, store_path
-from zwidth.sweep.store import Store
+from zwidth.sweep.store import SUFFIX, Store, create
 from zwidth.sweep.study import SweepStudy
-from zwidth.words.errors import StoreExistsError
+from zwidth.words.errors import StoreError, StoreExistsError
+from zwidth.words.formatting import describe
+
+_SHOWN_DIFFERENCES = 10
 
 
 @dataclass(frozen=True)
@@ -71,16 +76,11 @@ def compute_sweeps(
 ) -> Sweeps:
     """Compute what is missing in the stores ``<folder>/<study>.zarr``, made where they are not there (`check_stores`).
 
-    Args:
-        planned: the studies with their plans.
-        folder: held by the caller.
-        about: ``name``, ``description`` and ``config`` of the configuration, for the stores' attributes.
-        shard, workers, scheduler, progress: as in `zwidth.run`.
-
-    Raises:
-        InputError: the scheduler does not answer, or its workers do not see the folder.
+    The folder is held by the caller; ``about`` has name, description and config for the stores' attributes; the options
+    are those of `zwidth.run`. A scheduler that does not answer, or whose workers do not see the folder, is an
+    `InputError`.
     """
-    from zwidth.sweep.chunks import perform
+    from zwidth.sweep.jobs import perform
 
     with ExitStack() as stack:
         client = None
@@ -90,36 +90,48 @@ def compute_sweeps(
 
             client = stack.enter_context(connected(scheduler))
         stores, repaired = _prepare_stores(planned, folder, about, shard)
-        results = {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
-        names = {str(store.path): name for name, store in stores.items()}
-        points: dict[Job, int] = {}
+        sweeps = Sweeps(
+            {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
+        )
+        chunks: dict[Job, _Chunk] = {}
         for name, store in stores.items():
-            tasks = _pick_share(store.plan, shard)
+            tasks, sweep = _pick_share(store.plan, shard), sweeps.results[name]
             missing = [task for task in tasks if not store.is_done(task)]
-            points |= {Job(str(store.path), task): store.plan.points(task) for task in missing}
-            results[name].total, results[name].skipped = len(tasks), len(tasks) - len(missing)
-        sweeps = Sweeps(results)
-        if points:
+            chunks |= {Job(str(store.path), task): _Chunk(name, store, task) for task in missing}
+            sweep.total, sweep.skipped = len(tasks), len(tasks) - len(missing)
+        if chunks:
             if client is not None:
                 from zwidth.sweep.distributed import on_cluster
 
-                finished = on_cluster(list(points), client, perform)
+                finished = on_cluster(list(chunks), client, perform)
             elif workers is not None:
-                from zwidth.sweep.pool import in_workers
-
-                finished = in_workers(list(points), workers, perform)
+                finished = in_workers(list(chunks), workers, perform)
             else:
-                finished = in_this_process(list(points), perform)
+                finished = in_this_process(list(chunks), perform)
             try:
-                _follow(finished, points, sweeps, stores, names, progress)
+                _follow(finished, chunks, sweeps, progress)
             except LostSchedulerError as error:
                 sweeps.lost = f"scheduler: {scheduler} {error}"
-            _count(list(points), sweeps, stores, names)
+            _count(chunks, sweeps)
         return sweeps
 
 
+class _Chunk(NamedTuple):
+    """One chunk of one sweep."""
+
+    study: str
+    store: Store
+    task: Task
+
+    @property
+    def points(self) -> int:
+        return self.store.plan.points(self.task)
+
+    def __str__(self) -> str:
+        return f"{self.study}/{self.store.plan.describe(self.task)}"
+
+
 def _pick_share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
-    """The chunks that are this run's to compute."""
     tasks = list(plan.tasks())
     return tasks if shard is None else tasks[shard[0] - 1 :: shard[1]]
 
@@ -147,7 +159,9 @@ def _prepare_stores(
         if path.exists():
             stores[study.name] = store = Store(path)
             if shard is None:
-                remove_partials(path)
+                # Unfinished files of a run that was killed.
+                for left in path.rglob("*.partial"):
+                    left.unlink(missing_ok=True)
             repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard))]
         else:
             stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)
@@ -156,27 +170,21 @@ def _prepare_stores(
 
 
 def _follow(
-    results: Generator[Finished],
-    points: dict[Job, int],
-    sweeps: Sweeps,
-    stores: dict[str, Store],
-    names: dict[str, str],
-    progress: Callable[[Progress], None],
+    results: Generator[Finished], chunks: dict[Job, _Chunk], sweeps: Sweeps, progress: Callable[[Progress], None]
 ) -> None:
-    """Keep count of chunks while they are computed."""
-    start, ended, computed, total = time.perf_counter(), 0, 0, sum(points.values())
+    start, ended, computed = time.perf_counter(), 0, 0
+    total = sum(chunk.points for chunk in chunks.values())
     try:
         for number, finished in enumerate(results, start=1):
-            name = names[finished.job.path]
-            sweep = sweeps.results[name]
-            ended += points[finished.job]
+            chunk = chunks[finished.job]
+            ended += chunk.points
             if finished.error:
-                sweep.failed[f"{name}/{stores[name].plan.describe(finished.job.task)}"] = finished.error
+                sweeps.results[chunk.study].failed[str(chunk)] = finished.error
             else:
-                computed += points[finished.job]
+                computed += chunk.points
             rate = computed / max(time.perf_counter() - start, 1e-9)
             left = (total - ended) / rate if rate else math.nan
-            progress(Progress(name, number, len(points), ended, total, rate, left, finished.error))
+            progress(Progress(chunk.study, number, len(chunks), ended, total, rate, left, finished.error))
             if finished.hopeless:
                 sweeps.hopeless = finished.error
                 return
@@ -187,16 +195,97 @@ def _follow(
         results.close()
 
 
-def _count(jobs: list[Job], sweeps: Sweeps, stores: dict[str, Store], names: dict[str, str]) -> None:
+def _count(chunks: dict[Job, _Chunk], sweeps: Sweeps) -> None:
     """Count the chunks that are done: not those that an engine calls so, but those that the stores hold."""
     over = sweeps.hopeless or sweeps.interrupted or sweeps.lost
-    for job in jobs:
-        name = names[job.path]
-        sweep, store = sweeps.results[name], stores[name]
-        chunk = f"{name}/{store.plan.describe(job.task)}"
-        if store.holds(job.task):
+    for chunk in chunks.values():
+        sweep = sweeps.results[chunk.study]
+        if chunk.store.holds(chunk.task):
             sweep.computed += 1
             # Somebody else has done it in the meantime, a worker that was given up say.
-            sweep.failed.pop(chunk, None)
+            sweep.failed.pop(str(chunk), None)
         elif not over:
-            sweep.failed.setdefault(chunk, "it was computed, and is not in the store")
+            sweep.failed.setdefault(str(chunk), "it was computed, and is not in the store")
+
+
+def store_path(folder: Path, study: SweepStudy) -> Path:
+    return folder / f"{study.name}{SUFFIX}"
+
+
+def new_store(folder: Path, study: SweepStudy, plan: Plan, about: Mapping[str, Any], *, shared: bool) -> Store:
+    """Make the store of a study; where other runs share it, one of them may have been faster."""
+    attributes = {
+        "title": f"{about['name']}: {study.name}",
+        "comment": about["description"],
+        "source": f"zwidth {versions()['zwidth']}",
+        "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} made by zwidth run",
+        "precision": "float64",
+        "versions": versions(),
+        "config": about["config"],
+        "config_sha256": digest(about["config"]),
+        "study": study.model_dump(mode="json", exclude_none=True),
+        "plan": plan.as_dict(),
+    }
+    store = create(store_path(folder, study), attributes, may_exist=shared)
+    check_same(store, study)
+    return store
+
+
+def check_same(store: Store, study: SweepStudy) -> None:
+    """Refuse a store that was made from another study or by other releases."""
+    now = study.model_dump(mode="json", exclude_none=True)
+    refuse_changes(store.path, study.name, "store", store.attributes["study"], now)
+    refuse_versions(store.path, store.attributes["versions"])
+
+
+def refuse_changes(where: Path, name: str, what: str, old: Any, new: Any) -> None:
+    """Raise a `StoreError` that names every key in which results were made from another study."""
+    changed = list(differences(old, new))
+    if changed:
+        lines = [
+            f"{where}: studies[{name}].{key}: the {what} was made with {_spell_value(before)}, the configuration has "
+            f"{_spell_value(after)}"
+            for key, before, after in changed[:_SHOWN_DIFFERENCES]
+        ]
+        more = len(changed) - _SHOWN_DIFFERENCES
+        lines += [f"{where}: {more} more keys differ"] if more > 0 else []
+        remedy = f"{where}: change the configuration back, or choose another folder with --out DIR"
+        raise StoreError("\n".join([*lines, remedy]))
+
+
+def refuse_versions(where: Path, old: dict[str, str]) -> None:
+    """Refuse to go on with results of other releases: together they are not what either of them would compute."""
+    now = versions()
+    for key in (key for key in now if key != "python" and old.get(key) != now[key]):
+        raise StoreError(
+            f"{where}: made with {key} {old.get(key)}, now there is {now[key]}; install the same release, or choose "
+            "another folder with --out DIR"
+        )
+
+
+def _spell_value(value: Any) -> str:
+    return "nothing" if value is None else describe(value)
+
+
+def repair(store: Store, tasks: Iterable[Task]) -> list[str]:
+    """Take back the marks of chunks that are damaged, and write damaged coordinates again; returns what was found."""
+    found = []
+    names = store.damaged_files()
+    if names:
+        store.restore(names)
+        found += [f"{name} (restored)" for name in names]
+    for task in tasks:
+        fault = store.fault_of(task) if store.is_done(task) else ""
+        if fault:
+            store.forget(task)
+            found.append(f"{store.plan.describe(task)}: {fault}")
+    return found
+
+
+def remove(folder: Path, study: SweepStudy) -> None:
+    """Make room for a store to be made again; what is no store of a sweep stays, and is then refused."""
+    path = store_path(folder, study)
+    if path.is_dir() and not path.is_symlink():
+        with suppress(StoreError):
+            Store(path).attributes  # noqa: B018  (raises where the store is not one of ours)
+            shutil.rmtree(path)

@@ -56,11 +56,9 @@ class Grid:
         self.sizes = sizes
 
     def dims_of(self, family: Family) -> tuple[str, ...]:
-        """The dimensions that the outputs of a family have."""
         return self.dims if family == "wall" else self.device_dims
 
     def shape_of(self, family: Family) -> tuple[int, ...]:
-        """The sizes of these dimensions."""
         return tuple(self.sizes[name] for name in self.dims_of(family))
 
     @cached_property
@@ -158,7 +156,6 @@ class Grid:
         return self._device(name, slices, shape)[:, None]
 
     def _dim_of(self, name: str) -> str | None:
-        """The dimension along which a parameter changes."""
         table = self.axes.devices
         if table is not None and name in table.columns:
             return "device"
@@ -169,5 +166,4 @@ class Grid:
         return np.broadcast_to(alpha, (devices, alpha.shape[1])), np.broadcast_to(beta, (devices, beta.shape[1]))
 
     def size_of(self, family: Family) -> int:
-        """How many points a family has."""
         return math.prod(self.shape_of(family))

@@ -1,19 +1,35 @@
-"""What the engines hand out and get back."""
+"""Chunks of stores, from nothing to done: in this process, or in workers, replaced when something kills them."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Iterable
-from typing import NamedTuple, TypeAlias
+from contextlib import suppress
+from functools import lru_cache
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
 
-from zwidth.sweep.files.whole import hopeless
+from zwidth.arrays.kernel_cache import mend_compilation_cache
+from zwidth.sweep.files import hopeless
 from zwidth.sweep.plan import Task
+from zwidth.sweep.store import Store
 from zwidth.words.errors import ZwidthError
 
 Perform: TypeAlias = Callable[[str, str, int], None]
-"""What computes one chunk: `zwidth.sweep.chunks.perform`, or in a test something that fails."""
+"""What computes one chunk: `zwidth.sweep.jobs.perform`, or in a test something that fails."""
 
 MAX_ATTEMPTS = 3
 """How often a chunk is tried whose worker is killed."""
+# Never fork a process in which JAX may have started: its threads do not survive, its locks do.
+_CONTEXT = multiprocessing.get_context("spawn")
+# Seconds that a worker may take to end by itself.
+_PATIENCE = 3.0
 
 
 class LostSchedulerError(ZwidthError):
@@ -45,11 +61,144 @@ def attempt(perform: Perform, job: Job) -> Finished:
 
 
 def describe_failure(job: Job, error: BaseException) -> Finished:
-    """What an exception means for a job and the others."""
     return Finished(job, f"{type(error).__name__}: {error}", hopeless(error))
 
 
 def in_this_process(jobs: Iterable[Job], perform: Perform) -> Generator[Finished]:
-    """Do one job after the other."""
     for job in jobs:
         yield attempt(perform, job)
+
+
+@lru_cache(maxsize=4)
+def _open_store(path: str, made: int) -> Store:
+    """A store that this process works on; ``made`` tells it from another one that took its place."""
+    return Store(Path(path))
+
+
+def perform(path: str, family: str, index: int) -> None:
+    """Compute and write one chunk of a store, by its number in a family of outputs, unless it is done already."""
+    store = _open_store(path, os.stat(os.path.join(path, "zarr.json")).st_ino)
+    task = Task("device" if family == "device" else "wall", index)
+    if store.is_done(task):
+        return
+    plan = store.plan.family(family)
+    if store.study.with_parts:
+        from zwidth.sweep.scenes import compute_scenes
+
+        block = store.grid.scene_block(plan.place(index))
+        values = compute_scenes(plan.family, plan.outputs, store.study, block)
+    else:
+        # Loads JAX, which a process that only hands out work has no use for.
+        from zwidth.sweep.compute import compute
+
+        values = compute(plan.family, plan.outputs, store.grid.block(plan.place(index)), store.study.accuracy)
+    # A scheduler that restarts, or a run that goes on, may have handed it out twice.
+    if not store.is_done(task):
+        store.write(task, values)
+
+
+def in_workers(jobs: Iterable[Job], count: int, perform: Perform) -> Generator[Finished]:
+    """Do jobs in ``count`` processes; a job whose worker dies is tried again, at the end and a few times at most."""
+    waiting = deque(jobs)
+    deaths: Counter[Job] = Counter()
+    workers = [_Worker(number, count, perform) for number in range(min(count, len(waiting)))]
+    try:
+        while waiting or any(worker.job for worker in workers):
+            for worker in workers:
+                if worker.job is None and waiting:
+                    worker.start(waiting.popleft())
+            busy = [worker for worker in workers if worker.job]
+            ready = wait([part for worker in busy for part in (worker.pipe, worker.process.sentinel)])
+            for worker in (worker for worker in busy if worker.pipe in ready or worker.process.sentinel in ready):
+                job, finished = worker.job, worker.result()
+                if finished is not None:
+                    yield finished
+                    continue
+                assert job is not None, "a busy worker has a job"
+                deaths[job] += 1
+                why = worker.cause_of_death()
+                workers[workers.index(worker)] = _Worker(worker.number, count, perform)
+                if deaths[job] < MAX_ATTEMPTS:
+                    waiting.append(job)
+                else:
+                    yield Finished(job, f"its worker died each of {MAX_ATTEMPTS} times ({why})")
+    finally:
+        for worker in workers:
+            worker.stop()
+
+
+class _Worker:
+    """One process of ``count``, and what it is doing."""
+
+    def __init__(self, number: int, count: int, perform: Perform) -> None:
+        self.number = number
+        self.job: Job | None = None
+        self.pipe, theirs = _CONTEXT.Pipe()
+        self.process = _CONTEXT.Process(target=_work, args=(theirs, number, count, perform), daemon=True)
+        self.process.start()
+        theirs.close()
+
+    def start(self, job: Job) -> None:
+        self.job = job
+        # Where the worker is dead already, its sentinel says so.
+        with suppress(OSError):
+            self.pipe.send(job)
+
+    def result(self) -> Finished | None:
+        """How the job went; None where the worker died over it."""
+        try:
+            finished = self.pipe.recv() if self.pipe.poll() else None
+        except (EOFError, OSError):
+            finished = None
+        self.job = None
+        return finished
+
+    def cause_of_death(self) -> str:
+        self.process.join()
+        code = self.process.exitcode or 0
+        return f"signal {signal.Signals(-code).name}" if code < 0 else f"exit code {code}"
+
+    def stop(self) -> None:
+        """End the process; what it was writing is not there yet under its name."""
+        # An idle one ends by itself when nobody can send it anything any more.
+        if self.job is None:
+            self.pipe.close()
+        else:
+            self.process.terminate()
+        self.process.join(_PATIENCE)
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+def _work(pipe: Connection, number: int, count: int, perform: Perform) -> None:
+    # Ctrl-C reaches the whole group of processes; the parent decides what becomes of it.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    # Ends as a program does, so that Python has no leaked semaphore to complain about.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    _share_processors(number, count)
+    mend_compilation_cache()
+    while True:
+        try:
+            job: Any = pipe.recv()
+        except (EOFError, OSError):
+            return
+        pipe.send(attempt(perform, job))
+
+
+def _share_processors(number: int, count: int) -> None:
+    """Keep to this worker's share of the processors: JAX would start a thread on each of them in every worker."""
+    if not hasattr(os, "sched_setaffinity"):
+        return
+    available = sorted(os.sched_getaffinity(0))
+    if 1 < count <= len(available):
+        os.sched_setaffinity(0, available[number::count])
+
+
+def _end_with_parent() -> None:
+    """A parent that is killed cannot end its workers."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None, "a worker has a parent"
+    parent.join()
+    os._exit(1)

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from zwidth.sweep.files.whole import check_folder, existing
+from zwidth.sweep.files import check_folder, existing
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import ResourceError
@@ -61,12 +61,10 @@ class FamilyPlan:
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """How many chunks there are along each dimension."""
         return tuple(-(-size // chunk) for size, chunk in zip(self.shape, self.chunks, strict=True))
 
     @property
     def count(self) -> int:
-        """How many chunks there are."""
         return math.prod(self.counts)
 
     @property
@@ -80,20 +78,16 @@ class FamilyPlan:
         return " x ".join(f"{dim} {size}" for dim, size in zip(self.dims, self.shape, strict=True)) or "one point"
 
     def position(self, index: int) -> tuple[int, ...]:
-        """The position of a chunk along each dimension."""
         return tuple(int(part) for part in np.unravel_index(index, self.counts)) if self.counts else ()
 
     def place(self, index: int) -> tuple[slice, ...]:
-        """The points of a chunk."""
         starts = zip(self.position(index), self.chunks, self.shape, strict=True)
         return tuple(slice(at * chunk, min((at + 1) * chunk, size)) for at, chunk, size in starts)
 
     def points(self, index: int) -> int:
-        """How many points a chunk has."""
         return math.prod(part.stop - part.start for part in self.place(index))
 
     def describe(self, index: int) -> str:
-        """A chunk by its name and its place, for messages."""
         parts = zip(self.dims, self.place(index), strict=True)
         place = ", ".join(f"{dim} {part.start}:{part.stop}" for dim, part in parts)
         return f"{Task(self.family, index)}{f' ({place})' if place else ''}"
@@ -113,7 +107,6 @@ class Plan:
     seconds: float  # on one core, a rough guess
 
     def family(self, name: str) -> FamilyPlan:
-        """The plan of one family."""
         return next(family for family in self.families if family.family == name)
 
     def tasks(self) -> Iterator[Task]:
@@ -122,11 +115,9 @@ class Plan:
             yield from (Task(family.family, index) for index in range(family.count))
 
     def points(self, task: Task) -> int:
-        """How many points a chunk has."""
         return self.family(task.family).points(task.index)
 
     def describe(self, task: Task) -> str:
-        """A chunk for messages."""
         return self.family(task.family).describe(task.index)
 
     @property
@@ -142,7 +133,6 @@ class Plan:
         }
 
     def lines(self) -> Iterator[str]:
-        """The plan in words."""
         yield f"study {self.study}"
         for family in self.families:
             chunk = " x ".join(map(str, family.chunks))
@@ -177,7 +167,9 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
         families.append(FamilyPlan(family, outputs, grid.dims_of(family), shape, chunk_shape(shape, target)))
         seconds += size * slowness
     largest = max(math.prod(plan.chunks) * _bytes_per_point(plan.outputs) for plan in families)
-    disk = sum(math.prod(plan.shape) * _disk_bits(plan.outputs) for plan in families) // 8 + 2**16
+    # Numbers hardly shrink, truth values are packed, a status is nearly always 0.
+    bits = [1 + sum(64 if OUTPUTS[name].dtype == "float64" else 1 for name in plan.outputs) for plan in families]
+    disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
     model = "device with parts, held delay" if study.with_parts else _model(study.axes.most_periods)
     return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
@@ -217,7 +209,6 @@ def choose_methods(study: SweepStudy) -> dict[str, tuple[str, str]]:
 
 
 def _model(longest: float) -> str:
-    """What is modelled, in words."""
     degree = math.floor(longest) + 3
     if longest == math.floor(longest):
         return f"damped mass, zero-order hold, held delay: polynomials of degree up to {degree}"
@@ -227,12 +218,7 @@ def _model(longest: float) -> str:
 
 
 def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collection[str] = ()) -> None:
-    """Refuse, before any work, what cannot fit on the disk or in memory; ``begun`` studies have their disk space.
-
-    Raises:
-        InputError: the folder cannot be made or written.
-        ResourceError: it does not fit; the message has the numbers and the remedy.
-    """
+    """Refuse, before any work, what cannot fit on the disk or in memory; ``begun`` studies have their disk space."""
     check_folder(folder)
     if not plans:
         return
@@ -271,11 +257,6 @@ def _bytes_per_point(outputs: tuple[str, ...]) -> int:
     hidden += 32 if MARGIN_OUTPUTS & set(outputs) else 0
     hidden += 8 if {"passive", "passivity_margin"} & set(outputs) else 0
     return 8 * floats + hidden + (16 if floats else 0) + len(outputs) + 4
-
-
-def _disk_bits(outputs: tuple[str, ...]) -> int:
-    """Bits for a point on the disk: numbers hardly shrink, truth values are packed, a status is nearly always 0."""
-    return 1 + sum({"float64": 64, "bool": 1, "uint8": 1}[OUTPUTS[name].dtype] for name in outputs)
 
 
 def _size(count: float) -> str:

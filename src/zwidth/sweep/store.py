@@ -22,8 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from zwidth.sweep.files.provenance import digest
-from zwidth.sweep.files.whole import checksum, content, hidden_beside, remove_quietly, write_whole
+from zwidth.sweep.files import checksum, content, digest, hidden_beside, remove_quietly, write_whole
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.study import SweepStudy
@@ -95,17 +94,14 @@ class Store:
 
     @cached_property
     def study(self) -> SweepStudy:
-        """The study that the store is for."""
         return SweepStudy.model_validate(self.attributes["study"])
 
     @cached_property
     def plan(self) -> Plan:
-        """The plan that the store was made with."""
         return kept_plan(self.study, self.attributes["plan"])
 
     @cached_property
     def grid(self) -> Grid:
-        """The study's grid."""
         return Grid(self.study)
 
     @cached_property
@@ -134,7 +130,6 @@ class Store:
         return self.path / name_checksums(task.family) / "c" / str(task.index) / "0"
 
     def is_done(self, task: Task) -> bool:
-        """Whether a chunk is marked as done."""
         return self.flag(task).exists()
 
     def holds(self, task: Task) -> bool:
@@ -305,7 +300,6 @@ def find_stores(path: Path) -> list[Path]:
 
 
 def find_store(path: str | os.PathLike[str]) -> Store:
-    """The only store at a path."""
     folder = Path(os.fsdecode(path))
     found = find_stores(folder)
     if len(found) != 1:

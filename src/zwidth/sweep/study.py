@@ -2,30 +2,30 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, fields
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BeforeValidator, ValidationError, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, WrapValidator, create_model
 from pydantic_core import PydanticCustomError
 
-from zwidth.config.device_table import DeviceTable, read_table
+from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
-from zwidth.config.fields import members
+from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
-from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
+from zwidth.config.scenes import AnyScene, PhysicalScene, find_second_period, is_with_parts
 from zwidth.config.study import HeldOnly, Study, register
-from zwidth.config.values import Quantity
+from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.scenes.scene import Scene
-from zwidth.sweep.axes import Axes
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import (
     MAX_DELAY_PERIODS,
+    NORMALIZED,
+    OF_PARTS,
     OUTPUTS,
     OUTPUTS_WITH_PARTS,
     PARAMETERS,
@@ -42,6 +42,104 @@ _EXAMPLES = {
     "velocity": "velocity: {kind: low_pass, cutoff: 100 Hz}",
     "coupling": "coupling: {mass: 50 g, stiffness: 20 kN/m}",
 }
+
+
+def _axis_field(name: str) -> tuple[Any, Any]:
+    if name == "devices":
+        rows = "Parameters that move together, one row a device: lists of equal length, or a CSV file."
+        return TableField | None, Field(default=None, description=rows)  # pyright: ignore[reportOperatorIssue]
+    axis: Any = Annotated[Axis, axis_of(name)]
+    words = describe_parameter(PARAMETERS[name]) + ("." if name in WALL else "; the scene's where left out.")
+    return axis | None, Field(default=None, description=words)
+
+
+# In the order in which a store keeps what was asked of it.
+_OF_WALL, _OF_DEVICE = ("stiffness", "virtual_damping"), ("mass", "damping", "period", "rate", "delay")
+_FIELDS: Any = {name: _axis_field(name) for name in (*OF_PARTS, "devices", *NORMALIZED, *_OF_WALL, *_OF_DEVICE)}
+# Some of the names have dots, which a class body cannot have.
+_Axes: Any = create_model("_Axes", __base__=Strict, **_FIELDS)
+
+
+class Axes(_Axes):
+    """The parameters of a sweep and the values that each of them takes."""
+
+    what: ClassVar[str] = "the axes of a sweep"
+
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        return _mixed([key for key in raw if key in PARAMETERS], "axes")
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        """A parameter that is both an axis and a column, and kinds that only the table's columns show."""
+        columns = tuple(self.devices.columns) if self.devices else ()
+        own = [name for name in PARAMETERS if getattr(self, name) is not None]
+        for name in own:
+            if name in columns:
+                twice = "given twice, as an axis and as a column of devices"
+                yield (name,), problem(twice, "each parameter once", "remove one")
+        if columns and not any(name in columns for name in own):
+            yield from ((("devices",), what) for _, what in _mixed([*own, *columns], "axes and devices together"))
+
+    @property
+    def given(self) -> tuple[str, ...]:
+        columns = self.devices.columns if self.devices else {}
+        return tuple(name for name in PARAMETERS if name in columns or getattr(self, name) is not None)
+
+    @property
+    def given_of_parts(self) -> tuple[str, ...]:
+        """Those of them that belong to a velocity filter, a hand or a coupling."""
+        return tuple(name for name in self.given if name in OF_PARTS)
+
+    @property
+    def physical(self) -> bool:
+        return any(name in PHYSICAL for name in self.given)
+
+    @property
+    def delay_in_periods(self) -> bool:
+        """Whether the delays count sampling periods."""
+        source = self.devices if self.delay is None else self.delay
+        return source is not None and source.in_periods
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        sizes = {"device": self.devices.size} if self.devices else {}
+        for name in PARAMETERS:
+            axis = getattr(self, name)
+            if axis is not None and axis.form != "number":
+                sizes[name] = axis.size
+        return sizes
+
+    def ends(self, name: str) -> tuple[float, float]:
+        source = self.devices.columns[name] if self.place(name) == "devices" else getattr(self, name).entries
+        return min(source), max(source)
+
+    def place(self, name: str) -> str:
+        return "devices" if getattr(self, name) is None else name
+
+    @property
+    def most_periods(self) -> float:
+        """The longest delay in the shortest periods."""
+        if "d" in self.given:
+            return self.ends("d")[1]
+        if "delay" not in self.given:
+            return 0.0
+        longest = self.ends("delay")[1]
+        if self.delay_in_periods:
+            return longest
+        return longest * (self.ends("rate")[1] if "rate" in self.given else 1.0 / self.ends("period")[0])
+
+
+def _mixed(keys: list[str], where: str) -> Iterable[LocatedProblem]:
+    if not keys:
+        return
+    physical = keys[0] in PHYSICAL
+    for key in keys:
+        if (key in PHYSICAL) != physical:
+            kinds = "physical key, after normalized ones" if not physical else "normalized key, after physical ones"
+            allowed = f"{where} are in SI units or normalized, never both"
+            remedy = f"choose from {listing(PHYSICAL if physical else NORMALIZED)}"
+            yield (key,), problem(kinds, allowed, remedy, on_key=True)
+    yield from find_second_period(keys)
 
 
 def _check_output(name: Any) -> str:
@@ -203,11 +301,7 @@ class SweepStudy(_Parts, _Swept):
                 yield error
 
     def make_scene(self, values: dict[str, float]) -> Scene:
-        """The scene at a point of the grid, from the parameters that the axes give.
-
-        Raises:
-            InputError: the parts refuse the values.
-        """
+        """The scene at a point of the grid, from the parameters that the axes give."""
         given = dict(values)
         period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
         delay = given.pop("delay", 0.0) * (period if self.axes.delay_in_periods else 1.0)
@@ -230,25 +324,19 @@ class SweepStudy(_Parts, _Swept):
 
     @property
     def families(self) -> dict[Family, tuple[str, ...]]:
-        """The outputs of walls and those of devices."""
         groups: dict[Family, tuple[str, ...]] = {
             family: tuple(name for name in self.outputs if OUTPUTS[name].family == family) for family in STATUS_OF
         }
         return {family: names for family, names in groups.items() if names}
 
     @property
-    def points(self) -> int:
-        return math.prod(self.axes.sizes.values())
+    def sizes(self) -> dict[str, int]:
+        return self.axes.sizes
 
     @property
     def nbytes(self) -> int:
         # As they are in memory, with a status code.
         return self.points * (1 + 8 * len(self.outputs))
-
-    @property
-    def extent(self) -> str:
-        sizes = self.axes.sizes
-        return f"{' x '.join(sizes) or 'one point'} = {' x '.join(str(size) for size in sizes.values()) or 1}"
 
 
 def _columns(raw: Any) -> set[str]:

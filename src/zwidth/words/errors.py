@@ -67,6 +67,5 @@ def describe_choice(value: object, allowed: tuple[str, ...]) -> str:
 
 
 def check_choice(field: str, value: object, allowed: tuple[str, ...]) -> None:
-    """Raise `InputError` unless ``value`` is one of ``allowed``."""
     if value not in allowed:
         raise InputError(f"{field}: {describe_choice(value, allowed)}")

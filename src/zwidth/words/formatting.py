@@ -1,15 +1,28 @@
-"""Values for people: numbers with SI prefixes and a fixed count of significant digits, and what was received."""
+"""Values for people: numbers with SI prefixes and few digits, what was received, and the cells of CSV files.
+
+The first line of a CSV file that holds something has the names of the columns, which may have units in brackets. Lines
+before it that begin with # are remarks, and so is the ``sep=;`` of spreadsheets. Columns are separated by tabs, else
+semicolons, else commas: the first of these that the line of names holds. Where commas do not separate, they may be
+decimal signs.
+"""
 
 from __future__ import annotations
 
+import csv
 import difflib
 import math
 import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
+
+from zwidth.words.errors import InputError
 
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
+_REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
+_TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
+_DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
 
 
 def plain(value: float, digits: int = 4) -> str:
@@ -116,3 +129,34 @@ def short(value: float) -> str:
     """The shortest text of a number, without ``.0`` where it is whole."""
     text = f"{value:g}"
     return text if float(text) == value else repr(value)
+
+
+def read_rows(file: Path, most_bytes: int) -> tuple[list[tuple[int, list[str]]], str]:
+    """The row of names and those below that hold something, each with its line; and what separates cells."""
+    # A pipe would be waited for.
+    if not file.is_file():
+        raise InputError(f"{file}: {'it is no file' if file.exists() else 'no such file'}; check the path")
+    try:
+        if file.stat().st_size > most_bytes:
+            raise InputError(f"{file}: it has more than {most_bytes >> 20} MiB; take a part of it")
+        lines = file.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise InputError(f"{file}: it is no text in UTF-8; save it as CSV in UTF-8") from None
+    except OSError as error:
+        raise InputError(f"{file}: {error.strerror or error}; check the path") from None
+    first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), len(lines))
+    separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
+    reader = csv.reader(lines[first:], delimiter=separator, skipinitialspace=True, strict=True)
+    try:
+        rows = [(first + reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        raise InputError(f"{file}:{first + reader.line_num}: {error}; check the quotes") from None
+    if separator != ",":
+        rows[1:] = [(line, [_DECIMAL_COMMA.sub(r"\1.", cell) for cell in cells]) for line, cells in rows[1:]]
+    return [row for row in rows if any(row[1])], separator
+
+
+def split_title(title: str) -> tuple[str, str]:
+    """The name of a column, and its unit, which stands in brackets at its end."""
+    match = _TITLE.fullmatch(title.strip())
+    return (match[1], (match[2] or match[3] or "").strip()) if match else (title, "")

@@ -271,7 +271,6 @@ class Output:
         return self.label or self.name.replace("_", " ")
 
     def units_in(self, physical: bool) -> str:
-        """The unit that the store states."""
         return self.physical_units if physical and self.physical_units else self.units
 
 
@@ -357,7 +356,6 @@ STATUS_OF: dict[Family, str] = {"wall": "status", "device": "ridge_status"}
 
 
 def status_flags() -> dict[str, Any]:
-    """The CF description of a status."""
     codes = [*(int(status) for status in Status), NOT_COMPUTED]
     meanings = " ".join([*(status.name.lower() for status in Status), "not_computed"])
     return {"long_name": "why a point has its values", **_flags(codes, meanings)}

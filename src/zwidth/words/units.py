@@ -30,12 +30,10 @@ class Dimension(NamedTuple):
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Their names."""
         return (*self.powers, *self.factors)
 
     @property
     def base(self) -> str:
-        """The SI unit that a number without a unit is in."""
         return next(iter(self.powers))
 
     def in_base(self, mantissa: str, exponent: int, unit: str) -> float | None:
@@ -75,7 +73,6 @@ PERIOD_WORDS = ("periods", "period")
 
 
 def find_dimension(unit: str) -> Dimension:
-    """The units beside an SI base unit."""
     return _OF_UNIT[unit]
 
 
@@ -146,11 +143,7 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
 def read_quantity(
     value: Any, dimension: Dimension, allowed: Range = ANY, *, periods: bool = False
 ) -> tuple[float, str]:
-    """A quantity that the model is computed for, in its base unit or, where allowed, in "periods"; and which of them.
-
-    Raises:
-        UnusableValueError: it is no number, has another unit, or is out of range.
-    """
+    """A quantity that the model is computed for, in its base unit or, where allowed, in "periods"; and which."""
     amount, unit = _parse(value, dimension, periods=periods)
     check_range(amount, allowed, unit)
     least, most = SI_RANGE

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.cli.words import passivity_words
+from zwidth.pages.words import passivity_words
 
 DEVICE = ["--mass", "100 g", "--damping", "10", "--delay", "1 periods"]
 RATE = ["--rate", "1 kHz"]

@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from zwidth.cli.commands import cli
-from zwidth.cli.init import find_examples
+from zwidth.cli.commands import cli, find_examples
 from zwidth.studies.document import load_config
 from zwidth.words.errors import InputError
 

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from zwidth.config.axes import AxisOf
-from zwidth.config.values import Quantity
+from zwidth.config.values import AxisOf, Quantity
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import math
 import pytest
 
 import zwidth
-from zwidth.config.circumstances import Circumstances
 from zwidth.config.faults import ConfigFileError
 from zwidth.studies.document import Config
+from zwidth.studies.simulate import Circumstances
 
 DEVICE = "mass: 100 g, period: 1 ms, delay: 1 periods"
 FOAW = "velocity: {kind: foaw, noise: 20 um, samples: 12}"

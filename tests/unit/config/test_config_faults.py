@@ -15,7 +15,7 @@ FOLDER = Path(__file__).parents[2] / "data" / "bad_configs"
 # and how its remedy begins.
 FAULTS = {
     "a_list": [("1:1: got a list of 2 items", "write 'key: value' lines, or {key: value}")],
-    "alias_bomb": [("1:32: d[0][0][8][8]: too many values by alias", "write them out")],
+    "alias_bomb": [("1:23: e[5][5][7][4][5]: too many values", "write long axes as linear or log")],
     "alias_of_itself": [("4:5: studies[0]: an alias of what it is part of", "write the values out")],
     "alias_undefined": [("3:10: not valid YAML", "define it before with '&', or remove the '*'")],
     "axis_boolean": [("7:16: studies[0].delta[1]: got true", "write a number such as 0.5")],

@@ -17,8 +17,7 @@ from zwidth.config.scenes import NormalizedWall, PhysicalDevice, PhysicalWall, n
 from zwidth.parts.checks import Span
 from zwidth.scenes.scene import Scene
 from zwidth.studies.document import KINDS, Config, config_json_schema, load_config
-from zwidth.studies.passivity import PassivityStudy
-from zwidth.studies.ridge import RidgeStudy
+from zwidth.studies.ridge import PassivityStudy, RidgeStudy
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 SHIPPED = sorted(CONFIGS.glob("*.yaml"))
@@ -62,7 +61,7 @@ def test_the_scene_supplies_what_a_study_leaves_out(load):
     assert ridge.d.values() == [1.5]
     assert list(boundary.d.values()) == [0, 1]
     assert grid.delta.values() == [3]
-    assert grid.shape == (1, 2, 1, 1)
+    assert tuple(grid.sizes.values()) == (1, 2, 1, 1)
     assert step.devices == (recommend.device,) == (config.scene.device,)
     assert step.pairs() == ((config.scene.device, None),)
     assert (recommend.device.mass, recommend.device.period) == (0.1, 1e-3)

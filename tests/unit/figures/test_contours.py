@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from zwidth.figures.contours import label_contours
+from zwidth.figures.grid import label_contours
 from zwidth.figures.style import new_figure
 
 X, Y = np.linspace(-1.0, 1.0, 40), np.linspace(-2.0, 2.0, 50)

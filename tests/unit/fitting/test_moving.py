@@ -5,7 +5,7 @@ import pytest
 import tolerances
 
 import zwidth
-from zwidth.fitting.moving import PARTS, Recording, Recordings
+from zwidth.fitting.moving import Recording, Recordings
 
 EXACT = tolerances.FIT_EXACT.float64
 PERIOD, FINER, SKIP = 1e-3, 20, 6
@@ -58,7 +58,7 @@ def test_a_mass_that_sticks_stays_and_forgets_its_speed():
 
 def test_several_logs_share_the_device_alone():
     logs = tuple(Recording(random_force(seed), np.zeros(294), SKIP) for seed in (1, 2))
-    model = Recordings(logs, PARTS)
+    model = Recordings(logs)
     theta = np.array([1e-5, 0.02, 1.3, 0.1, 1e-4, -0.2, -3e-4, 1e-7, 1e-6])
     places, slopes = model.predict(theta)
     for k, log in enumerate(logs):

@@ -8,7 +8,7 @@ import pytest
 from run_folders import record_of
 
 import zwidth
-from zwidth.runs.inputs import gather_inputs
+from zwidth.runs.record import gather_inputs
 from zwidth.sweep.dataset import open_dataset
 from zwidth.words.errors import StoreExistsError
 

@@ -108,7 +108,7 @@ def test_a_study_that_is_added_is_computed_and_one_that_is_removed_stays(finishe
 
 
 def test_another_release_is_refused(finished, both, monkeypatch):
-    monkeypatch.setattr("zwidth.sweep.files.provenance.__version__", "99.0")
+    monkeypatch.setattr("zwidth.sweep.files.__version__", "99.0")
     with pytest.raises(
         StoreError, match=r"run\.json: made with zwidth .*, now there is 99\.0; install the same release"
     ):

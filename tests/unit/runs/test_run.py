@@ -14,7 +14,7 @@ import zwidth
 from zwidth.runs import run
 from zwidth.studies import Outcome, load_config
 from zwidth.studies.map import MapStudy
-from zwidth.sweep.verify import verify
+from zwidth.sweep.dataset import verify
 from zwidth.words.errors import ConfigError, InputError, StoreError, StoreExistsError
 
 

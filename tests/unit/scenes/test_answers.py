@@ -172,3 +172,16 @@ def test_to_control():
     assert model.dt == 1e-3
     poles = FILTERED.poles(5e3, 2.0)
     assert np.abs(control.poles(model)).max() == pytest.approx(np.abs(poles).max(), abs=1e-12)
+
+
+def test_poles_that_are_almost_one_are_told_apart():
+    """A soft wall on a device with hardly any damping: alpha = q^2/4 + w^2, z = 1 - q/2 +- j w, or two real poles."""
+    rng = np.random.default_rng(1)
+    for _ in range(60):
+        period, mass, damping = 10 ** rng.uniform(-4, -2), 10 ** rng.uniform(-2, 1), 10 ** rng.uniform(-12, -4)
+        delta = damping * period / mass
+        alpha = min(0.25 * delta**2 * 10 ** rng.uniform(-1, 6), 1e-3)
+        scene = zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(period, rng.integers(12) * period))
+        stiffness = alpha * mass / period**2
+        slowest = -period / scene.pole_table(stiffness).time_constant[0]
+        assert slowest == pytest.approx(np.log1p(scene.spectral_radius(stiffness) - 1), rel=1e-6, abs=3e-16)

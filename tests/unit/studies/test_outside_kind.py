@@ -9,7 +9,7 @@ import pytest
 from sweeping import main_of
 
 import zwidth
-from zwidth.config.axes import DeltaAxis
+from zwidth.config.values import DeltaAxis
 from zwidth.studies import ComputedStudy, Outcome, document, register
 from zwidth.words.errors import ConfigError, StoreError
 

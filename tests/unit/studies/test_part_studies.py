@@ -9,9 +9,8 @@ from matplotlib.path import Path as Polygon
 import zwidth
 from zwidth import figures
 from zwidth.figures.table import SI_COLUMNS, select
-from zwidth.studies.boundary import BoundaryStudy
-from zwidth.studies.compare import CompareStudy
-from zwidth.studies.filters import FiltersStudy
+from zwidth.studies.boundary import BoundaryStudy, CompareStudy
+from zwidth.studies.design import FiltersStudy
 from zwidth.studies.recommend import RecommendStudy
 
 DEVICE = {"mass": 0.1, "damping": 10.0, "period": 1e-3, "delay": "1 periods"}

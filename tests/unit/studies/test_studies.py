@@ -13,9 +13,8 @@ from zwidth.loops.rigid.poles import unstable_poles
 from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
 from zwidth.studies.map import MapStudy
 from zwidth.studies.outcome import csv_text
-from zwidth.studies.passivity import PassivityStudy, unit_outline
 from zwidth.studies.recommend import RecommendStudy
-from zwidth.studies.ridge import RidgeStudy, needed_models, ridge_table, slope_table
+from zwidth.studies.ridge import PassivityStudy, RidgeStudy, needed_models, ridge_table, slope_table, unit_outline
 from zwidth.studies.step import StepStudy
 
 DELTAS = np.array([0.0, 0.5, 2.0, 2.5, 4.0])

@@ -75,7 +75,7 @@ def test_work_of_a_killed_worker_is_done_by_another(cluster, finished, tmp_path)
 
 
 def test_a_chunk_that_always_kills_its_worker_is_named_and_the_exit_code_is_1(cluster, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr("zwidth.sweep.chunks.perform", killed_on_2)
+    monkeypatch.setattr("zwidth.sweep.jobs.perform", killed_on_2)
     path = tmp_path / "sweep.yaml"
     path.write_text(yaml.safe_dump({"version": 1, "name": "sweep", "studies": [study()]}), encoding="utf-8")
     assert main_of("run", path, "--out", tmp_path / "out", "--scheduler", cluster) == 1
@@ -128,7 +128,7 @@ def own_cluster(folder):
 def test_a_scheduler_that_dies_or_falls_silent_ends_the_run_in_one_line(
     finished, tmp_path, monkeypatch, capfd, disturbed
 ):
-    monkeypatch.setattr("zwidth.sweep.chunks.perform", disturbed)
+    monkeypatch.setattr("zwidth.sweep.jobs.perform", disturbed)
     path, out = tmp_path / "sweep.yaml", tmp_path / "out"
     path.write_text(yaml.safe_dump({"version": 1, "name": "test", "studies": [study()]}), encoding="utf-8")
     with own_cluster(tmp_path) as address:

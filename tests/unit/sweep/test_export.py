@@ -7,9 +7,8 @@ import pytest
 import xarray
 from sweeping import config_of, run_sweeps, study
 
-from zwidth.sweep import export
-from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.export import to_csv, to_netcdf
+from zwidth.sweep import dataset
+from zwidth.sweep.dataset import open_dataset, to_csv, to_netcdf
 from zwidth.words.errors import StoreError, StoreExistsError
 
 AXES = {"devices": {"label": ["a", "b"], "mass": [0.1, 1], "damping": [1, 2]}, "rate": 1000, "stiffness": [10, 20, 1e6]}
@@ -62,7 +61,7 @@ def test_a_table_has_a_row_a_point(folder, tmp_path, monkeypatch):
     )
     assert not {"stiffness", "mass", "rate"} & set(rows[0])
     assert rows[-1]["stable"] == "False"
-    monkeypatch.setattr(export, "MAX_CSV_POINTS", 5)
+    monkeypatch.setattr(dataset, "MAX_CSV_POINTS", 5)
     with pytest.raises(StoreError, match="6 points, a table may have 5; export to netCDF"):
         to_csv(folder / "map.zarr", tmp_path / "again.csv")
 

@@ -9,11 +9,9 @@ import zwidth
 from zwidth.config.faults import ConfigFileError
 from zwidth.runs.draw import draw_stores
 from zwidth.studies.document import Config
-from zwidth.sweep.chunks import perform
-from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.export import to_csv, to_netcdf
+from zwidth.sweep.dataset import open_dataset, to_csv, to_netcdf, verify
+from zwidth.sweep.jobs import perform
 from zwidth.sweep.study import SweepStudy
-from zwidth.sweep.verify import verify
 from zwidth.words.status import Status
 
 CUTOFFS, DAMPINGS = [10.0, 30.0, 100.0], [0.0, 10.0]

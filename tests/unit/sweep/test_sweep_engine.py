@@ -25,10 +25,9 @@ from sweeping import (
 )
 
 import zwidth
-from zwidth.sweep.dataset import open_dataset
+from zwidth.sweep.dataset import open_dataset, verify
 from zwidth.sweep.plan import Task
 from zwidth.sweep.store import Store
-from zwidth.sweep.verify import verify
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.status import Status
 
@@ -252,7 +251,7 @@ def test_another_configuration_is_refused(finished, change, key, words):
 
 def test_another_release_is_refused(finished, monkeypatch):
     config, folder = finished
-    monkeypatch.setattr("zwidth.sweep.files.provenance.__version__", "99.0")
+    monkeypatch.setattr("zwidth.sweep.files.__version__", "99.0")
     with pytest.raises(StoreError, match=r"made with zwidth .*, now there is 99\.0; install the same release"):
         run_sweeps(config, folder, resume=True)
 

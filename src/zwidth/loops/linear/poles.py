@@ -24,6 +24,8 @@ from zwidth.words.types import Array
 
 # Aberth's steps at most, and the step, in units of the pole's own distance from z = 1, that ends them.
 _STEPS, _ARRIVED = 60, 4e-16
+# Where the distance from z = 1 has digits of its own that eigenvalues do not know.
+_NEAR_ONE = 1e-6
 # Numbers that a block of walls holds: eigenvalues and the distances between poles take order^2 each.
 _NUMBERS = 1 << 20
 
@@ -103,11 +105,24 @@ def _start(loop: LoopRoots, alpha: Array, beta: Array) -> Array:
 
 def _polish(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Array:
     """Aberth's steps: Newton's, from which each pole keeps off the others."""
-    here = np.arange(len(zeta))
+    _take_steps(loop, alpha, beta, zeta, np.arange(len(zeta)))
+    # Steps keep a real pair real and a conjugate one conjugate. Of two poles next to z = 1 that are almost one,
+    # eigenvalues may have made the other kind, from which no step leads to them.
+    at = evaluate(loop, alpha[:, None], beta[:, None], zeta)
+    stray = (np.abs(at.value) > 1e-10 * at.size) & (np.abs(zeta) < _NEAR_ONE)
+    zeta *= np.where(stray, 1.0 + 0.3 * np.exp(2.4j * np.arange(zeta.shape[1])), 1.0)
+    _take_steps(loop, alpha, beta, zeta, np.flatnonzero(stray.any(1)))
+    return zeta
+
+
+def _take_steps(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array, rows: Array) -> None:
+    """Move some walls' poles until they stay."""
     same = np.eye(zeta.shape[1], dtype=bool)
     for _ in range(_STEPS):
-        now = zeta[here]
-        at = evaluate(loop, alpha[here, None], beta[here, None], now)
+        if not rows.size:
+            break
+        now = zeta[rows]
+        at = evaluate(loop, alpha[rows, None], beta[rows, None], now)
         with np.errstate(all="ignore"):
             newton = at.value / at.slope
             apart = np.where(same, np.inf, now[:, :, None] - now[:, None, :])
@@ -115,12 +130,8 @@ def _polish(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Array:
         # Below the rounding of P a step moves nothing but noise.
         good = np.isfinite(step) & (np.abs(at.value) > 1e-16 * at.size) & (np.abs(step) < 0.5)
         step = np.where(good, step, 0.0)
-        zeta[here] = now - step
-        moving = (np.abs(step) > _ARRIVED * np.abs(now)).any(1)
-        if not moving.any():
-            break
-        here = here[moving]
-    return zeta
+        zeta[rows] = now - step
+        rows = rows[(np.abs(step) > _ARRIVED * np.abs(now)).any(1)]
 
 
 def poles_less_one(loop: LoopRoots, alpha: Array, beta: Array) -> Array:

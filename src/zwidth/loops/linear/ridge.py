@@ -74,11 +74,7 @@ class BoundRidge(NamedTuple):
 
 
 def find_ridge(border: Border, negative_damping: bool) -> BoundRidge | None:
-    """The stiffest stable wall with alpha > 0, None where no such wall is stable.
-
-    Raises:
-        ArithmeticError: the rows of the plane contradict what was found.
-    """
+    """The stiffest stable wall with alpha > 0 or None; ArithmeticError where the rows contradict what was found."""
     least = -np.inf if negative_damping else 0.0
     tops = _tops(border, least) if border.curved else []
     for top in tops[:_MOST_TOPS]:

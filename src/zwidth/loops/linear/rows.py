@@ -210,15 +210,10 @@ class Island(NamedTuple):
 
 @dataclass(frozen=True)
 class StablePieces:
-    """The stable set of one loop, piece by piece.
-
-    Args:
-        boundary: of the loop.
-        corners: dampings at which the set's edge has ends or turns, or passes from K > 0 to K < 0.
-    """
+    """The stable set of one loop, piece by piece."""
 
     boundary: Boundary
-    corners: np.ndarray
+    corners: np.ndarray  # dampings at which the set's edge has ends or turns, or passes from K > 0 to K < 0
 
     @cached_property
     def _rows(self) -> tuple[np.ndarray, BoundIntervals]:

@@ -47,24 +47,8 @@ class Structure(NamedTuple):
     negative: bool
 
 
-class _Arguments(NamedTuple):
-    """What the equations depend on beside the unknowns."""
-
-    parts: Any
-    gain: Array
-    zeros: Array
-    poles: Array
-    start: Array
-    codes: Array
-    scales: Array
-
-
 def structure_of(scene: Any, paths: tuple[str, ...], negative: bool) -> Structure:
-    """What is static of a scene when these parameters move.
-
-    Raises:
-        TracedDelayError: how many whole periods the delay has depends on a traced value.
-    """
+    """What is static of a scene when these parameters move; how many whole periods the delay has must be."""
     delay, period = scene.timing.delay, scene.timing.period
     undelayed = isinstance(delay, float) and delay == 0.0
     if is_traced(delay, period) and not undelayed:
@@ -135,30 +119,29 @@ def _solve(structure: Structure, scene: Any, start: Array, codes: Array) -> tupl
     estimate, complexes = chain.estimate, jnp.result_type(start.dtype, jnp.complex64)
     # The size of the unknowns.
     scales = jnp.stack([start[0], jnp.abs(start[0]) + jnp.abs(start[1]), start[2], start[3]])
-    args = _Arguments(
-        jax.tree.map(jnp.asarray, respond(chain)),
-        jnp.asarray(estimate.gain, start.dtype),
-        jnp.asarray(estimate.zeros, complexes),
-        jnp.asarray(estimate.poles, complexes),
-        start,
-        codes,
-        jnp.where(scales > 0, scales, 1.0),
-    )
-    begin = start / args.scales
+    scales = jnp.where(scales > 0, scales, 1.0)
+    moving = {
+        "gain": jnp.asarray(estimate.gain, start.dtype),
+        "zeros": jnp.asarray(estimate.zeros, complexes),
+        "poles": jnp.asarray(estimate.poles, complexes),
+    }
+    begin = start / scales
+    args = (jax.tree.map(jnp.asarray, respond(chain)), moving, start, codes, scales)
     found = polish(partial(_residual, chain), begin, args)
     # Newton must stay where the search put it; a double root is met to half of the digits.
     close = jnp.all(jnp.abs(found - begin) <= 256.0 * float(jnp.finfo(start.dtype).eps) ** 0.5)
-    return *(found * args.scales), close
+    return *(found * scales), close
 
 
-def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
-    """The four equations, of order one."""
-    alpha, beta, w1, w2 = unknowns * args.scales
-    estimate = replace(chain.estimate, gain=args.gain, zeros=args.zeros, poles=args.poles)
+def _residual(chain: Chain, unknowns: Array, args: Any) -> Array:
+    """The four equations, of order one; ``args`` is what they depend on beside the unknowns."""
+    parts, moving, start, codes, scales = args
+    alpha, beta, w1, w2 = unknowns * scales
+    estimate = replace(chain.estimate, **moving)
 
     def distance(w: Array) -> tuple[Array, Array]:
         """``r = alpha + beta F - q`` over the size of q, and F."""
-        q, f = required_wall(chain, w, args.parts), estimate.jet(circle(w)).value
+        q, f = required_wall(chain, w, parts), estimate.jet(circle(w)).value
         size = jax.lax.stop_gradient(jnp.abs(q))
         return (alpha + beta * f - q) / jnp.where(size > 0, size, 1.0), f
 
@@ -168,14 +151,14 @@ def _residual(chain: Chain, unknowns: Array, args: _Arguments) -> Array:
         size = jax.lax.stop_gradient(jnp.abs(f) * jnp.abs(slope))
         across = across / jnp.where(size > 0, size, 1.0)
         # At z = -1 F is real, and may be 0.
-        return r, jnp.where(args.codes[0] == Condition.PAIR, across, slope.imag)
+        return r, jnp.where(codes[0] == Condition.PAIR, across, slope.imag)
 
     # One text for both angles, so that the compiler reads it once.
     r, across = jax.vmap(both)(jnp.stack([w1, w2]))
-    stays = unknowns[2:] - args.start[2:] / args.scales[2:]
+    stays = unknowns[2:] - start[2:] / scales[2:]
     # A pole pair at w, or a real pole where w stays.
-    meet = jnp.stack([r.real, jnp.where(args.codes == Condition.PAIR, r.imag, stays)], -1)
-    which = jnp.maximum(args.codes[1] - Condition.PLUS_ONE, 0)
+    meet = jnp.stack([r.real, jnp.where(codes == Condition.PAIR, r.imag, stays)], -1)
+    which = jnp.maximum(codes[1] - Condition.PLUS_ONE, 0)
     second = jnp.stack(
         [meet[1], jnp.stack([across[0], stays[1]]), jnp.stack([unknowns[1], stays[1]])],
     )[which]

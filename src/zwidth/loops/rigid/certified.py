@@ -32,29 +32,21 @@ FIRST_BITS = 128
 _EXTRA_BITS = 64
 
 
-class Decision(NamedTuple):
-    """What is known of one point."""
-
-    stable: bool
-    status: Status
-    bits: int
-
-
 def available() -> bool:
     """Whether python-flint is installed."""
     return find_spec("flint") is not None
 
 
-def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> Decision:
-    """Decide one point of the domain, taken as exact: alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
+def decide(alpha: float, beta: float, delta: float, d: float, max_bits: int) -> tuple[bool, Status, int]:
+    """Label, status and bits of one exact point: alpha > 0 and beta > -delta, or alpha = 0 and beta > delta."""
     edge, bits = alpha == 0, min(FIRST_BITS, max_bits)
     while True:
         found = verdict(alpha, beta, delta, d, bits)
         if found.stable or found.unstable:
             inside = bool(found.stable)
-            return Decision(inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits)
+            return inside and not edge, Status.ON_BOUNDARY if inside and edge else Status.OK, bits
         if bits == max_bits:
-            return Decision(False, Status.UNDECIDED, bits)
+            return False, Status.UNDECIDED, bits
         bits = min(2 * bits, max_bits)
 
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from functools import cache, wraps
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -98,24 +98,20 @@ def frequency_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyL
     return jnp.stack([re, im])
 
 
-class _Line(NamedTuple):
-    """What the equations depend on beside the unknowns; ``number`` is the alpha or beta of the line."""
+def _residual(line: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Array]) -> Array:
+    """The three equations, of order one; ``unknowns`` are alpha, beta and omega over their scales.
 
-    loop: FrequencyLoop
-    number: Array
-    scales: Array
-
-
-def _residual(line: str, unknowns: Array, args: _Line) -> Array:
-    """The three equations, of order one; ``unknowns`` are alpha, beta and omega over their scales."""
-    alpha, beta, omega = unknowns * args.scales
+    ``args`` are the loop, the alpha or beta of the line, and the scales.
+    """
+    loop, number, scales = args
+    alpha, beta, omega = unknowns * scales
 
     def pole(beta: Array, omega: Array) -> Array:
-        return frequency_residual(omega, alpha, beta, args.loop)
+        return frequency_residual(omega, alpha, beta, loop)
 
     if line != "ridge":
         wall, k = (alpha, beta), int(line == "row")
-        return jnp.append(pole(beta, omega), (wall[k] - args.number) / args.scales[k])
+        return jnp.append(pole(beta, omega), (wall[k] - number) / scales[k])
     zero, one = jnp.zeros_like(beta), jnp.ones_like(beta)
     value, by_beta = jax.jvp(pole, (beta, omega), (one, zero))
     _, by_omega = jax.jvp(pole, (beta, omega), (zero, one))
@@ -130,7 +126,7 @@ def _solve(line: str, start: Array, number: Array, loop: FrequencyLoop, delay_mo
     scale_alpha = jnp.maximum(jnp.abs(wall.alpha), jnp.finfo(start.dtype).tiny)
     scales = jnp.stack([scale_alpha, jnp.maximum(jnp.abs(wall.beta), scale_alpha), jnp.ones_like(start)])
     unknowns = jnp.stack([*wall, start]) / scales
-    omega = polish(lambda *at: _residual(line, *at), unknowns, _Line(loop, number, scales))[2]
+    omega = polish(lambda *at: _residual(line, *at), unknowns, (loop, number, scales))[2]
     omega = store_once(omega, start)
     return omega, frequency_boundary(omega, loop, delay_model)
 

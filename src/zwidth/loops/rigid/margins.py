@@ -12,7 +12,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
 from zwidth.arrays.roots import false_position, follow_root
-from zwidth.arrays.xp import along, epsilon, frozen, namespace, nan_with_nan_slopes
+from zwidth.arrays.xp import along, epsilon, frozen, namespace, nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.crossover import gain_crossover, stable_at
 from zwidth.loops.rigid.device import ANY, DeviceTerms, device, split_delay, valid_wall
 from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, find_angle, modulus, size_and_phase
@@ -96,7 +96,7 @@ def margins_kernel(
     spoiled = nan_with_nan_slopes(ok, alpha, beta, delta, d)
     alpha, beta, delta = xp.where(ok, alpha, 1.0), xp.where(ok, beta, 1.0), xp.where(ok, delta, 1.0)
     d = xp.where(ok, d, 0.0)
-    here = device(delta, d)
+    here = store_once(device(delta, d), delta)
     crossover = gain_crossover(alpha, beta, here)
     crosses = crossover.exists
     w = xp.where(crosses, find_angle(crossover), 1.0)
@@ -211,7 +211,7 @@ def _delay_margin(wall: tuple[Array, ...], d: Array, phase: Array, xp: Any) -> A
 def _bound_undelayed(f: Array, alpha: Array, beta: Array, delta: Array) -> tuple[Array, Array, Array]:
     """Below one period of delay: the phase at the crossover, the crossover, and whether there is one."""
     xp = namespace(f, alpha)
-    here = device(delta, f)
+    here = store_once(device(delta, f), f)
     crossover = gain_crossover(alpha, beta, here)
     w = xp.where(crossover.exists, find_angle(crossover), 1.0)
     return size_and_phase(w, alpha, beta, here)[1], w, crossover.exists

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import along, frozen, namespace, nan_with_nan_slopes, repeat
+from zwidth.arrays.xp import along, apply_each, frozen, namespace, nan_with_nan_slopes, repeat, store_once
 from zwidth.loops.rigid.crossover import Crossover, gain_crossover
 from zwidth.loops.rigid.device import DeviceTerms, device, valid_wall
 from zwidth.words.types import Array, ArrayLike
@@ -95,7 +95,7 @@ def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
     inputs = (alpha, beta, delta, d)
     xp = namespace(*inputs)
     alpha, beta, delta, d = (xp.where(ok, value, 1.0) for value in inputs)
-    return modulus(alpha, beta, device(delta, d))[0] + nan_with_nan_slopes(ok, *inputs)
+    return modulus(alpha, beta, store_once(device(delta, d), delta))[0] + nan_with_nan_slopes(ok, *inputs)
 
 
 def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:
@@ -149,9 +149,8 @@ def _lowest(alpha: Array, beta: Array, here: DeviceTerms, xp: Any) -> Array:
 
     alpha, beta = xp.asarray(alpha), xp.asarray(beta)
     here = DeviceTerms(*(xp.asarray(field) for field in here))
-    center = at(xp.ones_like(alpha))
     # The distance at the crossover is at most 2; at the low end |L| is 3.
-    start = at(3.0 * xp.ones_like(alpha))
+    center, start = apply_each(at, [xp.ones_like(alpha), 3.0 * xp.ones_like(alpha)], xp)
     # With room: the wall's own phase may rise by a quarter turn meanwhile.
     turn = 3.0 * np.pi / (here.whole + 0.5)
     part = along(np.arange(1, _TURN + 1) / _TURN, center)

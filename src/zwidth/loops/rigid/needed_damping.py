@@ -44,15 +44,6 @@ class PeakCondition(NamedTuple):
     needed: Array
 
 
-class Turns(NamedTuple):
-    """The ends of the frequency axis: what is needed there, and whether the peak lies beyond them."""
-
-    at_zero: Array
-    rise: Array  # E at w = 0
-    at_pi: Array
-    reaches_pi: Array  # n = 0 only
-
-
 def describe_delay(d: Array) -> Delay:
     """The `Delay` of d >= 0."""
     n, f = split_delay(d)
@@ -84,14 +75,14 @@ def _rise(a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> tupl
     return needed, rise, by_beta
 
 
-def turns(a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> Turns:
-    """What the wall ``(2 a, beta)`` needs at w = 0 and at w = pi, and where it needs more in between."""
+def turns(a: Array, beta: Array, delay: Delay, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
+    """Of the wall ``(2 a, beta)``: its need at w = 0, E there, its need at w = pi, and whether that is the peak."""
     f, k, _ = delay
     xp = namespace(a, f)
     at_zero, rise, _ = _rise(a, beta, delay, kind)
     b = beta + a
     end = beta * (1.0 - 5.0 * f) - 2.0 * a * f + 0.5 * f * beta * (beta + 2.0 * a) / xp.where(b > 0, b, 1.0)
-    return Turns(at_zero, xp.where(beta > 0, rise, -1.0), b * (1.0 - f), (k == 1) & (end >= 0))
+    return at_zero, xp.where(beta > 0, rise, -1.0), b * (1.0 - f), (k == 1) & (end >= 0)
 
 
 def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> PeakCondition:
@@ -189,9 +180,9 @@ def needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY
     scale = frozen(alpha + xp.abs(beta), xp)
     scale = xp.where(scale > 0, scale, 1.0)
     a, beta = 0.5 * alpha / scale, beta / scale
-    ends = turns(a, beta, delay, kind)
-    rises = ends.rise > 0
-    inside = rises & ~ends.reaches_pi
+    at_zero, rise, at_pi, reaches_pi = turns(a, beta, delay, kind)
+    rises = rise > 0
+    inside = rises & ~reaches_pi
     # Where there is no peak, harmless values that have one.
     a_in, beta_in = xp.where(inside, a, 0.0), xp.where(inside, beta, 1.0)
     if kind.short:
@@ -199,12 +190,12 @@ def needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY
         delay_in = Delay(f_in, delay.k, 4.0 * f_in * (1.0 - f_in))
     else:
         delay_in = delay
-    u = frozen(peak(a_in, beta_in, delay_in, xp.where(inside, ends.rise, 1.0), kind), xp)
+    u = frozen(peak(a_in, beta_in, delay_in, xp.where(inside, rise, 1.0), kind), xp)
     here = condition(u, a_in, beta_in, delay_in, kind)
     # One more step, as its effect on the height: with it the second derivatives are right too.
     curvature = frozen(xp.where(here.bend < 0, here.bend * here.root / here.needed, -1.0), xp)
     height = here.needed - xp.where(here.bend < 0, 0.5 * here.slope * here.slope / curvature, 0.0)
-    return scale * xp.where(rises, xp.where(ends.reaches_pi, ends.at_pi, height), ends.at_zero)
+    return scale * xp.where(rises, xp.where(reaches_pi, at_pi, height), at_zero)
 
 
 def directions(d: Array) -> tuple[Array, Array]:

@@ -11,7 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.xp import angle, apply_each, epsilon, frozen, namespace, nan_unless, nan_with_nan_slopes, repeat
+from zwidth.arrays.xp import (
+    angle,
+    apply_each,
+    epsilon,
+    frozen,
+    namespace,
+    nan_unless,
+    nan_with_nan_slopes,
+    repeat,
+    store_once,
+)
 from zwidth.loops.rigid.circle import Loop, count, factor_loop
 from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
@@ -84,6 +94,11 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     return xp.maximum(0.5 * xp.log(body * wall / (sizes[0] * sizes[1])) / turns, -1.0), im
 
 
+def both_starts(loop: Loop, fractional: bool) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    """The slow pole and the first pair of the ring, roughly."""
+    return _slow_pole(loop), _pair(loop, fractional)
+
+
 def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, Array, Array]:
     """The slow pole and the pair, after so many steps from their starts."""
 
@@ -92,7 +107,7 @@ def both_poles(steps: int, loop: Loop, fractional: bool) -> tuple[Array, Array, 
     def follow(start: tuple[Array, Array]) -> tuple[Array, Array]:
         return repeat(steps, lambda at: halley_step(*at, loop, fractional), start, xp)
 
-    slow, pair = apply_each(follow, [_slow_pole(loop), _pair(loop, fractional)], xp)
+    slow, pair = apply_each(follow, both_starts(loop, fractional), xp)
     return (*slow, *pair)
 
 
@@ -174,7 +189,7 @@ def traced_kernel(alpha: Array, beta: Array, delta: Array, d: Array, fractional:
     from jax.lax import cond
 
     xp = namespace(alpha, beta, delta, d)
-    loop = factor_loop(alpha, beta, delta, d, fractional)
+    loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
     still = frozen(loop, xp)
     eps = epsilon(still.c)
     found = certify_pole(*candidate(still, fractional), eps**0.58, still, fractional, False)

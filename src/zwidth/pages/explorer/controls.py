@@ -1,15 +1,16 @@
-"""What can be set on the page: the numbers and the parts of a scene."""
+"""What can be set on the page, the numbers and the parts of a scene; and the view as text that reproduces it."""
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from zwidth.parts.device import Device
-from zwidth.parts.paths import PARTS, find_parts
+from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
 from zwidth.parts.wall import VirtualWall
@@ -24,6 +25,22 @@ from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
 _MOST_POLES = 80
 # Of a number that the page sends, in its units.
 _LARGEST = 1e100
+_SCRIPT = """\
+import matplotlib.pyplot as plt
+import zwidth
+
+{notes}scene = {scene}
+verdict = zwidth.assess(scene)
+print("stable" if verdict.stable else "UNSTABLE", f"spectral radius {{verdict.spectral_radius:.6f}}")
+print(f"K_max = {{scene.max_stiffness().stiffness:.6g}} {unit}")
+
+for outline in scene.stable_region():
+    plt.fill(outline.stiffness, outline.virtual_damping, fill=False)
+plt.plot(scene.wall.stiffness, scene.wall.virtual_damping, "o")
+plt.xlabel("{x}")
+plt.ylabel("{y}")
+plt.show()
+"""
 
 
 class Slider(NamedTuple):
@@ -65,21 +82,19 @@ CHOICES = {
 CHOICES["coupling"] |= {"motor": "tip, sensor at the motor", "tip": "tip, sensor at the tip"}
 
 
-def _small_device() -> Scene:
-    return Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3), VirtualWall(10e3, 40.0))
+_SMALL_DEVICE = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3), VirtualWall(10e3, 40.0))
 
 
 @dataclass(frozen=True)
 class Controls:
     """A scene with its wall; a normalized one has m = 1 and T = 1, so that K is alpha and B is beta."""
 
-    scene: Scene = field(default_factory=_small_device)
+    scene: Scene = _SMALL_DEVICE
     normalized: bool = False
     scale: tuple[float, float] = (0.1, 1e-3)  # mass and period that a normalized scene takes when it gets units again
 
     @property
     def wall(self) -> tuple[float, float]:
-        """K and B."""
         return float(self.scene.wall.stiffness), float(self.scene.wall.virtual_damping)
 
     def shown(self) -> dict[str, Any]:
@@ -97,11 +112,7 @@ class Controls:
         return found | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
-        """New controls with some values as the page shows them.
-
-        Raises:
-            InputError: a name or a value is not one that the page has, or a part refuses it.
-        """
+        """New controls with some values as the page shows them; what it does not have is an `InputError`."""
         new = self
         for name, value in shown.items():
             if name in CHOICES:
@@ -120,11 +131,7 @@ class Controls:
         return new.check()
 
     def check(self) -> Controls:
-        """The same, if the page can follow them.
-
-        Raises:
-            InputError: the loop has too many poles.
-        """
+        """The same, if the page can follow so many poles."""
         # Where parts refuse only together, as a cut-off beyond half the sampling rate, the loop does.
         order = self.scene.loop.roots.order
         if order > _MOST_POLES:
@@ -171,18 +178,12 @@ def _find_form(part: Any) -> str:
 
 
 def normalized_controls(alpha: float, beta: float, delta: float, d: float) -> Controls:
-    """The controls of a normalized wall."""
     scene = Scene(Device(1.0, float(delta)), Timing(1.0, float(d)), VirtualWall(float(alpha), float(beta)))
     return Controls(scene, normalized=True)
 
 
 def read_controls(path: Path | None) -> Controls:
-    """The scene of a configuration, or of the one that a run folder has recorded; without either, a small device.
-
-    Raises:
-        InputError: there is no scene, or none that the page can show.
-        ConfigError: the configuration has faults.
-    """
+    """The scene of a configuration, or of the one that a run folder has recorded; without either, a small device."""
     if path is None:
         return Controls()
     if path.is_dir():
@@ -207,3 +208,36 @@ def read_controls(path: Path | None) -> Controls:
         wall, half = (0.0, 0.0), 0.5 * float(best.stiffness)
         wall = (half, choose_damping(controls.scene, best, half)) if isfinite(half) else wall
     return replace(controls, scene=replace(controls.scene, wall=VirtualWall(*wall))).check()
+
+
+def to_yaml(controls: Controls) -> str:
+    """A configuration: the scene, its stable walls and, of a rigid device, the passive ones and the response."""
+    scene = controls.scene
+    studies: list[dict[str, Any]] = [{"kind": "boundary", "name": "stable_walls"}]
+    if not scene.parts_beyond:
+        studies[0] |= {"passivity": True} if scene.operator is None else {}
+        studies.append({"kind": "step", "name": "response"})
+    # JSON is YAML of one line.
+    lines = ["version: 1", "name: explored", "scene:"]
+    own = {name: value for name, value in controls.shown().items() if name != "mode"}
+    section = own if controls.normalized else spell_scene(scene)
+    lines += [f"  {name}: {json.dumps(value)}" for name, value in section.items()]
+    return "\n".join([*lines, "studies:", *(f"  - {json.dumps(study)}" for study in studies)]) + "\n"
+
+
+def to_python(controls: Controls) -> str:
+    """A script that builds the scene, judges its wall and draws the stable set."""
+    parts = spell_part(controls.scene)
+    text = "zwidth.Scene(\n" + "".join(f"    {name}={_spell(part)},\n" for name, part in parts.items()) + ")"
+    normalized = {"notes": "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "unit": "(alpha)"}
+    normalized |= {"x": "normalized stiffness alpha", "y": "normalized damping beta"}
+    physical = {"notes": "", "unit": "N/m", "x": "stiffness K in N/m", "y": "virtual damping B in N s/m"}
+    return _SCRIPT.format(scene=text, **(normalized if controls.normalized else physical))
+
+
+def _spell(part: Any) -> str:
+    """A part as Python writes it."""
+    if not hasattr(part, "__dataclass_fields__"):
+        return repr(part)
+    given = ", ".join(f"{name}={_spell(value)}" for name, value in spell_part(part).items())
+    return f"zwidth.{type(part).__name__}({given})"

@@ -95,7 +95,6 @@ def _on_edge(scene: Scene, stiffness: np.ndarray, damping: np.ndarray) -> Curve:
 
 
 def judge_quickly(scene: Scene) -> tuple[bool, np.ndarray]:
-    """Whether the scene's wall is stable, and its poles."""
     return bool(scene.decide_stability(method="companion").stable), scene.poles()
 
 
@@ -203,5 +202,4 @@ def normalized_lines(verdict: Assessment) -> list[str]:
 
 
 def word_of(verdict: Assessment) -> str:
-    """The verdict in a word."""
     return "marginal" if verdict.marginal else "stable" if verdict.stable else "UNSTABLE"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Iterator
 from concurrent.futures import Executor
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -16,26 +17,24 @@ from bokeh.plotting import figure
 
 from zwidth.figures import style
 from zwidth.pages.explorer import model
-from zwidth.pages.explorer.controls import Controls
-from zwidth.pages.explorer.details import IMPORTING, Update, Wish, Words, compute_details, show_outlines
-from zwidth.pages.explorer.recipes import to_python, to_yaml
+from zwidth.pages.explorer.controls import Controls, to_python, to_yaml
+from zwidth.pages.words import check_lines, list_slopes
 from zwidth.parts.wall import VirtualWall
+from zwidth.scenes.assessment import Assessment, assess, limits_of
+from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
 
+# Held while JAX is being imported: what looks for it meanwhile would find half of it.
+IMPORTING = Lock()
+
+# What a part of the page shows: the columns of a source, or a text, by name.
+Update = dict[str, Any]
 # A message holds some dozen numbers.
 _LONGEST_MESSAGE = 4000
-_COLUMNS = {
+_POINTS = ("edge", "passive", "ridge", "best", "wall", "poles", "nyquist", "crossover", "step")
+_COLUMNS = dict.fromkeys(_POINTS, ("x", "y")) | {
     "area": ("xs", "ys"),
-    "edge": ("x", "y"),
     "contours": ("xs", "ys", "x", "y", "text"),
-    "passive": ("x", "y"),
-    "ridge": ("x", "y"),
-    "best": ("x", "y"),
-    "wall": ("x", "y"),
-    "poles": ("x", "y"),
-    "nyquist": ("x", "y"),
-    "crossover": ("x", "y"),
-    "step": ("x", "y"),
     "contact": ("x", "position", "force"),
 }
 # What hangs on the device and takes its time: another device's is taken away at once.
@@ -46,11 +45,77 @@ _DARK = {"ink": "#F2F2F2", "faint": "#A6A6A6", "edge": style.SKY, "passive": "#2
 _TURN = np.linspace(0.0, 2.0 * np.pi, 361)
 
 
+@dataclass(frozen=True)
+class Wish:
+    """What is to be computed."""
+
+    scene: Scene
+    normalized: bool
+    across: model.Range
+    up: model.Range
+    outline: bool  # of a device that has changed
+    contact: bool
+    costly: bool  # what takes seconds in a scene with parts
+
+
+def compute_details(wish: Wish) -> Iterator[Update]:
+    """The parts in the order in which they are wanted; whoever asks may stop after each."""
+    scene, quick = wish.scene, wish.scene.loop.outline() is not None
+    if wish.outline and not quick:
+        yield show_outlines(model.outlines(scene))
+    verdict = assess(scene)
+    own = model.normalized_lines(verdict) if wish.normalized else None
+    lines = own or check_lines(scene, verdict, [])
+    yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(wish, verdict)}
+    if wish.outline:
+        passive = model.passive_set(scene)
+        x, y = passive if passive is not None else (np.empty(0), np.empty(0))
+        yield {"passive": {"x": x, "y": y}, "contours": model.contours(scene, wish.across, wish.up)}
+    if not own:
+        yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
+    if wish.contact or (wish.costly and not quick):
+        with IMPORTING:
+            import jax  # noqa: F401
+    if quick or wish.costly:
+        x, y = model.ridge_path(scene)
+        yield {"ridge": {"x": x, "y": y}}
+        yield {"slopes": "\n".join([] if wish.normalized else [slope.line() for slope in list_slopes(scene)])}
+    if wish.contact:
+        time, position, force, text = model.contact_motion(scene, 2 * model.length_of(scene, verdict))
+        position = position * _length(wish)
+        yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}
+
+
+def show_outlines(outlines: list[model.Curve]) -> Update:
+    """All outlines, closed, as one line and as one area: what lies within two of them is a hole."""
+    xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines] for axis in (0, 1))
+    x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
+    return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}}
+
+
+def _length(wish: Wish) -> float:
+    """How many of the units of length that the page shows are one of the scene's: it shows millimeters."""
+    return 1.0 if wish.normalized else 1e3
+
+
+def _wall_curves(wish: Wish, verdict: Assessment) -> Update:
+    scene = wish.scene
+    curve, cross = model.nyquist_curve(scene), model.crossover(scene, verdict)
+    time, position = model.step_motion(scene, model.length_of(scene, verdict))
+    best = verdict.stiffness_max, verdict.virtual_damping_at_max
+    return {
+        "nyquist": {"x": np.real(curve), "y": np.imag(curve)},
+        "crossover": {"x": [cross.real], "y": [cross.imag]},
+        "step": {"x": time, "y": position * _length(wish)},
+        "best": {"x": [best[0]], "y": [best[1]]},
+    }
+
+
 class Page:
     """One open page."""
 
-    def __init__(self, document: Document, controls: Controls, words: Words, executor: Executor) -> None:
-        self.document, self.controls, self.words, self.executor = document, controls, words, executor
+    def __init__(self, document: Document, controls: Controls, executor: Executor) -> None:
+        self.document, self.controls, self.executor = document, controls, executor
         self.generation, self.serial, self.dark = 0, 0, False
         self.device: tuple[Any, ...] = ()
         self.drawn = False
@@ -64,23 +129,20 @@ class Page:
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))
         self.inks: list[tuple[Any, str, str]] = []
         self.frame: tuple[model.Range, model.Range] | None = None
-        self.plots = {name: draw() for name, draw in self._drawings().items()}
+        self.plots = {
+            "plane": self._draw_plane(),
+            "poles": self._draw_poles(),
+            "nyquist": self._draw_nyquist(),
+            "step": self._draw_motion("step", "y"),
+            "contact": self._draw_motion("contact", "position"),
+            "force": self._draw_motion("contact", "force"),
+        }
         self.plots["plane"].tags = [self.inputs, self.answer]
         self.plots["plane"].on_event(Tap, self._tap)
         for name, plot in self.plots.items():
             plot.name = name
             document.add_root(plot)
         self._paint()
-
-    def _drawings(self) -> dict[str, Callable[[], figure]]:
-        return {
-            "plane": self._draw_plane,
-            "poles": self._draw_poles,
-            "nyquist": self._draw_nyquist,
-            "step": lambda: self._draw_motion("step", "y", "position over force"),
-            "contact": lambda: self._draw_motion("contact", "position", "position"),
-            "force": lambda: self._draw_motion("contact", "force", "wall force"),
-        }
 
     def _new(self, height: int, **keywords: Any) -> figure:
         tools = "pan,wheel_zoom,box_zoom,reset"
@@ -145,14 +207,12 @@ class Page:
         plot.xaxis.axis_label, plot.yaxis.axis_label = "Re L", "Im L"
         return plot
 
-    def _draw_motion(self, source: str, column: str, label: str) -> figure:
+    def _draw_motion(self, source: str, column: str) -> figure:
         plot = self._new(220)
         self._add(plot, "line", source, "edge", x="x", y=column, line_width=2)
-        plot.xaxis.axis_label, plot.yaxis.axis_label = "time", label
         return plot
 
     def _paint(self) -> None:
-        """Colors for a light page or a dark one."""
         inks = _DARK if self.dark else _LIGHT
         for glyph, name, ink in self.inks:
             setattr(glyph, name, inks[ink])
@@ -253,7 +313,7 @@ class Page:
     def _compute(self, generation: int, wish: Wish) -> None:
         """In the worker's thread: compute part by part, unless something newer is wanted."""
         try:
-            for update in compute_details(wish, self.words):
+            for update in compute_details(wish):
                 if generation != self.generation:
                     return
                 self._hand_over(generation, update)
@@ -262,7 +322,6 @@ class Page:
             self._hand_over(generation, {"error": _explain(error), "busy": False})
 
     def close(self) -> None:
-        """Want nothing more."""
         self.generation += 1
 
     def _hand_over(self, generation: int, update: Update) -> None:

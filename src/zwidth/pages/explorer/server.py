@@ -28,7 +28,6 @@ from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler, RedirectHandler, RequestHandler, StaticFileHandler
 
 from zwidth.pages.explorer.controls import CHOICES, SLIDERS, Controls
-from zwidth.pages.explorer.details import Words
 from zwidth.pages.explorer.page import Page
 from zwidth.words.errors import InputError
 
@@ -88,7 +87,6 @@ class _Closed(RequestHandler):
     """What the browser is told of everything of ours."""
 
     def set_default_headers(self) -> None:
-        """Nothing from elsewhere, nothing for elsewhere."""
         self.set_header("Content-Security-Policy", _POLICY.format(host=self.application.host))  # pyright: ignore[reportAttributeAccessIssue]
         self.set_header("Referrer-Policy", "no-referrer")
         self.set_header("X-Content-Type-Options", "nosniff")
@@ -126,7 +124,7 @@ class PageHandler(_Closed, SessionHandler):
 class Explorer:
     """A server that listens; `run` serves until it is told to stop."""
 
-    def __init__(self, controls: Controls, words: Words, port: int = 0) -> None:
+    def __init__(self, controls: Controls, port: int = 0) -> None:
         try:
             listening = socket.create_server((HOST, port), backlog=256)
         except OSError as error:
@@ -144,7 +142,7 @@ class Explorer:
 
         def make(document: Document) -> None:
             document.title = "zwidth explore"
-            page = Page(document, controls, words, self._executor)
+            page = Page(document, controls, self._executor)
             document.on_session_destroyed(lambda _: page.close())
 
         application = GuardedServer(make, token, self.port)
@@ -153,7 +151,6 @@ class Explorer:
         self._server = BaseServer(self.loop, application, http)
 
     def run(self) -> None:
-        """Serve until Ctrl-C or SIGTERM."""
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 signal.signal(number, lambda *_: self.loop.add_callback_from_signal(self.loop.stop))

@@ -10,16 +10,26 @@ from collections.abc import Iterator
 from html import escape
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from string import Template
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from zwidth.config.study import KINDS
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
-from zwidth.sweep.files.whole import write_whole
+from zwidth.sweep.files import write_whole
 from zwidth.sweep.store import SUFFIX
 from zwidth.words.errors import StoreError
+from zwidth.words.quantities import OUTPUTS, VARIABLES
+
+if TYPE_CHECKING:
+    import xarray
 
 FILE = "report.html"
+_GRAY = "not finite, or not known"
+# Of each axis of a slice, of each other axis, and numbers a map in all: half a megabyte.
+_ALONG, _OTHERS, _MOST = 120, 9, 120_000
 
 
 def write_report(folder: str | os.PathLike[str], out: str | os.PathLike[str] | None = None) -> Path:
@@ -77,26 +87,36 @@ def _check(record: Record, done: list[dict[str, Any]]) -> None:
 
 
 def _page(where: Path, content: dict[str, Any], done: list[dict[str, Any]]) -> str:
-    style, script = (_resource(name) for name in ("report.css", "report.js"))
-    name = escape(str(content.get("name", where.name)))
-    policy = (
-        f"default-src 'none'; img-src data:; style-src '{_digest(style)}'; script-src '{_digest(script)}'; "
-        "base-uri 'none'; form-action 'none'"
+    html, style, script = (
+        files("zwidth.pages.report").joinpath(f"report.{kind}").read_text(encoding="utf-8")
+        for kind in ("html", "css", "js")
     )
-    contents = "".join(f'<li><a href="#{escape(each["name"])}">{escape(each["name"])}</a></li>' for each in done)
-    sections = "".join(_section(where, entry) for entry in done)
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f'<meta http-equiv="Content-Security-Policy" content="{policy}">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="referrer" content="no-referrer">'
-        f"<title>{name}: stability of virtual walls</title><style>{style}</style></head><body><main>"
-        f"<h1>{name}</h1><p>{escape(str(content.get('description') or ''))}</p>"
-        f'<p class="soft">Computed from {escape(str(content.get("started", "")))} on, in '
-        f"{escape(str(content.get('precision', 'float64')))}, by zwidth "
-        f"{escape(str(content['versions'].get('zwidth', '')))}.</p>"
-        f'<nav aria-label="Studies"><ul>{contents}<li><a href="#again">How to compute it again</a></li></ul></nav>'
-        f"{sections}{_reproduce(where, content)}</main><script>{script}</script></body></html>\n"
+    digests = [base64.b64encode(hashlib.sha256(text.encode()).digest()).decode() for text in (style, script)]
+    path = where / CONFIG_FILE
+    config = path.read_text(encoding="utf-8") if path.is_file() and not path.is_symlink() else ""
+    texts = {
+        "name": content.get("name", where.name),
+        "description": content.get("description") or "",
+        "started": content.get("started", ""),
+        "precision": content.get("precision", "float64"),
+        "release": content["versions"].get("zwidth", ""),
+        "digest": content.get("config_sha256", ""),
+    }
+    rows = "".join(
+        f'<tr><th scope="row">{escape(name)}</th><td>{escape(str(version))}</td></tr>'
+        for name, version in content["versions"].items()
+    )
+    return Template(html).substitute(
+        {name: escape(str(text)) for name, text in texts.items()},
+        style=style,
+        script=script,
+        style_digest=digests[0],
+        script_digest=digests[1],
+        contents="".join(f'<li><a href="#{escape(each["name"])}">{escape(each["name"])}</a></li>' for each in done),
+        sections="".join(_section(where, entry) for entry in done),
+        beside=f" Beside it goes the folder <code>{INPUTS}</code> of the run." if content.get("inputs") else "",
+        versions=_scrolling("Versions", f"<tbody>{rows}</tbody>"),
+        config=f'<h3>Configuration</h3><pre tabindex="0">{escape(config)}</pre>' if config else "",
     )
 
 
@@ -113,7 +133,6 @@ def _section(where: Path, entry: dict[str, Any]) -> str:
 
 
 def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
-    """Figures, slices and tables of a study."""
     for file in sorted(entry.get("files", {})):
         path = where / file
         if file.endswith(".svg"):
@@ -129,8 +148,6 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
             # Stores are not read through links: what one leads to may be anybody's.
             yield f'<p class="soft">{escape(file)} is a link, and not shown.</p>'
         elif file.endswith(SUFFIX):
-            from zwidth.pages.report.slices import find_slices
-
             with open_dataset(path) as data:
                 if not data.attrs["complete"]:
                     raise StoreError(f"{path}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
@@ -149,34 +166,85 @@ def _published(content: dict[str, Any]) -> str:
     )
 
 
-def _reproduce(where: Path, content: dict[str, Any]) -> str:
-    versions = "".join(
-        f'<tr><th scope="row">{escape(name)}</th><td>{escape(str(version))}</td></tr>'
-        for name, version in content["versions"].items()
-    )
-    path = where / CONFIG_FILE
-    text = path.read_text(encoding="utf-8") if path.is_file() and not path.is_symlink() else ""
-    beside = f" Beside it goes the folder <code>{INPUTS}</code> of the run." if content.get("inputs") else ""
-    config = f'<h3>Configuration</h3><pre tabindex="0">{escape(text)}</pre>' if text else ""
-    digest = escape(str(content.get("config_sha256", "")))
-    return (
-        '<section><h2 id="again">How to compute it again</h2>'
-        "<p>Save the configuration below as <code>config.yaml</code>, install these versions, and run "
-        f"<code>zwidth run config.yaml</code>.{beside} The same versions give the same numbers.</p>"
-        f'<p class="soft">SHA-256 of the configuration: {digest}</p>'
-        + _scrolling("Versions", f"<tbody>{versions}</tbody>")
-        + f"{config}</section>"
-    )
-
-
 def _scrolling(name: str, rows: str) -> str:
     """A table that scrolls by itself where the page is narrow, by keyboard as well."""
     return f'<div class="wide" tabindex="0" role="region" aria-label="{name}"><table>{rows}</table></div>'
 
 
-def _resource(name: str) -> str:
-    return files("zwidth.pages.report").joinpath(name).read_text(encoding="utf-8")
+def find_slices(data: xarray.Dataset) -> Iterator[str]:
+    """The maps of a store, as HTML."""
+    # Loads matplotlib.
+    from zwidth.figures.grid import choose_axes
+
+    # A store lists its variables in any order.
+    for name in (name for name in OUTPUTS if name in data and name != "kind"):
+        axes = choose_axes(data, name)
+        if len(axes) == 2 and "device" not in axes:
+            yield _draw(data[name], name, *axes)
 
 
-def _digest(text: str) -> str:
-    return f"sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}"
+def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
+    from zwidth.figures.style import pick_evenly
+
+    output = OUTPUTS[name]
+    others = [str(dim) for dim in values.dims if dim not in (x, y)]
+    along = min(_ALONG, int(np.sqrt(_MOST / max(1, np.prod([min(values.sizes[dim], _OTHERS) for dim in others])))))
+    most = {dim: along if dim in (x, y) else _OTHERS for dim in map(str, values.dims)}
+    thin = values.isel({dim: pick_evenly(values.sizes[dim], count) for dim, count in most.items()})
+    thin = thin.transpose(*others, y, x).load()
+    numbers = thin.values.astype(np.float32)
+    finite = numbers[np.isfinite(numbers)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+    steep = output.look in ("logarithmic", "steep") and low > 0
+    content = {
+        "name": name,
+        "unit": _unit(thin),
+        "truth": output.dtype == "bool",
+        "scale": "log" if steep else "linear",
+        "low": low,
+        "high": min(high, 1e4 * low) if steep else high,
+        "x": _axis(thin, x),
+        "y": _axis(thin, y),
+        "others": [_axis(thin, dim) for dim in others],
+        "values": base64.b64encode(np.where(np.isfinite(numbers), numbers, np.nan).astype("<f4").tobytes()).decode(),
+    }
+    words = f"{output.long_name}, over {_words(x)} (across) and {_words(y)} (up)"
+    sliders = "".join(
+        f'<label>{escape(_words(dim))}: <span></span><input type="range" min="0" max="{thin.sizes[dim] - 1}" value="0">'
+        "</label>"
+        for dim in others
+    )
+    ends = (
+        f"not {name}, {name}"
+        if output.dtype == "bool"
+        else f"{low:.4g} to {content['high']:.4g} {_unit(thin)}".rstrip()
+    )
+    thinned = "" if thin.size == values.size else f" Shown are {thin.size:,} of {values.size:,} values."
+    return (
+        f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
+        f"Dark to bright: {ends}; gray: {_GRAY}.{thinned} "
+        "Point, or focus the map and use the arrow keys, to read a value.</p>"
+        f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
+        f'</output><script type="application/json">{_embed(content)}</script></div>'
+    )
+
+
+def _axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:
+    along = values[dim]
+    labels = along.dtype.kind not in "biuf"
+    steps = [str(label) for label in along.values] if labels else np.asarray(along.values, float).tolist()
+    return {"name": _words(dim), "unit": "" if labels else _unit(along), "values": steps}
+
+
+def _unit(values: xarray.DataArray) -> str:
+    unit = str(values.attrs.get("units", ""))
+    return "" if unit == "1" else unit
+
+
+def _words(dim: str) -> str:
+    return VARIABLES[dim].words if dim in VARIABLES else dim
+
+
+def _embed(content: dict[str, Any]) -> str:
+    """JSON that ends no script element."""
+    return json.dumps(content, separators=(",", ":")).replace("<", "\\u003c")

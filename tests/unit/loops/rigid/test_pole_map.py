@@ -102,3 +102,30 @@ def test_what_is_no_map_is_left_to_the_points():
     assert found is not None
     assert found[2] == (2, BETA.size, ALPHA.size)
     assert ALPHA.size * BETA.size >= SMALLEST_MAP
+
+
+def double_pole(z, delta, d):
+    """The wall with a double pole at a real z: there beta f' = Q' and alpha + beta f = Q."""
+    coefficients = [np.asarray(zwidth.char_poly(*wall, delta, d)) for wall in ((0, 0), (1, 0), (0, 1))]
+    device, stiff, damped = coefficients[0], coefficients[1] - coefficients[0], coefficients[2] - coefficients[0]
+    value = [np.polyval(p, z) for p in (device, stiff, damped)]
+    slope = [np.polyval(np.polyder(p), z) for p in (device, stiff, damped)]
+    matrix = np.array([[value[1], value[2]], [slope[1], slope[2]]])
+    return np.linalg.solve(matrix, -np.array([value[0], slope[0]]))
+
+
+@pytest.mark.parametrize(("z", "d"), [(0.9, 0.0), (0.85, 1.0), (0.95, 4.0), (0.9, 1.5)])
+@pytest.mark.parametrize("width", [0.05, 1e-4])
+def test_two_poles_that_meet_are_followed_together(z, d, width):
+    """A map across a double pole: half of its walls have two real poles, the others a pair."""
+    alpha, beta = double_pole(z, 0.1, d)
+    alphas, betas = (middle * (1.0 + width * np.linspace(-1.0, 1.0, 64)) for middle in (alpha, beta))
+    found, missing = follow_poles(Area.whole(alphas[None], betas[None], np.array([0.1]), np.array([d])), 1e-9)
+    assert missing.shape[1] < 64
+    columns = [np.tile(alphas, 64), np.repeat(betas, 64), np.full(4096, 0.1), np.full(4096, d)]
+    alone = outermost_poles(columns, 1e-9)
+    error = np.where(np.isinf(found.error), 0.0, np.abs(found.re - alone.re.reshape(1, 64, 64)))
+    assert (error <= found.error + alone.error.reshape(1, 64, 64)).all()
+    np.testing.assert_allclose(np.exp(found.re[0, 31, 31]), z, atol=0.2)
+    real = np.sin(alone.im) < 1e-6
+    assert 0.1 < real.mean() < 0.9

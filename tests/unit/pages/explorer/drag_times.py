@@ -9,9 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from bokeh.document import Document
 
-from zwidth.cli.explore import check_lines, slope_lines
 from zwidth.pages.explorer.controls import Controls
-from zwidth.pages.explorer.details import Words
 from zwidth.pages.explorer.page import Page
 
 SCENES = {
@@ -34,7 +32,7 @@ def main() -> None:
     print(f"{'scene':<28}{'wall clock: median':>20}{'90 %':>8}{'processor: median':>20}{'90 %':>8}")
     with ThreadPoolExecutor(1) as executor:
         for name, change in SCENES.items():
-            page = Page(Document(), Controls().change(change), Words(check_lines, slope_lines), executor)
+            page = Page(Document(), Controls().change(change), executor)
             moved = "delta" if page.controls.normalized else "damping"
             spent = []
             for k in range(UPDATES):

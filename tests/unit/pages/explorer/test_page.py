@@ -11,7 +11,7 @@ from click.testing import CliRunner
 from open_pages import open_page, say
 
 from zwidth.cli.commands import cli
-from zwidth.pages.explorer import details, model
+from zwidth.pages.explorer import model
 from zwidth.pages.explorer.controls import Controls
 
 
@@ -126,7 +126,7 @@ def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
     def fail(scene):
         raise ZeroDivisionError("far away")
 
-    monkeypatch.setattr(details, "assess", fail)
+    monkeypatch.setattr("zwidth.pages.explorer.page.assess", fail)
     say(page, rest=True)
     page.queue.work()
     assert page.texts["error"] == "ZeroDivisionError: far away"

@@ -6,8 +6,7 @@ import matplotlib.pyplot as plt
 import pytest
 
 import zwidth
-from zwidth.pages.explorer.controls import Controls, normalized_controls, read_controls
-from zwidth.pages.explorer.recipes import to_python, to_yaml
+from zwidth.pages.explorer.controls import Controls, normalized_controls, read_controls, to_python, to_yaml
 
 VIEWS = {
     "rigid": Controls(),

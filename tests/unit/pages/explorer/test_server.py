@@ -8,9 +8,7 @@ import pytest
 
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
 
-from zwidth.cli.explore import check_lines, slope_lines
 from zwidth.pages.explorer.controls import Controls
-from zwidth.pages.explorer.details import Words
 from zwidth.pages.explorer.server import Explorer
 
 
@@ -22,7 +20,7 @@ def explorer():
     def serve():
         loop = asyncio.new_event_loop()
         asyncio.set_event_loop(loop)
-        made.append(Explorer(Controls(), Words(check_lines, slope_lines)))
+        made.append(Explorer(Controls()))
         ready.set()
         made[0].run()
         made[0].loop.close(all_fds=True)

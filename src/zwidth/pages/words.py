@@ -1,4 +1,4 @@
-"""What `zwidth check` and `zwidth ridge` say of a scene, its wall and what limits it, in plain words."""
+"""What `zwidth check`, `zwidth ridge` and the explorer say of a scene, its wall and what limits it, in plain words."""
 
 from __future__ import annotations
 
@@ -30,8 +30,15 @@ def print_json(result: Any) -> None:
     click.echo(json.dumps(to_json(result), indent=2, allow_nan=False))
 
 
+def tell(result: Any, lines: list[str], as_json: bool) -> None:
+    """Print an answer for machines, or its lines for people."""
+    if as_json:
+        print_json(result)
+    for line in () if as_json else lines:
+        click.echo(line)
+
+
 def scene_lines(scene: Scene) -> list[str]:
-    """Device, timing and parts."""
     device, timing = scene.device, scene.timing
     lines = [
         row("device", f"m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}"),
@@ -73,7 +80,6 @@ def stability_word(stable: bool, marginal: bool = False) -> str:
 
 
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
-    """The verdict on a scene's wall."""
     wall = scene.wall
     word = stability_word(verdict.stable, verdict.marginal)
     best = "none: no stiffness is stable at any damping"
@@ -160,8 +166,13 @@ def pole_words(constant: float, frequency: float) -> str:
     return f"{verb} with time constant {with_unit(abs(constant), 's')}{swing}"
 
 
+def check_lines(scene: Scene, verdict: Assessment, limits: list[Limit]) -> list[str]:
+    """What `zwidth check` says of a scene's wall, without color."""
+    lines = [*verdict_lines(scene, verdict), *limit_lines(limits), *note_lines(scene_notes(scene))]
+    return [click.unstyle(line) for line in lines]
+
+
 def limit_lines(limits: list[Limit]) -> list[str]:
-    """What limits the stiffest wall, the largest gain first."""
     lines = []
     for limit in limits:
         if isfinite(limit.stiffness):
@@ -172,12 +183,8 @@ def limit_lines(limits: list[Limit]) -> list[str]:
 
 
 def friction_lines(rule: FrictionRule) -> list[str]:
-    """The rule of friction and resolution."""
-    parts = []
-    if rule.by_damping is not None:
-        parts.append(f"2 b/T = {with_unit(rule.by_damping, 'N/m')}")
-    if rule.by_friction is not None:
-        parts.append(f"2 f_c/Q = {with_unit(rule.by_friction, 'N/m')}")
+    ends = {"2 b/T": rule.by_damping, "2 f_c/Q": rule.by_friction}
+    parts = [f"{name} = {with_unit(end, 'N/m')}" for name, end in ends.items() if end is not None]
     if rule.stiffness is None:
         parts.append("both are needed for the rule")
     else:
@@ -209,6 +216,10 @@ def scene_notes(scene: Scene) -> list[str]:
     return [*coded_period_notes(scene), *describe_islands(scene)]
 
 
+def note_lines(notes: list[str]) -> list[str]:
+    return [row("note", note) for note in notes]
+
+
 class Slope(NamedTuple):
     """The derivative of K_max in one parameter of a scene, and what a small step of it comes to in words."""
 
@@ -218,11 +229,9 @@ class Slope(NamedTuple):
     words: str
 
     def line(self) -> str:
-        """For people."""
         return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
-        """For machines."""
         return {"value": self.value, "unit": self.unit}
 
 

@@ -1,22 +1,30 @@
-"""Figs. 5, 7 and 8: stability boundaries in the (alpha, beta) plane."""
+"""The (alpha, beta) plane: stability boundaries (Figs. 5, 7 and 8), and maps of an output."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
+from itertools import product
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import ListedColormap, Normalize
+from matplotlib.colors import ListedColormap, Normalize, TwoSlopeNorm
 from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 
-from zwidth.figures import style
-from zwidth.figures.region import draw_zeros, mark_wall, shade_region
+from zwidth.figures import stable_set, style
+from zwidth.figures.stable_set import draw_zeros, mark_wall, shade_region
 from zwidth.figures.table import Table, curves, select, si_scale
 from zwidth.words.errors import InputError
 
 # A legend of more entries than this is harder to read than a color bar.
 _LEGEND_ENTRIES = 8
+# A grid of more panels than this says nothing on a page: evenly spaced deltas and delays stand for all.
+_PANELS = 3
+
+# Light, so that labels and curves drawn over them stay legible; in gray, passive is the darker one.
+SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
 
 
 @style.house_style()
@@ -47,7 +55,7 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
     if not apart and len(panels) > 1:
         raise InputError(f"axes: got {len(panels)} for {len(delays)} delays; give one for all, or one for each")
     for panel, d in zip(panels, delays, strict=False):
-        _draw_panel(panel, select(table, d=d) if apart else select(table), colors, scale)
+        _draw_boundaries(panel, select(table, d=d) if apart else select(table), colors, scale)
         if apart:
             panel.set_title(f"$d = {d:g}$")
     style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
@@ -62,7 +70,7 @@ def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray
     return panels
 
 
-def _draw_panel(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[float, float] | None) -> None:
+def _draw_boundaries(ax: Axes, table: Table, colors: dict[float, Any], scale: tuple[float, float] | None) -> None:
     """Draw all of a table into one Axes, without labels."""
     edges = curves(table, "d", "delta", "delay_model", curve="boundary")
     # From the largest region to the smallest, so that none hides another.
@@ -122,3 +130,90 @@ def _legend_handles(table: Table, colors: dict[float, Any]) -> list[Line2D]:
     if "passive" in kinds:
         handles.append(style.line("passivity condition", style.DASH_DOTTED, 1.2))
     return handles
+
+
+@style.house_style()
+def draw_map(
+    arrays: Mapping[str, np.ndarray],
+    output: str,
+    axes: style.AnyAxes | None = None,
+    *,
+    edges: Callable[[float, float], stable_set.Outlines | None] = lambda delta, d: None,
+) -> np.ndarray:
+    """Draw one output over alpha and beta: panels for delta (columns) and d (rows), three of each at most.
+
+    Args:
+        arrays: what the npz file of a map study holds: alpha, beta, delta, d, and the output along these; with
+            stiffness_N_per_m and virtual_damping_N_s_per_m a single panel is in SI units as well.
+        output: "stable", "spectral_radius" or "passive".
+        axes: an Axes of yours for the first delta and d alone, or one for each panel.
+        edges: gives the exact edge of what is stable or passive at a delta and d, drawn in place of that of the cells
+            where all cells agree with it; where there is none, the contour of the spectral radius bounds stable walls.
+    """
+    delta, d = arrays["delta"], arrays["d"]
+    rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
+    places = list(product(rows, columns))
+    single = len(places) == 1
+    width, height = (5.9, 4.3) if single else (0.6 + 2.3 * len(columns), 1.0 + 2.1 * len(rows))
+    size = (max(width, 4.0), height, len(columns))
+    panels = style.panels(axes, len(places), *size, sharex=True, sharey=True)
+    image: Any = None
+    for ax, (row, column) in zip(panels, places, strict=False):
+        place = np.s_[:, :, column, row]
+        image = _draw_cells(ax, arrays, output, arrays[output][place].T)
+        exact = edges(float(delta[column]), float(d[row])) if output in SHADES else None
+        if output in SHADES and _draw_region(ax, arrays, output, place, exact):
+            image.set_cmap(ListedColormap(["white", "white"]))
+        ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
+    style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
+    scale = si_scale(arrays)
+    if single and scale is not None:
+        style.add_si_axes(panels[0], scale)
+    if output == "spectral_radius":
+        beyond = "max" if np.nanmax(image.get_array()) > image.norm.vmax else "neither"
+        panels[0].figure.colorbar(image, ax=list(panels), label="spectral radius (stable below 1)", extend=beyond)
+        return panels
+    edge: dict[str, Any] = {"edgecolor": style.BLACK, "linewidth": 0.6}
+    shades = {output: SHADES[output], f"not {output}": "white"}
+    handles = [Patch(facecolor=color, label=label, **edge) for label, color in shades.items()]
+    style.legend(panels, handles, outside=axes is None, ncols=2)
+    return panels
+
+
+def _draw_region(
+    ax: Axes, arrays: Mapping[str, np.ndarray], output: str, place: Any, exact: stable_set.Outlines | None
+) -> bool:
+    """The region within its exact edge, or within the contour of the radius; tells whether either is known."""
+    alpha, beta, good = arrays["alpha"], arrays["beta"], arrays[output][place].T.astype(bool)
+    look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
+    if exact is not None and stable_set.agrees(exact, alpha, beta, good):
+        stable_set.draw_region(ax, exact, SHADES[output], label="exact edge", **look)
+        return True
+    radius = arrays["spectral_radius"][place].T if output == "stable" and "spectral_radius" in arrays else None
+    # On alpha = 0 a pole sits at z = 1 whatever beta is, and the contour would follow that column.
+    keep = alpha != 0
+    if radius is None or min(radius[:, keep].shape) < 2 or not np.isfinite(radius).all():
+        return False
+    if not radius[:, keep].min() < 1.0 < radius[:, keep].max():
+        return False
+    ax.contourf(alpha[keep], beta, radius[:, keep], levels=[-np.inf, 1.0], colors=[SHADES[output]], zorder=1)
+    ax.contour(alpha[keep], beta, radius[:, keep], levels=[1.0], colors=style.BLACK, linewidths=1.2, zorder=2)
+    return True
+
+
+def _draw_cells(ax: Axes, arrays: Mapping[str, np.ndarray], output: str, values: np.ndarray) -> Any:
+    alpha, beta = arrays["alpha"], arrays["beta"]
+    look: dict[str, Any] = {"shading": "nearest", "rasterized": True}
+    if output != "spectral_radius":
+        shades = ListedColormap(["white", SHADES[output]])
+        return ax.pcolormesh(alpha, beta, values.astype(float), cmap=shades, vmin=0, vmax=1, **look)
+    # Shades on both sides of 1, where the loop changes from stable to unstable, and that contour.
+    low = float(np.min(values[np.isfinite(values)], initial=0.9))
+    norm = TwoSlopeNorm(1.0, min(low, 1.0 - 1e-6), max(2.0 - low, 1.0 + 1e-6))
+    image = ax.pcolormesh(alpha, beta, values, cmap="PuOr_r", norm=norm, **look)
+    # On alpha = 0 a pole sits at z = 1 whatever beta is, and the contour would follow that column.
+    keep = alpha != 0
+    shown = values[:, keep]
+    if min(shown.shape) >= 2 and np.nanmin(shown) < 1.0 < np.nanmax(shown):
+        ax.contour(alpha[keep], beta, shown, levels=[1.0], colors=style.BLACK, linewidths=1.2)
+    return image

@@ -14,16 +14,16 @@ import yaml
 from sweeping import assert_same, config_of, main_of, run_sweeps, study, values_of
 
 import zwidth
-from zwidth.sweep.files import lock
-from zwidth.sweep.files.lock import held_briefly, holding
-from zwidth.sweep.verify import verify
+from zwidth.sweep import files
+from zwidth.sweep.dataset import verify
+from zwidth.sweep.files import held_briefly, holding
 from zwidth.words.errors import InputError, StoreBusyError
 
 # Holds the folder until it is killed, and says when it does.
 HOLD = """
 import sys, time
 from pathlib import Path
-from zwidth.sweep.files.lock import holding
+from zwidth.sweep.files import holding
 shard = tuple(map(int, sys.argv[2:])) or None
 with holding(Path(sys.argv[1]), shard):
     print("held", flush=True)
@@ -33,7 +33,7 @@ with holding(Path(sys.argv[1]), shard):
 
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch):
-    monkeypatch.setattr(lock, "_PATIENCE", 0.1)
+    monkeypatch.setattr(files, "_PATIENCE", 0.1)
 
 
 @pytest.fixture

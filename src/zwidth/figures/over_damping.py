@@ -1,0 +1,222 @@
+"""Figs. 6, 9 and 10: damping and stiffness of stable and of passive walls over the physical damping."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from zwidth.figures import grid, style
+from zwidth.figures.table import Table, curves, select
+
+# The first scaling of Fig. 10 shows this share of the range of delta.
+_ZOOM = 0.1
+# Below, alpha_max hardly depends on delta and the ratio says nothing.
+_LEAST_DELTA = 0.1
+
+
+@style.house_style()
+def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
+    """Draw the virtual damping that is stable for alpha -> 0 over delta, with the stable side shaded.
+
+    Solid: held delay; dashed: the fractional power; dash-dotted: the passivity condition. The lower bound
+    ``beta = -delta`` is common to all delays.
+
+    Args:
+        table: columns of a boundary study in the plane delta_beta: curve, d, delay_model, delta, beta_lower,
+            beta_upper.
+        ax: an Axes of yours; the function returns one, not an array of them.
+    """
+    ax = ax or style.panels(None, 1, 5.4, 4.1)[0]
+    assert ax is not None
+    stable = curves(table, "d", "delay_model", curve="stable")
+    passive = curves(table, "d", curve="passive")
+    colors = style.color_by_value([interval.d for interval in stable])
+    for interval in stable:
+        if interval.delay_model == "held":
+            _shade(ax, interval, colors[interval.d], zorder=1)
+        label = f"beta_upper, d = {interval.d:g}, {interval.delay_model}"
+        look = {"color": colors[interval.d], "linestyle": style.dash_of(interval), "zorder": 3}
+        ax.plot(interval.delta, interval.beta_upper, label=label, **look)
+    look = {"color": style.VERMILION, "linestyle": style.DASH_DOTTED, "linewidth": 1.3, "zorder": 4}
+    for interval in passive:
+        _shade(ax, interval, style.VERMILION)
+        for name in ("beta_lower", "beta_upper"):
+            ax.plot(interval.delta, getattr(interval, name), label=f"passive {name}, d = {interval.d:g}", **look)
+    _draw_lower_bound(ax, stable[0], several=len(colors) > 1)
+    deltas = np.concatenate([interval.delta for interval in stable])
+    grid.scale_axis(ax, "x", np.unique(deltas))
+    values = np.concatenate([np.r_[interval.beta_lower, interval.beta_upper] for interval in stable])
+    ax.set_ylim(*style.span(float(values.min()), float(values.max())))
+    ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
+    style.label_ends(ax, stable, [interval.beta_upper[-1] for interval in stable], colors)
+    ax.set(title=r"$\alpha \to 0$", xlabel=style.DELTA_LABEL, ylabel=style.BETA_LABEL)
+    handles = style.delay_model_handles(stable)
+    if passive:
+        handles.append(style.line("passivity condition", style.DASH_DOTTED, 1.3, style.VERMILION))
+    if handles:
+        ax.legend(handles=handles, loc="upper left")
+    return ax
+
+
+def _shade(ax: Axes, interval: Any, color: Any, **keywords: Any) -> None:
+    look = {"color": color, "alpha": 0.08, "linewidth": 0.0, **keywords}
+    ax.fill_between(interval.delta, interval.beta_lower, interval.beta_upper, **look)
+
+
+def _draw_lower_bound(ax: Axes, first: Any, *, several: bool) -> None:
+    """One line for all delays, where they agree."""
+    ax.plot(first.delta, first.beta_lower, color=style.BLACK, label="beta_lower", zorder=2.5)
+    middle = int(0.55 * first.delta.size)
+    text = r"$\beta = -\delta$ for every $d$" if several else r"$\beta = -\delta$"
+    place = (first.delta[middle], first.beta_lower[middle])
+    ax.annotate(text, place, xytext=(8, 6), textcoords="offset points", fontsize=8)
+
+
+@style.house_style()
+def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings: bool = False) -> np.ndarray:
+    """Draw alpha_max over delta, one curve for every delay and delay model; below a curve some wall is stable.
+
+    Args:
+        table: columns of a ridge study: d, delay_model, delta, alpha_max.
+        axes: an Axes of yours; two of them, in this order, for the two scalings.
+        two_scalings: show the small deltas in a panel of their own, as the paper does.
+    """
+    width, height = (style.WIDTH, 3.6) if two_scalings else (5.4, 4.1)
+    panels = style.panels(axes, 1 + two_scalings, width, height, columns=1 + two_scalings)
+    for panel, share in zip(panels, (_ZOOM, 1.0)[-len(panels) :], strict=True):
+        _draw_scaling(panel, table, share)
+    style.letter(panels)
+    for panel in panels[1:]:
+        panel.set_ylabel("")
+    return panels
+
+
+def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
+    """Draw the curves up to a share of the range of delta."""
+    delta = np.asarray(table["delta"])
+    end = share * float(delta.max())
+    columns = {name: column[delta <= end * (1.0 + 1e-12)] for name, column in select(table).items()}
+    shown = curves(columns, "d", "delay_model")
+    colors = style.color_by_value([path.d for path in shown])
+    for path in shown:
+        color = colors[path.d]
+        look = {"color": color, "linestyle": style.dash_of(path), "zorder": 3}
+        ax.plot(path.delta, path.alpha_max, label=f"alpha_max, d = {path.d:g}, {path.delay_model}", **look)
+        if path.delay_model == "held":
+            ax.fill_between(path.delta, 0.0, path.alpha_max, color=color, alpha=0.07, linewidth=0.0, zorder=1)
+    ax.set_xlim(float(columns["delta"].min()), end)
+    highest = float(np.nanmax(columns["alpha_max"]))
+    ax.set_ylim(0.0, 1.04 * highest)
+    if grid.logarithmic(shown[0].delta):
+        # The stiffest wall grows with the damping, over as many decades.
+        style.use_logarithmic(ax, "x", columns["delta"])
+        style.use_logarithmic(ax, "y", columns["alpha_max"])
+        ax.set_ylim(float(np.nanmin(columns["alpha_max"])), 1.2 * highest)
+    style.label_ends(ax, shown, [path.alpha_max[-1] for path in shown], colors)
+    ax.set(xlabel=style.DELTA_LABEL, ylabel=style.ALPHA_MAX_LABEL)
+    if handles := style.delay_model_handles(shown):
+        ax.legend(handles=handles, loc="upper left")
+
+
+@style.house_style()
+def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
+    """Draw alpha_max/delta over delta beside its limit g(d), and g over the delay.
+
+    Args:
+        table: columns of a ridge study: d, delay_model, delta, alpha_max.
+        slopes: delay_model, d and slope, which is g(d): over a range of delays, those of ``table`` among them.
+        axes: an Axes of yours for the first panel alone, or two.
+    """
+    panels = style.panels(axes, 2, style.WIDTH, 3.6, 2, gridspec_kw={"width_ratios": [1.15, 1.0]})
+    paths, models = curves(table, "d", "delay_model"), curves(slopes, "delay_model")
+    colors = style.color_by_value([path.d for path in paths])
+    for path in paths:
+        own = next(model for model in models if model.delay_model == path.delay_model)
+        path.limit = float(own.slope[own.d == path.d][0])
+    _draw_ratio(panels[0], paths, colors)
+    for ax in panels[1:]:
+        _draw_limit(ax, paths, models, colors)
+    style.letter(panels)
+    return panels
+
+
+def _draw_ratio(ax: Axes, paths: list[Any], colors: dict[float, Any]) -> None:
+    """alpha_max/delta on logarithmic axes, the limits dotted across."""
+    for path in paths:
+        color, dash = colors[path.d], style.dash_of(path)
+        label = f"alpha_max/delta, d = {path.d:g}, {path.delay_model}"
+        shown = path.delta >= _LEAST_DELTA
+        delta = path.delta[shown]
+        ax.plot(delta, path.alpha_max[shown] / delta, color=color, linestyle=dash, label=label, zorder=3)
+        ax.axhline(path.limit, color=color, linestyle=style.DOTTED, linewidth=0.9, label=f"g, d = {path.d:g}", zorder=2)
+    limits = [path.limit for path in paths]
+    ends = _LEAST_DELTA, max(float(path.delta.max()) for path in paths)
+    style.use_logarithmic(ax, "x", ends)
+    style.use_logarithmic(ax, "y", limits)
+    ax.set_xlim(*ends)
+    ax.set_ylim(0.7 * min(limits), 3.0 * max(limits))
+    style.label_ends(ax, paths, [path.limit for path in paths], colors)
+    ax.set(xlabel=style.DELTA_LABEL, ylabel=r"$\alpha_{\max}/\delta = K_{\max}T/b$")
+    limit = style.line(r"its limit $g(d)$", style.DOTTED, 0.9)
+    ax.legend(handles=[style.line(r"$\alpha_{\max}/\delta$"), limit], loc="upper right")
+
+
+def _draw_limit(ax: Axes, paths: list[Any], models: list[Any], colors: dict[float, Any]) -> None:
+    for model in models:
+        look = {"color": style.GRAY, "linestyle": style.dash_of(model), "zorder": 2}
+        ax.plot(model.d, model.slope, label=f"g, {model.delay_model}", **look)
+    for path in paths:
+        ax.plot([path.d], [path.limit], "o", color=colors[path.d], markersize=5, zorder=3, clip_on=False)
+    ax.set_xlim(0.0, max(float(model.d.max()) for model in models))
+    ax.set_ylim(0.0, 1.04 * max(float(model.slope.max()) for model in models))
+    ax.set(xlabel=r"delay  $d = t_d/T$", ylabel=r"limit slope  $g(d)$")
+    if handles := style.delay_model_handles(models):
+        ax.legend(handles=handles, loc="upper right")
+
+
+@style.house_style()
+def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
+    """Draw the stiffest stable (solid) and the stiffest passive wall (dash-dotted) over delta, and their ratio.
+
+    Args:
+        table: columns of a passivity study: d, delta, alpha_max, alpha_max_passive.
+        axes: an Axes of yours for the two maxima alone, or two.
+    """
+    panels = style.panels(axes, 2, style.WIDTH, 3.6, 2)
+    costs = curves(table, "d")
+    colors = style.color_by_value([cost.d for cost in costs])
+    for ax, draw in zip(panels, (_draw_maxima, _draw_share), strict=False):
+        draw(ax, costs, colors)
+        deltas = np.asarray(table["delta"])
+        grid.scale_axis(ax, "x", np.unique(deltas))
+        ax.set_xlabel(style.DELTA_LABEL)
+    style.letter(panels)
+    return panels
+
+
+def _draw_maxima(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
+    for cost in costs:
+        color, d = colors[cost.d], f"d = {cost.d:g}"
+        ax.plot(cost.delta, cost.alpha_max, color=color, label=f"alpha_max, {d}", zorder=3)
+        passive: dict[str, Any] = {"linestyle": style.DASH_DOTTED, "label": f"alpha_max_passive, {d}"}
+        ax.plot(cost.delta, cost.alpha_max_passive, color=color, zorder=3, **passive)
+        gap = (cost.delta, cost.alpha_max_passive, cost.alpha_max)
+        ax.fill_between(*gap, color=color, alpha=0.12, linewidth=0.0, zorder=1)
+    ax.set_ylim(0.0, 1.04 * max(float(np.nanmax(cost.alpha_max)) for cost in costs))
+    style.label_ends(ax, costs, [cost.alpha_max[-1] for cost in costs], colors)
+    ax.set_ylabel(style.ALPHA_LABEL)
+    passive_line = style.line("stiffest passive wall", style.DASH_DOTTED)
+    handles = [style.line(r"stiffest stable wall, $\alpha_{\max}$"), passive_line]
+    ax.legend(handles=handles, loc="upper left")
+
+
+def _draw_share(ax: Axes, costs: list[Any], colors: dict[float, Any]) -> None:
+    """The share of the stable stiffness that a passive wall reaches."""
+    ratios = [100.0 * cost.alpha_max_passive / cost.alpha_max for cost in costs]
+    for cost, ratio in zip(costs, ratios, strict=True):
+        ax.plot(cost.delta, ratio, color=colors[cost.d], label=f"passive share, d = {cost.d:g}", zorder=3)
+    ax.set_ylim(0.0, 100.0)
+    style.label_ends(ax, costs, [ratio[-1] for ratio in ratios], colors)
+    ax.set_ylabel(r"stiffest passive wall in % of $\alpha_{\max}$")

@@ -1,0 +1,215 @@
+"""One or two poles of all walls of a cell, as polynomials in the place of the wall in it.
+
+On a pole ``alpha + beta f = Q(z)``, ``f = 1 - 1/z``, ``Q = -z^n (z - 1)(z - c)/M(z)``. Around a center z0, with
+``z = z0 (1 + u)``, ``alpha = alpha0 + a xi``, ``beta = beta0 + b eta`` (|xi|, |eta| <= 1), a wall's poles solve
+
+    A(u) = Q(z) - beta0 f(z) - alpha0 = a xi + b eta f(z)
+
+A group is one pole, or the two next to the real axis that may meet there: their sums have no branch where they do. Sums
+over a group are integrals along a circle around it. The steps C1 to C3 are those of docs/theory/maps.md.
+"""
+
+from __future__ import annotations
+
+from math import comb
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.loops.rigid.circle import Loop
+
+# Orders of the polynomials in xi and eta; each group takes the least that will do.
+ORDERS = (4, 10, 20)
+# Terms of A by u.
+_TERMS = 36
+_PLACES = np.arange(_TERMS + 1)
+# Steps to the middles of groups.
+_STEPS = 4
+# Radii of circles over the largest; how many places on the next one is that a mean over a group of one or two needs.
+_CIRCLES = 2.0 ** (-0.5 * np.arange(14))
+_BESIDE = {1: 2, 2: 1}
+# More than this A need not be over what walls change.
+_AMPLE = 100.0
+# Points on a circle and their weights: all around for one pole, and above the real axis, twice as dense, for two.
+_POINTS = {1: np.exp(2j * np.pi * np.arange(48) / 48), 2: np.exp(1j * np.pi * np.arange(49) / 48)}
+_WEIGHTS = {1: np.full(48, 1.0 / 48.0), 2: np.pad(np.full(47, 1.0 / 48.0), 1, constant_values=0.5 / 48.0)}
+# Rounding errors of the polynomials, in units of what the circle allows.
+ROUNDING = 1e-14
+# How many ways lead to a power of xi and eta, over its order (eta first).
+_SHARES = np.array([[comb(i + j, j) / max(i + j, 1) for i in range(ORDERS[-1] + 1)] for j in range(ORDERS[-1] + 1)])
+
+
+class Cells(NamedTuple):
+    """The middles of cells: their loops, and the half lengths of the cells along alpha and beta."""
+
+    loop: Loop
+    a: np.ndarray
+    b: np.ndarray
+
+
+class Group(NamedTuple):
+    """One or two poles of each cell, by A around a center e^(re + j im) and a circle around them (C2)."""
+
+    re: np.ndarray
+    im: np.ndarray
+    a: Any  # complex coefficients of A by u, (terms, cells)
+    f: Any
+    w: Any  # 1/z
+    disk: np.ndarray  # the circle's radius in u
+    low: np.ndarray  # the least logarithm of a modulus in the cell
+    error: np.ndarray  # of sums to each order, in units of what the circle allows (orders, cells)
+
+
+def pick(tree: Any, index: Any) -> Any:
+    """Some of the cells of arrays whose last axis they are."""
+    return type(tree)(*(pick(leaf, index) for leaf in tree)) if isinstance(tree, tuple) else tree[..., index]
+
+
+def _complex(re: np.ndarray, im: np.ndarray) -> np.ndarray:
+    value = np.empty(re.shape, complex)
+    value.real, value.imag = re, im
+    return value
+
+
+def _expand(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool, terms: int) -> tuple[Any, ...]:
+    """The coefficients of A around centers; f and 1/z there, and the moduli of factors that bound A elsewhere."""
+    size, sine = np.expm1(re), np.sin(0.5 * im)
+    r = 1.0 + size
+    near = _complex(size - 2.0 * r * sine * sine, 2.0 * r * sine * np.cos(0.5 * im))
+    z, off = near + 1.0, near + loop.em
+    w, body = 1.0 / z, 1.0 / (loop.a2 * z + loop.h)
+    # Q = -z^n (z - 1)(z - c)/((a2 z + h)(1 + q/z)), each factor by u.
+    n, growth = loop.turns - 1.0, np.exp((loop.turns - 1.0) * re)
+    lead, rho = -_complex(growth * np.cos(n * im), growth * np.sin(n * im)) * body, loop.a2 * z * body
+    late = z / (z + loop.q)
+    if fractional:
+        lead *= late
+    f, places = near * w, np.arange(terms)[:, None]
+    power = np.ones((terms + 1, re.size))
+    np.cumprod((n - places) / (places + 1.0), axis=0, out=power[1:])
+    a = near * off * lead * power
+    a[1:] += z * (near + off) * lead * power[:-1]
+    a[2:] += z * z * lead * power[:-2]
+    if fractional:
+        _divide(a, rho)
+        a[1:] += a[:-1].copy()
+        _divide(a, late)
+    else:
+        _divide(a, rho)
+    a[0] -= f * loop.beta + loop.alpha
+    a[1:] += (-1.0) ** (places + 1.0) * (w * loop.beta)
+    return a, f, w, [np.abs(part) for part in (near, off, lead, rho, late)]
+
+
+def _divide(a: np.ndarray, x: Any) -> None:
+    """Divide series by 1 + x u = 1/((1 - x u)(1 + x^2 u^2)(1 + x^4 u^4) ...)."""
+    shift, x = 1, -x
+    while shift < len(a):
+        a[shift:] += x * a[:-shift]
+        shift, x = 2 * shift, x * x
+
+
+def find_middle(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The real place next to a pole between two of them, where A' is 0, nearly."""
+    near = np.expm1(re) - 2.0 * np.exp(re) * np.sin(0.5 * im) ** 2
+    re, im = np.where(near > -1.0, np.log1p(near), np.log(-1.0 - near)), np.where(near > -1.0, 0.0, np.pi)
+    longest = 0.5 / loop.turns
+    for _ in range(_STEPS):
+        _, slope, bend = _expand(re, im, loop, fractional, 2)[0].real
+        re = re + np.log1p(np.clip(-0.5 * slope / bend, -longest, longest))
+    return re, im
+
+
+def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional: bool) -> Group:
+    """The circle on which the group's term of A is the largest, over all of the others and what walls change (C2)."""
+    loop = cells.loop
+    a, f, w, (near, off, lead, rho, late) = _expand(re, im, loop, fractional, _TERMS)
+    r, level, by, sizes = np.exp(re), np.abs(f), np.abs(w), np.abs(a)
+    limit = 1.0 / np.maximum(1.0, np.maximum(rho, late) if fractional else rho)
+    largest = np.minimum(2.0 / loop.turns, 0.4 * limit)
+    disk = largest * _CIRCLES[:, None]
+    # The rest of A's series is bounded by a wider disk, on which every factor is at most what it is for |u|.
+    wide = np.minimum(4.0 * disk, 0.5 * (disk + limit))
+    most = lead * np.exp(loop.turns * wide) * (near + r * wide) * (off + r * wide) / (1.0 - rho * wide)
+    if fractional:
+        most *= (1.0 + wide) / (1.0 - late * wide)
+    rest = (most + np.abs(loop.beta) * by / (1.0 - wide)) * (disk / wide) ** (_TERMS + 1)
+    total = ((sizes * largest ** _PLACES[:, None]).T[:, None] @ _CIRCLES ** _PLACES[:, None])[:, 0].T
+    # Of P's own rounding errors what `pole_step` says, too.
+    rounding = 2.0**-52 * (16.0 + loop.turns * (np.abs(re) + im))
+    rest += rounding * (total + 2.0 * (np.abs(loop.alpha) + np.abs(loop.beta) * level))
+    main = sizes[poles] * disk**poles
+    low = 2.0 * main - total - rest
+    ratio = low / (cells.a + cells.b * (level + by * disk / (1.0 - disk)))
+    score = np.where(ratio > 1.02, ratio / (1.0 + 1e12 * rest / low), 0.0)
+    # With circles beside it between which no pole is either, means of points on it are nearly exact.
+    beside, cells_of = _BESIDE[poles], np.arange(re.size)
+    # Where all is small enough for every order, a smaller circle is farther from what is outside.
+    rank = np.minimum(score, _AMPLE) * (1.0 + 0.01 * np.arange(_CIRCLES.size)[:, None])
+    best = (rank[beside:-beside] * (score[: -2 * beside] > 0) * (score[2 * beside :] > 0)).argmax(0) + beside
+    own, spread, alias = (best, cells_of), np.log(main / low) - np.log1p(-1.0 / ratio), np.full(re.size, np.inf)
+    for step in (beside, beside + 1):
+        outer, inner = np.maximum(best - step, 0), np.minimum(best + step, _CIRCLES.size - 1)
+        between = (outer + inner == 2 * best) & (np.minimum(score[outer, cells_of], score[inner, cells_of]) > 0)
+        # Of the sums of powers of tau/A, and as often as there are points that of the middle's own poles.
+        missed = 2.0 ** (-24 * step * poles) * (1 + 48 * poles)
+        missed = missed * (4.5 * spread[outer, cells_of] + spread[inner, cells_of])
+        alias = np.where(between, np.fmin(alias, missed), alias)
+    good = score[own] > 0
+    if poles == 1:
+        # A pole alone in a disk about a real center is real, and off the real axis in one that the axis does not meet.
+        good &= (im == 0.0) | (im == np.pi) | (np.sin(im) > disk[own])
+    inverse, power = 1.0 / ratio[own], np.array(ORDERS)[:, None] + 1
+    share = rest[own] / (low[own] * (1.0 - inverse))
+    error = inverse**power / (power * (1.0 - inverse)) + share / (1.0 - share)
+    error = np.where(good & (share < 0.5), error + alias, np.inf)
+    # Two stay in the smallest disk that will do; one moves from the center by less.
+    if poles == 1:
+        reach = 1.0 / ratio + sizes[0] / low
+        farthest = np.where((ratio > 1.02) & (reach < 0.98), np.log1p(-reach) * disk / (1.0 - disk), -np.inf)
+    else:
+        farthest = np.where(ratio > 1.02, np.log1p(-disk), -np.inf)
+    return Group(re, im, a, f, w, disk[own], re + farthest.max(0), error)
+
+
+def _powers(x: Any, count: int, first: Any = 1.0) -> np.ndarray:
+    """1, x, x^2, ... times a factor, of points on circles (cells, points): (cells, powers, parts of points)."""
+    powers = np.empty((count, *x.shape), complex)
+    powers[0], known = first, 1
+    while known < count:
+        np.multiply(powers[: min(known, count - known)], x, out=powers[known : 2 * known])
+        known, x = 2 * known, x * x
+    return powers.view(float).transpose(1, 0, 2)
+
+
+def sum_up(poles: int, group: Group, cells: Cells, order: int) -> list[np.ndarray]:
+    """The log |1 + u| of one pole, or sums of u/disk and its square over two, by powers of eta and xi (C1)."""
+    points, weights, count = _POINTS[poles], _WEIGHTS[poles], 48 * poles
+    u = group.disk[:, None] * points
+    terms = (group.a * group.disk ** _PLACES[:, None]).T
+    inverse = 1.0 / np.fft.ifft(terms, count, norm="forward")[:, : points.size]
+    turn = np.fft.ifft(terms * _PLACES, count, norm="forward")[:, : points.size] * inverse
+    along_xi = _powers(np.conj(cells.a[:, None] * inverse), order + 1).transpose(0, 2, 1)
+    along_eta = cells.b[:, None] * inverse * (group.f[:, None] + group.w[:, None] * (u / (1.0 + u)))
+    places, sums = np.arange(order + 1), []
+    shares = np.where(places[:, None] + places <= order, _SHARES[: order + 1, : order + 1], 0.0)
+    for k in range(1, poles + 1):
+        weight = weights * (u / (1.0 + u) if poles == 1 else k * points**k)
+        found = _powers(along_eta, order + 1, weight) @ along_xi * shares
+        # Of the middle's own poles.
+        middle = (turn * (weights * points**k)).sum(1)
+        found[:, 0, 0] = np.log1p(group.disk * middle).real if poles == 1 else middle.real
+        sums.append(found)
+    return sums
+
+
+def larger_of_two(first: np.ndarray, second: np.ndarray, disk: Any, error: Any) -> tuple[np.ndarray, np.ndarray]:
+    """log |1 + u| of the larger pole and its error, from sums of u/disk and its square known to 1 and 2 errors (C3)."""
+    # half +- sqrt(inside)
+    half, doubt = 0.5 * first, 2.01 * error
+    inside = 0.5 * second - half * half
+    real = disk * (half + np.sqrt(np.maximum(inside, 0.0)))
+    half = disk * half
+    size = np.where(inside > 0, np.log1p(real), 0.5 * np.log1p(half * (2.0 + half) - disk**2 * np.minimum(inside, 0.0)))
+    apart = np.where(inside > -doubt, np.minimum(np.sqrt(doubt), doubt / np.sqrt(np.abs(inside))), 0.0)
+    return size, disk / (1.0 - disk) ** 2 * (0.5 * error + doubt + apart)
