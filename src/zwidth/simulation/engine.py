@@ -20,12 +20,10 @@ from zwidth.simulation.period import Program, Reading, Work, control, forces_of,
 from zwidth.words.types import Array
 
 BLOCK = 128
-# The tail's windows, the same number in each half.
-WINDOWS = 8
 
 
 class Extent(NamedTuple):
-    """How far every body went before the tail and in each of its windows, (1 + windows, bodies, lanes)."""
+    """How far every body went before the tail and in each of its halves, (3, bodies, lanes)."""
 
     low: Array
     high: Array
@@ -40,7 +38,7 @@ class Summary(NamedTuple):
     impact: Array  # velocity at the first sample in contact
     given: Array  # the most energy that the wall has given so far
     extent: Extent
-    turns: Array  # how often the velocity turned positive then, (1 + windows, lanes)
+    turns: Array  # how often the velocity turned positive then, (3, lanes)
     first_turn: Array
     last_turn: Array
 
@@ -83,9 +81,9 @@ def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) ->
     back = np.mod(-np.arange(rings[0]), rings[0])
     # What the program would have read.
     positions = round_to(lanes.resolution, x - back[:, None] * v)
-    zero, far = np.zeros(x.size), np.full((1 + WINDOWS, count // 2, x.size), np.inf)
+    zero, far = np.zeros(x.size), np.full((3, count // 2, x.size), np.inf)
     program = Program(positions, _settle(lanes, positions[0], v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
-    turns = np.zeros((1 + WINDOWS, x.size))
+    turns = np.zeros((3, x.size))
     never = zero + np.nan
     summary = Summary(zero, zero, zero, never, zero, Extent(far, -far), turns, never, never)
     return State(BodyState(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
@@ -102,7 +100,7 @@ def _settle(lanes: Lanes, x: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: Inputs) -> tuple[State, Any]:
-    """One period; ``ends`` the periods at which the windows of the tail begin, and the end."""
+    """One period; ``ends`` the periods at which the halves of the tail begin, and the end."""
     sensed = state.body.x[0] + given.noise
     program, reading = control(lanes, options, state.program, given.k, sensed)
     forces = forces_of(lanes, options, program.commands, given.k)
@@ -135,8 +133,8 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     (body, work), frames = jax.lax.scan(substep, (state.body, state.work), np.arange(options.substeps))
     summary = _summarize(lanes, state, reading, body, work, given.k, ends, motion)
     after = State(body, program, work, summary)
-    # A block goes on behind the last period. There is no window behind the last one, and what is written there is
-    # dropped; to choose between old and new windows would copy all of them each period.
+    # A block goes on behind the last period. There is no half behind the last one, and what is written there is
+    # dropped; to choose between old and new halves would copy all of them each period.
     going = given.k < ends[-1]
     old = state._replace(summary=state.summary._replace(extent=summary.extent, turns=summary.turns))
     after = jax.tree.map(partial(jnp.where, going), after, old)
@@ -152,8 +150,8 @@ def _summarize(
     first = reading.touching & ~state.program.touching & (k > 0) & jnp.isnan(known.impact)
     turning = (v <= 0) & (next_v > 0)
     moment = k - v / jnp.where(next_v > v, next_v - v, 1.0)
-    window = jnp.sum(k >= ends)
-    low, high = known.extent.low[window], known.extent.high[window]
+    half = jnp.sum(k >= ends)
+    low, high = known.extent.low[half], known.extent.high[half]
     return Summary(
         jnp.fmax(known.deepest, places[0]),
         jnp.fmax(known.widest, jnp.abs(places).max(0)),
@@ -161,12 +159,12 @@ def _summarize(
         jnp.where(first, v, known.impact),
         jnp.fmax(known.given, work.wall),
         Extent(
-            known.extent.low.at[window].set(jnp.fmin(low, places)),
-            known.extent.high.at[window].set(jnp.fmax(high, places)),
+            known.extent.low.at[half].set(jnp.fmin(low, places)),
+            known.extent.high.at[half].set(jnp.fmax(high, places)),
         ),
-        known.turns.at[window].add(turning),
-        jnp.where(turning & (window > 0) & jnp.isnan(known.first_turn), moment, known.first_turn),
-        jnp.where(turning & (window > 0), moment, known.last_turn),
+        known.turns.at[half].add(turning),
+        jnp.where(turning & (half > 0) & jnp.isnan(known.first_turn), moment, known.first_turn),
+        jnp.where(turning & (half > 0), moment, known.last_turn),
     )
 
 
@@ -184,7 +182,7 @@ def run_lanes(
     lanes: Lanes, options: Options, course: Course, given: Given, rings: tuple[int, int]
 ) -> tuple[State, np.ndarray, Reading | None, Frame | None]:
     """The last state, the last positions, and what is recorded along a first axis of periods (and of substeps)."""
-    edges = course.periods - course.tail * np.arange(WINDOWS, -1, -1) // WINDOWS
+    edges = course.periods - course.tail * np.arange(2, -1, -1) // 2
     state: Any = jax.tree.map(jnp.asarray, begin(lanes, given.position, given.velocity, rings))
     lanes, ends = jax.tree.map(jnp.asarray, lanes), jnp.asarray(edges)
     recorded: Any = deque(maxlen=None if options.record else CYCLE // BLOCK + 1)

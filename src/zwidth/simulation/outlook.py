@@ -51,12 +51,11 @@ def foresee(
 
     A motion near the end of the range of floats overflows, and nothing is proved of it.
     """
-    count = push.size
-    no = np.zeros(count, bool)
-    outlook = Outlook(no, no.copy(), no.copy(), no.copy(), np.full(count, np.inf))
+    no = np.zeros(push.size, bool)
+    outlook = Outlook(no, no.copy(), no.copy(), no.copy(), np.full(push.size, np.inf))
     if options.foaw or options.jitter:
         return outlook
-    late, window = (np.broadcast_to(np.asarray(part), count) for part in (lanes.late, lanes.estimator.window))
+    late, window = (np.broadcast_to(np.asarray(part), push.size) for part in (lanes.late, lanes.estimator.window))
     finite = np.isfinite(state.body.x).all(0)
     shapes = np.stack([late, window], 1)
     for shape in np.unique(shapes[known & finite], axis=0):
@@ -83,7 +82,7 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
     # The decisions in force; what slips on feels a constant friction.
     modes = np.stack([exact & touching, touching, stuck], 1)
     slip = np.where(dry, state.body.slip[at], 0.0)
-    other = ~linear & ((squarings > 0) | stuck | ~modes[:, 0]) & ((slip == 0) | (group.bodies == 2))
+    other = ~(linear & (squarings != 0)) & ~(unstable & modes[:, 0] & ~stuck) & ((slip == 0) | (group.bodies == 2))
     # Who is pushed on no spring comes back.
     other &= touching | stuck | (group.push <= 0) | np.any(lanes.rate[:, :, 0] != 0, axis=1)
     rubbed = group._replace(push=group.push - slip * motor.coulomb)
@@ -91,7 +90,7 @@ def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, p
         own = other & (modes == (seen, wall, held)).all(1)
         part = take(rubbed, own)
         settles[own] = _settles(part, (seen, wall, held), slip[own], bilateral[own], pulling[own], periods)
-    repeats = linear & (squarings == 0)
+    repeats = linear & (squarings == 0) & ~settles
     own = ~exact & ~dry & ~settles
     if own.any() and not group.filter:
         repeats[own] = _repeats(take(group, own), bilateral[own], pulling[own], sensed[:, own], periods)
@@ -150,16 +149,13 @@ def _settles(
         if not late:
             fixed[:, 3] = fixed[:, 1]
     ends = np.einsum("lrn,ln->lr", rows, rest) + fixed
-    settled = np.isfinite(ends).all(-1)
-    if not bilateral.all():
-        # Where the map leads to another side of the wall there is nothing to bound.
-        settled &= bilateral | (ends[:, 0] > 0) if wall else bilateral | (drift <= 0)
+    # Where the map leads to another side of the wall there is nothing to bound.
+    settled = np.isfinite(ends).all(-1) & (bilateral | ((ends[:, 0] > 0) if wall else (drift <= 0)))
     # A body that slips on keeps its velocity's sign, at the samples and where the force changes between them.
     signed = np.zeros((len(reading), 2, n))
     signed[:, 0, m // 2], signed[:, 1, :m] = 1.0, group.halfway[:, m // 2, :m]
     signed[:, 1, sent + late] = group.halfway[:, m // 2, m]
-    low, high = np.full(ends.shape, np.nan), np.full(ends.shape, np.nan)
-    above = np.zeros(len(reading), bool)
+    low, high, above = np.full(ends.shape, np.nan), np.full(ends.shape, np.nan), np.zeros(len(reading), bool)
     low[settled], high[settled], above[settled] = bound_rows(
         (loop.A - both)[settled],
         (group.state - rest)[settled],
@@ -172,13 +168,12 @@ def _settles(
     # Forces that came before count as they are.
     slack = 1e-9 * (np.abs(ends) + np.maximum(high, -low))
     low, high = ends + low - slack, ends + high + slack
-    scale = np.abs(group.state).max(-1) + np.abs(rest).max(-1)
     settled &= np.isfinite(low + high).all(-1)
     far = np.abs(drift) * _LONG * periods
     if not seen and wall:
         settled &= (low[:, 0] - far > reading - 0.5 * quantum) & (high[:, 0] + far < reading + 0.5 * quantum)
     if not held:
-        settled &= far <= 1e-9 * scale
+        settled &= far <= 1e-9 * (np.abs(group.state).max(-1) + np.abs(rest).max(-1))
     if not wall:
         side = high[:, 0] + far <= np.where(quantum > 0, 0.5 * quantum * (1 - 1e-9), 0.0)
         if m == 2 and not held:
@@ -223,8 +218,9 @@ def _is_restless(group: LaneGroup, unstable: np.ndarray, bilateral: np.ndarray, 
     inside &= (quantum == 0) | (count != 0) | (off > 0)
     inside |= ~bilateral & (place <= 0)
     outside = bilateral | (push > 0.5 * spring * quantum)
-    # At the motor's limit it may leave for good or rest where the limit lets it.
-    return (alpha > 0) & ~dry & inside & outside & (np.abs(push) < most) & np.isfinite(place)
+    # At the motor's limit it may leave for good or rest where the limit lets it; nothing stops who is pushed harder.
+    bound = (alpha > 0) & ~dry & inside & outside & (np.abs(push) < most) & np.isfinite(place)
+    return bound | (loose & (np.abs(push) > (most + lanes.motor.static) * (1 + 1e-9)))
 
 
 def _outgrows(group: LaneGroup, loop: LoopMap, periods: int) -> np.ndarray:
@@ -284,8 +280,7 @@ def _repeats(
     if np.isfinite(motor.max_rate).any():
         for j in range(late + 1, len(commands)):
             commands[j] = np.clip(commands[j], commands[j - 1] - motor.max_rate, commands[j - 1] + motor.max_rate)
-    kinds = range(late + 1)
-    change = [np.abs(commands[length + j, np.arange(at.size)] - commands[j]) for j in kinds]
+    change = [np.abs(commands[length + j, np.arange(at.size)] - commands[j]) for j in range(late + 1)]
     same = np.max(change, axis=0) <= 1e-9 * np.abs(commands).max(0)
     moves, before, after = group.plant[..., :m], group.plant[..., m].T, group.plant[..., m + 1].T
     body, room = group.state[:, :m].T.copy(), np.full(at.size, 0.5)

@@ -152,22 +152,16 @@ class Motion:
         return data
 
 
-def classify(known: Any, outlook: Any, blur: np.ndarray, course: Any) -> np.ndarray:
-    """How motions end; ``blur`` is by how much the widths of windows may differ for no reason of the loop's."""
-    low, high = known.extent.low[1:], known.extent.high[1:]
-    half = len(low) // 2
-    whole = np.stack([high[part].max(0) - low[part].min(0) for part in (slice(half), slice(half, None))])
-    first, second = whole.max(1)
+def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:
+    """How motions end."""
+    wide = known.extent.high[1:] - known.extent.low[1:]
+    first, second = wide.max(1)
     # A tail of a period or two has not moved for want of time.
     still = (second <= _AT_REST * known.widest) & (first <= np.sqrt(_AT_REST) * known.widest) & (course.tail >= _STILL)
-    swinging = np.stack([known.turns[1 : half + 1].sum(0), known.turns[half + 1 :].sum(0)]).min(0) >= _SWINGS
-    swinging &= ~still
-
-    alike = np.ptp(whole[:, 0], axis=0) <= _ALIKE * whole[:, 0].max(0) + blur
-    slow = outlook.pace > _FOR_GOOD * course.periods
-    linear = slow & (outlook.settles | outlook.grows)
-    lasting = swinging & (outlook.repeats | (alike & linear))
-    growing = outlook.grows & ~still & ((whole[1, 0] >= whole[0, 0]) | (outlook.pace <= 2 * course.periods))
+    alike = np.ptp(wide[:, 0], axis=0) <= _ALIKE * wide[:, 0].max(0)
+    slow = (outlook.pace > _FOR_GOOD * course.periods) & (outlook.settles | outlook.grows)
+    lasting = ~still & (known.turns[1:].min(0) >= _SWINGS) & (outlook.repeats | (alike & slow))
+    growing = outlook.grows & ~still & ((wide[1, 0] >= wide[0, 0]) | (outlook.pace <= 2 * course.periods))
     kind = np.where(outlook.restless & (second > _AT_REST * known.widest), MotionKind.RESTLESS, MotionKind.UNCLEAR)
     kind = np.where(growing, MotionKind.GROWING, kind)
     kind = np.where(outlook.settles, np.where(still, MotionKind.REST, MotionKind.DECAYING), kind)
@@ -192,17 +186,15 @@ def to_si(
     state, reading, frame = found
     known, force = state.summary, mass / period**2
     low, high = (part[1:, 0] for part in known.extent)
-    half = len(low) // 2
     finite = np.isfinite(state.body.x).all(0)
     turns = known.turns[1:].sum(0)
     frequency = (turns - 1) / ((known.last_turn - known.first_turn) * period)
     # A motion that is lost before it is large was not followed.
     lost = ~finite & (known.widest < _BEYOND)
-    outcome = classify(known, outlook, 2.0 * given.resolution + 6.0 * given.noise, course)
-    outcome = np.where(lost, MotionKind.INVALID, outcome)
+    outcome = np.where(lost, MotionKind.INVALID, classify(known, outlook, course))
     columns = {
         "amplitude": np.where(outcome == MotionKind.DIVERGED, np.inf, 0.5 * (high.max(0) - low.min(0))),
-        "trend": np.divide(*(high[part].max(0) - low[part].min(0) for part in (slice(half, None), slice(half)))),
+        "trend": (high[1] - low[1]) / (high[0] - low[0]),
         "frequency": np.where((turns > 1) & (outcome != MotionKind.REST), frequency, np.nan),
         "penetration": known.deepest,
         "bounces": known.exits.astype(int),

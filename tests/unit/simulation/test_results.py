@@ -182,3 +182,14 @@ def test_an_adaptive_window_takes_a_line_that_misses_by_just_its_bound():
                 break
             allowed.append(slope / 1e-3)
         assert found.estimated_velocity[k] == pytest.approx(allowed[-1], rel=1e-12)
+
+
+def test_what_the_program_makes_of_a_sample_is_in_si_units():
+    K, B = 2e3, 5.0
+    found = SCENE.simulate(K, B, start_position=1e-3, start_velocity=0.1, resolution=1e-5, periods=50)
+    rate = np.diff(found.measured) / 1e-3
+    np.testing.assert_allclose(found.estimated_velocity[1:], rate, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(found.command, -(K * found.measured + B * found.estimated_velocity), rtol=1e-9)
+    # A period late.
+    np.testing.assert_allclose(found.wall_force[1:], found.command[:-1], rtol=1e-9)
+    assert found.wall_force[0] == 0

@@ -1,0 +1,201 @@
+"""What is proved of motions: bounds beside the steps themselves, decisions beside those of the motion simulated on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.simulation.maps import bound_rows, solve_lanes, square
+
+SCENE = zwidth.Scene(zwidth.Device(mass=0.1, damping=2.0), zwidth.Timing(period=1e-3, delay=1e-3))
+TOP = SCENE.max_stiffness()
+CODES = zwidth.MotionKind
+
+
+def turn(radius: float, angle: float) -> np.ndarray:
+    """A map that turns by the angle and shrinks by the radius."""
+    return radius * np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+
+def beside(*parts: np.ndarray) -> np.ndarray:
+    """Maps side by side, in coordinates that mix them."""
+    n = sum(len(part) for part in parts)
+    whole, at = np.zeros((n, n)), 0
+    for part in parts:
+        whole[at : at + len(part), at : at + len(part)] = part
+        at += len(part)
+    mix = np.eye(n) + 0.3 * np.random.default_rng(n).standard_normal((n, n))
+    return mix @ whole @ np.linalg.inv(mix)
+
+
+SHIFT = np.diag(np.ones(3), -1)
+STABLE = {
+    "slow turn and a shift register": beside(turn(0.9995, 0.05), SHIFT),
+    "slow and quick": beside(turn(0.999, 0.3), np.array([[0.8]]), np.array([[-0.4]]), SHIFT),
+    "equal eigenvalues": beside(np.array([[0.97, 1.0], [0.0, 0.97]]), SHIFT),
+}
+
+
+@pytest.mark.parametrize("name", STABLE)
+def test_bounds_hold_every_step_and_are_near(name):
+    A, rng = STABLE[name], np.random.default_rng(1)
+    n = len(A)
+    states, rows = rng.standard_normal((20, n)), rng.standard_normal((20, 3, n))
+    maps = np.broadcast_to(A, (20, n, n))
+    low, high, _ = bound_rows(maps, states, rows, np.zeros((20, 0, n)))
+    now, least, most = states, np.inf, -np.inf
+    for _ in range(30_000):
+        values = np.einsum("lrn,ln->lr", rows, now)
+        least, most = np.minimum(least, values), np.maximum(most, values)
+        now = now @ A.T
+    reach = np.maximum(np.abs(least), np.abs(most))
+    assert np.all((low <= least + 1e-12) & (high >= most - 1e-12))
+    assert np.all((least - low <= 0.06 * reach) & (high - most <= 0.06 * reach))
+
+
+def test_of_what_does_not_decay_nothing_is_said():
+    maps = np.stack([beside(turn(radius, 0.3), SHIFT) for radius in (1.01, 0.9)])
+    low, high, above = bound_rows(maps, np.ones((2, 6)), np.ones((2, 1, 6)), np.ones((2, 1, 6)))
+    assert np.isnan([low[0], high[0]]).all()
+    assert np.isfinite([low[1], high[1]]).all()
+    assert not above.any()
+
+
+def test_a_row_stays_above_zero_where_the_slowest_part_wins():
+    """``0.99^k + a 0.9^k`` from a = -1.2 to 1: it is above 0 if it is so at k = 0."""
+    share = np.array([-1.2, -1.01, -0.9, 0.5, 1.0])
+    maps = np.broadcast_to(np.diag([0.99, 0.9]), (5, 2, 2))
+    state = np.stack([np.ones(5), share], 1)
+    _, _, above = bound_rows(maps, state, np.zeros((5, 0, 2)), np.ones((5, 1, 2)))
+    assert above.tolist() == [False, False, True, True, True]
+    _, _, below = bound_rows(maps, -state, np.zeros((5, 0, 2)), np.ones((5, 1, 2)))
+    assert not below.any()
+
+
+def test_squarings_show_decay_and_growth():
+    radii = np.array([0.5, 0.99, 0.9999, 1.0, 1.0001, 1.3])
+    found = square(np.stack([beside(turn(radius, 1.0), SHIFT) for radius in radii]))
+    assert np.sign(found).tolist() == [1, 1, 1, 0, -1, -1]
+    # Half of it within twice as many periods as the radius asks for, but for what the mixed coordinates take.
+    halving = np.log(0.5) / np.log(radii[1:3])
+    assert np.all((2.0 ** found[1:3] >= halving) & (2.0 ** found[1:3] <= 16 * halving))
+
+
+def test_a_lane_without_a_solution_spoils_no_other():
+    maps = np.stack([np.eye(2), np.zeros((2, 2)), 2.0 * np.eye(2)])
+    found = solve_lanes(maps, np.ones((3, 2, 1)))[..., 0]
+    assert found[[0, 2]].tolist() == [[1.0, 1.0], [0.5, 0.5]]
+    assert np.isnan(found[1]).all()
+
+
+def _limit_force(motion: zwidth.Motion, given: dict) -> np.ndarray:
+    return np.abs(motion.command) >= given["max_force"][:, None] * (1 - 1e-9)
+
+
+def _limit_rate(motion: zwidth.Motion, given: dict) -> np.ndarray:
+    change = np.abs(np.diff(motion.command, axis=-1, prepend=0.0)) / 1e-3
+    return change >= given["max_rate"][:, None] * (1 - 1e-9)
+
+
+def _leave(motion: zwidth.Motion, given: dict) -> np.ndarray:
+    return ~motion.contact
+
+
+def _pull(motion: zwidth.Motion, given: dict) -> np.ndarray:
+    return (motion.command >= 0.0) | ~motion.contact
+
+
+SPREAD = np.linspace(0.0, 1.0, 120)
+HIT = {"start_position": 1e-3, "stiffness": 0.7 * float(TOP.stiffness), "virtual_damping": float(TOP.virtual_damping)}
+# What each motion may meet, and at which samples it does.
+MEETS = {
+    "the motor's limit": ({"max_force": 0.5 + 4.0 * SPREAD, "push": 0.4}, _limit_force),
+    "the limit of its rate": ({"max_rate": 10.0 ** (1.0 + 3.0 * SPREAD)}, _limit_rate),
+    "the surface": ({"push": 4.0 * SPREAD, "contact": "unilateral"}, _leave),
+    "a force that would pull": ({"push": 8.0 * SPREAD, "contact": "push_only"}, _pull),
+}
+
+
+@pytest.mark.parametrize("name", MEETS)
+def test_who_is_said_to_come_to_rest_meets_no_decision_any_more(name):
+    given, meets = MEETS[name]
+    periods = 40
+    now = SCENE.simulate(**HIT, **given, periods=periods)
+    later = SCENE.simulate(**HIT, **given, periods=3000)
+    met = meets(later, given)
+    # At a limit it may not be again; the side of the wall is the last one.
+    before = met[:, periods - 1 : periods] & (given.get("contact") is not None)
+    changes = np.any(met[:, periods:] != before, axis=1)
+    settles = np.isin(now.outcome, [CODES.REST, CODES.DECAYING])
+    assert settles.sum() > 10
+    assert changes.sum() > 10
+    assert not np.any(settles & changes)
+    assert np.all(later.amplitude[settles] < 1e-9)
+    # A bound that is too wide says too little.
+    assert np.mean(settles | changes) > 0.95
+
+
+def test_who_pushes_harder_than_motor_and_friction_goes_on():
+    found = SCENE.simulate(
+        1e3, 5.0, push=[1.4, 1.6, -1.6, 1.6], max_force=1.0, coulomb=[0.5, 0.5, 0.5, 0.7], periods=4000
+    )
+    assert [CODES(code).name for code in found.outcome] == ["REST", "RESTLESS", "RESTLESS", "REST"]
+    assert found.amplitude[1] == pytest.approx(found.amplitude[2])
+
+
+def test_who_creeps_while_it_slips_comes_to_rest():
+    """Overdamped and rubbed, the device slips one way for good, and so it does in 20 times as many periods."""
+    push = np.concatenate([np.linspace(0.2, 2.0, 30), np.linspace(-2.0, -0.6, 30)])
+    given = {"start_position": -1e-3, "push": push, "coulomb": 0.1, "static": 0.12}
+    now = SCENE.simulate(200.0, 30.0, **given, periods=300)
+    later = SCENE.simulate(200.0, 30.0, **given, periods=6000)
+    settles = np.isin(now.outcome, [CODES.REST, CODES.DECAYING])
+    turned = (np.sign(later.velocity[:, 300:]) * np.sign(now.velocity[:, -1:]) < 0).any(1)
+    assert settles[:30].sum() > 15
+    assert settles[30:].sum() > 15
+    assert not np.any(settles & turned)
+    assert np.all(later.amplitude[settles] < 1e-9)
+
+
+VELOCITIES = {"difference": zwidth.BackwardDifference(), "low pass": zwidth.LowPass(cutoff=80.0)}
+
+
+@pytest.mark.parametrize("name", VELOCITIES)
+def test_a_damper_without_a_spring_comes_to_rest_where_it_is(name):
+    """No place is asked for: the device coasts by ``m v/(b + B)``, and readings shift with it."""
+    scene = SCENE.replace(velocity=VELOCITIES[name])
+    now = scene.simulate(0.0, [5.0, 8.0], start_position=2e-3, start_velocity=0.05, periods=60)
+    later = scene.simulate(0.0, [5.0, 8.0], start_position=2e-3, start_velocity=0.05, periods=6000)
+    assert now.outcome.tolist() == [CODES.DECAYING] * 2
+    assert later.outcome.tolist() == [CODES.REST] * 2
+    np.testing.assert_allclose(later.position[:, -1], 2e-3 + 0.1 * 0.05 / (2.0 + np.array([5.0, 8.0])), rtol=0.05)
+
+
+def test_a_held_body_is_let_go_by_what_swings_behind_it():
+    """Friction holds the motor; the tip's swing falls slowly, and breaks it loose in some of these."""
+    coupled = zwidth.Scene(zwidth.Device(0.1, 2.0, zwidth.Coupling(0.05, 5e3, 0.5)), zwidth.Timing(1e-3, 1e-3))
+    given = {"start_velocity": 0.2, "coulomb": np.linspace(0.05, 6.0, 120)}
+    now = coupled.simulate(2e3, 5.0, **given, periods=60)
+    later = coupled.simulate(2e3, 5.0, **given, periods=1500)
+    loose = ~later.sticking[:, 60:].all(1)
+    settles = np.isin(now.outcome, [CODES.REST, CODES.DECAYING])
+    assert settles.sum() > 5
+    assert loose.sum() > 5
+    assert not np.any(settles & loose)
+    assert np.mean(settles | loose) > 0.25
+
+
+def test_readings_that_are_said_to_repeat_do_so():
+    periods, wall = 1200, (0.6 * float(TOP.stiffness), float(TOP.virtual_damping))
+    given = {"start_position": 1e-3, "resolution": np.geomspace(3e-6, 1e-4, 80), "max_force": 20.0, "max_rate": 2e4}
+    now = SCENE.simulate(*wall, **given, periods=periods, record=False)
+    later = SCENE.simulate(*wall, **given, periods=8 * periods)
+    counts = np.round(later.measured / given["resolution"][:, None]).astype(int)
+    cyclic = np.array(
+        [any(np.array_equal(row[periods:], row[periods - p : -p]) for p in range(2, 250)) for row in counts]
+    )
+    steady = now.outcome == CODES.STEADY
+    assert steady.sum() > 20
+    assert not np.any(steady & ~cyclic)
+    assert np.mean(steady[cyclic]) > 0.5
