@@ -314,6 +314,6 @@ def _compare(one: DeviceFit, other: DeviceFit) -> str:
     # Exact records would leave nothing to divide by.
     floor = (1e-9 * np.maximum(np.abs(values[0]), np.abs(values[1]))) ** 2 + 1e-300
     far = float(away @ np.linalg.solve(spread + np.diag(floor), away))
-    verdict = "agree" if far <= _CHANCE else "do NOT agree"
+    verdict = "log and buzzing walls agree" if far <= _CHANCE else "log and buzzing walls do NOT agree"
     apart = f"squared, they are {plain(far, 3)} apart in units of their errors"
-    return f"log and buzzing walls {verdict}: {apart}; 95 % of equal devices stay below {_CHANCE}"
+    return f"{verdict}: {apart}; 95 % of equal devices stay below {_CHANCE}"
