@@ -35,7 +35,7 @@ import zwidth
 from zwidth.cli import cli
 from zwidth.loops.linear.passivity import has_condition
 from zwidth.simulation.result import MotionKind
-from zwidth.words.status import RidgeKind, Status
+from zwidth.words.status import Status
 
 SEED = 20
 # Relative distance from the edge within which two roads may round to different sides.
@@ -199,12 +199,10 @@ def highest_questions(wall: Wall) -> Iterator[Question]:
             below = bool(scene.is_stable(*wall[1:])) or (None if near_the_edge(wall) else False)
             yield Question("stable below K_max", {"max_stiffness": True, "is_stable": below})
         else:
-            # A corner may be the tip of a wedge that leans: its own row misses it, the columns below do not.
+            # It may be the tip of a wedge that leans: its own row hardly meets it, the columns below it do.
             edges = scene.stable_damping(top.stiffness * (1 - WEDGE))
             near = edges.size and np.abs(edges / top.virtual_damping - 1).min() <= math.sqrt(WEDGE)
-            yield Question(
-                "K_max is a tip", {"max_stiffness": top.kind == RidgeKind.CORNER, "stable_damping": bool(near)}
-            )
+            yield Question("K_max is a tip", {"max_stiffness": True, "stable_damping": bool(near)})
 
 
 def assessed_questions(wall: Wall) -> Iterator[Question]:
