@@ -22,8 +22,8 @@ from zwidth.fitting.device_fit import (
     RivalDevice,
     StiffnessEstimate,
     in_si,
-    scene_of,
 )
+from zwidth.fitting.scenes import scene_of
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity
 from zwidth.scenes.scene import Scene

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle, lag_jet
-from zwidth.fitting.device_fit import with_cutoff
+from zwidth.fitting.scenes import with_cutoff
 from zwidth.loops.rigid.device import held_plant, split_delay
 from zwidth.loops.rigid.ridge import plant_slopes
 from zwidth.parts.velocity import Estimate, Velocity

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.parts.device import Device
-from zwidth.parts.timing import Timing
+from zwidth.fitting.scenes import scene_of
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.formatting import to_json, with_unit
@@ -327,19 +326,6 @@ def _doubt_period(period: float) -> list[str]:
     return [
         f"a sampling period of {with_unit(period, 's')} is far from any loop; the time may be {slip}: check its unit"
     ]
-
-
-def scene_of(values: Iterable[float], period: float, velocity: Velocity) -> Scene:
-    """A device of this mass, damping and delay with its timing; a fourth value is the velocity's cut-off."""
-    mass, damping, delay, *cutoff = map(float, values)
-    if cutoff:
-        velocity = with_cutoff(velocity, cutoff[0])
-    return Scene(Device(mass, damping), Timing(period=period, delay=delay), velocity=velocity)
-
-
-def with_cutoff(velocity: Any, cutoff: float) -> Any:
-    """A low-pass with another cut-off in Hz."""
-    return replace(velocity, cutoff=cutoff, **({"time_constant": None} if hasattr(velocity, "time_constant") else {}))
 
 
 def in_si(theta: Iterable[float], period: float) -> tuple[np.ndarray, np.ndarray]:

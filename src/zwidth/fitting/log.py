@@ -14,11 +14,11 @@ from zwidth.fitting.device_fit import (
     FittedMotion,
     StiffnessEstimate,
     in_si,
-    scene_of,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
+from zwidth.fitting.scenes import scene_of
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.words.errors import InputError

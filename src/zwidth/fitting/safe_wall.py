@@ -11,13 +11,13 @@ a grid of frequencies; eigenvalues then judge the wall on every device.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from zwidth.arrays.circle import circle
 from zwidth.fitting.buzzing import NeededAnswer
-from zwidth.fitting.device_fit import DeviceFit, scene_of
+from zwidth.fitting.scenes import scene_of
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.loop import RigidVariants
 from zwidth.loops.rigid.device import device_status
@@ -30,6 +30,9 @@ from zwidth.words.errors import InputError
 from zwidth.words.quantities import SI_RANGE
 from zwidth.words.status import Status
 from zwidth.words.types import Array
+
+if TYPE_CHECKING:
+    from zwidth.fitting.device_fit import DeviceFit
 
 _SAMPLES, _MOST_SAMPLES = 8000, 100_000
 # Rounds of draws; where most are impossible, the estimate says nothing.

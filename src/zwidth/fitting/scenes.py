@@ -1,0 +1,25 @@
+"""The scene of a fitted device."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+from zwidth.parts.device import Device
+from zwidth.parts.timing import Timing
+from zwidth.parts.velocity import Velocity
+from zwidth.scenes.scene import Scene
+
+
+def scene_of(values: Iterable[float], period: float, velocity: Velocity) -> Scene:
+    """A device of this mass, damping and delay with its timing; a fourth value is the velocity's cut-off."""
+    mass, damping, delay, *cutoff = map(float, values)
+    if cutoff:
+        velocity = with_cutoff(velocity, cutoff[0])
+    return Scene(Device(mass, damping), Timing(period=period, delay=delay), velocity=velocity)
+
+
+def with_cutoff(velocity: Any, cutoff: float) -> Any:
+    """A low-pass with another cut-off in Hz."""
+    return replace(velocity, cutoff=cutoff, **({"time_constant": None} if hasattr(velocity, "time_constant") else {}))
