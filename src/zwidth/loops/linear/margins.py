@@ -152,7 +152,7 @@ def polish_roots(
 ) -> np.ndarray:
     """Newton's method between ends of different sign; a step that leaves them, and every fourth, is a bisection.
 
-    `numerics.roots.newton` ends beside a crossing where L is all but 0, and with another gain margin.
+    `arrays.roots.newton` ends beside a crossing where L is all but 0, and with another gain margin.
     """
     x = 0.5 * (low + high)
     for step in range(_STEPS if x.size else 0):
