@@ -126,6 +126,7 @@ def test_two_poles_that_meet_are_followed_together(z, d, width):
     alone = outermost_poles(columns, 1e-9)
     error = np.where(np.isinf(found.error), 0.0, np.abs(found.re - alone.re.reshape(1, 64, 64)))
     assert (error <= found.error + alone.error.reshape(1, 64, 64)).all()
-    np.testing.assert_allclose(np.exp(found.re[0, 31, 31]), z, atol=0.2)
+    # The double pole is the outermost one, known to the root of rounding.
+    assert zwidth.spectral_radius(alpha, beta, 0.1, d) == pytest.approx(z, abs=1e-6)
     real = np.sin(alone.im) < 1e-6
     assert 0.1 < real.mean() < 0.9
