@@ -115,11 +115,9 @@ def questions(columns: tuple[Any, ...]) -> Iterator[tuple[str, Make, Make, tuple
     def top(a: Any, b: Any) -> Any:
         return ridge.ridge_kernel(a, b, "held", ANY)
 
-    strips = evaluate._compile_strips.__wrapped__
     wide = xp.WIDE
     yield "WIDE, radius", compiled(quick, wide), compiled(quick), columns
     yield "WIDE, verdict", compiled(stable, wide), compiled(stable), columns
-    yield "STRIP, verdict", lambda: strips(stable, (), xp.STRIP), compiled(stable, wide), columns
     few = (delta[:8192], d[:8192])
     yield (
         "store_once, ridge kkt",

@@ -22,7 +22,6 @@ from .loops.rigid.boundary import stable_region as stable_region
 from .loops.rigid.counting import count_poles as count_poles
 from .loops.rigid.margins import Margins as Margins
 from .loops.rigid.margins import margins as margins
-from .loops.rigid.modulus import modulus_margin as modulus_margin
 from .loops.rigid.passivity import is_passive as is_passive
 from .loops.rigid.passivity import passive_area as passive_area
 from .loops.rigid.passivity import passivity_margin as passivity_margin

@@ -139,7 +139,6 @@ CASES = [
     of_walls(zwidth.is_passive, derivatives=None, value="False where bad"),
     of_walls(zwidth.passivity_margin),
     of_walls(zwidth.margins, value="NaN where bad or alpha <= 0", gradient_in="tests/unit/loops/rigid/test_margins.py"),
-    of_walls(zwidth.modulus_margin, value="NaN where bad or alpha <= 0"),
     of_devices("boundary", zwidth.boundary, {"omega": [0.0, 0.5, 3.0]}),
     of_devices(
         "boundary_point of a row",

@@ -202,6 +202,19 @@ def test_a_click_gives_the_verdict_of_check(page, place):
     assert page.inner_text("#word") == ("stable" if zwidth.assess(shown_scene(page)).stable else "UNSTABLE")
 
 
+@pytest.mark.parametrize("slow", [False, True], ids=["at once after another", "held"])
+def test_no_click_is_lost(page, slow):
+    plane = page.locator("#plane").bounding_box()
+    first, last = ((plane["x"] + x * plane["width"], plane["y"] + 0.5 * plane["height"]) for x in (0.3, 0.6))
+    page.mouse.click(*first)
+    # From 0.3 s on the plot takes it for a press.
+    page.mouse.click(*last, delay=600 if slow else 0)
+    frame = page.evaluate(
+        "(() => { const r = Bokeh.documents[0].get_model_by_name('plane').x_range; return [r.start, r.end] })()"
+    )
+    wait(page, f"document.getElementById('stiffness').valueAsNumber > {frame[0] + 0.4 * (frame[1] - frame[0])!r}")
+
+
 def test_arrow_keys_move_the_wall(page):
     before = shown_scene(page).wall
     page.focus("#plane")

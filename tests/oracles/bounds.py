@@ -7,7 +7,7 @@ import numpy as np
 from zwidth.arrays.evaluate import broadcast
 from zwidth.loops.rigid.device import wall_status
 from zwidth.loops.rigid.folding import NAMES
-from zwidth.loops.rigid.outermost_poles import prove_radii
+from zwidth.loops.rigid.outermost_poles import find_poles, outermost_poles, usable
 from zwidth.words.status import Status
 
 
@@ -23,10 +23,13 @@ class Radius(NamedTuple):
 def bound_radius(alpha, beta, delta, d, *, accuracy=1e-9) -> Radius:
     """What `zwidth.spectral_radius` knows of each point."""
     arrays = broadcast(dict(zip(NAMES, (alpha, beta, delta, d), strict=True)))
-    radius, proved = prove_radii(arrays, accuracy)
-    status = np.asarray(wall_status(*arrays))
-    certified = (status == Status.OK) & (proved <= accuracy)
+    shape, arrays = arrays[0].shape, [np.atleast_1d(array) for array in arrays]
+    radius, certified, _ = find_poles(arrays, accuracy)
+    proved, status = np.full(radius.shape, accuracy), np.asarray(wall_status(*arrays))
+    # What is known of the others, whether of a map or not.
+    left = usable([array[~certified] for array in arrays])[0]
+    proved[~certified] = np.where(np.isnan(radius[~certified]), np.inf, outermost_poles(left, accuracy).error)
     # Of the pole at 1 of a wall without stiffness, and of any other, the logarithm has all the digits.
     error = np.where(np.isinf(proved), np.inf, (np.expm1(proved) + 2e-16) * radius)
     status = np.where((status == Status.OK) & ~certified, Status.NOT_CONVERGED, status)
-    return Radius(*(leaf.reshape(arrays[0].shape) for leaf in (radius, error, certified, status)))
+    return Radius(*(leaf.reshape(shape) for leaf in (radius, error, certified, status)))

@@ -21,7 +21,7 @@ from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.xp import STRIP, WIDE, is_jax, is_traced, tree_map
+from zwidth.arrays.xp import WIDE, is_jax, is_traced, tree_map
 from zwidth.words.errors import InputError, PrecisionWarning
 from zwidth.words.quantities import SIZES
 from zwidth.words.types import ArrayLike
@@ -200,7 +200,7 @@ def evaluate_columns(
     """`evaluate` of concrete columns of one length; one of a single value goes to the kernel as a number."""
     count, few = _length(columns), max(1, FEW // weight)
     if route == "jax" or (route == "auto" and count > few):
-        return map_blocks(_compile_strips(kernel, static, STRIP // weight), columns, BLOCK // weight)
+        return map_blocks(_compile_columns(kernel, static), columns, BLOCK // weight)
 
     def at_once(*parts: np.ndarray) -> Any:
         with np.errstate(all="ignore"):
@@ -295,25 +295,15 @@ def _no_change(leaf: Any) -> Any:
 
 
 @cache
-def _compile_strips(kernel: Callable[..., Any], static: tuple[Any, ...], strip: int) -> Callable[..., Any]:
-    """A kernel compiled for blocks of columns, which it goes through strip by strip."""
+def _compile_columns(kernel: Callable[..., Any], static: tuple[Any, ...]) -> Callable[..., Any]:
+    """A kernel compiled for blocks of columns."""
     import jax
 
-    def strips(*columns: Any) -> Any:
-        size = max(column.size for column in columns)
-        shared = [column.size == 1 < size for column in columns]
-        long = tuple(column for column, same in zip(columns, shared, strict=True) if not same)
+    def whole(*columns: Any) -> Any:
+        count = _length(columns)
+        return kernel(*(column[0] if column.size == 1 < count else column for column in columns), *static)
 
-        def run(parts: tuple[Any, ...]) -> Any:
-            rest = iter(parts)
-            return kernel(*(c[0] if same else next(rest) for c, same in zip(columns, shared, strict=True)), *static)
-
-        if size <= strip:
-            return run(long)
-        found = jax.lax.map(run, tuple(column.reshape(-1, strip) for column in long))
-        return tree_map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), found)
-
-    return jax.jit(strips, compiler_options=WIDE)
+    return jax.jit(whole, compiler_options=WIDE)
 
 
 def map_blocks(
@@ -348,11 +338,31 @@ def map_blocks(
         tree_map(lambda to, leaf: np.copyto(to[start:stop], leaf[: stop - start]), whole, result)
 
     store(0, first)
-    if count > size:
-        # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
-        with ThreadPoolExecutor(threads or processors()) as pool:
-            list(pool.map(lambda start: store(start, run(start)), range(size, count, size)))
+    # The first piece has compiled the function; JAX lets go of the interpreter while it computes.
+    run_in_threads(lambda start: store(start, run(start)), range(size, count, size), threads)
     return whole
+
+
+def run_in_threads(function: Callable[[Any], Any], items: Sequence[Any], threads: int | None = None) -> list[Any]:
+    """The function's results for all items, computed on every processor."""
+    threads = min(threads or processors(), len(items))
+    if threads < 2:
+        return list(map(function, items))
+    with ThreadPoolExecutor(threads) as pool:
+        return list(pool.map(function, items))
+
+
+@contextmanager
+def work_beside() -> Iterator[Callable[..., Any]]:
+    """What begins to call functions, one after the other, in a thread of their own; at the end all have come back."""
+    if processors() < 2:
+        yield lambda function, *arguments: function(*arguments)
+        return
+    calls: list[Any] = []
+    with ThreadPoolExecutor(1) as pool:
+        yield lambda function, *arguments: calls.append(pool.submit(function, *arguments))
+        for call in calls:
+            call.result()
 
 
 def _length(columns: Sequence[np.ndarray]) -> int:

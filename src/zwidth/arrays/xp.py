@@ -173,10 +173,6 @@ Values = TypeVar("Values")
 # times as fast for radii and 1.04 times for verdicts.
 WIDE = {"xla_cpu_prefer_vector_width": 512}
 
-# A kernel over a block of points goes through it in pieces of so many, whose intermediates stay next to the processor.
-# Runs 1.05 times as fast for verdicts.
-STRIP = 1 << 12
-
 
 def store_once(values: Values, witness: Array) -> Values:
     """``values``, computed once: for a kernel in which many later steps use them.

@@ -21,7 +21,6 @@ from zwidth.config.parts import (
     make_parts_base,
 )
 from zwidth.config.values import Delay, NonNegative, Number, describe_entry, quantity_of
-from zwidth.loops.normalization import normalize
 from zwidth.parts.checks import Span
 from zwidth.parts.device import Device
 from zwidth.parts.timing import Timing
@@ -142,11 +141,6 @@ class _PhysicalPlant(_Parts, _Mass):
     def parts_beyond(self) -> tuple[str, ...]:
         """What makes it more than a rigid mass with the difference of two samples, which every kind of study takes."""
         return self.to_scene().parts_beyond
-
-    @property
-    def moving_mass(self) -> float:
-        """The mass that the wall's force acts on, in kg: the device's, and that of a hand held rigidly."""
-        return self.to_scene().mass
 
     @property
     def delta(self) -> float:
@@ -342,10 +336,8 @@ def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
         return wall.alpha, wall.beta
     if isinstance(device, NormalizedDevice):
         raise InputError("wall: got one in SI units for a normalized device; give alpha and beta")
-    own = {"stiffness": wall.stiffness, "virtual_damping": wall.virtual_damping}
-    with np.errstate(over="ignore"):
-        plain = normalize(mass=device.moving_mass, period=device.period, **own)
-    return float(plain.alpha), float(plain.beta)
+    alpha, beta = device.to_scene().normalize_walls(wall.stiffness, wall.virtual_damping)
+    return float(alpha), float(beta)
 
 
 def is_normalized(raw: dict[str, Any]) -> bool:

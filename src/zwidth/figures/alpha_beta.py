@@ -148,7 +148,7 @@ def draw_map(
         output: "stable", "spectral_radius" or "passive".
         axes: an Axes of yours for the first delta and d alone, or one for each panel.
         edges: gives the exact edge of what is stable or passive at a delta and d, drawn in place of that of the cells
-            where all cells agree with it; where there is none, the contour of the spectral radius bounds stable walls.
+            where all cells agree with it.
     """
     delta, d = arrays["delta"], arrays["d"]
     rows, columns = style.pick_evenly(d.size, _PANELS), style.pick_evenly(delta.size, _PANELS)
@@ -162,7 +162,9 @@ def draw_map(
         place = np.s_[:, :, column, row]
         image = _draw_cells(ax, arrays, output, arrays[output][place].T)
         exact = edges(float(delta[column]), float(d[row])) if output in SHADES else None
-        if output in SHADES and _draw_region(ax, arrays, output, place, exact):
+        if exact is not None and stable_set.agrees(exact, arrays["alpha"], arrays["beta"], arrays[output][place].T > 0):
+            look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
+            stable_set.draw_region(ax, exact, SHADES[output], label="exact edge", **look)
             image.set_cmap(ListedColormap(["white", "white"]))
         ax.set_title(rf"$\delta = {delta[column]:g}$,  $d = {d[row]:g}$")
     style.label_axes(panels, style.ALPHA_LABEL, style.BETA_LABEL, once=axes is None)
@@ -178,27 +180,6 @@ def draw_map(
     handles = [Patch(facecolor=color, label=label, **edge) for label, color in shades.items()]
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
-
-
-def _draw_region(
-    ax: Axes, arrays: Mapping[str, np.ndarray], output: str, place: Any, exact: stable_set.Outlines | None
-) -> bool:
-    """The region within its exact edge, or within the contour of the radius; tells whether either is known."""
-    alpha, beta, good = arrays["alpha"], arrays["beta"], arrays[output][place].T.astype(bool)
-    look: dict[str, Any] = {"color": style.BLACK, "linewidth": 1.2, "zorder": 2}
-    if exact is not None and stable_set.agrees(exact, alpha, beta, good):
-        stable_set.draw_region(ax, exact, SHADES[output], label="exact edge", **look)
-        return True
-    radius = arrays["spectral_radius"][place].T if output == "stable" and "spectral_radius" in arrays else None
-    # On alpha = 0 a pole sits at z = 1 whatever beta is, and the contour would follow that column.
-    keep = alpha != 0
-    if radius is None or min(radius[:, keep].shape) < 2 or not np.isfinite(radius).all():
-        return False
-    if not radius[:, keep].min() < 1.0 < radius[:, keep].max():
-        return False
-    ax.contourf(alpha[keep], beta, radius[:, keep], levels=[-np.inf, 1.0], colors=[SHADES[output]], zorder=1)
-    ax.contour(alpha[keep], beta, radius[:, keep], levels=[1.0], colors=style.BLACK, linewidths=1.2, zorder=2)
-    return True
 
 
 def _draw_cells(ax: Axes, arrays: Mapping[str, np.ndarray], output: str, values: np.ndarray) -> Any:

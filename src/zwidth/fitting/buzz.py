@@ -24,11 +24,12 @@ from zwidth.fitting.device_fit import (
     in_si,
 )
 from zwidth.fitting.scenes import scene_of
+from zwidth.fitting.words import spell_rival
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain, with_unit
+from zwidth.words.formatting import plain
 from zwidth.words.status import Status
 
 # Beyond this condition number some direction is not seen at all.
@@ -98,6 +99,8 @@ def fit_buzz(
         >>> print(f"{fit.mass * 1e3:.0f} g")
         100 g
     """
+    from scipy.special import chdtri
+
     period = check_number("period", period)
     velocity = BackwardDifference() if velocity is None else velocity
     if not isinstance(velocity, Velocity):
@@ -122,7 +125,7 @@ def fit_buzz(
     freedom = 2 * len(table) - onsets.unknowns
     best, scale, equals = _choose(onsets, found, freedom, share is not None)
     against = None
-    if share and best.squares > _unlikely(freedom):
+    if share and best.squares > chdtri(freedom, _CHANCE):
         against = (
             f"the walls contradict each other: they are {plain(np.sqrt(best.squares / freedom), 2)} times as far from "
             "this device as their noise explains; look for friction, a compliance or a hand that holds it"
@@ -152,7 +155,7 @@ def fit_buzz(
             rivals.append(RivalDevice(mass, damping, delay, stiffness, *cutoff[:1]))
     if rivals:
         status = Status.UNDECIDED
-        doubts.append(f"another device fits as well: {_describe(rivals[0])}; add the experiment named next")
+        doubts.append(f"another device fits as well: {spell_rival(rivals[0])}; add the experiment named next")
     covariance = by_theta @ np.linalg.inv(information) @ by_theta.T
     if against:
         doubts.append(against)
@@ -198,14 +201,6 @@ def _choose(
     return best, 1.0 if known_noise else max(best.squares / freedom, _EXACT**2), equals
 
 
-def _describe(device: RivalDevice) -> str:
-    cutoff = "" if device.cutoff is None else f", cut-off {with_unit(device.cutoff, 'Hz')}"
-    return (
-        f"m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, "
-        f"t_d = {with_unit(device.delay, 's')}{cutoff}"
-    )
-
-
 def _at_edge(onsets: Onsets, fit: Candidate) -> bool:
     """Whether the fitted walls are where stability ends as K rises: other lobes hold walls that buzzed long before."""
     kappa, period = onsets.follow(fit.theta).kappa, onsets.period
@@ -224,12 +219,6 @@ def _delay_beyond(slopes: np.ndarray, best: Candidate) -> float:
     """Where the delay of the least squares would lie that is held at 0, in standard errors of walls of noise 1."""
     inverse = np.linalg.pinv(slopes)[2]
     return float(inverse @ best.residuals.ravel() / np.linalg.norm(inverse))
-
-
-def _unlikely(freedom: int) -> float:
-    from scipy.special import chdtri
-
-    return float(chdtri(freedom, _CHANCE))
 
 
 def _refuse_blind(slopes: np.ndarray, theta: np.ndarray, table: np.ndarray, on_edge: bool) -> None:

@@ -99,12 +99,10 @@ class Onsets:
         coded = getattr(self.velocity, "coded_period", None) or self.period
         return _LOWEST * float(self.w.min()) / (2 * np.pi * self.period), _HIGHEST * 0.5 / coded
 
-    def velocity_at(self, theta: np.ndarray) -> Velocity:
-        """The velocity estimate that is meant by theta."""
-        return with_cutoff(self.velocity, float(np.exp(theta[3]))) if self.unknown_cutoff else self.velocity
-
     def _estimate_at(self, theta: np.ndarray) -> Estimate:
-        return self.velocity_at(theta).estimate(self.period) if self.unknown_cutoff else self._estimate
+        if not self.unknown_cutoff:
+            return self._estimate
+        return with_cutoff(self.velocity, float(np.exp(theta[3]))).estimate(self.period)
 
     def is_possible(self, theta: np.ndarray) -> bool:
         """Whether a filter of this cut-off is looked for."""

@@ -235,10 +235,7 @@ class DeviceFit:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
-        return to_json(self._numbers())
-
-    def _numbers(self) -> dict[str, Any]:
-        return {
+        numbers = {
             **{name: getattr(self, name) for name in (*NAMES, *(["cutoff"] if "cutoff" in self.errors else []))},
             "stiffness_max": self.stiffness_max,
             "virtual_damping": self.virtual_damping,
@@ -256,6 +253,7 @@ class DeviceFit:
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),
         }
+        return to_json(numbers)
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,16 @@ the unknown zero of the encoder, errors of two samples correlate as
     E[e_i e_k] = sum_h w_h cos(2 pi h (x_i - x_k)/q),    w_h = q^2/(2 pi^2 h^2) exp(-(2 pi h sigma/q)^2),
 
 so samples of a slow motion err alike. Neither knows of n, so that the variance of a sample is sigma^2 + q^2/12.
+
+Samples of a rest all err the same: least squares that took them for thousands of errors would follow that one. So the
+mean of a stretch that stays within a step counts by its own variance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -23,16 +27,21 @@ _OFF, _MOST = 0.02, 1e7
 
 def find_resolution(position: np.ndarray) -> float:
     """The step that all positions are whole numbers of, but for a common offset; 0 where there is none."""
-    steps = np.diff(np.unique(position))
-    if steps.size < 2:
-        return float(steps[0]) if steps.size else 0.0
-    step, span = float(steps.min()), float(np.ptp(position))
-    if span > _MOST * step:
-        return 0.0
-    # The smallest step is the least sure one: by ever longer ways.
-    for way in [*np.sort(steps)[:: max(1, steps.size // 50)].tolist(), span]:
-        step = way / max(1.0, np.round(way / step))
-    return step if fits_steps(position, step) else 0.0
+    ways = np.sort(np.diff(np.unique(position)))
+    if ways.size < 2:
+        return float(ways.sum())
+    span, rest = float(np.ptp(position)), ways[:1]
+    # Euclid's: what the smallest way leaves of the others, and what that leaves.
+    while rest.size and span <= _MOST * rest.min():
+        step = smallest = float(rest.min())
+        # The smallest way is the least sure one: by ever longer ones.
+        for way in [*ways[:: max(1, ways.size // 50)].tolist(), span]:
+            step = way / max(1.0, np.round(way / step))
+        if fits_steps(position, step):
+            return step
+        rest = np.abs(ways - smallest * np.round(ways / smallest))
+        rest = rest[rest > _OFF * smallest]
+    return 0.0
 
 
 def fits_steps(position: np.ndarray, step: float) -> bool:
@@ -49,6 +58,32 @@ class MeasurementNoise:
     variance: float
     resolution: float
 
+    @cached_property
+    def stretches(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Where stretches within a step begin, their samples, how many times white noise's variance the means have."""
+        starts, first = [], np.inf
+        for k, place in enumerate(self.position.tolist()):
+            if not abs(place - first) < self.resolution:
+                starts.append(k)
+                first = place
+        sizes = np.diff([*starts, self.position.size])
+        alike = np.ones(sizes.size)
+        for wave, weight in self._waves():
+            alike += weight / self.variance * (np.abs(np.add.reduceat(wave, starts)) ** 2 / sizes - 1.0)
+        return np.array(starts), sizes, np.maximum(alike, 1.0)
+
+    @property
+    def count(self) -> int:
+        """How many samples of white noise have squares as large as these, weighed."""
+        _, sizes, alike = self.stretches
+        return int(np.sum(sizes + 1.0 - alike))
+
+    def weigh(self, columns: np.ndarray) -> np.ndarray:
+        """Columns over samples in which the mean of every stretch is so small that it counts by its own variance."""
+        starts, sizes, alike = self.stretches
+        beyond = (1.0 - alike**-0.5) / sizes
+        return columns - np.repeat((np.add.reduceat(columns, starts).T * beyond).T, sizes, axis=0)
+
     def spread(self, slopes: np.ndarray) -> np.ndarray:
         """``J^T C J`` for columns J, with C the covariance of the samples."""
         plain = slopes.T @ slopes
@@ -58,12 +93,12 @@ class MeasurementNoise:
             total = total + weight * (np.real(np.outer(along, along.conj())) - plain)
         return total
 
-    def spread_of_sums(self, count: int) -> float:
-        """The mean square of sums of ``count`` neighbors."""
+    def spread_of_sums(self, count: int, weights: MeasurementNoise) -> float:
+        """The mean square of sums of ``count`` neighbors, weighed as those of other positions would be."""
         starts = np.arange(0, self.position.size - count + 1, count)
         total = self.variance * count
         for wave, weight in self._waves():
-            sums = np.add.reduceat(wave[: starts[-1] + count], starts)
+            sums = np.add.reduceat(weights.weigh(wave)[: starts[-1] + count], starts)
             total += weight * (float(np.mean(np.abs(sums) ** 2)) - count)
         return total
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.buzz import BuzzPoint
-from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.device_fit import DeviceFit, reach_of
 from zwidth.fitting.safe_wall import draw_devices
 from zwidth.fitting.words import LINEAR, AxisUnits, choose_wall
 from zwidth.words.errors import InputError
@@ -18,8 +18,6 @@ from zwidth.words.formatting import header
 _DRAWS, _ROWS, _BEYOND = 1000, 121, 1.1
 # Lags of the autocorrelation, at most, and at most as a share of the samples.
 _LAGS, _SHARE = 60, 0.25
-# Of a normal distribution: 95 % lie within.
-_NORMAL = 1.959963984540054
 
 
 def gather_evidence(
@@ -62,7 +60,7 @@ def correlate_residuals(fit: DeviceFit) -> dict[str, np.ndarray]:
     return {
         header("lag", "s"): lags * fit.period,
         "autocorrelation": products / size if size > 0 else np.full(most, np.nan),
-        "band": np.full(most, _NORMAL / np.sqrt(count)),
+        "band": np.full(most, reach_of(None) / np.sqrt(count)),
     }
 
 

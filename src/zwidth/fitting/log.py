@@ -92,13 +92,14 @@ def fit_log(
         in NumPy: a log of 3,000 samples takes about half a second, and unlike in JAX nothing is compiled for its
         length. Friction makes false optima, one for every turn or rest that is missed: starts of no friction and of 0.3
         to 35 % of the largest force are followed from the first 300 samples to ever more. Where none at all explains
-        the log nearly as well, the errors reach to it; they know that an encoder errs alike in neighboring samples. How
-        often the intervals hold the true device is measured in docs/fitting.md.
+        the log nearly as well, the errors reach to it; they know that an encoder errs alike in neighboring samples, of
+        which a rest counts as one. How often the intervals hold the true device is measured in docs/fitting.md.
 
     References:
         Ljung 1999, System Identification, section 4.2 (output error). Leeb, Poetscher 2005, Econometric Theory 21,
-        21-59 (intervals after a choice of models do not hold). Widrow, Kollar 2008, Quantization Noise (an encoder's
-        error). Hulin, Preusche, Hirzinger 2006, eq. (9).
+        21-59 (intervals after a choice of models do not hold). Schwarz 1978, Annals of Statistics 6, 461-464 (further
+        numbers that explain no more than chance). Widrow, Kollar 2008, Quantization Noise (an encoder's error). Hulin,
+        Preusche, Hirzinger 2006, eq. (9).
 
     Example:
         >>> import numpy as np
@@ -120,7 +121,7 @@ def fit_log(
     best = fit_model(recordings, longest, step)
     theta = best.theta
     _refuse_unmoved(best, period)
-    if not best.conditioned:
+    if best.inverse.open[:3].any():
         raise InputError(
             "force: mass, damping and delay cannot be told apart by this log; record longer, with a force that changes "
             "its sign at different times, as steps to and fro"
@@ -179,7 +180,7 @@ def _find_step(resolution: Any, logs: tuple[Log, ...]) -> tuple[float, list[str]
 
 def _refuse_unmoved(best: FittedModel, period: float) -> None:
     """Raise `InputError` where the force explains nothing of the motion, the contrary of it, or too little."""
-    model, theta, squares = best.model, best.theta, best.squares
+    model, theta, squares = best.model, best.theta, float(best.residuals @ best.residuals)
     # What there would be without any force, not even friction.
     alone = model.predict(np.append(theta[:-2], [0.0, 0.0]))[1][:, 3:-2]
     sizes = np.linalg.norm(alone, axis=0)
@@ -217,10 +218,10 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
         doubts.append(f"a force of {with_unit(push, 'N')} is far from any device; it may be in mN: N is meant")
     if errors[0] > VAGUE * mass:
         doubts.append(MASS_OPEN)
-    if best.count < _FEW:
+    if residuals.size < _FEW:
         doubts.append(
-            f"only {best.count} positions count, for those before serve as past force: so few may suit quite another "
-            "device, and the errors do not say so; record longer, or give a shorter max_delay"
+            f"only {residuals.size} positions count, for those before serve as past force: so few may suit quite "
+            "another device, and the errors do not say so; record longer, or give a shorter max_delay"
         )
     size = float(residuals @ residuals)
     if size <= _EXACT**2 * residuals.size * way**2:

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.fitting.encoder import MeasurementNoise
 from zwidth.loops.rigid.device import PhiFunctions, phi_functions, split_delay
 
 
@@ -205,6 +206,11 @@ class Recordings:
     """Several logs of one device; theta is ``(g, delta, d)``, for each log x0 and v0, then o and c."""
 
     logs: tuple[Recording, ...]
+    noise: MeasurementNoise | None = None
+
+    def weigh(self, columns: np.ndarray) -> np.ndarray:
+        """Columns over samples, as `MeasurementNoise.weigh` where the noise is known."""
+        return columns if self.noise is None else self.noise.weigh(columns)
 
     def begin(self, count: int) -> Recordings:
         """Of each log so many first positions."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,6 +40,14 @@ _BLIND, _ROUNDING = 1e7, 1e-13
 _CHANCE = 1e-3
 
 
+class ColumnsInverse(NamedTuple):
+    """Their pseudo-inverse, which numbers the positions leave open, and how many they tell."""
+
+    matrix: np.ndarray
+    open: np.ndarray
+    rank: int
+
+
 @dataclass(frozen=True)
 class FittedModel:
     """A model at its least squares."""
@@ -52,8 +61,8 @@ class FittedModel:
 
     @property
     def count(self) -> int:
-        """How many positions it was fitted to."""
-        return self.model.measured.size
+        """How many positions it was fitted to, as many as of white noise."""
+        return self.model.measured.size if self.model.noise is None else self.model.noise.count
 
     @cached_property
     def moved(self) -> tuple[np.ndarray, np.ndarray]:
@@ -70,7 +79,7 @@ class FittedModel:
         """Of the noise of a position."""
         return self.squares / max(1, self.count - self.theta.size)
 
-    @property
+    @cached_property
     def noise(self) -> MeasurementNoise:
         """That of its positions; at rest, x0 takes up an encoder's error, and the residuals show less than there is."""
         return MeasurementNoise(self.moved[0], max(self.variance, self.resolution**2 / 12.0), self.resolution)
@@ -78,48 +87,33 @@ class FittedModel:
     @cached_property
     def columns(self) -> tuple[np.ndarray, np.ndarray]:
         """The derivatives, each of size 1 or, as that in the v0 of a mass that sticks, 0; and their sizes."""
-        sizes = np.linalg.norm(self.moved[1], axis=0)
+        columns = self.model.weigh(self.moved[1])
+        sizes = np.linalg.norm(columns, axis=0)
         sizes = np.where(sizes > 0, sizes, 1.0)
-        return self.moved[1] / sizes, sizes
+        return columns / sizes, sizes
 
     @cached_property
-    def inverse(self) -> tuple[np.ndarray, np.ndarray]:
-        """The pseudo-inverse of the columns, and which numbers the positions leave open."""
+    def inverse(self) -> ColumnsInverse:
+        """By singular values."""
         left, values, right = np.linalg.svd(self.columns[0], full_matrices=False)
         blind = values * _BLIND < values[0]
         inverse = right[~blind].T / values[~blind] @ left[:, ~blind].T
-        return inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0)
-
-    @property
-    def conditioned(self) -> bool:
-        """Whether the positions tell mass, damping and delay."""
-        return not self.inverse[1][:3].any()
+        return ColumnsInverse(inverse, np.any(np.abs(right[blind]) > _BLIND**-0.5, axis=0), int(np.sum(~blind)))
 
     def step_beyond(self, k: int) -> float:
         """Where the least squares of what is held at its bound would lie, in standard errors from there."""
-        step = self.inverse[0][k] @ self.residuals / self.columns[1][k]
+        step = self.inverse.matrix[k] @ self.model.weigh(self.residuals) / self.columns[1][k]
         return float(step / np.sqrt(self.covariance[k, k]))
 
-    @property
-    def leaves_open(self) -> bool:
-        """Whether the positions do not tell friction from a constant force."""
-        return bool(self.inverse[1][-2:].all())
-
     def lag_behind(self, other: FittedModel) -> float:
-        """By how much its squares are more than another model's, in squares of standard errors.
-
-        By chance the other takes up what noise there is along their difference, of an encoder at rest a lot.
-        """
+        """By how much its squares are more than another model's, in squares of standard errors."""
         floor = self.count * (_ROUNDING * float(np.abs(self.model.measured).max())) ** 2
         ratio = max(self.squares, floor) / max(other.squares, floor)
-        apart = (other.moved[0] - self.moved[0])[:, None]
-        size = float(np.sum(apart**2))
-        alike = float(self.noise.spread(apart)[0, 0]) / (self.noise.variance * size) if size > 0 else 1.0
-        return self.count * np.log(ratio) / max(1.0, alike)
+        return self.count * np.log(ratio)
 
     def explains_as_well(self, other: FittedModel) -> bool:
-        """Whether another model leaves less by no more than one number more would by chance, or than rounding."""
-        return self.lag_behind(other) < np.log(self.count)
+        """Whether another model leaves less by no more than its further numbers would by chance, or than rounding."""
+        return self.lag_behind(other) < max(1, other.inverse.rank - self.inverse.rank) * np.log(self.count)
 
     @cached_property
     def excess(self) -> float:
@@ -129,10 +123,11 @@ class FittedModel:
         """
         from scipy.special import chdtri
 
-        size = int(2 * np.ceil(self.count ** (1 / 3)))
-        starts = np.arange(0, self.count - size + 1, size)
-        sums = np.add.reduceat(self.residuals[: starts[-1] + size], starts)
-        expected = self.noise.spread_of_sums(size)
+        weights, total = self.model.noise or self.noise, self.residuals.size
+        size = int(2 * np.ceil(total ** (1 / 3)))
+        starts = np.arange(0, total - size + 1, size)
+        sums = np.add.reduceat(weights.weigh(self.residuals)[: starts[-1] + size], starts)
+        expected = self.noise.spread_of_sums(size, weights)
         if not expected > 0:
             return 1.0
         found = float(np.mean(sums**2)) / expected
@@ -145,11 +140,11 @@ class FittedModel:
         NaN of what is open. Where squares rise less towards a rival than slopes say, as beyond a corner, the errors
         that way are as large as to leave it as many standard errors away as its squares do.
         """
-        columns, sizes = self.columns
+        (columns, sizes), weigh = self.columns, self.model.weigh
         # Not by the products of columns, which keep half of the digits.
-        inverse, blind = self.inverse
+        inverse, blind, _ = self.inverse
         triangle = inverse @ inverse.T
-        whole = self.excess * (triangle @ self.noise.spread(columns) @ triangle) / np.outer(sizes, sizes)
+        whole = self.excess * (triangle @ self.noise.spread(weigh(columns)) @ triangle) / np.outer(sizes, sizes)
         whole[blind], whole[:, blind] = np.nan, np.nan
         for rival in self.rivals:
             known = ~blind & np.diag(whole > 0)
@@ -167,6 +162,10 @@ def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: flo
     """The device of the least squares, with a constant force and friction."""
     model = Recordings(recordings)
     best = _fit(model, _follow(model, _start(model, longest), longest), longest, resolution)
+    if resolution:
+        # At rest an encoder errs by the same all the time: that counts once.
+        model = replace(model, noise=best.noise)
+        best = _fit(model, best.theta, longest, resolution)
     # Of a mass that slides one way only, and rests before or after, how much is of which stays open: one of them is
     # none. Beside that device others fit that slide back a little within the noise.
     steps = np.diff(best.moved[0])
@@ -176,16 +175,13 @@ def fit_model(recordings: tuple[Recording, ...], longest: float, resolution: flo
         parts, none = ((pull, LEAST * abs(g) * model.largest), -1) if way * pull > 0 else ((0.0, -way * pull), -2)
         start = np.append(best.theta[:-2], parts)
         rival = _fit(model, start, longest, resolution, (none,))
-        if rival.leaves_open and rival.explains_as_well(best):
+        if rival.inverse.open[-2:].all() and rival.explains_as_well(best):
             return rival
-        # Towards such a corner steps may hardly end.
-        if rival.arrived and not best.arrived and rival.lag_behind(best) < 1.0:
-            best = rival
     # Without friction nothing rests: beyond that corner the squares may rise less than the slopes say.
     if best.theta[-1] ** 2 < _CLOSE_BY * best.covariance[-1, -1]:
         none = best.theta - np.nan_to_num(best.covariance[:, -1]) * best.theta[-1] / best.covariance[-1, -1]
         none[-1] = LEAST * abs(none[0]) * model.largest
-        gliding = FittedModel(model, *_settle(model, none, longest, (-1,)), resolution)
+        gliding = _settle(model, none, longest, resolution, (-1,))
         if best.explains_as_well(gliding):
             return replace(best, rivals=(gliding,))
         return replace(gliding, rivals=(best,))
@@ -259,43 +255,35 @@ def _follow(model: Recordings, starts: list[np.ndarray], longest: float) -> np.n
 def _fit(
     model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
 ) -> FittedModel:
-    """Least squares from a start, or at rest where that is as good."""
-    best = FittedModel(model, *_settle(model, start, longest, held), resolution)
-    still = _rest(best)
-    if still is not None:
-        resting = FittedModel(model, *_settle(model, still, longest, held), resolution)
-        # A start at rest needs one number less.
+    """Least squares from a start, or at rest where that is as good.
+
+    First speeds that friction stops within the noise hardly move the positions. Beside such a speed the position's
+    derivative is next to 0, and steps towards the best one hardly end.
+    """
+    best = _settle(model, start, longest, resolution, held)
+    speed, (_, delta, *_, friction) = np.abs(best.theta[model.speeds]), best.theta
+    # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
+    slid = speed**2 / (2.0 * friction + delta * speed)
+    idle = (slid > 0) & (slid < _WITHIN * np.sqrt(best.variance))
+    if idle.any():
+        still = best.theta.copy()
+        still[model.speeds[idle]] = 0.0
+        resting = _settle(model, still, longest, resolution, held)
         if not best.arrived or resting.explains_as_well(best):
             return resting
     return best
 
 
 def _settle(
-    model: Recordings, start: np.ndarray, longest: float, held: tuple[int, ...] = ()
-) -> tuple[np.ndarray, float, bool]:
+    model: Recordings, start: np.ndarray, longest: float, resolution: float, held: tuple[int, ...] = ()
+) -> FittedModel:
     """As `_refine`, with neither damping nor delay negative."""
     best = _refine(model, start, longest, held)
-    while any(best[0][k] < 0 for k in (1, 2)):
-        negative = tuple(k for k in (1, 2) if best[0][k] < 0)
+    while negative := tuple(k for k in (1, 2) if best[0][k] < 0):
         best[0][list(negative)] = 0.0
         held = (*held, *negative)
         best = _refine(model, best[0], longest, held)
-    return best
-
-
-def _rest(fitted: FittedModel) -> np.ndarray | None:
-    """Without the first speeds that friction stops within the noise: they hardly move the positions; None without any.
-
-    Beside such a speed the position's derivative is next to 0, and steps towards the best one hardly end.
-    """
-    speeds, (_, delta, *_, friction) = fitted.model.speeds, fitted.theta
-    speed = np.abs(fitted.theta[speeds])
-    # The way to the stop, v^2/(2 c) without damping and v/delta without friction.
-    slid = speed**2 / (2.0 * friction + delta * speed)
-    idle = (slid > 0) & (slid < _WITHIN * np.sqrt(fitted.variance))
-    still = fitted.theta.copy()
-    still[speeds[idle]] = 0.0
-    return still if idle.any() else None
+    return FittedModel(model, *best, resolution)
 
 
 def _refine(
@@ -317,12 +305,17 @@ def _refine(
     low[-1] = LEAST * abs(start[0]) * model.largest
     low[list(held)] = high[list(held)] = start[list(held)]
     theta, measured, damping = np.clip(start, low, high), model.measured, _EASY
-    place, slopes = model.predict(theta)
-    squares = float(np.sum((measured - place) ** 2))
+
+    def look(theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        place, slopes = model.predict(theta)
+        rest = model.weigh(measured - place)
+        return rest, model.weigh(slopes), float(rest @ rest)
+
+    (rest, slopes, squares), promised = look(theta), np.inf
     for _ in range(most):
         sizes = np.linalg.norm(slopes, axis=0)
         # Only what moves the positions moves, and nothing out of its bounds.
-        fall = slopes.T @ (measured - place)
+        fall = slopes.T @ rest
         free = (sizes > 0) & ((theta > low) | (fall > 0)) & ((theta < high) | (fall < 0))
         sizes = sizes[free]
         columns = slopes[:, free] / sizes
@@ -334,8 +327,7 @@ def _refine(
             trial = theta.copy()
             trial[free] += step / sizes
             trial = np.clip(trial, low, high)
-            trial_place, trial_slopes = model.predict(trial)
-            trial_squares = float(np.sum((measured - trial_place) ** 2))
+            trial_rest, trial_slopes, trial_squares = look(trial)
             if trial_squares < squares or damping > _STUBBORN:
                 break
             if promised <= arrived * squares:
@@ -343,9 +335,9 @@ def _refine(
             damping = max(10.0 * damping, _EASY)
         if not trial_squares < squares:
             # No step in the direction of the slopes helps any more: a corner, or rounding.
-            return theta, squares, promised <= _NEARLY * squares
-        theta, place, slopes, squares, before = trial, trial_place, trial_slopes, trial_squares, squares
+            break
+        theta, rest, slopes, squares, before = trial, trial_rest, trial_slopes, trial_squares, squares
         damping = 0.0 if damping < _LIGHT else damping / 10.0
         if before - squares <= arrived * before and promised <= arrived * before:
             return theta, squares, True
-    return theta, squares, False
+    return theta, squares, promised <= _NEARLY * squares

@@ -29,8 +29,6 @@ _TROUBLES = {
     Status.UNREACHABLE: "the delay ends the range looked in",
 }
 _ROTARY_NOTE = "# A rotary axis: kg stands for kg m^2 (inertia), N s/m for N m s/rad, N/m for N m/rad, N for N m."
-
-
 NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
 
 
@@ -107,7 +105,7 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
         rows.append(("position noise", units.spell("position", fit.noise, 3)))
         if fit.resolution:
             rows.append(("step of the encoder", units.spell("position", fit.resolution, 3)))
-    rows += [("or as well", _spell_rival(rival, units)) for rival in fit.rivals]
+    rows += [("or as well", spell_rival(rival, units)) for rival in fit.rivals]
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if safe.status == Status.OK:
         bound = f"K = {units.spell('stiffness', safe.stiffness)}, B = {units.spell('damping', safe.virtual_damping)}"
@@ -143,7 +141,8 @@ def list_doubts(fit: DeviceFit, units: AxisUnits) -> list[str]:
     return [doubt.replace("N s/m", ROTARY.damping).replace("N/m", ROTARY.stiffness) for doubt in fit.doubts]
 
 
-def _spell_rival(rival: RivalDevice, units: AxisUnits) -> str:
+def spell_rival(rival: RivalDevice, units: AxisUnits = LINEAR) -> str:
+    """Its numbers in a line."""
     parts = {SYMBOLS[name]: units.spell(name, getattr(rival, name)) for name in ("mass", "damping", "delay")}
     parts |= {} if rival.cutoff is None else {SYMBOLS["cutoff"]: units.spell("cutoff", rival.cutoff)}
     parts[SYMBOLS["stiffness_max"]] = units.spell("stiffness", rival.stiffness_max)

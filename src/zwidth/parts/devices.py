@@ -13,7 +13,6 @@ from typing import Any, Literal, NamedTuple
 
 from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
-from zwidth.parts.timing import Timing
 from zwidth.words.errors import InputError, describe_choice
 
 
@@ -85,10 +84,6 @@ class KnownDevice:
         """
         return Device(mass=self._chosen("mass", mass), damping=self._chosen("damping", damping))
 
-    def to_timing(self, *, delay: Any = 0.0) -> Timing:
-        """A `zwidth.Timing` with the published period and a delay of yours in s."""
-        return Timing(period=self._chosen("period", None), delay=delay)
-
     def _chosen(self, name: str, given: Any) -> Any:
         if given is not None:
             return given
@@ -96,8 +91,7 @@ class KnownDevice:
         if found is None:
             known = ", ".join(self.numbers)
             raise InputError(
-                f"{name}: none is published for {self.name!r} (published are {known}); "
-                + ("use Timing(period=...)" if name == "period" else f"give to_device({name}=...)")
+                f"{name}: none is published for {self.name!r} (published are {known}); give to_device({name}=...)"
             )
         return found.value
 

@@ -91,7 +91,7 @@ def assess(scene: Scene) -> Assessment:
     stands, best, known = scene.margins(), scene.max_stiffness(), has_condition(scene.device)
     margin = float(scene.passivity_margin()) if known else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
-    row, column = (_list_intervals(ends) for ends in (scene.stable_stiffness(), scene.stable_damping()))
+    row, column = (tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
     lower, upper = nearest_interval(column, scene.wall.virtual_damping)
     slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
     return Assessment(
@@ -117,10 +117,6 @@ def assess(scene: Scene) -> Assessment:
         frequency=slowest.angle / (2.0 * math.pi * period),
         **{name: float(getattr(stands, name)) for name in _MARGINS},
     )
-
-
-def _list_intervals(ends: np.ndarray) -> Intervals:
-    return tuple((low, high) for low, high in ends.tolist())
 
 
 def name_kind(wall: StiffestWall) -> str:

@@ -107,11 +107,6 @@ class Scene(SceneAnswers):
         within = {"velocity": plain, "operator": grasp}
         return tuple(name for name in find_parts(self) if not within.get(name))
 
-    @property
-    def is_rigid(self) -> bool:
-        """Whether it is a rigid mass with the backward difference, for which the closed forms hold."""
-        return not self.parts_beyond
-
     @cached_property
     def loop(self) -> LinearLoop:
         """Its loop, normalized, that answers every question about its walls."""

@@ -18,8 +18,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from zwidth.arrays.evaluate import check_scalars, evaluate
-from zwidth.arrays.roots import last_cell, newton
-from zwidth.arrays.xp import frozen, is_traced, namespace, nan_with_nan_slopes, within
+from zwidth.arrays.roots import follow_root, last_cell, newton
+from zwidth.arrays.xp import apply_each, frozen, is_traced, namespace, nan_with_nan_slopes, within
 from zwidth.loops.normalization import Normalized, denormalize, normalize, quantity_status
 from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, device_status
 from zwidth.loops.rigid.polynomial import check_delay_model
@@ -292,20 +292,18 @@ def _kernel(*arguments: Any) -> Requirement:
         return misfit(x, _Request(*(part[..., None] for part in still)))
 
     inner, outer, offset = _bracket(parameter, still)
+    at_inner, at_outer = apply_each(misfit, (inner, outer), xp)
     # Cut off by the domain, the bracket may end short of any zero.
-    beyond = ~(misfit(outer) > 0.0)
+    beyond = ~(at_outer > 0.0)
     if parameter == "damping":
-        low, high, crossed = inner, outer, ~(misfit(inner) > 0.0)
+        low, high, crossed = inner, outer, ~(at_inner > 0.0)
     else:
         low, high, crossed = last_cell(at_samples, inner, outer, offset)
     x = frozen(newton(with_slope, low, high, high, _STEPS)[0], xp)
     # Between samples that are all short of K a peak may touch it.
     crossed = crossed | (xp.abs(misfit(x)) <= 1e-12)
-    for _ in range(0 if xp is np else 2):
-        # Each of these steps makes one more order of derivatives exact.
-        value, slope = with_slope(x, given)
-        step = value / slope
-        x = x - xp.where(xp.abs(step) <= 1e-3 * xp.abs(x), step, 0.0)
+    near = 1e-3 * xp.abs(x)
+    x = follow_root(lambda x: misfit(x, given), x, lambda slope, step: xp.abs(step) <= near)
     x = xp.where(x < inner, inner, x)
     found = crossed & ~beyond
     value = xp.where(found, x, 0.0)

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from zwidth.arrays.evaluate import compute_concretely, processors
-from zwidth.loops.linear.chain import Chain, chain_of
+from zwidth.loops.linear.chain import chain_of
 from zwidth.parts.paths import Parts, replace_parameters
-from zwidth.parts.velocity import FOAW, BackwardDifference, Estimate
+from zwidth.parts.velocity import FOAW, BackwardDifference
 from zwidth.simulation.flow import Mechanics, mechanics
 from zwidth.simulation.lanes import (
     Course,
@@ -30,30 +29,6 @@ from zwidth.simulation.result import to_si
 TOGETHER = 1 << 10
 
 
-@dataclass(frozen=True)
-class Numbers:
-    """One number a simulation of everything that is given to it, in SI units."""
-
-    stiffness: np.ndarray
-    virtual_damping: np.ndarray
-    start_position: np.ndarray
-    start_velocity: np.ndarray
-    push: np.ndarray
-    resolution: np.ndarray
-    noise: np.ndarray
-    coulomb: np.ndarray
-    static: np.ndarray
-    max_force: np.ndarray
-    max_rate: np.ndarray
-    jitter: np.ndarray
-    seed: np.ndarray
-    history: np.ndarray | None  # (lanes, periods)
-
-    def take(self, places: np.ndarray) -> Numbers:
-        """Those of some simulations."""
-        return replace(self, **{name: part[places] for name, part in vars(self).items() if part is not None})
-
-
 def structure(scene: Parts) -> tuple[Any, ...]:
     """What the scenes of one program share: their bodies, which of them is sensed, and FOAW's longest window."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
@@ -67,96 +42,121 @@ def name_bodies(scene: Parts) -> tuple[str, ...]:
     return "position", *tip, *hand
 
 
-def _chain(scene: Parts) -> Chain:
-    if isinstance(scene.velocity, FOAW):
-        scene = replace_parameters(scene, {"velocity": BackwardDifference()})
-    return chain_of(scene)
+class Batch:
+    """Simulations of scenes of one structure.
 
+    ``which`` is the scene of each; ``numbers`` has a row each of the arguments of `simulate`, by name and in SI units.
+    """
 
-def run_batch(scenes: list[Any], which: np.ndarray, numbers: Numbers, course: Course) -> dict[str, np.ndarray]:
-    """Run simulations of scenes of one structure; ``which`` is the scene of each. Columns of one row a simulation."""
-    chains = [_chain(scene) for scene in scenes]
-    machine = mechanics(chains)
-    fractions = np.array([float(chain.d - chain.whole) for chain in chains])
-    names = name_bodies(scenes[0])
-    first_velocity = scenes[0].velocity
-    jitter, friction = bool(np.any(numbers.jitter > 0)), bool(np.any(numbers.static > 0))
-    options = Options(
-        substeps=course.substeps,
-        pieces=4 if jitter else 2 if friction or np.any(fractions > 0) else 1,
-        friction=friction,
-        jitter=jitter,
-        foaw=first_velocity.samples if isinstance(first_velocity, FOAW) else 0,
-        record=course.record,
-    )
-    estimates: list[Estimate | FOAW] = [
-        scene.velocity if isinstance(scene.velocity, FOAW) else chain.estimate
-        for scene, chain in zip(scenes, chains, strict=True)
-    ]
-    late = np.array([chain.whole for chain in chains])
-    periods = np.array([float(scene.timing.period) for scene in scenes])
-    masses = np.array([float(scene.mass) for scene in scenes])
-    windows = [each.window if isinstance(each, Estimate) else each.samples for each in estimates]
+    def __init__(self, scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], course: Course) -> None:
+        self.names, self.which, self.numbers, self.course = name_bodies(scenes[0]), which, numbers, course
+        # An adaptive window is no filter: its own numbers stand beside the chain's.
+        adapts = isinstance(scenes[0].velocity, FOAW)
+        plain = [replace_parameters(each, {"velocity": BackwardDifference()}) for each in scenes] if adapts else scenes
+        chains = [chain_of(each) for each in plain]
+        self.machine = mechanics(chains)
+        self.estimates: list[Any] = (
+            [each.velocity for each in scenes] if adapts else [chain.estimate for chain in chains]
+        )
+        self.late = np.array([chain.whole for chain in chains])
+        self.fractions = np.array([float(chain.d - chain.whole) for chain in chains])
+        self.periods = np.array([float(scene.timing.period) for scene in scenes])
+        self.masses = np.array([float(scene.mass) for scene in scenes])
+        jitter, friction = bool(np.any(numbers["jitter"] > 0)), bool(np.any(numbers["static"] > 0))
+        self.options = Options(
+            substeps=course.substeps,
+            pieces=4 if jitter else 2 if friction or np.any(self.fractions > 0) else 1,
+            friction=friction,
+            jitter=jitter,
+            foaw=scenes[0].velocity.samples if adapts else 0,
+            record=course.record,
+        )
+        windows = [each.samples if isinstance(each, FOAW) else each.window for each in self.estimates]
+        self.rings = round_up(max(windows) + 1), round_up(int(self.late.max()) + 3)
 
-    def run(places: np.ndarray) -> dict[str, np.ndarray]:
-        own, lane_of = np.unique(which[places], return_inverse=True)
-        if len(scenes) == 1:
+    def lay(self, places: np.ndarray) -> tuple[Lanes, Given]:
+        """Some of the simulations side by side."""
+        own, lane_of = np.unique(self.which[places], return_inverse=True)
+        if len(self.periods) == 1:
             # One serves all lanes.
             lane_of = np.zeros(1, int)
-        few = Mechanics(*(part if name == "place" else part[own] for name, part in machine._asdict().items()))
-        given, period, mass = numbers.take(places), periods[which[places]], masses[which[places]]
+        course, options = self.course, self.options
+        numbers = {name: part[places] for name, part in self.numbers.items()}
+        machine = Mechanics(*(part if name == "place" else part[own] for name, part in self.machine._asdict().items()))
+        period, mass = self.periods[self.which[places]], self.masses[self.which[places]]
         force = period * period / mass
+        late = self.late[own][lane_of]
         lanes = Lanes(
-            alpha=given.stiffness * force,
-            beta=given.virtual_damping * period / mass,
-            resolution=given.resolution,
-            push=given.push * force,
+            alpha=numbers["stiffness"] * force,
+            beta=numbers["virtual_damping"] * period / mass,
+            resolution=numbers["resolution"],
+            push=numbers["push"] * force,
             bilateral=np.array([course.contact == "bilateral"]),
             pulling=np.array([course.contact != "push_only"]),
-            late=late[own][lane_of],
+            late=late,
             motor=Motor(
-                given.max_force * force,
-                given.max_rate * period * force,
-                given.coulomb * force,
-                given.static * force,
+                numbers["max_force"] * force,
+                numbers["max_rate"] * period * force,
+                numbers["coulomb"] * force,
+                numbers["static"] * force,
             ),
-            estimator=lay_estimators([estimates[k] for k in own], lane_of),
-            **lay_machines(few, cut_period(fractions[own], options.substeps, options.pieces), lane_of, options),
+            estimator=lay_estimators([self.estimates[k] for k in own], lane_of),
+            **lay_machines(
+                machine, cut_period(self.fractions[own], options.substeps, options.pieces), lane_of, options
+            ),
         )
+        instants = durations = None
         if options.jitter:
-            late_of, fraction_of = late[own][lane_of], fractions[own][lane_of]
             instants, durations = draw_instants(
-                given.seed, given.jitter / period, late_of, fraction_of, course.periods, options.substeps
+                numbers["seed"],
+                numbers["jitter"] / period,
+                late,
+                self.fractions[own][lane_of],
+                course.periods,
+                course.substeps,
             )
-        else:
-            instants, durations = None, None
-        drawn = draw_noise(given.seed, given.noise, course.periods)
-        history = None if given.history is None else (given.history * force[:, None]).T
-        rings = round_up(max(windows) + 1), round_up(int(late.max()) + 3)
+        return lanes, Given(
+            position=numbers["start_position"],
+            velocity=numbers["start_velocity"] * period,
+            noise=draw_noise(numbers["seed"], numbers["noise"], course.periods),
+            history=(numbers["push_history"] * force[:, None]).T if "push_history" in numbers else None,
+            durations=durations,
+            instants=instants,
+            period=period,
+            mass=mass,
+        )
+
+    def run(self, places: np.ndarray) -> dict[str, np.ndarray]:
+        """Columns of one row a simulation."""
         # What JAX is needed for begins here.
         from zwidth.simulation.engine import run_lanes
         from zwidth.simulation.outlook import foresee
 
-        outside = Given(given.start_position, given.start_velocity * period, drawn, history, durations)
+        lanes, given = self.lay(places)
         with compute_concretely():
-            state, sensed, reading, frame = run_lanes(lanes, options, course, outside, rings)
-            last, steady = lanes.push + np.zeros(places.size), given.noise == 0
-            if history is not None:
+            state, sensed, reading, frame = run_lanes(lanes, self.options, self.course, given, self.rings)
+            last, steady = lanes.push + np.zeros(places.size), self.numbers["noise"][places] == 0
+            if given.history is not None:
                 # A hand that still moves in the tail moves on.
-                last, steady = last + history[-1], steady & np.all(history[-course.tail :] == history[-1], axis=0)
-            outlook = foresee(lanes, options, state, last, steady, sensed, course.periods)
-        found = state, reading, frame
-        return to_si(found, given, outlook, instants, period, mass, names, course)
+                tail = given.history[-self.course.tail :]
+                last, steady = last + tail[-1], steady & np.all(tail == tail[-1], axis=0)
+            outlook = foresee(lanes, self.options, state, last, steady, sensed, self.course.periods)
+        return to_si((state, reading, frame), given, lanes.motor.static > 0, outlook, self.names, self.course)
 
-    count = which.size
+
+def run_batch(
+    scenes: list[Any], which: np.ndarray, numbers: dict[str, np.ndarray], course: Course
+) -> dict[str, np.ndarray]:
+    """Run the simulations of a `Batch`: columns of one row each."""
+    batch, count = Batch(scenes, which, numbers, course), which.size
     size = min(TOGETHER, 1 << (count - 1).bit_length())
     # The last piece is filled up with its last simulation: one size is one compilation.
     pieces = [np.minimum(np.arange(first, first + size), count - 1) for first in range(0, count, size)]
-    found = [run(pieces[0])]
+    found = [batch.run(pieces[0])]
     if len(pieces) > 1:
         # The first piece has compiled the program; JAX lets go of the interpreter while it computes.
         with ThreadPoolExecutor(processors()) as pool:
-            found.extend(pool.map(run, pieces[1:]))
+            found.extend(pool.map(batch.run, pieces[1:]))
     return {name: np.concatenate([each[name] for each in found])[:count] for name in found[0]}
 
 

@@ -123,12 +123,9 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
             number, force = piece
             return move(lanes, options, *carry, force, given.push, (j, number), durations[j, number]), None
 
-        if options.friction or options.jitter:
-            # Compiled once, not once a piece.
-            return jax.lax.scan(one, (body, work), (np.arange(options.pieces), jnp.stack(forces)))[0], frame
-        for piece in enumerate(forces):
-            (body, work), _ = one((body, work), piece)
-        return (body, work), frame
+        # What is long is compiled once, not once a piece.
+        pieces, short = (np.arange(options.pieces), jnp.stack(forces)), not (options.friction or options.jitter)
+        return jax.lax.scan(one, carry, pieces, unroll=short)[0], frame
 
     (body, work), frames = jax.lax.scan(substep, (state.body, state.work), np.arange(options.substeps))
     summary = _summarize(lanes, state, reading, body, work, given.k, ends, motion)
@@ -189,26 +186,23 @@ def run_lanes(
     for first in range(0, course.periods, BLOCK):
         inputs = Inputs(
             np.arange(first, first + BLOCK),
-            _cut(given.noise, first, 0.0, (1,)),
-            lanes.push[None] + _cut(given.history, first, 0.0, (1,)),
-            _cut(given.durations, first, 0.0, (0, 0, 1)),
+            _cut(given.noise, first, (1,)),
+            lanes.push[None] + _cut(given.history, first, (1,)),
+            _cut(given.durations, first, (0, 0, 1)),
         )
         # Lanes are last axes on purpose, whatever the caller wants of arrays of theirs.
         with jax.numpy_rank_promotion("allow"):
             state, found = compile_block(options)(lanes, ends, state, inputs)
         recorded.append(jax.tree.map(np.asarray, found))
-    state = jax.tree.map(np.asarray, state)
     behind = -course.periods % BLOCK
-    kept = jax.tree.map(lambda *parts: np.concatenate(parts), *recorded)
-    kept = jax.tree.map(lambda part: part[: len(part) - behind], kept)
-    sensed, recording = kept
-    reading, frame = recording or (None, None)
-    return state, sensed[-CYCLE:], reading, frame
+    joined = jax.tree.map(lambda *parts: np.concatenate(parts)[: BLOCK * len(parts) - behind], *recorded)
+    sensed, (reading, frame) = joined[0], joined[1] or (None, None)
+    return jax.tree.map(np.asarray, state), sensed[-CYCLE:], reading, frame
 
 
-def _cut(values: np.ndarray | None, first: int, rest: float, shape: tuple[int, ...]) -> np.ndarray:
-    """The block of values along time that begins there, filled up; of one lane where there are none."""
+def _cut(values: np.ndarray | None, first: int, shape: tuple[int, ...]) -> np.ndarray:
+    """The block of values along time that begins there, filled up with 0; of one lane where there are none."""
     if values is None:
-        return np.full((BLOCK, *shape), rest)
+        return np.zeros((BLOCK, *shape))
     part = values[first : first + BLOCK]
-    return np.pad(part, ((0, BLOCK - len(part)), *((0, 0),) * (part.ndim - 1)), constant_values=rest)
+    return np.pad(part, ((0, BLOCK - len(part)), *((0, 0),) * (part.ndim - 1)))

@@ -44,13 +44,16 @@ class Course(NamedTuple):
 
 
 class Given(NamedTuple):
-    """What comes from outside, normalized."""
+    """What comes from outside, normalized, and the units of that."""
 
     position: np.ndarray
     velocity: np.ndarray
     noise: np.ndarray | None  # (periods, lanes), in m
     history: np.ndarray | None  # (periods, lanes)
     durations: np.ndarray | None  # (periods, substeps, pieces, lanes)
+    instants: np.ndarray | None  # (periods + 1, lanes), in periods
+    period: np.ndarray  # in s
+    mass: np.ndarray  # in kg
 
 
 class Motor(NamedTuple):
@@ -94,8 +97,10 @@ class Lanes(NamedTuple):
     longest: Array  # step with friction
 
 
-def _lay(parts: np.ndarray, which: np.ndarray) -> np.ndarray:
+def _lay(parts: Any, which: np.ndarray) -> Any:
     """One array a scene, along the first axis, as one a lane along the last; of length 1 where there is one scene."""
+    if isinstance(parts, tuple):
+        return type(parts)(*(_lay(part, which) for part in parts))
     last = np.moveaxis(parts, 0, -1)
     return last[..., which] if parts.shape[0] > 1 else last
 
@@ -103,11 +108,6 @@ def _lay(parts: np.ndarray, which: np.ndarray) -> np.ndarray:
 def round_up(size: int) -> int:
     """0 or the next power of 2, at least 2: what is filled up so is compiled for a few sizes and not for every one."""
     return 0 if size == 0 else max(2, 1 << (size - 1).bit_length())
-
-
-def lay_flow(found: Flow, which: np.ndarray) -> Flow:
-    """Flows of scenes as flows of lanes."""
-    return Flow(*(_lay(part, which) for part in found))
 
 
 def lay_estimators(estimates: Sequence[Estimate | FOAW], which: np.ndarray) -> Estimator:
@@ -128,7 +128,7 @@ def lay_estimators(estimates: Sequence[Estimate | FOAW], which: np.ndarray) -> E
             D = matrices.D[0, 0]
         window, bound = (each.window, 0.0) if isinstance(each, Estimate) else (each.samples, each.noise)
         columns.append((A, B, C, D, window, bound))
-    return Estimator(*(_lay(np.array(column), which) for column in zip(*columns, strict=True)))
+    return _lay(Estimator(*map(np.array, zip(*columns, strict=True))), which)
 
 
 def cut_period(fractions: np.ndarray, substeps: int, pieces: int) -> np.ndarray:
@@ -158,7 +158,7 @@ def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, o
     ways = (machine.rate, machine.held) if options.friction else (machine.rate,)
     digits = Flow(*(np.zeros((1, 1, 1, 1, 1)) for _ in Flow._fields))
     if options.friction or options.jitter:
-        found = [lay_flow(digit_flow(way, machine.drain), which) for way in ways]
+        found = [_lay(digit_flow(way, machine.drain), which) for way in ways]
         digits = Flow(*(np.stack(column) for column in zip(*found, strict=True)))
     longest = find_longest_steps(machine) if options.friction else np.array([2.0])
     return {
@@ -166,7 +166,7 @@ def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, o
         "place": machine.place[..., None],
         "energy": _lay(machine.energy, which),
         "durations": _lay(durations, which),
-        "pieces": lay_flow(flow(machine.rate, machine.drain, durations), which),
+        "pieces": _lay(flow(machine.rate, machine.drain, durations), which),
         "digits": digits,
         "longest": _lay(longest, which),
     }

@@ -32,20 +32,32 @@ class LoopMap(NamedTuple):
 class LaneGroup(NamedTuple):
     """Lanes of one structure at their last sample."""
 
-    lanes: Any  # `Lanes` of numbers along the first axis
+    lanes: Any  # `Lanes` of numbers along the first axis, but for the motion over pieces and digits
     plant: np.ndarray  # (lanes, m, m + 2): the bodies' map, and by the force before and after its change
     held: np.ndarray  # (lanes, m, m)
     halfway: np.ndarray  # (lanes, m, m + 1): the bodies' map until the force changes
     state: np.ndarray  # (lanes, n)
     push: np.ndarray
+    touching: np.ndarray
+    slip: np.ndarray
     late: int
     window: int
-    bodies: int  # of the state
-    filter: int
+
+    @property
+    def bodies(self) -> int:
+        """How many numbers of the state are theirs."""
+        return self.plant.shape[1]
+
+    @property
+    def sent(self) -> int:
+        """Where in the state the newest command stands."""
+        return self.state.shape[1] - self.late - 1
 
 
-def _rows(part: Any, at: np.ndarray) -> np.ndarray:
-    """Some lanes of an array whose last axis they are, as its first."""
+def _rows(part: Any, at: np.ndarray) -> Any:
+    """Some lanes of arrays whose last axis they are, as their first."""
+    if isinstance(part, tuple):
+        return type(part)(*(_rows(each, at) for each in part))
     part = np.moveaxis(np.asarray(part), -1, 0)
     return part[at] if len(part) > 1 else np.broadcast_to(part, (at.size, *part.shape[1:]))
 
@@ -69,25 +81,16 @@ def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray
 
 
 def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int, at: np.ndarray) -> LaneGroup:
-    program = state.program
-    late, window = (int(_rows(part, at)[0]) for part in (lanes.late, lanes.estimator.window))
+    """Lanes of one structure behind k periods."""
+    program, body = state.program, state.body
+    own: Any = _rows(lanes._replace(pieces=(), digits=()), at)
+    late, window = int(own.late[0]), int(own.estimator.window[0])
 
     def recall(ring: np.ndarray, count: int) -> np.ndarray:
         return ring[(k - 1 - np.arange(count)) % len(ring)][:, at].T
 
-    parts = [state.body.x[:, at].T, program.filtered[:, at].T]
+    parts = [body.x[:, at].T, program.filtered[:, at].T]
     parts += [recall(program.positions, window), recall(program.commands, late + 1)]
-    own = type(lanes)(
-        **{
-            name: part if isinstance(part, tuple) else _rows(part, at)
-            for name, part in lanes._asdict().items()
-            if name not in ("motor", "estimator", "pieces", "digits")
-        },
-        motor=type(lanes.motor)(*(_rows(part, at) for part in lanes.motor)),
-        estimator=type(lanes.estimator)(*(_rows(part, at) for part in lanes.estimator)),
-        pieces=lanes.pieces,
-        digits=lanes.digits,
-    )
     plant, halfway = _compose(lanes, options, at)
     size = plant.shape[1]
     held = plant[..., :size]
@@ -96,17 +99,14 @@ def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int,
         motion, force = np.roll(own.place[:, 0], size // 2, -1), own.rate[..., -1]
         held = np.eye(size) + _rows(lanes.digits.change[1, 0], at)[..., :-1]
         held = held @ (np.eye(size) - force[..., :, None] * motion[..., None, :])
-    return LaneGroup(
-        own, plant, held, halfway, np.concatenate(parts, 1), push[at], late, window, size, program.filtered.shape[0]
-    )
+    touching, slip = program.touching[at] | own.bilateral, body.slip[at]
+    return LaneGroup(own, plant, held, halfway, np.concatenate(parts, 1), push[at], touching, slip, late, window)
 
 
 def lay_loop(group: LaneGroup, seen: bool, touching: bool, held: bool) -> LoopMap:
     """The map with the position read or the reading as it is, with the wall or without, free or held."""
-    n, m, p, W, late = group.state.shape[1], group.bodies, group.filter, group.window, group.late
-    lanes, count = group.lanes, len(group.state)
-    estimator = lanes.estimator
-    past, sent = m + p, m + p + W
+    (count, n), m, W, late, sent = group.state.shape, group.bodies, group.window, group.late, group.sent
+    lanes, estimator, past = group.lanes, group.lanes.estimator, sent - W
     reading = np.zeros(n)
     reading[0] = float(seen)
     # What enters the velocity's filter, and what an error of the reading adds to it.
@@ -134,13 +134,11 @@ def lay_loop(group: LaneGroup, seen: bool, touching: bool, held: bool) -> LoopMa
     A[:, m:past, m:past] = estimator.A
     A[:, m:past] += estimator.B[..., None] * entering
     misread[:, m:past] = estimator.B * added
-    for j in range(W):
-        A[:, past + j] = reading if j == 0 else np.eye(n)[past + j - 1]
+    # Registers shift: past readings, and commands on their way.
+    A[:, past:] = np.eye(n, k=-1)[past:]
     if W:
-        misread[:, past] = 1.0
+        A[:, past], misread[:, past] = reading, 1.0
     A[:, sent], misread[:, sent] = command, misled
-    for j in range(1, late + 1):
-        A[:, sent + j, sent + j - 1] = 1.0
     return LoopMap(A, pushed, misread, command, misled)
 
 
@@ -218,31 +216,29 @@ def solve_lanes(A: np.ndarray, b: np.ndarray) -> np.ndarray:
         return np.concatenate([solve_lanes(A[:middle], b[:middle]), solve_lanes(A[middle:], b[middle:])])
 
 
-def take(group: LaneGroup, own: np.ndarray) -> LaneGroup:
+def take(part: Any, own: np.ndarray) -> Any:
     """Some lanes of a group, by their places or a mask."""
-
-    def pick(parts: Any) -> Any:
-        return parts._replace(
-            **{name: part[own] for name, part in parts._asdict().items() if isinstance(part, np.ndarray)}
-        )
-
-    lanes = pick(group.lanes)._replace(motor=pick(group.lanes.motor), estimator=pick(group.lanes.estimator))
-    return pick(group)._replace(lanes=lanes)
+    if isinstance(part, tuple):
+        return type(part)(*(take(each, own) for each in part))
+    return part[own] if isinstance(part, np.ndarray) else part
 
 
 def find_kept(group: LaneGroup, seen: bool, held: bool) -> np.ndarray:
     """What the maps of lanes keep: the place of a held body, a shift of bodies that no spring returns, or 0."""
-    n, m = group.state.shape[1], group.bodies
-    kept = np.zeros((len(group.state), n))
+    m, past, estimator = group.bodies, group.sent - group.window, group.lanes.estimator
+    kept = np.zeros(group.state.shape)
     if held:
         kept[:, :m] = group.lanes.place[:, 0]
         return kept
     kept[:, 0] = 1.0
     if seen:
         # Readings shift with it, and what a filter of them settles on.
-        kept[:, n - group.late - 1 - group.window : n - group.late - 1] = 1.0
-        if not group.window and group.filter:
-            own = np.eye(group.filter) - group.lanes.estimator.A
-            kept[:, m : m + group.filter] = solve_lanes(own, group.lanes.estimator.B[..., None])[..., 0]
-    loose = np.all(group.lanes.rate[:, :, 0] == 0, axis=1)
-    return kept * (loose & (~np.bool_(seen) | (group.lanes.alpha == 0)))[:, None]
+        kept[:, past : group.sent] = 1.0
+        if not group.window:
+            kept[:, m:past] = solve_lanes(np.eye(past - m) - estimator.A, estimator.B[..., None])[..., 0]
+    return kept * (is_loose(group) & (~np.bool_(seen) | (group.lanes.alpha == 0)))[:, None]
+
+
+def is_loose(group: LaneGroup) -> np.ndarray:
+    """Whether no spring returns the bodies of lanes."""
+    return np.all(group.lanes.rate[:, :, 0] == 0, axis=1)

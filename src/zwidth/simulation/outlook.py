@@ -18,6 +18,7 @@ from zwidth.simulation.maps import (
     bound_rows,
     find_kept,
     gather,
+    is_loose,
     lay_loop,
     solve_lanes,
     square,
@@ -61,65 +62,53 @@ def foresee(
     for shape in np.unique(shapes[known & finite], axis=0):
         at = np.flatnonzero(known & finite & (shapes == shape).all(1))
         group = gather(lanes, options, state, push, periods, at)
-        for name, part in _foresee(group, state, at, sensed[:, at], periods).items():
+        for name, part in _foresee(group, sensed[:, at], periods).items():
             getattr(outlook, name)[at] = part
     return outlook
 
 
-def _foresee(group: LaneGroup, state: Any, at: np.ndarray, sensed: np.ndarray, periods: int) -> dict[str, np.ndarray]:
-    lanes, motor, count = group.lanes, group.lanes.motor, at.size
-    bilateral = np.broadcast_to(lanes.bilateral, count)
-    pulling = np.broadcast_to(lanes.pulling, count)
+def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int) -> dict[str, np.ndarray]:
+    lanes, motor, touching = group.lanes, group.lanes.motor, group.touching
     exact, dry = lanes.resolution == 0, motor.static > 0
     endless = np.isinf(motor.max_force) & np.isinf(motor.max_rate)
-    touching = np.broadcast_to(state.program.touching, state.body.x.shape[1:])[at] | bilateral
-    stuck = dry & (state.body.slip[at] == 0)
+    stuck = dry & (group.slip == 0)
     loop = lay_loop(group, True, True, False)
     squarings = square(loop.A)
     unstable = squarings < 0
-    linear = exact & bilateral & endless & ~dry & pulling
+    linear = exact & lanes.bilateral & endless & ~dry & lanes.pulling
     settles = linear & (squarings > 0)
     # The decisions in force; what slips on feels a constant friction.
     modes = np.stack([exact & touching, touching, stuck], 1)
-    slip = np.where(dry, state.body.slip[at], 0.0)
+    slip = np.where(dry, group.slip, 0.0)
     other = ~(linear & (squarings != 0)) & ~(unstable & modes[:, 0] & ~stuck) & ((slip == 0) | (group.bodies == 2))
     # Who is pushed on no spring comes back.
-    other &= touching | stuck | (group.push <= 0) | np.any(lanes.rate[:, :, 0] != 0, axis=1)
-    rubbed = group._replace(push=group.push - slip * motor.coulomb)
+    other &= touching | stuck | (group.push <= 0) | ~is_loose(group)
+    rubbed = group._replace(push=group.push - slip * motor.coulomb, slip=slip)
     for seen, wall, held in np.unique(modes[other], axis=0):
         own = other & (modes == (seen, wall, held)).all(1)
-        part = take(rubbed, own)
-        settles[own] = _settles(part, (seen, wall, held), slip[own], bilateral[own], pulling[own], periods)
+        settles[own] = _settles(take(rubbed, own), (seen, wall, held), periods)
     repeats = linear & (squarings == 0) & ~settles
     own = ~exact & ~dry & ~settles
-    if own.any() and not group.filter:
-        repeats[own] = _repeats(take(group, own), bilateral[own], pulling[own], sensed[:, own], periods)
+    if own.any() and not lanes.estimator.A.size:
+        repeats[own] = _repeats(take(group, own), sensed[:, own], periods)
     grows = linear & unstable
-    own = ~linear & unstable & bilateral & endless & pulling & ~settles
+    own = ~linear & unstable & lanes.bilateral & endless & lanes.pulling & ~settles
     if own.any():
-        grows[own] = _outgrows(take(group, own), LoopMap(*(part[own] for part in loop)), periods)
+        grows[own] = _outgrows(take(group, own), take(loop, own), periods)
     return {
         "settles": settles,
         "grows": grows,
         "repeats": repeats,
-        "restless": _is_restless(group, unstable, bilateral, dry),
+        "restless": _is_restless(group, unstable),
         "pace": np.where(squarings == 0, np.inf, np.exp2(np.abs(squarings))),
     }
 
 
-def _settles(
-    group: LaneGroup,
-    mode: tuple[bool, bool, bool],
-    slip: np.ndarray,
-    bilateral: np.ndarray,
-    pulling: np.ndarray,
-    periods: int,
-) -> np.ndarray:
+def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> np.ndarray:
     """Whether no decision changes any more: the wall is kept or left for good, the reading stays, no limit is met."""
     seen, wall, held = mode
-    lanes, motor, m, late = group.lanes, group.lanes.motor, group.bodies, group.late
-    n = group.state.shape[1]
-    sent, quantum = n - late - 1, lanes.resolution
+    lanes, motor, bilateral, quantum = group.lanes, group.lanes.motor, group.lanes.bilateral, group.lanes.resolution
+    m, late, sent, slip, n = group.bodies, group.late, group.sent, group.slip, group.state.shape[1]
     loop = lay_loop(group, seen, wall, held)
     reading = round_to(quantum, group.state[:, 0])
     constant = loop.pushed * group.push[:, None] + (0.0 if seen else loop.misread * reading[:, None])
@@ -175,7 +164,7 @@ def _settles(
     if not held:
         settled &= far <= 1e-9 * (np.abs(group.state).max(-1) + np.abs(rest).max(-1))
     if not wall:
-        side = high[:, 0] + far <= np.where(quantum > 0, 0.5 * quantum * (1 - 1e-9), 0.0)
+        side = high[:, 0] + far <= 0.5 * quantum * (1 - 1e-9)
         if m == 2 and not held:
             # Nothing stops one body on no spring that is outside and moves on, and is pushed, away from the wall.
             away = np.concatenate([group.state[:, :2], group.push[:, None], group.state[:, sent:]], 1)
@@ -183,7 +172,7 @@ def _settles(
     else:
         side = low[:, 0] > 0 if seen else reading > 0
     settled &= bilateral | side
-    least, most = -motor.max_force, np.where(pulling, motor.max_force, np.minimum(motor.max_force, 0.0))
+    least, most = -motor.max_force, np.where(lanes.pulling, motor.max_force, 0.0)
     if held and m == 2:
         # The only body does not move: it feels the commands on their way, and at last those within the limits.
         waiting = group.state[:, sent:]
@@ -201,11 +190,10 @@ def _settles(
     return settled
 
 
-def _is_restless(group: LaneGroup, unstable: np.ndarray, bilateral: np.ndarray, dry: np.ndarray) -> np.ndarray:
+def _is_restless(group: LaneGroup, unstable: np.ndarray) -> np.ndarray:
     """Whether there is no place where the device could come to rest."""
-    lanes, m, push = group.lanes, group.bodies, group.push
-    alpha, quantum, most = lanes.alpha, lanes.resolution, lanes.motor.max_force
-    loose = np.all(lanes.rate[:, :, 0] == 0, axis=1)
+    lanes, motor, m, push, loose = group.lanes, group.lanes.motor, group.bodies, group.push, is_loose(group)
+    alpha, quantum, bilateral = lanes.alpha, lanes.resolution, lanes.bilateral
     force = group.plant[..., m] + group.plant[..., m + 1]
     way = np.eye(m) - group.plant[..., :m]
     way[loose] = np.eye(m)
@@ -215,12 +203,12 @@ def _is_restless(group: LaneGroup, unstable: np.ndarray, bilateral: np.ndarray, 
     off = np.abs(push - (alpha + spring) * count * quantum)
     # In the wall it is the loop's own rest, or one within a step of the encoder.
     inside = np.where(quantum > 0, off > 0.5 * spring * quantum + 1e-9 * np.abs(push), unstable)
-    inside &= (quantum == 0) | (count != 0) | (off > 0)
     inside |= ~bilateral & (place <= 0)
     outside = bilateral | (push > 0.5 * spring * quantum)
     # At the motor's limit it may leave for good or rest where the limit lets it; nothing stops who is pushed harder.
-    bound = (alpha > 0) & ~dry & inside & outside & (np.abs(push) < most) & np.isfinite(place)
-    return bound | (loose & (np.abs(push) > (most + lanes.motor.static) * (1 + 1e-9)))
+    bound = (alpha > 0) & (motor.static == 0) & inside & outside
+    bound &= (np.abs(push) < motor.max_force) & np.isfinite(place)
+    return bound | (loose & (np.abs(push) > (motor.max_force + motor.static) * (1 + 1e-9)))
 
 
 def _outgrows(group: LaneGroup, loop: LoopMap, periods: int) -> np.ndarray:
@@ -239,15 +227,13 @@ def _outgrows(group: LaneGroup, loop: LoopMap, periods: int) -> np.ndarray:
     return (part * growth > _ROOM * shoved) & (growth * periods > 0.05)
 
 
-def _repeats(
-    group: LaneGroup, bilateral: np.ndarray, pulling: np.ndarray, sensed: np.ndarray, periods: int
-) -> np.ndarray:
+def _repeats(group: LaneGroup, sensed: np.ndarray, periods: int) -> np.ndarray:
     """Whether the readings repeat for good: the motion draws near to one that repeats, too near for a change.
 
     Without a filter readings alone decide the commands, whatever the motor's limits: two motions of equal readings
     differ by what the bodies make of it.
     """
-    found = np.zeros(len(bilateral), bool)
+    found = np.zeros(len(group.push), bool)
     counts = sensed / group.lanes.resolution
     reading, memory = np.floor(counts + 0.5), group.window + group.late + 2
     # A cycle holds a change of the reading, and comes nearest to where it began.
@@ -267,15 +253,16 @@ def _repeats(
     if not at.size:
         return found
     group, reading = take(group, at), reading[:, at]
-    lanes, motor, m, window, late = group.lanes, group.lanes.motor, group.bodies, group.window, group.late
+    lanes, motor, quantum = group.lanes, group.lanes.motor, group.lanes.resolution
+    m, window, late = group.bodies, group.window, group.late
     # The readings of one more cycle, and what the program makes of them.
     past = len(reading)
     again = reading[past - length + np.arange(length[0])[:, None] % length, np.arange(at.size)]
-    reading = np.concatenate([reading, again]) * lanes.resolution
+    reading = np.concatenate([reading, again]) * quantum
     entering = (reading[past:] - reading[past - window : -window]) / window if window else reading[past:]
     wanted = -(lanes.alpha * reading[past:] + lanes.beta * lanes.estimator.D * entering)
-    wanted = np.where(bilateral[at] | (again > 0), wanted, 0.0)
-    most = np.where(pulling[at], motor.max_force, np.minimum(motor.max_force, 0.0))
+    wanted = np.where(lanes.bilateral | (again > 0), wanted, 0.0)
+    most = np.where(lanes.pulling, motor.max_force, 0.0)
     commands = np.concatenate([group.state[:, : -late - 2 : -1].T, np.clip(wanted, -motor.max_force, most)])
     if np.isfinite(motor.max_rate).any():
         for j in range(late + 1, len(commands)):
@@ -286,7 +273,7 @@ def _repeats(
     body, room = group.state[:, :m].T.copy(), np.full(at.size, 0.5)
     for j in range(length[0]):
         own = slice(np.count_nonzero(length > j))
-        room[own] = np.minimum(room[own], 0.5 - np.abs(body[0, own] / lanes.resolution[own] - again[j, own]))
+        room[own] = np.minimum(room[own], 0.5 - np.abs(body[0, own] / quantum[own] - again[j, own]))
         forces = before[:, own] * (commands[j, own] + group.push[own])
         forces += after[:, own] * (commands[j + 1, own] + group.push[own])
         body[:, own] = np.einsum("lnm,ml->nl", moves[own], body[:, own]) + forces
@@ -295,5 +282,5 @@ def _repeats(
     # Differences of cycles add up along each eigenvector, or for as long as a motion may last.
     times = np.minimum(2.0 / np.abs(1.0 - values ** length[:, None]), (_LONG * periods / length)[:, None])
     sum_ = np.sum(np.abs(vectors[:, 0] * share) * times, axis=-1)
-    found[at] = same & (np.abs(values).max(-1) <= 1.0 + 1e-12) & (sum_ < room * lanes.resolution)
+    found[at] = same & (np.abs(values).max(-1) <= 1.0 + 1e-12) & (sum_ < room * quantum)
     return found

@@ -175,15 +175,14 @@ def classify(known: Any, outlook: Any, course: Any) -> np.ndarray:
 def to_si(
     found: Any,
     given: Any,
+    dry: np.ndarray,
     outlook: Any,
-    instants: np.ndarray | None,
-    period: np.ndarray,
-    mass: np.ndarray,
     bodies: tuple[str, ...],
     course: Any,
 ) -> dict[str, np.ndarray]:
     """Columns of one row a simulation, by the names of `Motion`; ``bodies`` names the positions of all bodies."""
     state, reading, frame = found
+    period, mass, instants = given.period, given.mass, given.instants
     known, force = state.summary, mass / period**2
     low, high = (part[1:, 0] for part in known.extent)
     finite = np.isfinite(state.body.x).all(0)
@@ -214,7 +213,7 @@ def to_si(
     columns |= {
         "velocity": unroll(frame.velocity) / period[:, None],
         "wall_force": unroll(frame.force) * force[:, None],
-        "sticking": (unroll(frame.slip) == 0) & (given.static > 0)[:, None],
+        "sticking": (unroll(frame.slip) == 0) & dry[:, None],
         "measured": reading.measured.T,
         "estimated_velocity": reading.velocity.T / period[:, None],
         "command": reading.command.T * force[:, None],

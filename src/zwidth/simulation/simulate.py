@@ -12,7 +12,7 @@ from zwidth.arrays.evaluate import as_float64, join_shapes, processors
 from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole
 from zwidth.parts.wall import resolve_wall
-from zwidth.simulation.batch import TOGETHER, Numbers, run_batch, structure
+from zwidth.simulation.batch import TOGETHER, run_batch, structure
 from zwidth.simulation.lanes import Course
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.words.errors import InputError, ResourceError, check_choice
@@ -123,20 +123,7 @@ def simulate(
         >>> print(f"{hit.penetration * 1e3:.2f} mm, left {hit.bounces} times")
         0.21 mm, left 1 times
     """
-    given = {
-        "stiffness": stiffness,
-        "virtual_damping": virtual_damping,
-        "start_position": start_position,
-        "start_velocity": start_velocity,
-        "push": push,
-        "resolution": resolution,
-        "noise": noise,
-        "coulomb": coulomb,
-        "static": static,
-        "max_force": max_force,
-        "max_rate": max_rate,
-        "jitter": jitter,
-    }
+    given = {name: value for name, value in locals().items() if name in _ARGUMENTS}
     check_choice("contact", contact, CONTACTS)
     periods = check_whole("periods", periods, 1, 10**9)
     substeps = check_whole("substeps", substeps, 1, 10_000)
@@ -153,7 +140,8 @@ def simulate(
     for places in groups.values():
         own = np.flatnonzero(np.isin(which, places))
         if own.size:
-            part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), numbers.take(own), course)
+            rows = {name: column[own] for name, column in numbers.items()}
+            part = run_batch([known[k] for k in places], np.searchsorted(places, which[own]), rows, course)
             for name, column in part.items():
                 if name not in found:
                     found[name] = np.full((which.size, *column.shape[1:]), _missing(column.dtype), column.dtype)
@@ -172,13 +160,13 @@ def simulate(
     return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
 
 
-def _check_memory(numbers: Numbers, course: Course) -> None:
+def _check_memory(numbers: dict[str, np.ndarray], course: Course) -> None:
     """Refuse what the memory of a machine may not hold."""
-    count, instants = numbers.seed.size, course.periods * course.substeps
+    count, instants = numbers["seed"].size, course.periods * course.substeps
     together = min(count, TOGETHER * processors())
     kept = count * instants * _RECORDED if course.record else 0
-    jitter = together * instants * _JITTERED if np.any(numbers.jitter > 0) else 0
-    drawn = together * course.periods * _DRAWN * (bool(np.any(numbers.noise > 0)) + (numbers.history is not None))
+    jitter = together * instants * _JITTERED if np.any(numbers["jitter"] > 0) else 0
+    drawn = together * course.periods * _DRAWN * (bool(np.any(numbers["noise"] > 0)) + ("push_history" in numbers))
     if kept + jitter + drawn > _MOST_BYTES:
         remedy = "use record=False, or fewer at a time" if kept else "use fewer periods, or fewer at a time"
         raise ResourceError(
@@ -224,8 +212,8 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
 
 def _read(
     known: list[Any], which: np.ndarray, given: dict[str, Any], seed: Any, history: Any, periods: int
-) -> tuple[Numbers, np.ndarray, np.ndarray]:
-    """The numbers of all simulations, the scene of each in the batch's shape, and which have usable numbers."""
+) -> tuple[dict[str, np.ndarray], np.ndarray, np.ndarray]:
+    """The numbers of all simulations by name, the scene of each in the batch's shape, and which have usable ones."""
     if given["static"] is None:
         given = {**given, "static": given["coulomb"]}
     walls = [resolve_wall(scene.wall, given["stiffness"], given["virtual_damping"]) for scene in known]
@@ -235,8 +223,8 @@ def _read(
     elif given["virtual_damping"] is None:
         given = {**given, "virtual_damping": 0.0}
     arrays = {name: as_float64(name, value) for name, value in given.items()}
-    seeds = _read_seeds(seed)
-    outer, pushes = [], None
+    seeds, pushes = _read_seeds(seed), None
+    shapes = {"scenes": which.shape, **{name: array.shape for name, array in arrays.items()}, "seed": seeds.shape}
     if history is not None:
         pushes = as_float64("push_history", history)
         if not pushes.ndim or pushes.shape[-1] != periods:
@@ -244,10 +232,8 @@ def _read(
                 f"push_history: got an array of shape {pushes.shape}; its last axis holds one force for each of "
                 f"{periods} periods"
             )
-        outer = [pushes.shape[:-1]]
-    known_shapes = {"scenes": which.shape, **{name: array.shape for name, array in arrays.items()}, "seed": seeds.shape}
-    known_shapes |= dict.fromkeys(["push_history without its last axis"], outer[0]) if outer else {}
-    shape = join_shapes((name, part) for name, part in known_shapes.items() if part or name == "scenes")
+        shapes["push_history without its last axis"] = pushes.shape[:-1]
+    shape = join_shapes((name, part) for name, part in shapes.items() if part or name == "scenes")
     if not math.prod(shape):
         raise InputError(f"scenes: got a batch of shape {shape}; one simulation at least is needed")
     which = np.broadcast_to(which, shape)
@@ -258,15 +244,17 @@ def _read(
         if array.ndim == 0 and not np.all(usable):
             raise InputError(f"{name}: got {float(array):g} {_ARGUMENTS[name][0]}; {allowed}")
         good &= usable
-    flat = {name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()}
-    steady = None
+    numbers: dict[str, Any] = {
+        name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()
+    }
+    numbers["seed"] = np.broadcast_to(seeds, shape).reshape(-1)
     if pushes is not None:
         if pushes.ndim == 1 and not np.all(np.isfinite(pushes)):
             raise InputError("push_history: got a force that is not finite; fill the gaps")
         finite = np.isfinite(pushes)
         good &= np.broadcast_to(finite.all(-1), shape)
-        steady = np.broadcast_to(np.where(finite, pushes, 0.0), (*shape, periods)).reshape(-1, periods)
-    numbers = Numbers(**flat, seed=np.broadcast_to(seeds, shape).reshape(-1), history=steady)
+        filled = np.where(finite, pushes, 0.0)
+        numbers["push_history"] = np.broadcast_to(filled, (*shape, periods)).reshape(-1, periods)
     return numbers, which, good.reshape(-1)
 
 

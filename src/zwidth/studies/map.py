@@ -77,11 +77,10 @@ class MapStudy(ComputedStudy):
         arrays = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, **outputs}
         arrays = add_si_of_scene(arrays, self.delta, self.d, scene)
         names = outputs if min(alpha.size, beta.size) > 1 else ()
-        edges = {name: partial(_find_edge, name, share) for name in names}
+
+        def find_edge(name: str, delta: float, d: float) -> Outlines | None:
+            return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)
+
+        edges = {name: partial(find_edge, name) for name in names}
         draw = {f"_{name}": partial(figures.draw_map, arrays, name, edges=edge) for name, edge in edges.items()}
         return Outcome(arrays=arrays, figures=draw)
-
-
-def _find_edge(name: str, share: float, delta: float, d: float) -> Outlines | None:
-    """The exact edge of what is stable or passive on a device."""
-    return find_edges(delta * (share if name == "passive" else 1.0), d).get(name)

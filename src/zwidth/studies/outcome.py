@@ -124,15 +124,9 @@ class WallsStudy(ComputedStudy):
 _CHOICE = ("stiffness_fraction", "walls")
 
 
-def si_scales(device: PhysicalDevice | PhysicalScene) -> tuple[float, float]:
-    """N/m for alpha = 1 and N s/m for beta = 1."""
-    mass = device.moving_mass
-    return mass / device.period**2, mass / device.period
-
-
 def add_si_columns(table: Table, device: PhysicalDevice | PhysicalScene) -> Table:
     """A table with its walls in N/m and N s/m as well."""
-    stiffness, damping = si_scales(device)
+    stiffness, damping = device.to_scene().units
     return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 

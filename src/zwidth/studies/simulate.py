@@ -22,7 +22,7 @@ from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
 from zwidth.simulation.simulate import Contact
-from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text, si_scales
+from zwidth.studies.outcome import ComputedStudy, Outcome, WallsStudy, csv_text
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import header, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE, Range
@@ -218,7 +218,7 @@ def wall_in_si(device: PhysicalDevice, wall: AnyWall) -> tuple[float, float]:
     """Stiffness in N/m and virtual damping in N s/m of a wall on a device."""
     if isinstance(wall, PhysicalWall):
         return wall.stiffness, wall.virtual_damping
-    stiffness, damping = si_scales(device)
+    stiffness, damping = device.to_scene().units
     return wall.alpha * stiffness, wall.beta * damping
 
 

@@ -78,7 +78,7 @@ class ResponseStudy(ComputedStudy):
         clock, length, units = 1.0, 1.0, ("", "", "", "")
         if physical:
             assert isinstance(device, PhysicalDevice), "only a device with mass and period has SI units"
-            clock, length = device.period, device.period**2 / device.moving_mass
+            clock, length = device.period, 1.0 / device.to_scene().units.stiffness
             units = ("_s", "_m", "_m_per_s", "_N")
         second, meter, speed, newton = units
         time, settling_time = raw.time * clock, raw.settling_time * clock

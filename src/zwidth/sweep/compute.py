@@ -15,7 +15,7 @@ from typing import TypeAlias
 import numpy as np
 
 from zwidth.loops.rigid.margins import margins_kernel
-from zwidth.loops.rigid.outermost_poles import area_poles, list_poles, radius_at
+from zwidth.loops.rigid.outermost_poles import area_poles, list_poles
 from zwidth.loops.rigid.passivity import margin_at_one_delay
 from zwidth.loops.rigid.pole_map import Area
 from zwidth.loops.rigid.response import decay_time
@@ -33,8 +33,6 @@ _ROW_PIECE = 1 << 12
 _WALL_PIECE = 1 << 12
 # Points whose columns are laid out at one time; more of them run one after the other.
 _LAID_OUT = 1 << 20
-# From here on it is cheaper to treat the betas of each device together than to list every pair.
-_MANY_ROWS = 256
 # Walls of one device that are worth a map.
 _SMALLEST_PLANE = 1 << 8
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin")
@@ -135,10 +133,6 @@ def _stable(block: Block, shape: tuple[int, ...]) -> np.ndarray:
 
 def _limits(block: Block) -> np.ndarray:
     """The stiffest stable alpha of every device and beta, shape (D, B)."""
-    if block.plane.beta.shape[1] >= _MANY_ROWS:
-        size = min(_ROW_PIECE, 1 << (block.plane.beta.shape[1] - 1).bit_length())
-        devices = zip(block.beta, block.delta, block.d, strict=True)
-        return np.stack([_limits_of_one(beta, delta, d, size) for beta, delta, d in devices])
     columns = tuple(
         np.broadcast_to(part, block.beta.shape).ravel() for part in (block.beta, block.delta[:, None], block.d[:, None])
     )
@@ -151,10 +145,6 @@ def _limits(block: Block) -> np.ndarray:
             picked = tuple(column[index] for column in columns)
             limit[index] = in_pieces(lambda *piece: (row_limits(*piece),), picked, _ROW_PIECE)[0]
     return limit.reshape(block.beta.shape)
-
-
-def _limits_of_one(beta: np.ndarray, delta: float, d: float, size: int) -> np.ndarray:
-    return in_pieces(lambda piece: (row_limits(piece, np.array([delta]), np.array([d])),), (beta,), size)[0]
 
 
 def _by_device(
@@ -188,17 +178,13 @@ def _radius_planes(accuracy: float, block: Block) -> Columns:
     """The spectral radii of maps, whether they are proved to an accuracy, and the rates of decay."""
     alpha, beta, alphas, betas = block.plane
     found = area_poles(Area(alpha, beta, block.delta, block.d, (betas, alphas)), accuracy, with_rate=True)
-    walls = (block.alpha[:, None, :], block.beta[:, :, None], block.delta[:, None, None], block.d[:, None, None])
-    radius = radius_at(found.re, found.error, list(np.broadcast_arrays(*walls)))
-    return tuple(leaf.transpose(0, 2, 1) for leaf in (radius, found.error <= accuracy, found.rate))
+    return tuple(leaf.transpose(0, 2, 1) for leaf in found)
 
 
 def _radius_columns(accuracy: float, columns: Columns) -> Columns:
     """The same of listed walls."""
-    walls = list(columns)
     # Always compiled, however few they are: a value must not depend on the size of its chunk.
-    found = list_poles(walls, accuracy, with_rate=True, few=0)
-    return radius_at(found.re, found.error, walls), found.error <= accuracy, found.rate
+    return list_poles(list(columns), accuracy, with_rate=True, few=0)
 
 
 def _margins(with_delay: bool, with_modulus: bool, columns: Columns) -> Columns:

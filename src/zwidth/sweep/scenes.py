@@ -34,8 +34,12 @@ def compute_scenes(
         values = {name: float(column[k]) for name, column in block.parameters.items()}
         try:
             scene = _keep(study.make_scene(values))
-            walls = block.stiffness[k][:, None], block.virtual_damping[k][None, :]
-            one, told = _compute_walls(scene, outputs, *walls) if family == "wall" else _compute_device(scene)
+            if family == "wall":
+                walls = block.stiffness[k][:, None], block.virtual_damping[k][None, :]
+                one, told = _compute_walls(scene, outputs, *walls)
+            else:
+                top = scene.max_stiffness()
+                one, told = {"stiffness_max": top.stiffness, "virtual_damping_at_max": top.virtual_damping}, top.status
         except InputError:
             status[k] = Status.INVALID_INPUT
             continue
@@ -65,10 +69,3 @@ def _compute_walls(
         found["passive"] = margin > 0
         unknown |= np.isnan(margin)
     return found, np.where(unknown, Status.NOT_CONVERGED, Status.OK)
-
-
-def _compute_device(scene: Scene) -> tuple[dict[str, float], int]:
-    top = scene.max_stiffness()
-    return {"stiffness_max": float(top.stiffness), "virtual_damping_at_max": float(top.virtual_damping)}, int(
-        top.status
-    )

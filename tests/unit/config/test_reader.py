@@ -204,17 +204,20 @@ def conforms(value, schema, root):
     return isinstance(value, str | bool) or value >= schema.get("minimum", value)
 
 
+@pytest.fixture(scope="module")
+def schema():
+    return json.loads(json.dumps(config_json_schema()))
+
+
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda path: path.stem)
-def test_the_schema_fits_the_shipped_configs(path):
-    schema = json.loads(json.dumps(config_json_schema()))
+def test_the_schema_fits_the_shipped_configs(path, schema):
     raw = yaml.safe_load(path.read_text(encoding="utf-8"))
     assert conforms(raw, schema, schema)
     raw["studies"][0]["colour"] = "red"
     assert not conforms(raw, schema, schema)
 
 
-def test_the_schema_describes_every_field():
-    schema = config_json_schema()
+def test_the_schema_describes_every_field(schema):
     assert set(schema["$defs"]) >= {model.__name__ for model in KINDS.values()}
     for model in [schema, *schema["$defs"].values()]:
         for name, field in model["properties"].items():

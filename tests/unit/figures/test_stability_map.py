@@ -29,13 +29,3 @@ def fine():
     alpha, beta = np.linspace(0.0, 1.0, 30), np.linspace(-1.0, 1.0, 30)
     radius = 0.5 + alpha[:, None] + beta[None] ** 2
     return {"alpha": alpha, "beta": beta, "d": np.array([1.0]), "stable": (radius < 1)[:, :, None, None]}
-
-
-def test_the_contour_of_the_radius_bounds_what_is_stable():
-    (ax,) = figures.draw_map(grid_map(), "stable")
-    line = ax.collections[2].get_paths()[0].vertices
-    assert np.abs(line[:, 0] + line[:, 1] ** 2 - 0.5).max() < 0.07
-    # A straight piece between two values of beta, 0.5 apart, is off by (0.5/2)^2 at most.
-    without = {name: values for name, values in grid_map().items() if name != "spectral_radius"}
-    (ax,) = figures.draw_map(without, "stable")
-    assert len(ax.collections) == 1

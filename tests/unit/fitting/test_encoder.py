@@ -27,11 +27,38 @@ def test_errors_of_an_encoder_spread_as_drawn_ones(noise):
     drawn = errors @ columns
     # A variance of 4,000 draws is known to 2.2 %.
     np.testing.assert_allclose(np.diag(model.spread(columns)), drawn.var(0), rtol=0.1)
-    assert model.spread_of_sums(20) == pytest.approx(np.mean(errors.reshape(4000, 20, 20).sum(2) ** 2), rel=0.1)
+    sums = model.weigh(errors.T).reshape(20, 20, 4000).sum(1)
+    assert model.spread_of_sums(20, model) == pytest.approx(np.mean(sums**2), rel=0.1)
     if noise < 0.2:
         # As white noise they would be far smaller.
         white = MeasurementNoise(position, model.variance, 0.0)
         assert np.diag(model.spread(columns))[0] > 1.8 * np.diag(white.spread(columns))[0]
+
+
+def test_a_rest_counts_as_one_sample():
+    random = np.random.default_rng(5)
+    rests = STEP * np.repeat([0.0, 3.3, 11.2, 7.6], 100)
+    model = MeasurementNoise(rests, STEP**2 / 12, STEP)
+    # The waves that are not followed are taken for white: 1.6 % of 400.
+    assert 4 <= model.count < 12
+    zeros = STEP * random.uniform(-0.5, 0.5, (4000, 4))
+    weighed = model.weigh(np.repeat(zeros, 100, axis=1).T)
+    assert np.mean(np.sum(weighed**2, 0)) == pytest.approx(model.variance * model.count, rel=0.6)
+
+
+def test_errors_at_an_even_speed_of_nearly_whole_steps_are_alike():
+    random, position = np.random.default_rng(6), 1.003 * STEP * np.arange(400)
+    model = MeasurementNoise(position, STEP**2 / 12, STEP)
+    np.testing.assert_allclose(model.weigh(np.eye(400)), np.eye(400), atol=1e-15)
+    drawn = np.array([(read(position, 0.0, random) - position).sum() for _ in range(4000)])
+    assert model.spread(np.ones((400, 1)))[0, 0] == pytest.approx(drawn.var(), rel=0.1)
+
+
+def test_the_step_is_found_in_few_positions():
+    # None of them one step from another.
+    counts = np.array([0, 0, 6, 16, 31, 46, 46, 46])
+    assert find_resolution(STEP * counts) == pytest.approx(STEP, rel=1e-9)
+    assert find_resolution(3e-5 * np.sqrt(counts)) == 0.0
 
 
 def test_the_step_is_found_in_positions():

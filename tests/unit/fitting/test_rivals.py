@@ -14,9 +14,9 @@ from zwidth.words.status import Status
 SKIP = bench_fit.SKIP
 
 
-def fit_made(seed):
+def fit_made(seed, span=bench_fit.NOISY):
     """The fit of a log of the benchmark, and how many standard errors it is off in what it tells."""
-    made = bench_fit.make_log(seed, bench_fit.NOISY)
+    made = bench_fit.make_log(seed, span)
     fit = zwidth.fit_log(made.time, made.position, made.force)
     names = ("mass", "damping", "delay", "friction", "offset")
     truth: dict[str, float] = {str(name): value for name, value in zip(names, made.truth, strict=True)}
@@ -55,10 +55,30 @@ def test_errors_of_friction_reach_to_none_where_none_fits_as_well(seed):
     assert np.abs(list(away.values())).max() < 4.0
 
 
-@pytest.mark.parametrize("seed", [17, 97])
-def test_a_search_that_creeps_towards_no_friction_ends_there(seed):
+# Along what these logs leave nearly open steps hardly end.
+@pytest.mark.parametrize("seed", [17, 97, 333, 545, 549])
+def test_a_search_that_creeps_has_arrived(seed):
     fit, away = fit_made(seed)
-    assert (fit.status, fit.friction) == (Status.OK, 0.0)
+    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert not fit.intervals["friction"].low > 0
+    assert np.abs(list(away.values())).max() < 4.0
+
+
+# An encoder without noise errs by the same all the time a device rests. Counted as thousands of errors, that of 1165
+# and the first ones told friction from a constant force, 7 to 92 standard errors off; the others have few different
+# positions, of which not every step was found, and were 5 to 35 off in mass, damping and delay.
+@pytest.mark.parametrize("seed", [29, 89, 197, 209, 1165, 221, 285, 297, 1037, 1297])
+def test_a_rest_counts_once_where_an_encoder_has_no_noise(seed):
+    fit, away = fit_made(seed, bench_fit.SILENT)
+    assert (fit.status, fit.doubts) == (Status.OK, ())
+    assert set(away) == {"mass", "damping", "delay"}
+    assert np.abs(list(away.values())).max() < 4.0
+
+
+def test_errors_are_alike_wherever_a_device_returns_to_the_same_place():
+    # Inside a wall, on and off for a step of the encoder. Stays taken for independent: 6 standard errors off.
+    fit, away = fit_made(1174, bench_fit.SILENT)
+    assert (fit.status, fit.doubts) == (Status.OK, ())
     assert np.abs(list(away.values())).max() < 4.0
 
 

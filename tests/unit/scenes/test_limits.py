@@ -1,8 +1,10 @@
 """What limits a scene: each ideal scene is what its record says."""
 
+import numpy as np
 import pytest
 
 from zwidth import Coupling, Device, LowPass, Scene, Timing, VelocityFilter, WindowedDifference, limits_of
+from zwidth.scenes import assessment
 
 RIGID = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
 
@@ -23,6 +25,15 @@ def test_a_filter_and_a_compliance():
     for limit in found:
         assert limit.stiffness == pytest.approx(ideals[limit.name].max_stiffness().stiffness, rel=1e-12)
         assert limit.gain == pytest.approx(limit.stiffness / now, rel=1e-12)
+
+
+def test_what_cannot_be_computed_comes_last(monkeypatch):
+    scene = RIGID.replace(velocity=LowPass(cutoff=100.0), coupling=Coupling(0.05, 2e4, 1.0))
+    first, *others = [limit.name for limit in limits_of(scene)]
+    known = assessment._stiffness
+    assert first == "delay"
+    monkeypatch.setattr(assessment, "_stiffness", lambda of: np.nan if of.timing.delay == 0 else known(of))
+    assert [limit.name for limit in limits_of(scene)] == [*others, first]
 
 
 def test_only_what_the_scene_has():

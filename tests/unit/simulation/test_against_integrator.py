@@ -33,24 +33,18 @@ def simulate(motion: RandomMotion, seed: int) -> tuple[Motion, RandomMotion]:
     return found, motion._replace(arguments=motion.arguments | {"jitter_samples": late})
 
 
-def deviation(found: Motion, motion: RandomMotion) -> tuple[float, bool]:
-    """The largest difference of position and velocity, relative; and whether the motion can tell."""
-    own = motion.kind in ("rigid", "filter")
-    history = judge(motion, closed_form=own)
-    told = nearest_decision(history) > NEAR and condition(motion, history, closed_form=own) < CHAOTIC
-    # The first body, at the start of every period.
-    first = (part.reshape(PERIODS + 1, -1)[:PERIODS, 0] for part in (history.position, history.velocity))
-    pairs = zip((np.asarray(found.position), np.asarray(found.velocity)), first, strict=True)
-    return max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs), told
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_motions_are_those_of_an_independent_integrator(kind):
-    rng = np.random.default_rng([12, KINDS.index(kind)])
+    rng, own = np.random.default_rng([12, KINDS.index(kind)]), kind in ("rigid", "filter")
     compared = 0
     for seed in range(3):
-        error, told = deviation(*simulate(random_motion(kind, rng), seed))
-        if told:
-            compared += 1
-            assert error < tolerances.JUDGE.float64
+        found, motion = simulate(random_motion(kind, rng), seed)
+        history = judge(motion, closed_form=own)
+        # The first body, at the start of every period.
+        first = (part.reshape(PERIODS + 1, -1)[:PERIODS, 0] for part in (history.position, history.velocity))
+        pairs = zip((np.asarray(found.position), np.asarray(found.velocity)), first, strict=True)
+        alike = max(float(np.abs(a - b).max() / np.abs(b).max()) for a, b in pairs) < tolerances.JUDGE.float64
+        compared += alike
+        # Who differs is asked why, and has one excuse.
+        assert alike or nearest_decision(history) <= NEAR or condition(motion, history, closed_form=own) >= CHAOTIC
     assert compared >= 2

@@ -174,10 +174,10 @@ def test_single_bodies_on_friction_as_in_closed_form():
     for k in range(16):
         motion = random_motion(("rigid", "filter")[k % 2], rng)
         got, expected = judge(motion), judge(motion, closed_form=True)
-        if nearest_decision(got) < 1e-8 or condition(motion, expected, closed_form=True) > 1e4:
+        if not largest_difference(got, expected) < tol.JUDGE.float64:
+            assert nearest_decision(got) < 1e-8 or condition(motion, expected, closed_form=True) > 1e4
             left_out += 1
             continue
-        assert largest_difference(got, expected) < tol.JUDGE.float64
         assert worst(got.command, expected.command) < tol.JUDGE.float64
         assert [kind for _, kind in got.events] == [kind for _, kind in expected.events]
         if got.events:
@@ -195,10 +195,10 @@ def test_motions_do_not_depend_on_the_steps(kind):
     for _ in range(2):
         motion = random_motion(kind, rng)
         got, other = judge(motion), judge(motion, rtol=1e-13, step=0.1)
-        if nearest_decision(got) < 1e-8 or condition(motion, got) > 1e4:
+        if not largest_difference(got, other) < tol.JUDGE.float64:
+            assert nearest_decision(got) < 1e-8 or condition(motion, got) > 1e4
             left_out += 1
             continue
-        assert largest_difference(got, other) < tol.JUDGE.float64
         assert [kind for _, kind in got.events] == [kind for _, kind in other.events]
     assert left_out <= 1
 

@@ -139,6 +139,22 @@ def test_scenes_without_jitter_have_instants_beside_some_that_have_it():
     assert late.max() > 0
 
 
+def test_a_dataset_has_one_time_where_all_share_it_and_else_instants():
+    both = [SCENE, SCENE.replace(period=5e-4)]
+    shared, own = (zwidth.simulate(scenes, [1e3, 2e3], 5.0, periods=8).to_dataset("wall") for scenes in (SCENE, both))
+    assert shared.time.dims == ("time",)
+    np.testing.assert_allclose(shared.time, 1e-3 * np.arange(8))
+    assert own.instant.dims == ("wall", "time")
+    np.testing.assert_allclose(own.instant, np.outer([1e-3, 5e-4], np.arange(8)))
+
+
+def test_what_becomes_of_a_motion_is_said_of_a_hand_that_holds_still_in_the_tail():
+    pushes = np.ones((4, 200))
+    pushes[1:, :120], pushes[2, 160], pushes[3, -1] = 2.0, 1.1, 1.1
+    found = SCENE.simulate(1e3, 5.0, push_history=pushes, periods=200, tail=60)
+    assert [MotionKind(code).name for code in found.outcome] == ["DECAYING", "DECAYING", "UNCLEAR", "UNCLEAR"]
+
+
 @pytest.mark.parametrize(
     "scenes, options, words",
     [

@@ -237,6 +237,16 @@ def test_jitter_is_late_by_less_than_asked_and_none_is_the_limit_of_little():
     assert np.any(much.position != run(jitter=9e-4, seed=1).position)
 
 
+@pytest.mark.parametrize("delay", [0.0, 0.6, 2.3])
+def test_late_samples_command_forces_that_act_their_delay_behind_them(delay):
+    scene = SCENE.replace(delay=delay * 1e-3)
+    motion = run(scene, jitter=[9e-4, 4e-4], stiffness=900.0, substeps=40, seed=[0, 1])
+    for time, force, command in zip(motion.time, motion.wall_force, motion.command, strict=True):
+        sets_in = time[::40] + delay * 1e-3
+        newest = np.searchsorted(sets_in, time * (1 + 1e-12), side="right") - 1
+        np.testing.assert_allclose(force, np.where(newest >= 0, command[newest], 0.0), rtol=1e-12)
+
+
 def test_an_undamped_swing_has_its_frequency_and_known_motions_their_outcome():
     scene = zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-4, 0.0))
     swing = run(scene, stiffness=50.0, virtual_damping=0.0, periods=16_000, tail=12_000, record=False)

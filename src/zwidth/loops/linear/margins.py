@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, Jet, circle
-from zwidth.arrays.roots import bisect
+from zwidth.arrays.roots import bisect, false_position
 from zwidth.arrays.xp import within
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import Chain, find_roots
@@ -35,8 +35,8 @@ from zwidth.words.types import Array
 # Halvings beside a zero of the wall, and how much of itself the wall may change from node to node.
 _HALVINGS, _SHARE = 40, 0.25
 _STEPS, _CLOSED = 100, 4e-16
-# A Newton step so small, of the angle, leaves an error of its own square.
-_ARRIVED = 1e-10
+# An L so small, as a share of what it changes by over w, is a zero of it.
+_NOTHING = 1e-10
 
 
 class OpenLoop(NamedTuple):
@@ -91,7 +91,9 @@ class OpenLoop(NamedTuple):
 
         # At pi L is real in any case.
         found = self._roots(turn, until=-1)
-        return found[self.at(found).value.real < 0]
+        L = self.at(found)
+        # Where L passes through 0 its phase jumps, and no factor brings a pole there.
+        return found[(L.value.real < 0) & (np.abs(L.value) > _NOTHING * found * np.abs(L.slope))]
 
     def _roots(self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], until: int | None = None) -> np.ndarray:
         w, L = self.w[:until], Jet(*(part[:until] for part in self.L))
@@ -101,7 +103,9 @@ class OpenLoop(NamedTuple):
             w = np.sort(np.concatenate([w, dips]))
             value, slope = read(self.at(w))
         k = np.flatnonzero((value[:-1] > 0) != (value[1:] > 0))
-        return polish_roots(lambda x: read(self.at(x)), w[k], w[k + 1], value[k] > 0)
+        sign = np.where(value[k] > 0, 1.0, -1.0)
+        ends = sign * value[k], sign * value[k + 1]
+        return false_position(lambda x: sign * read(self.at(x))[0], w[k], w[k + 1], *ends, _STEPS, _CLOSED * w[k])
 
     def _dips(
         self, read: Callable[[Jet], tuple[np.ndarray, np.ndarray]], w: np.ndarray, value: np.ndarray, slope: np.ndarray
@@ -145,29 +149,6 @@ def open_loop_response(loop: LoopRoots, alpha: Array, beta: Array, at: CirclePoi
         # At pi it is real.
         real = at.w >= np.pi
         return Jet(np.where(real, found.value.real + 0j, found.value), found.slope)
-
-
-def polish_roots(
-    read: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]], low: np.ndarray, high: np.ndarray, falling: np.ndarray
-) -> np.ndarray:
-    """Newton's method between ends of different sign; a step that leaves them, and every fourth, is a bisection.
-
-    `arrays.roots.newton` ends beside a crossing where L is all but 0, and with another gain margin.
-    """
-    x = 0.5 * (low + high)
-    for step in range(_STEPS if x.size else 0):
-        value, slope = read(x)
-        ahead = (value > 0) == falling
-        low, high = np.where(ahead, x, low), np.where(ahead, high, x)
-        with np.errstate(all="ignore"):
-            new = x - value / slope
-        good = (new >= low) & (new <= high) & (step % 4 != 3)
-        new = np.where(good, new, 0.5 * (low + high))
-        done = (np.abs(new - x) <= _ARRIVED * x) & good | (high - low <= _CLOSED * x) | (value == 0)
-        x = np.where(value == 0, x, new)
-        if done.all():
-            break
-    return x
 
 
 def margins_of(wall: OpenLoop, stable: bool) -> Margins:
@@ -281,22 +262,9 @@ def _passages(cell: int, here: Crossovers, there: Crossovers) -> list[Passage]:
 
 
 def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: float, at: Passage) -> float:
-    """The delay of a passage, by bisection and false position with the exact loop of each trial."""
-    low, high = (float(value) for value in loops.delays[at.cell : at.cell + 2])
+    """The delay of a passage, by false position with the exact loop of each trial."""
+    low, high = loops.delays[at.cell], loops.delays[at.cell + 1]
     ends = found[at.cell], found[at.cell + 1]
-
-    def excess(delay: float) -> float:
-        loop = loop_at(loops.chain, delay)
-        if at.curve < 0:
-            last = OpenLoop.lay_out(loop, alpha, beta, np.array([3.0])).L.value[-1].real
-            return float(np.log(abs(float(last))))
-        here = _cross(loop, alpha, beta, nodes_of(loop))
-        share = (delay - low_end) / (high_end - low_end)
-        place = int(np.argmin(np.abs(here.w - (w0 + share * (w1 - w0)))))
-        turned = here.phase[place] - at.periods * here.w[place]
-        return float(turned - _TURN * np.round((turned - center) / _TURN) - center)
-
-    low_end, high_end = low, high
     w0 = w1 = center = 0.0
     if at.curve >= 0:
         w0 = float(ends[0].w[at.curve])
@@ -304,18 +272,23 @@ def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: fl
         # The multiple of 2 pi next to which it passes.
         before = float(ends[0].phase[at.curve]) - at.periods * w0
         center = _TURN * np.round(before / _TURN)
+
+    def excess(delay: np.float64) -> np.float64:
+        loop = loop_at(loops.chain, float(delay))
+        if at.curve < 0:
+            last = OpenLoop.lay_out(loop, alpha, beta, np.array([3.0])).L.value[-1].real
+            return np.log(np.abs(last))
+        here = _cross(loop, alpha, beta, nodes_of(loop))
+        share = (delay - low) / (high - low)
+        place = int(np.argmin(np.abs(here.w - (w0 + share * (w1 - w0)))))
+        turned = here.phase[place] - at.periods * here.w[place]
+        return turned - _TURN * np.round((turned - center) / _TURN) - center
+
     first, last = excess(low), excess(high)
-    for step in range(_TRIALS):
-        if high - low <= 1e-13 * (1.0 + high) or first == last:
-            break
-        x = low - first * (high - low) / (last - first) if step % 3 else 0.5 * (low + high)
-        x = min(max(x, low + 1e-3 * (high - low)), high - 1e-3 * (high - low))
-        value = excess(x)
-        if (value > 0) == (first > 0):
-            low, first = x, value
-        else:
-            high, last = x, value
-    return 0.5 * (low + high) + at.periods
+    sign = 1.0 if first > 0 else -1.0
+    width = 1e-13 * (1.0 + high)
+    passed = false_position(lambda x: sign * excess(x), low, high, sign * first, sign * last, _TRIALS, width)
+    return float(passed) + at.periods
 
 
 def _is_first_loss(chain: Chain, alpha: float, beta: float, margin: float) -> bool:

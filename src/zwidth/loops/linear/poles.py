@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.circle import Jet
 from zwidth.loops.linear.roots import LoopRoots, affine_polynomial, closed_loop_roots
 from zwidth.loops.rigid.counting import count_poles
 from zwidth.loops.rigid.poles import companion
@@ -38,34 +39,27 @@ class PolynomialValue(NamedTuple):
     size: Array
 
 
-def _times(one: tuple[Array, Array], other: tuple[Array, Array]) -> tuple[Array, Array]:
-    return one[0] * other[0], one[1] * other[0] + one[0] * other[1]
-
-
-def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> tuple[Array, Array]:
-    value, slope = np.full_like(zeta, factor), np.zeros_like(zeta)
+def _product(zeta: Array, offsets: Array, factor: float = 1.0) -> Jet:
+    found = Jet(np.full_like(zeta, factor), np.zeros_like(zeta))
     for offset in offsets:
-        one = zeta + offset
-        value, slope = value * one, slope * one + value
-    return value, slope
+        found = found.times(Jet(zeta + offset, 1.0))
+    return found
 
 
-def _power(zeta: Array, turns: int) -> tuple[Array, Array]:
+def _power(zeta: Array, turns: int) -> Jet:
     """``z^turns``."""
-    if turns == 0:
-        return np.ones_like(zeta), np.zeros_like(zeta)
-    below = (1.0 + zeta) ** (turns - 1)
-    return below * (1.0 + zeta), turns * below
+    below = (1.0 + zeta) ** (turns - 1) if turns else np.ones_like(zeta)
+    return Jet(below * (1.0 + zeta) if turns else below, turns * below)
 
 
-def _difference(zeta: Array, window: int) -> tuple[Array, Array]:
+def _difference(zeta: Array, window: int) -> Jet:
     """``(z^window - 1)/window``: next to z = 1 by the binomial's product, where the subtraction has no digit left."""
     power, slope = _power(zeta, window)
     log = 0.5 * np.log1p(np.maximum(2.0 * zeta.real + abs2(zeta), -0.999)) + 1j * np.arctan2(zeta.imag, 1.0 + zeta.real)
     turned = window * log
     near = np.abs(turned) < 1.0
     small = np.where(near, turned, 0.0)
-    return np.where(near, np.expm1(small), power - 1.0) / window, slope / window
+    return Jet(np.where(near, np.expm1(small), power - 1.0) / window, slope / window)
 
 
 def abs2(z: Array) -> Array:
@@ -83,17 +77,17 @@ def evaluate(loop: LoopRoots, alpha: Array, beta: Array, zeta: Array) -> Polynom
     """The factored polynomial; arrays that broadcast with zeta."""
     f = loop.estimate
     turns = f.window + f.lag
-    device = _times(_product(zeta, loop.poles), _power(zeta, loop.lag))
+    device = _product(zeta, loop.poles).times(_power(zeta, loop.lag))
     answer = _product(zeta, loop.zeros, loop.gain)
-    bottom = _times(_product(zeta, f.poles), _power(zeta, max(turns, 0)))
+    bottom = _product(zeta, f.poles).times(_power(zeta, max(turns, 0)))
     top = _product(zeta, f.zeros, float(f.gain))
     if f.window:
-        top = _times(top, _difference(zeta, f.window))
-    top = _times(top, _power(zeta, max(-turns, 0)))
-    wall = alpha * bottom[0] + beta * top[0], alpha * bottom[1] + beta * top[1]
-    own, pushed = _times(device, bottom), _times(answer, wall)
-    largest = np.abs(own[0]) + np.abs(answer[0]) * (np.abs(alpha * bottom[0]) + np.abs(beta * top[0]))
-    return PolynomialValue(own[0] + pushed[0], own[1] + pushed[1], largest)
+        top = top.times(_difference(zeta, f.window))
+    top = top.times(_power(zeta, max(-turns, 0)))
+    wall = Jet(alpha * bottom.value + beta * top.value, alpha * bottom.slope + beta * top.slope)
+    own, pushed = device.times(bottom), answer.times(wall)
+    largest = np.abs(own.value) + np.abs(answer.value) * (np.abs(alpha * bottom.value) + np.abs(beta * top.value))
+    return PolynomialValue(own.value + pushed.value, own.slope + pushed.slope, largest)
 
 
 def _start(loop: LoopRoots, alpha: Array, beta: Array) -> Array:

@@ -14,7 +14,6 @@ from zwidth.arrays.roots import bisect, newton
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import curve_at, find_dips, zeros_of
 from zwidth.loops.linear.poles import log_size, poles_less_one
-from zwidth.loops.rigid.row_limit import copy_rows
 from zwidth.words.quantities import WALL_RANGE
 
 # Rows whose crossings are laid out at one time.
@@ -83,13 +82,11 @@ def label_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.n
         return _count_walls(boundary, *np.broadcast_arrays(alpha, beta))
     ends = bound_intervals(boundary, rows)
     place = place.reshape(beta.shape)
-    steps = np.diff(alpha.reshape(-1)) if alpha.size > 1 else np.ones(1)
-    in_rows = bool(shape) and alpha.size == shape[-1] and beta.shape == (*shape[:-1], 1)
-    if in_rows and np.all(steps >= 0):
-        return _mark_rows(alpha.reshape(-1), ends, place.reshape(-1)).reshape(shape)
     stable = np.zeros(shape, bool)
-    for k in range(ends.low.shape[1]):
-        stable |= (alpha > ends.low[:, k][place]) & (alpha < ends.high[:, k][place])
+    for low, high in zip(ends.low.T, ends.high.T, strict=True):
+        inside = alpha > low[place]
+        inside &= alpha < high[place]
+        stable |= inside
     return stable
 
 
@@ -108,20 +105,6 @@ def _count_walls(boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> np.
             outside[left] = (log_size(poles_less_one(boundary.loop, alpha[left], beta[left])) >= 0).sum(1)
         stable[part] = good[part] & (outside == 0)
     return stable.reshape(shape)
-
-
-def _mark_rows(alpha: np.ndarray, ends: BoundIntervals, place: np.ndarray) -> np.ndarray:
-    """The same for ascending alpha along the last axis, at the speed at which rows are copied."""
-    stable = np.zeros((place.size, alpha.size), bool)
-    for k in range(ends.low.shape[1]):
-        missing = np.isnan(ends.high[:, k])
-        until = np.searchsorted(alpha, np.where(missing, -np.inf, ends.high[:, k]))
-        start = np.searchsorted(alpha, np.where(missing, -np.inf, ends.low[:, k]), side="right")
-        held = copy_rows(until[place], alpha.size)
-        if start.any():
-            held &= ~copy_rows(np.minimum(start, until)[place], alpha.size)
-        stable = held if k == 0 else stable | held
-    return stable
 
 
 # How near to an angle where the curve has no point of its own it is looked at, as a share of the way to a node.

@@ -124,16 +124,6 @@ def _take_lag(u: flint.arb, whole: int) -> Lag:
     return Lag(cosine, sine, half * half, lag < turn, w * (whole + 1) > turn)
 
 
-def decide_all(columns: list[np.ndarray], max_bits: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`decide` point by point: stable, status, bits."""
-    count = columns[0].size
-    stable, status, bits = np.zeros(count, bool), np.zeros(count, np.int32), np.zeros(count, np.int32)
-    alpha, beta, delta, d = (column.tolist() for column in columns)
-    for index in range(count):
-        stable[index], status[index], bits[index] = decide(alpha[index], beta[index], delta[index], d[index], max_bits)
-    return stable, status, bits
-
-
 class CertifiedResult(NamedTuple):
     """Labels that are right or absent, with the reason and the precision."""
 
@@ -195,5 +185,6 @@ def _settle_points(points: Points, verdict: np.ndarray, max_bits: int) -> tuple[
     rest = np.flatnonzero(inside & (verdict == OPEN))
     status[rest] = Status.UNDECIDED
     if rest.size and available():
-        stable[rest], status[rest], bits[rest] = decide_all([column[rest] for column in points], max_bits)
+        walls = zip(*(column[rest].tolist() for column in points), strict=True)
+        stable[rest], status[rest], bits[rest] = zip(*(decide(*wall, max_bits=max_bits) for wall in walls), strict=True)
     return stable, status, bits

@@ -28,6 +28,8 @@ from zwidth.words.types import Array
 _CUBIC_STEPS = 6
 # Cells are taken a little wider than they are, for rounding errors.
 _WIDER = 1.0 + 1e-12
+# Ends and middles of the pieces of an interval between zeros, each with a bound of its own.
+_CUTS = np.arange(9)[:, None, None] / 8.0
 
 
 class Loop(NamedTuple):
@@ -302,27 +304,27 @@ def count_in_cell(
     start, stop, last = _ends(at, loop, outer, ends_outer)
     # Where the wall's part is the larger at an end, its sign is that of every wall.
     sure &= (outer | (np.abs(at.front) > moved)) & (ends_outer | (np.abs(last) > a * r + b * (1.0 + r)))
-    turn = 0.0 * start
-    for first, second in zip(low, high, strict=True):
-        valid = ~np.isnan(first)
-        sure &= valid == ~np.isnan(second)
-        first, second = np.where(valid, np.fmin(first, second), 0.5), np.where(valid, np.fmax(first, second), 0.5)
-        w_first, w_second = find_turn(first, 1.0 - first, np), find_turn(second, 1.0 - second, np)
-        x = np.sin(0.25 * (w_first + w_second)) ** 2
-        part = _phase(x, at, loop, fractional, np)[0] / (2.0 * np.pi)
-        whole = np.round(part)
-        turn = turn + np.where(valid, np.where(outer, whole, -whole), 0.0)
-        outer = outer != valid
-        # z/(z - a) = 1 + a/(z - a) of every factor, where z is nearest to its zero.
-        wall = np.sqrt(np.maximum(at.front**2 + np.minimum(w1 * first, w1 * second), 0.0))
-        rate = loop.turns + 1.0 / np.sqrt(near**2 + 4.0 * r * first) + np.abs(loop.beta) / wall
-        rate = rate + loop.c / np.sqrt(at.off**2 + 4.0 * r * loop.c * first)
-        rate = rate + loop.h / np.sqrt(np.maximum(at.body**2 - 4.0 * r * loop.a2 * loop.h * second, 0.0))
-        if fractional:
-            rate = rate + loop.q / np.sqrt(np.maximum((r + loop.q) ** 2 - 4.0 * r * loop.q * second, 0.0))
-        reach = (a * r + b * np.sqrt(near**2 + 4.0 * r * second)) / wall
-        moves = 0.5 * (w_second - w_first) * rate + np.where(reach < 1.0, 0.5 * np.pi * reach, np.inf)
-        sure &= ~valid | (2.0 * np.pi * np.abs(part - whole) + moves < np.pi - 1e-9)
+    valid = ~np.isnan(low)
+    sure &= (valid == ~np.isnan(high)).all(0)
+    first, second = (np.where(valid, end(low, high), 0.5) for end in (np.fmin, np.fmax))
+    w_first, w_second = (find_turn(x, 1.0 - x, np) for x in (first, second))
+    cuts = np.sin(0.5 * (w_first + _CUTS * (w_second - w_first))) ** 2
+    first, x, second = cuts[:-1:2], cuts[1::2], cuts[2::2]
+    part = _phase(x, at, loop, fractional, np)[0] / (2.0 * np.pi)
+    whole = np.round(part[0])
+    # z/(z - a) = 1 + a/(z - a) of every factor, where z is nearest to its zero.
+    wall = np.sqrt(np.maximum(at.front**2 + np.minimum(w1 * first, w1 * second), 0.0))
+    rate = loop.turns + 1.0 / np.sqrt(near**2 + 4.0 * r * first) + np.abs(loop.beta) / wall
+    rate = rate + loop.c / np.sqrt(at.off**2 + 4.0 * r * loop.c * first)
+    rate = rate + loop.h / np.sqrt(np.maximum(at.body**2 - 4.0 * r * loop.a2 * loop.h * second, 0.0))
+    if fractional:
+        rate = rate + loop.q / np.sqrt(np.maximum((r + loop.q) ** 2 - 4.0 * r * loop.q * second, 0.0))
+    reach = (a * r + b * np.sqrt(near**2 + 4.0 * r * second)) / wall
+    moves = _CUTS[1] * (w_second - w_first) * rate + np.where(reach < 1.0, 0.5 * np.pi * reach, np.inf)
+    sure &= (~valid | (2.0 * np.pi * np.abs(part - whole) + moves < np.pi - 1e-9)).all((0, 1))
+    # The larger part alternates.
+    signs = np.where(outer, 1.0, -1.0) * (-1.0) ** np.arange(len(valid))[:, None]
+    turn = np.where(valid, signs * whole, 0.0).sum(0)
     return loop.turns + 2.0 - (stop - start + 2.0 * turn), sure
 
 

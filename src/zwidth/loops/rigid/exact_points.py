@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import optimistix
 
+from zwidth.arrays.circle import circle
 from zwidth.arrays.xp import nan_with_nan_slopes, store_once
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import device_status, wall_status
@@ -85,17 +86,13 @@ def lobe_end(loop: FrequencyLoop, d: Array, delay_model: str) -> Array:
 def frequency_residual(omega: Array, alpha: Array, beta: Array, loop: FrequencyLoop) -> Array:
     """``P(e^(j omega))/e^(j (2 + n) omega)`` as a real pair."""
     plant, whole = loop
-    sin = jnp.sin(omega)
-    # (z - 1)(z - c), then z^-n M (alpha + beta (1 - 1/z)), all as real pairs: optimistix wants real unknowns.
-    re_1, re_c = -2.0 * jnp.sin(0.5 * omega) ** 2, plant.em - 2.0 * jnp.sin(0.5 * omega) ** 2
-    re_m = -plant.gap + 2.0 * (plant.a2 + plant.a0) * jnp.cos(0.5 * omega) ** 2
-    im_m = (plant.a2 - plant.a0) * sin
-    re_w, im_w = alpha - beta * re_1, beta * sin
-    re_mw, im_mw = re_m * re_w - im_m * im_w, re_m * im_w + im_m * re_w
-    lag_re, lag_im = jnp.cos(whole * omega), -jnp.sin(whole * omega)
-    re = re_1 * re_c - sin * sin + lag_re * re_mw - lag_im * im_mw
-    im = sin * (re_1 + re_c) + lag_re * im_mw + lag_im * re_mw
-    return jnp.stack([re, im])
+    at, half = circle(omega), jnp.cos(0.5 * omega)
+    # (z - 1)(z - c) + z^-n M (alpha + beta (1 - 1/z))
+    m = 2.0 * (plant.a2 + plant.a0) * half * half - plant.gap + 1j * (plant.a2 - plant.a0) * jnp.sin(omega)
+    pushed = jnp.exp(-1j * whole * omega) * m * (alpha + beta * at.before * jnp.conj(at.z))
+    value = at.before * (at.before + plant.em) + pushed
+    # optimistix wants real unknowns.
+    return jnp.stack([value.real, value.imag])
 
 
 def _residual(line: str, unknowns: Array, args: tuple[FrequencyLoop, Array, Array]) -> Array:

@@ -64,7 +64,12 @@ def map_by_degree(
     check_scalars(arguments)
     traced = is_traced(*values)
     if traced:
-        delays, arrays = _concrete_delay(values[-1]), broadcast_traced(values)
+        if is_traced(values[-1]):
+            raise TracedDelayError(
+                "d: got a traced value, but the number of poles depends on it; pass d as a plain number, "
+                "for example through jit's static_argnums or a closure"
+            )
+        delays, arrays = as_float64("d", values[-1]), broadcast_traced(values)
         import jax.numpy as xp
     else:
         arrays, xp = broadcast(arguments), np
@@ -115,16 +120,6 @@ def _same_length(leaves: tuple[Any, ...], lead: bool, xp: Any) -> list[Any]:
         else:
             filled.append(xp.pad(leaf, ((0, 0), (0, missing)), constant_values=xp.nan))
     return filled
-
-
-def _concrete_delay(d: ArrayLike) -> np.ndarray:
-    """The delay as a concrete array; a traced one is refused where it decides an array's shape."""
-    if is_traced(d):
-        raise TracedDelayError(
-            "d: got a traced value, but the number of poles depends on it; pass d as a plain number, "
-            "for example through jit's static_argnums or a closure"
-        )
-    return as_float64("d", d)
 
 
 # Below this many values an argument is too small for looking for repetition to pay.
@@ -196,9 +191,9 @@ def _repeats(array: np.ndarray, axis: int) -> bool:
         return True
     if array.size < _WORTH_FOLDING:
         return False
-    first = array.take([0], axis=axis)
+    along = np.moveaxis(array, axis, 0)
     # Most arrays that do not repeat are found out by their last slice.
-    return bool(np.array_equal(first, array.take([-1], axis=axis)) and (array == first).all())
+    return bool(np.array_equal(along[0], along[-1]) and (along == along[0]).all())
 
 
 def pick_points(points: Points, mask: np.ndarray) -> Points:

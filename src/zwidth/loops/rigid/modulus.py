@@ -12,11 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import along, apply_each, frozen, namespace, nan_with_nan_slopes, repeat, store_once
+from zwidth.arrays.xp import along, apply_each, frozen, namespace, repeat
 from zwidth.loops.rigid.crossover import Crossover, gain_crossover
-from zwidth.loops.rigid.device import DeviceTerms, device, valid_wall
-from zwidth.words.types import Array, ArrayLike
+from zwidth.loops.rigid.device import DeviceTerms
+from zwidth.words.types import Array
 
 
 def find_angle(crossover: Crossover) -> Array:
@@ -56,46 +55,6 @@ def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tu
 SAMPLES_WEIGHT = 8
 # Samples over the turns and over the decades below the crossover; how many dips are refined, by how many zooms.
 _TURN, _DECADES, _DIPS, _ZOOMS, _TRIALS = 100, 50, 5, 5, 13
-
-
-def modulus_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
-    """Return how closely the Nyquist curve of the loop passes the point -1.
-
-    ``min over omega of |1 + L(e^(j omega))|``, with ``L = N(z) (alpha z + beta (z - 1))/(z^(2+n) (z - 1)(z - c))``; the
-    inverse of the largest sensitivity. A margin in the sense of robustness only where the wall is stable.
-
-    Args:
-        alpha: normalized stiffness, > 0.
-        beta: normalized virtual damping.
-        delta: normalized physical damping, >= 0.
-        d: delay in periods, >= 0, whole or not (held). All four broadcast.
-
-    Returns:
-        Array of the broadcast shape: 0 for a pole on the unit circle, at most 1 for a stable wall, at most 2 for any
-        other; NaN where alpha <= 0 or out of range.
-
-    Numerics:
-        About 1e-14, at a cost that does not grow with d. Traceable, with derivatives up to the second.
-
-    References:
-        Landau 1990 (modulus margin); Hulin, Preusche, Hirzinger 2006, eq. (15) for the loop.
-
-    Example:
-        >>> from zwidth import modulus_margin
-        >>> print(f"{modulus_margin(0.1, 0.2, 0.1, 0):.4f}")
-        0.5898
-    """
-    arguments = {"alpha": alpha, "beta": beta, "delta": delta, "d": d}
-    return evaluate(margin_kernel, arguments, weight=SAMPLES_WEIGHT, route="numpy")
-
-
-def margin_kernel(alpha: Array, beta: Array, delta: Array, d: Array) -> Array:
-    """`modulus_margin`, elementwise."""
-    ok = valid_wall(alpha, beta, delta, d) & (alpha > 0)
-    inputs = (alpha, beta, delta, d)
-    xp = namespace(*inputs)
-    alpha, beta, delta, d = (xp.where(ok, value, 1.0) for value in inputs)
-    return modulus(alpha, beta, store_once(device(delta, d), delta))[0] + nan_with_nan_slopes(ok, *inputs)
 
 
 def squared_distance(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> Array:

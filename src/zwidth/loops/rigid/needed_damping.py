@@ -58,7 +58,7 @@ def larger_root(linear: Array, square: Array, xp: Any) -> tuple[Array, Array]:
     return xp.where(linear > 0, 0.5 * (root + linear), 0.5 * square / xp.where(other > 0, other, 1.0)), root
 
 
-def _rise(a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> tuple[Array, Array, Array]:
+def _rise(a: Array, beta: Array, delay: Delay) -> tuple[Array, Array, Array]:
     """At w = 0: what is needed, E, and the derivative of E in beta."""
     f, k, kappa = delay
     xp = namespace(a, f)
@@ -67,60 +67,47 @@ def _rise(a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> tupl
     spring = (1.0 - f) * n * k * (2.0 * n + 1.0) + f * k * (k + 1.0) * (2.0 * k + 1.0)
     damper = (1.0 - f) * k * k + f * (k + 1.0) ** 2
     needed, root = larger_root(a * (2.0 * (n + f) + 1.0) - beta, kappa * a * a, xp)
-    rise, by_beta = beta * damper - a * spring / 3.0, damper
-    if kind.fractional:
-        per = 0.125 * kappa / xp.where(needed > 0, needed, 1.0)
-        pull = per * beta * (beta + 2.0 * a)
-        rise, by_beta = rise + pull, damper + 2.0 * per * (beta + a) + pull / xp.where(root > 0, root, 1.0)
-    return needed, rise, by_beta
+    per = 0.125 * kappa / xp.where(needed > 0, needed, 1.0)
+    pull = per * beta * (beta + 2.0 * a)
+    rise = beta * damper - a * spring / 3.0 + pull
+    return needed, rise, damper + 2.0 * per * (beta + a) + pull / xp.where(root > 0, root, 1.0)
 
 
-def turns(a: Array, beta: Array, delay: Delay, kind: DelayClasses) -> tuple[Array, Array, Array, Array]:
+def turns(a: Array, beta: Array, delay: Delay) -> tuple[Array, Array, Array, Array]:
     """Of the wall ``(2 a, beta)``: its need at w = 0, E there, its need at w = pi, and whether that is the peak."""
     f, k, _ = delay
     xp = namespace(a, f)
-    at_zero, rise, _ = _rise(a, beta, delay, kind)
+    at_zero, rise, _ = _rise(a, beta, delay)
     b = beta + a
     end = beta * (1.0 - 5.0 * f) - 2.0 * a * f + 0.5 * f * beta * (beta + 2.0 * a) / xp.where(b > 0, b, 1.0)
     return at_zero, xp.where(beta > 0, rise, -1.0), b * (1.0 - f), (k == 1) & (end >= 0)
 
 
-def condition(u: Array, a: Array, beta: Array, delay: Delay, kind: DelayClasses = ANY) -> PeakCondition:
+def condition(u: Array, a: Array, beta: Array, delay: Delay) -> PeakCondition:
     """The condition at ``u = 1 - cos w`` in (0, 2], for n >= 1 in (0, 1]."""
     f, k, kappa = delay
     xp = namespace(u, a)
     cos_w, square = 1.0 - u, u * (2.0 - u)
     # For n = 0 all is a polynomial in u, up to w = pi.
     undelayed = k == 1
-    if kind.long:
-        square_safe = xp.where(undelayed, 1.0, square) if kind.short else square
-        cosine, sine = _wave(xp.minimum(u, 1.0), k, xp)
-        tau = sine / xp.sqrt(square_safe)
-        if kind.short:
-            cosine, tau = xp.where(undelayed, cos_w, cosine), xp.where(undelayed, 1.0, tau)
-        tau1 = (k * cosine - tau * cos_w) / square_safe
-        if kind.short:
-            tau1 = xp.where(undelayed, 0.0, tau1)
-    else:
-        cosine, tau, tau1 = cos_w, 1.0, 0.0
+    square_safe = xp.where(undelayed, 1.0, square)
+    cosine, sine = _wave(xp.minimum(u, 1.0), k, xp)
+    cosine, tau = xp.where(undelayed, cos_w, cosine), xp.where(undelayed, 1.0, sine / xp.sqrt(square_safe))
+    tau1 = xp.where(undelayed, 0.0, (k * cosine - tau * cos_w) / square_safe)
     inner = (k * cosine - tau) / u
     spring, spring1 = tau * (2.0 - u) - cosine, inner + k * tau
     spring2 = (-k * k * tau - tau1 - inner) / u + k * tau1
     damper, damper1, damper2 = cosine, -k * tau, -k * tau1
-    if kind.fractional:
-        spring, spring1, spring2 = spring + 2.0 * f * cosine, spring1 - 2.0 * f * k * tau, spring2 - 2.0 * f * k * tau1
-        late, late_tau = cosine * cos_w - tau * square, tau * cos_w + cosine
-        late_tau1 = tau1 * cos_w - tau - k * tau
-        damper, damper1 = damper + f * (late - damper), damper1 - f * ((k + 1.0) * late_tau + damper1)
-        damper2 = damper2 - f * ((k + 1.0) * late_tau1 + damper2)
-    if kind.short:
-        # Of the size of f: above, 1 - 1 would leave rounding errors.
-        spring1, spring2 = xp.where(undelayed, -2.0 * f, spring1), xp.where(undelayed, 0.0, spring2)
-        damper1 = xp.where(undelayed, 4.0 * f * u - 3.0 * f - 1.0, damper1)
-        damper2 = xp.where(undelayed, 4.0 * f, damper2)
+    spring, spring1, spring2 = spring + 2.0 * f * cosine, spring1 - 2.0 * f * k * tau, spring2 - 2.0 * f * k * tau1
+    late, late_tau = cosine * cos_w - tau * square, tau * cos_w + cosine
+    late_tau1 = tau1 * cos_w - tau - k * tau
+    damper, damper1 = damper + f * (late - damper), damper1 - f * ((k + 1.0) * late_tau + damper1)
+    damper2 = damper2 - f * ((k + 1.0) * late_tau1 + damper2)
+    # Of the size of f: above, 1 - 1 would leave rounding errors.
+    spring1, spring2 = xp.where(undelayed, -2.0 * f, spring1), xp.where(undelayed, 0.0, spring2)
+    damper1 = xp.where(undelayed, 4.0 * f * u - 3.0 * f - 1.0, damper1)
+    damper2 = xp.where(undelayed, 4.0 * f, damper2)
     linear, linear1, linear2 = a * spring - beta * damper, a * spring1 - beta * damper1, a * spring2 - beta * damper2
-    if not kind.fractional:
-        return PeakCondition(linear1, linear2, linear, linear)
     gain = beta * (beta + 2.0 * a)
     needed, root = larger_root(linear, kappa * (a * a + 0.5 * gain * u), xp)
     # Stationary where this vanishes; its own slope is that of A there.
@@ -139,7 +126,7 @@ def _wave(u: Array, k: Array, xp: Any) -> tuple[Array, Array]:
     return (cosine - sine) * (cosine + sine), 2.0 * sine * cosine
 
 
-def peak(a: Array, beta: Array, delay: Delay, rise: Array, kind: DelayClasses = ANY) -> Array:
+def peak(a: Array, beta: Array, delay: Delay, rise: Array) -> Array:
     """u of the one peak between w = 0 and pi, where it exists; ``rise`` is E at u = 0.
 
     The start, from ``(1 - x cot x)/x^2 = 2 sum 1/(i^2 pi^2 - x^2)``, is within a few per cent. An error of u enters
@@ -152,9 +139,7 @@ def peak(a: Array, beta: Array, delay: Delay, rise: Array, kind: DelayClasses = 
     ratio = 2.0 * a * period / (beta + a)
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - 0.1307 * ratio, 0.5)
     y = np.pi**2 - 2.0 * ratio / xp.maximum(1.0 - (0.1307 + 0.00216 * y) * ratio, 0.5)
-    end = 2.0 * xp.sin(0.5 * np.pi / k) ** 2
-    if kind.short:
-        end = xp.where(k == 1, 2.0, end)
+    end = xp.where(k == 1, 2.0, 2.0 * xp.sin(0.5 * np.pi / k) ** 2)
     # Below this the height is that at 0 to the last digit.
     floor = epsilon(a) ** 0.5 * end
     # 1 - cos w to 1e-3
@@ -162,7 +147,7 @@ def peak(a: Array, beta: Array, delay: Delay, rise: Array, kind: DelayClasses = 
     u = xp.minimum(xp.maximum(0.5 * y * (1.0 - y * (1.0 / 12.0 - y * (1.0 / 360.0))), floor), end)
     # Unrolled: XLA then makes one loop over the points out of all steps.
     for _ in range(_STEPS):
-        here = condition(u, a, beta, delay, kind)
+        here = condition(u, a, beta, delay)
         # Near the turn E is all but a straight line from its value at 0, and Newton's method may leave (0, end].
         new = u - here.slope / xp.where(here.bend < 0, here.bend, -1.0)
         chord = u * rise / xp.where(here.slope < 0, rise - here.slope, 1.0)
@@ -180,18 +165,15 @@ def needed_damping(alpha: Array, beta: Array, d: Array, kind: DelayClasses = ANY
     scale = frozen(alpha + xp.abs(beta), xp)
     scale = xp.where(scale > 0, scale, 1.0)
     a, beta = 0.5 * alpha / scale, beta / scale
-    at_zero, rise, at_pi, reaches_pi = turns(a, beta, delay, kind)
+    at_zero, rise, at_pi, reaches_pi = turns(a, beta, delay)
     rises = rise > 0
     inside = rises & ~reaches_pi
     # Where there is no peak, harmless values that have one.
     a_in, beta_in = xp.where(inside, a, 0.0), xp.where(inside, beta, 1.0)
-    if kind.short:
-        f_in = xp.where(inside, delay.f, 0.5 if kind.fractional else 0.0)
-        delay_in = Delay(f_in, delay.k, 4.0 * f_in * (1.0 - f_in))
-    else:
-        delay_in = delay
-    u = frozen(peak(a_in, beta_in, delay_in, xp.where(inside, rise, 1.0), kind), xp)
-    here = condition(u, a_in, beta_in, delay_in, kind)
+    f_in = xp.where(inside, delay.f, 0.5)
+    delay_in = Delay(f_in, delay.k, 4.0 * f_in * (1.0 - f_in))
+    u = frozen(peak(a_in, beta_in, delay_in, xp.where(inside, rise, 1.0)), xp)
+    here = condition(u, a_in, beta_in, delay_in)
     # One more step, as its effect on the height: with it the second derivatives are right too.
     curvature = frozen(xp.where(here.bend < 0, here.bend * here.root / here.needed, -1.0), xp)
     height = here.needed - xp.where(here.bend < 0, 0.5 * here.slope * here.slope / curvature, 0.0)
@@ -205,7 +187,7 @@ def directions(d: Array) -> tuple[Array, Array]:
     f, k, _ = delay
     half, zero = 0.5 + 0.0 * d, 0.0 * d
     # E at w = 0 grows with beta. Without the pull of a fraction it vanishes at the first guess.
-    _, short, by_beta = _rise(half, zero, delay, DelayClasses(True, True, False))
+    _, short, by_beta = _rise(half, zero, delay._replace(kappa=zero))
     highest = -short / by_beta
     first, _ = newton(lambda beta: _rise(half, beta, delay)[1:], zero, highest, highest, _DIRECTION_STEPS)
     # (2 - 9 f) t^2 + (1 - 6 f) t = f

@@ -6,24 +6,22 @@ On maps of alpha and beta they come from series (`loops.rigid.pole_map`).
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks
+from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks, run_in_threads
 from zwidth.arrays.xp import WIDE
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import classify_delays, wall_status
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.pole_map import Area, follow_poles
+from zwidth.loops.rigid.pole_map import Area, fill_up, follow_poles
 from zwidth.loops.rigid.pole_search import (
-    LONG,
-    SHORT,
     Found,
     certification_width,
-    certify_both,
+    certify_starts,
     has_bound,
     quick_kernel,
     search,
@@ -33,8 +31,6 @@ from zwidth.words.status import Status
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(12)
 _LARGEST_ERROR = 0.1
-# How far below a pole the search for a larger one begins.
-_BELOW = 1e-6
 # Closer to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is: of the
 # radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
 _DOUBTFUL = 1e-8
@@ -45,6 +41,8 @@ _LARGEST_SHARE, _KNOWN = 1e-3, 1e-6
 _REAL = 1e-6
 # Smaller maps are not worth their cells.
 SMALLEST_MAP = 1 << 11
+# Walls of a map that become radii at one time, and listed ones whose poles are found without a compiler.
+_STRIP, _AT_ONCE = 1 << 15, 1 << 10
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 
@@ -88,9 +86,8 @@ def _of_one_kind(columns: list[np.ndarray], accuracy: float, kind: bool, few: in
             # Plain numbers are several times faster than arrays of one.
             found = [np.reshape(leaf, 1) for leaf in _quick([column[0] for column in columns], accuracy, kind)]
         elif size <= few:
-            pieces = [[column[start : start + FEW] for column in columns] for start in range(0, max(size, 1), FEW)]
-            parts = [_quick(piece, accuracy, kind) for piece in pieces]
-            found = list(map(np.concatenate, zip(*parts, strict=True)))
+            quick = lambda *piece: _quick(list(piece), accuracy, kind)  # noqa: E731
+            found = map_blocks(quick, columns, _AT_ONCE, within=partial(np.errstate, all="ignore"))
         else:
             # Always of one size: other batches may round differently.
             short = max(0, PIECE - size)
@@ -117,35 +114,23 @@ def _finish_poles(columns: list[np.ndarray], found: Found, accuracy: float, kind
 def _patiently(
     columns: list[np.ndarray], found: Found, error: np.ndarray, left: np.ndarray, accuracy: float, kind: bool
 ) -> None:
-    alpha, beta, delta, d = (column[left] for column in columns)
-    loop = factor_loop(alpha, beta, delta, d, kind)
-    one, other = certify_both(accuracy, loop, kind)
-    new = Found(*(np.where(one.proved, *pair) for pair in zip(one, other, strict=True)))
-    # Where neither start leads there, a third pole is next to the larger of what they lead to, more often than not.
-    low = np.fmax(one.re, other.re)[~new.proved] - _BELOW
-    left, loop = _store_poles(found, error, left, loop, new, new.proved, accuracy)
-    for start, halvings in ((low, SHORT), (None, LONG)):
-        if left.size:
-            new = search(accuracy, loop, kind, start, halvings)
-            good = new.proved | (halvings == LONG)
-            left, loop = _store_poles(found, error, left, loop, new, good, accuracy)
-    for factor in _LADDER[accuracy * _LADDER <= _LARGEST_ERROR]:
+    attempts: list[Any] = [certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
+    for attempt in attempts:
         if not left.size:
             return
-        here = has_bound(found.re[left], factor * accuracy, loop, kind)
-        error[left[here]], found.doubt[left[here]] = factor * accuracy, np.inf
-        left, loop = left[~here], type(loop)(*(part[~here] for part in loop))
-
-
-def _store_poles(
-    found: Found, error: np.ndarray, left: np.ndarray, loop: Any, new: Found, good: Any, accuracy: float
-) -> tuple[np.ndarray, Any]:
-    """Keep new poles where they are good; what is not proved by them is left."""
-    good = good & np.isfinite(new.re)
-    for whole, leaf in zip(found, new, strict=True):
-        whole[left[good]] = leaf[good]
-    error[left[new.proved]] = accuracy
-    return left[~new.proved], type(loop)(*(part[~new.proved] for part in loop))
+        full = fill_up(left)
+        loop = factor_loop(*(column[full] for column in columns), kind)
+        if not isinstance(attempt, float):
+            new = Found(*(leaf[: left.size] for leaf in attempt(accuracy, loop, kind)))
+            good = np.isfinite(new.re)
+            for whole, leaf in zip(found, new, strict=True):
+                whole[left[good]] = leaf[good]
+            error[left[new.proved]] = accuracy
+            left = left[~new.proved]
+        else:
+            here = has_bound(found.re[full], attempt * accuracy, loop, kind)[: left.size]
+            error[left[here]], found.doubt[left[here]] = attempt * accuracy, np.inf
+            left = left[~here]
 
 
 def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | None:
@@ -173,10 +158,10 @@ def as_area(points: Points) -> tuple[Area, tuple[int, ...], tuple[int, ...]] | N
 
 
 class WallPoles(NamedTuple):
-    """Logarithms of the radii of walls, their errors, infinite where none is proved, and rates of decay if wanted."""
+    """Spectral radii, NaN where no error is proved; whether the accuracy is; and rates of decay if wanted."""
 
-    re: np.ndarray
-    error: np.ndarray
+    radius: np.ndarray
+    proved: np.ndarray
     rate: np.ndarray  # NaN where less than three digits are known
 
     def map(self, function: Callable[[np.ndarray], np.ndarray]) -> WallPoles:
@@ -185,27 +170,30 @@ class WallPoles(NamedTuple):
 
 
 def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPoles:
-    """The outermost poles of a map (devices, betas, alphas): by series, and where these fail wall by wall.
+    """The outermost poles of a map: by series, and where these fail wall by wall.
 
     Nothing is compiled, and a wall's value does not depend on the others of its window.
     """
-    (re, error), missing = follow_poles(area, accuracy)
-    if with_rate:
-        left = error > _KNOWN * np.abs(re)
-        left[tuple(missing)] = True
-        missing = np.stack(np.nonzero(left))
-    found = WallPoles(re, error, -re if with_rate else _NONE)
-    held = (area.d % 1.0 != 0.0)[missing[0]]
-    kinds = [missing[:, held == kind] for kind in (False, True)]
-    for places in kinds:
-        if not places.size:
-            continue
-        # A multiple of 16: NumPy rounds odd ones at the end of a list otherwise.
-        walls = area.walls(np.pad(places, ((0, 0), (0, -places.shape[1] % 16)), mode="edge"))
-        for whole, leaf in zip(found, list_poles(walls, accuracy, with_rate, few=walls[0].size), strict=True):
-            if leaf.size:
-                whole[tuple(places)] = leaf[: places.shape[1]]
-    return found
+    re, arrays = follow_poles(area, accuracy, _KNOWN if with_rate else np.inf), area.arrays()
+    proved, rate = np.ones(re.shape, bool), -re if with_rate else _NONE
+    strip = max(1, _STRIP // re.shape[2])
+    strips = [(k, slice(i, i + strip)) for k in range(re.shape[0]) for i in range(0, re.shape[1], strip)]
+
+    def finish(place: Any) -> Any:
+        return _to_radii(re[place], accuracy, [array[place] for array in arrays])
+
+    def at(place: Any, missing: np.ndarray) -> Any:
+        return np.full(missing[0].size, place[0]), missing[0] + place[1].start, missing[1]
+
+    missing = [at(place, left) for place, left in zip(strips, run_in_threads(finish, strips), strict=True)]
+    places = tuple(map(np.concatenate, zip(*missing, strict=True)))
+    if places[0].size:
+        full = tuple(map(fill_up, places))
+        found = list_poles([array[full] for array in arrays], accuracy, with_rate, few=full[0].size)
+        for whole, leaf in zip((re, proved, rate), found, strict=True):
+            if whole.size:
+                whole[places] = leaf[: places[0].size]
+    return WallPoles(re, proved, rate)
 
 
 def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, few: int = FEW) -> WallPoles:
@@ -213,9 +201,11 @@ def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = Fal
     columns, status = usable(columns)
     found, bad = outermost_poles(columns, accuracy, few), status != Status.OK
     rate = rates(found, columns, accuracy) if with_rate else _NONE
-    found.error[bad] = np.inf
     rate[bad[: rate.size]] = np.nan
-    return WallPoles(found.re, found.error, rate)
+    found.error[bad] = np.inf
+    radius = np.where(np.isinf(found.error), np.nan, found.re)
+    _to_radii(radius, accuracy, columns)
+    return WallPoles(radius, found.error <= accuracy, rate)
 
 
 def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
@@ -226,17 +216,12 @@ def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = Fals
         columns = [array.reshape(-1) for array in arrays]
         return list_poles(columns, accuracy, with_rate).map(lambda leaf: leaf.reshape(shape))
     area, order, sizes = laid
-    back = np.argsort(order)
-    return area_poles(area, accuracy, with_rate).map(
-        lambda leaf: np.broadcast_to(leaf.reshape(sizes).transpose(back), shape)
-    )
 
+    def lay(leaf: np.ndarray) -> np.ndarray:
+        leaf = leaf.reshape(sizes).transpose(np.argsort(order))
+        return leaf if leaf.shape == shape else np.broadcast_to(leaf, shape).copy()
 
-def prove_radii(arrays: list[np.ndarray], accuracy: float) -> tuple[np.ndarray, np.ndarray]:
-    """Radii and relative errors (infinite where none is proved) of arrays of one shape."""
-    shape, arrays = arrays[0].shape, [np.atleast_1d(array) for array in arrays]
-    found = find_poles(arrays, accuracy)
-    return radius_at(found.re, found.error, arrays).reshape(shape), found.error.reshape(shape)
+    return area_poles(area, accuracy, with_rate).map(lay)
 
 
 def rates(found: OutermostPoles, columns: list[np.ndarray], accuracy: float) -> np.ndarray:
@@ -250,6 +235,8 @@ def rates(found: OutermostPoles, columns: list[np.ndarray], accuracy: float) -> 
     with np.errstate(all="ignore"):
         for kind in (False, True):
             part = np.flatnonzero((error > allowed) & (found.doubt <= allowed) & (held == kind))
+            if not part.size:
+                continue
             loop = factor_loop(*(column[part] for column in columns), fractional=kind)
             # Whether a count proves that no other pole is nearly as large.
             seen = count(found.re[part] - beyond[part], loop, kind)
@@ -267,16 +254,18 @@ def usable(columns: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
     return columns, status
 
 
-def radius_at(re: np.ndarray, error: np.ndarray, arrays: list[np.ndarray]) -> np.ndarray:
-    """Radii on the verdict's side of the circle, which the proved error alone may not tell."""
-    radius = np.exp(re)
-    radius[np.isinf(error)] = np.nan
-    near = np.nonzero(np.abs(re) <= _DOUBTFUL)
+def _to_radii(re: np.ndarray, accuracy: float, arrays: list[np.ndarray]) -> Any:
+    """In place, the radii on the verdict's side of the circle, which errors alone may not tell; where there is none."""
+    # Of a flat mask NumPy finds the few places ten times faster.
+    special = np.unravel_index(np.flatnonzero(~(np.abs(re) > _DOUBTFUL)), re.shape)
+    missing = np.isnan(re[special])
+    near, missing = (tuple(place[part] for place in special) for part in (~missing, missing))
+    np.exp(re, out=re)
     if near[0].size:
         alpha, beta, delta, d = (array[near] for array in arrays)
         with np.errstate(all="ignore"):
             stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
         # The largest number below 1 is as near to the truth as 1 itself. A wall without stiffness has a pole at 1.
-        known = np.where((alpha == 0) & (radius[near] <= 1.0 + error[near]), 1.0, np.maximum(radius[near], 1.0))
-        radius[near] = np.where(stable, np.minimum(radius[near], _BELOW_ONE), known)
-    return radius
+        known = np.where((alpha == 0) & (re[near] <= 1.0 + accuracy), 1.0, np.maximum(re[near], 1.0))
+        re[near] = np.where(stable, np.minimum(re[near], _BELOW_ONE), known)
+    return missing

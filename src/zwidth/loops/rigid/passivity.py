@@ -78,7 +78,7 @@ def table(d: float) -> PassiveTable:
     alpha = 1.0 - place
     beta = first * alpha + place * width
     with np.errstate(all="ignore"):
-        needed = needed_damping(alpha, beta, np.full(_TERMS, d), classify_delays(d))
+        needed = needed_damping(alpha, beta, np.full(_TERMS, d))
     # place width + alpha width is the width.
     terms = cosines @ needed * (2.0 / (_TERMS * width))
     terms[0] *= 0.5
@@ -168,9 +168,7 @@ def passivity_margin(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: Arr
         found = _on_maps(values)
         if found is not None:
             return found
-    kind = classify_delays(d)
-    # Compiled, one text serves every delay.
-    return evaluate(_margin_kernel, arguments, kind if kind == _NO_DELAY or np.size(d) <= FEW else ANY)
+    return evaluate(_margin_kernel, arguments, _NO_DELAY if classify_delays(d) == _NO_DELAY else ANY)
 
 
 def is_passive(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -221,7 +219,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
 
     def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         alpha, beta = unit * np.cos(angles), np.sin(angles)
-        needed = needed_damping(alpha, beta, np.full(angles.shape, float(delay)), classify_delays(delay))
+        needed = needed_damping(alpha, beta, np.full(angles.shape, float(delay)))
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi

@@ -17,9 +17,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from zwidth.loops.rigid.circle import Loop
+from zwidth.loops.rigid.pole_step import join
 
 # Orders of the polynomials in xi and eta; each group takes the least that will do.
-ORDERS = (4, 10, 20)
+ORDERS = (4, 8, 12, 20)
 # Terms of A by u.
 _TERMS = 36
 _PLACES = np.arange(_TERMS + 1)
@@ -65,22 +66,16 @@ def pick(tree: Any, index: Any) -> Any:
     return type(tree)(*(pick(leaf, index) for leaf in tree)) if isinstance(tree, tuple) else tree[..., index]
 
 
-def _complex(re: np.ndarray, im: np.ndarray) -> np.ndarray:
-    value = np.empty(re.shape, complex)
-    value.real, value.imag = re, im
-    return value
-
-
 def _expand(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool, terms: int) -> tuple[Any, ...]:
     """The coefficients of A around centers; f and 1/z there, and the moduli of factors that bound A elsewhere."""
     size, sine = np.expm1(re), np.sin(0.5 * im)
     r = 1.0 + size
-    near = _complex(size - 2.0 * r * sine * sine, 2.0 * r * sine * np.cos(0.5 * im))
+    near = join(size - 2.0 * r * sine * sine, 2.0 * r * sine * np.cos(0.5 * im))
     z, off = near + 1.0, near + loop.em
     w, body = 1.0 / z, 1.0 / (loop.a2 * z + loop.h)
     # Q = -z^n (z - 1)(z - c)/((a2 z + h)(1 + q/z)), each factor by u.
     n, growth = loop.turns - 1.0, np.exp((loop.turns - 1.0) * re)
-    lead, rho = -_complex(growth * np.cos(n * im), growth * np.sin(n * im)) * body, loop.a2 * z * body
+    lead, rho = -join(growth * np.cos(n * im), growth * np.sin(n * im)) * body, loop.a2 * z * body
     late = z / (z + loop.q)
     if fractional:
         lead *= late
@@ -203,13 +198,18 @@ def sum_up(poles: int, group: Group, cells: Cells, order: int) -> list[np.ndarra
     return sums
 
 
-def larger_of_two(first: np.ndarray, second: np.ndarray, disk: Any, error: Any) -> tuple[np.ndarray, np.ndarray]:
-    """log |1 + u| of the larger pole and its error, from sums of u/disk and its square known to 1 and 2 errors (C3)."""
+def larger_of_two(first: np.ndarray, second: np.ndarray, disk: Any) -> tuple[np.ndarray, np.ndarray]:
+    """log |1 + u| of the larger pole, from sums of u/disk and its square; and D of C3, which a double pole has at 0."""
     # half +- sqrt(inside)
-    half, doubt = 0.5 * first, 2.01 * error
+    half = 0.5 * first
     inside = 0.5 * second - half * half
     real = disk * (half + np.sqrt(np.maximum(inside, 0.0)))
-    half = disk * half
-    size = np.where(inside > 0, np.log1p(real), 0.5 * np.log1p(half * (2.0 + half) - disk**2 * np.minimum(inside, 0.0)))
-    apart = np.where(inside > -doubt, np.minimum(np.sqrt(doubt), doubt / np.sqrt(np.abs(inside))), 0.0)
-    return size, disk / (1.0 - disk) ** 2 * (0.5 * error + doubt + apart)
+    return 0.5 * np.log1p(real * (2.0 + real) - disk**2 * np.minimum(inside, 0.0)), inside
+
+
+def knows_larger(inside: np.ndarray, disk: Any, error: Any, allowed: Any) -> np.ndarray:
+    """Where the larger pole is known to what is allowed, if the two sums are to 1 and 2 errors (C3)."""
+    doubt = 2.01 * error
+    # Of the root: at most the root of the doubt, and the doubt over the root of what is inside.
+    rest = np.maximum(allowed * ((1.0 - disk) ** 2 / disk) - 0.5 * error - doubt, 0.0)
+    return np.abs(inside) * rest**2 >= np.where(doubt <= rest**2, -1.0, doubt**2)

@@ -7,10 +7,12 @@ is left of the smallest is for single walls.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from itertools import product
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.evaluate import processors, run_in_threads, work_beside
 from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
 from zwidth.loops.rigid.pole_groups import (
     ORDERS,
@@ -19,6 +21,7 @@ from zwidth.loops.rigid.pole_groups import (
     Group,
     enclose,
     find_middle,
+    knows_larger,
     larger_of_two,
     pick,
     sum_up,
@@ -27,17 +30,15 @@ from zwidth.loops.rigid.pole_search import both_starts
 from zwidth.loops.rigid.pole_step import halley_step
 
 # Sides of cells, in walls.
-_SIDES = (64, 32, 16, 8, 4)
+_SIDES = (128, 64, 32, 16, 8)
 # Cells of one list, and of those how many have their sums made at one time, and walls: what they need stays in caches.
-_LIST, _BATCH, _WALLS = 1 << 10, 1 << 7, 1 << 15
+_LIST, _BATCH, _WALLS = 1 << 9, 1 << 7, 1 << 14
 # Of Halley's method on both starts. Centers so near to the real axis are put on it.
 _STEPS, _REAL = 5, 1e-7
-# Below this accuracy the least order serves too few cells.
-_COARSE = 1e-5
 # Of the accuracy, for sums of two poles: their difference is a square root.
 _FINER = 1e-3
 # How far inside of the groups the circles of a count are, in units of how far the groups move in the cell.
-_INSIDE = (0.3, 1.0, 3.0, 10.0)
+_INSIDE = (0.3, 1.5, 6.0)
 
 
 class Area(NamedTuple):
@@ -54,19 +55,17 @@ class Area(NamedTuple):
         """All of a map."""
         return cls(alpha, beta, delta, d, (slice(0, beta.shape[1]), slice(0, alpha.shape[1])))
 
+    def arrays(self) -> list[np.ndarray]:
+        """alpha, beta, delta and d of the window, each in its shape (devices, betas, alphas)."""
+        beta, alpha = self.beta[:, self.window[0], None], self.alpha[:, None, self.window[1]]
+        return list(np.broadcast_arrays(alpha, beta, self.delta[:, None, None], self.d[:, None, None]))
+
     def walls(self, place: np.ndarray) -> list[np.ndarray]:
         """alpha, beta, delta and d at places (3, walls) by device, row and column in the window."""
         device, row, column = place
         alpha, beta = (device if part.shape[0] > 1 else 0 * device for part in (self.alpha, self.beta))
         row, column = row + self.window[0].start, column + self.window[1].start
         return [self.alpha[alpha, column], self.beta[beta, row], self.delta[device], self.d[device]]
-
-
-class MapPoles(NamedTuple):
-    """Logarithms of the moduli of outermost poles (devices, betas, alphas), and their errors, infinite for none."""
-
-    re: np.ndarray
-    error: np.ndarray
 
 
 class _AxisPieces(NamedTuple):
@@ -91,20 +90,17 @@ def _cut(values: np.ndarray, side: int) -> _AxisPieces:
         return _AxisPieces(middle, half, powers)
 
 
-def _fill(index: np.ndarray) -> np.ndarray:
+def fill_up(index: np.ndarray) -> np.ndarray:
     """A multiple of 16 places, the last one again: NumPy rounds odd ones at the end of a list otherwise."""
     return np.concatenate([index, np.repeat(index[-1:], -index.size % 16)])
 
 
 def _find_poles(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
     """The slow pole and the first pair of the ring, nearly, the larger one first: (2, cells)."""
-    # All at one time: the steps are short.
-    re, im = map(np.concatenate, zip(*both_starts(loop, fractional), strict=True))
-    twice = Loop(*(np.tile(part, 2) for part in loop))
+    re, im = map(np.stack, zip(*both_starts(loop, fractional), strict=True))
     for _ in range(_STEPS):
-        re, im = halley_step(re, im, twice, fractional)
+        re, im = halley_step(re, im, loop, fractional)
     im = np.where(im < _REAL, 0.0, np.where(np.pi - im < _REAL, np.pi, im))
-    re, im = re.reshape(2, -1), im.reshape(2, -1)
     larger = (re[0] >= re[1]) | np.isnan(re[1])
     return np.where(larger, re, re[::-1]), np.where(larger, im, im[::-1])
 
@@ -120,9 +116,11 @@ class _GroupOfCell(NamedTuple):
     def of(cls, accuracy: float, *groups: Group) -> _GroupOfCell:
         """The groups that need the least order."""
         wanted = accuracy, accuracy * _FINER
-        shares = [group.error * (group.disk / (1.0 - group.disk)) for group in groups]
+        shares = [
+            (group.error + ROUNDING) * (group.disk / (1.0 - group.disk)) + ROUNDING * np.abs(group.re)
+            for group in groups
+        ]
         needed = np.stack([(~(share <= most)).sum(0) for share, most in zip(shares, wanted, strict=False)])
-        needed = np.maximum(needed, accuracy < _COARSE)
         return cls(groups, needed, needed.argmin(0))
 
     @property
@@ -154,10 +152,10 @@ class _GroupOfCell(NamedTuple):
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, accuracy: float, out: MapPoles, first: list[int]) -> None:
-        self.area, self.side, self.accuracy, self.first = area, side, accuracy, first
+    def __init__(self, area: Area, side: int, accuracy: float, share: float, out: np.ndarray, first: list[int]) -> None:
+        self.area, self.side, self.accuracy, self.share, self.first = area, side, accuracy, share, first
         self.axes = _cut(area.alpha, side), _cut(area.beta, side)
-        self.tiles = [leaf.reshape(leaf.shape[0], -1, side, leaf.shape[2] // side, side) for leaf in out]
+        self.tiles = out.reshape(out.shape[0], -1, side, out.shape[2] // side, side)
 
     def split(self, places: np.ndarray) -> np.ndarray:
         """Each cell in four, without what is beyond the ends of the axes."""
@@ -168,16 +166,15 @@ class _Level:
         inside = (row < self.axes[1].middle.shape[1]) & (column < self.axes[0].middle.shape[1])
         return np.stack([device, row, column])[:, inside]
 
-    def solve_all(self, places: np.ndarray, fractional: bool) -> np.ndarray:
-        """`solve` list by list."""
+    def solve_all(self, places: np.ndarray, fractional: bool, begin: Any) -> np.ndarray:
+        """`solve` list by list; ``begin`` writes beside what is done here."""
         lists = (places[:, start : start + _LIST] for start in range(0, places.shape[1], _LIST))
-        with np.errstate(all="ignore"):
-            return np.concatenate([places[:, :0], *(self.solve(some, fractional) for some in lists)], axis=1)
+        return np.concatenate([places[:, :0], *(self.solve(some, fractional, begin) for some in lists)], axis=1)
 
-    def solve(self, places: np.ndarray, fractional: bool) -> np.ndarray:
+    def solve(self, places: np.ndarray, fractional: bool, begin: Any) -> np.ndarray:
         """Write the poles of the cells of which all is proved; the others are returned."""
         count = places.shape[1]
-        places = places[:, _fill(np.arange(count))]
+        places = places[:, fill_up(np.arange(count))]
         along = self._along(places)
         alpha, beta = (axis.middle[place] for axis, place in zip(self.axes, along, strict=True))
         half = (axis.half[place] for axis, place in zip(self.axes, along, strict=True))
@@ -185,21 +182,19 @@ class _Level:
         cells = Cells(loop, *half)
         re, im = _find_poles(loop, fractional)
         one = _GroupOfCell.of(self.accuracy, enclose(1, re[0], im[0], cells, fractional))
-        written = self._try([[one]], places, cells, fractional)
-        left = _fill(np.flatnonzero(~written))
+        written = self._try([[one]], places, cells, fractional, begin)
+        left = fill_up(np.flatnonzero(~written))
         if left.size:
             # Next to a double pole the two are followed together; where another pole is about to take over, both.
             own, twice = pick(cells, left), pick(cells, np.tile(left, 2))
-            re, im = re[:, left].reshape(-1), im[:, left].reshape(-1)
-            groups = (
-                enclose(1, re, im, twice, fractional),
-                enclose(2, *find_middle(re, im, twice.loop, fractional), twice, fractional),
-            )
+            singles = pick(one.groups[0], left), enclose(1, re[1, left], im[1, left], own, fractional)
+            middles = find_middle(re[:, left].reshape(-1), im[:, left].reshape(-1), twice.loop, fractional)
+            pairs = enclose(2, *middles, twice, fractional)
             larger, other = (
-                _GroupOfCell.of(self.accuracy, *(pick(group, part) for group in groups))
-                for part in (slice(left.size), slice(left.size, None))
+                _GroupOfCell.of(self.accuracy, single, pick(pairs, part))
+                for single, part in zip(singles, (slice(left.size), slice(left.size, None)), strict=True)
             )
-            written[left] = self._try([[larger], [larger, other]], places[:, left], own, fractional)
+            written[left] = self._try([[larger], [larger, other]], places[:, left], own, fractional, begin)
         return places[:, :count][:, ~written[:count]]
 
     def _along(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -211,7 +206,7 @@ class _Level:
         ]
 
     def _try(
-        self, proposals: list[list[_GroupOfCell]], places: np.ndarray, cells: Cells, fractional: bool
+        self, proposals: list[list[_GroupOfCell]], places: np.ndarray, cells: Cells, fractional: bool, begin: Any
     ) -> np.ndarray:
         """Write the cells in which groups are known and hold the outermost pole whatever the wall (C4, C5)."""
         wanted, indices, radii = [], [], []
@@ -219,7 +214,7 @@ class _Level:
             known = np.logical_and.reduce([choice.known for choice in followed])
             if len(followed) == 2:
                 known &= followed[0].is_apart(followed[1])
-            index = _fill(np.flatnonzero(known))
+            index = fill_up(np.flatnonzero(known))
             wanted.append(sum(choice.many for choice in followed))
             indices.append(np.tile(index, len(_INSIDE)))
             for inside in _INSIDE:
@@ -227,66 +222,97 @@ class _Level:
         loop, a, b = pick(cells, np.concatenate(indices))
         # One count for all of the circles.
         outside, sure = count_in_cell(np.concatenate(radii), loop, (a, b), fractional)
-        written, start = np.zeros(places.shape[1], bool), 0
+        proved, start = np.zeros((2, places.shape[1]), bool), 0
         for followed, many, index in zip(proposals, wanted, indices, strict=True):
             part = slice(start, start + index.size)
-            proved, start = np.zeros(written.size, bool), part.stop
-            proved[index[sure[part] & (outside[part] == many[index])]] = True
-            for merge, choice in enumerate(followed):
-                self._follow(choice, proved & ~written, places, cells, merge > 0)
-            written |= proved
-        return written
+            proved[len(followed) - 1, index[sure[part] & (outside[part] == many[index])]], start = True, part.stop
+        known = np.asarray(proved.any(0))
+        begin(self._follow, proposals[-1][0], known, places, cells, False)
+        if proved[1].any():
+            begin(self._follow, proposals[-1][1], proved[1] & ~proved[0], places, cells, True)
+        return known
 
     def _follow(self, choice: _GroupOfCell, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
         """Write the groups of some cells, in batches of one kind."""
-        for poles, group in enumerate(choice.groups, 1):
-            for k, order in enumerate(ORDERS):
-                index = np.flatnonzero(where & (choice.best == poles - 1) & (choice.needed[poles - 1] == k))
-                for start in range(0, index.size, _BATCH):
-                    some = _fill(index[start : start + _BATCH])
-                    batch = pick(group, some)
-                    self._write(places[:, some], sum_up(poles, batch, pick(cells, some), order), batch, k, merge)
+        for (poles, group), k in product(enumerate(choice.groups, 1), range(len(ORDERS))):
+            index = np.flatnonzero(where & (choice.best == poles - 1) & (choice.needed[poles - 1] == k))
+            for start in range(0, index.size, _BATCH):
+                some = index[start : start + _BATCH]
+                full = fill_up(some)
+                batch = pick(group, full)
+                with np.errstate(all="ignore"):
+                    sums = sum_up(poles, batch, pick(cells, full), ORDERS[k])
+                    self._write(places[:, some], sums, batch, k, merge)
 
     def _write(self, places: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
         """The poles of all walls of some cells, or the larger ones of these and of what is there."""
         size, order = max(1, _WALLS // self.side**2), ORDERS[k] + 1
+        if len(sums) == 1:
+            sums[0][:, 0, 0] += group.re
         for start in range(0, places.shape[1], size):
-            part = slice(start, start + size)
+            part = slice(start, min(start + size, places.shape[1]))
             some = places[:, part]
             xi, eta = (
                 axis.powers[place][..., :order] for axis, place in zip(self.axes, self._along(some), strict=True)
             )
-            on_walls = [eta @ (x[part] @ xi.transpose(0, 2, 1)) for x in sums]
+            along_xi = [x[part] @ xi.transpose(0, 2, 1) for x in sums]
+            device, row, column = some[0], some[1] - self.first[0], some[2] - self.first[1]
+            if len(sums) == 1 and not merge and self.share == np.inf:
+                # To where they belong at once: copies would take as long.
+                for one, other, *cell in zip(eta, along_xi[0], device, row, column, strict=True):
+                    np.matmul(one, other, out=self.tiles[cell[0], cell[1], :, cell[2]])
+                continue
+            values = [eta @ x for x in along_xi]
             re, disk, error = (x[part, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
             if len(sums) == 1:
-                values, error = on_walls[0], disk / (1.0 - disk) * error
+                values, allowed = values[0], self.allowed(values[0])
+                known = disk / (1.0 - disk) * error <= allowed
             else:
-                values, error = larger_of_two(on_walls[0], on_walls[1], disk, error)
-            values += re
-            inside = some[0], some[1] - self.first[0], slice(None), some[2] - self.first[1]
-            whole, errors = self.tiles
-            whole[inside] = np.maximum(whole[inside], values) if merge else values
-            errors[inside] = np.maximum(errors[inside], error) if merge else error
+                values, inside = larger_of_two(*values, disk)
+                values += re
+                known = knows_larger(inside, disk, error, self.allowed(values))
+            if not known.all():
+                values[np.broadcast_to(~known, values.shape)] = np.nan
+            walls = device, row, slice(None), column
+            self.tiles[walls] = np.maximum(self.tiles[walls], values) if merge else values
+
+    def allowed(self, values: np.ndarray) -> Any:
+        """The errors that walls may have."""
+        return self.accuracy if self.share == np.inf else np.minimum(self.accuracy, self.share * np.abs(values))
+
+    def forget(self, places: np.ndarray) -> None:
+        """NaN for all walls of some cells."""
+        self.tiles[places[0], places[1] - self.first[0], :, places[2] - self.first[1]] = np.nan
 
 
-def follow_poles(area: Area, accuracy: float) -> tuple[MapPoles, np.ndarray]:
-    """The outermost poles in the window (devices, betas, alphas), and the places (3, walls) of those that no cell has.
+def follow_poles(area: Area, accuracy: float, share: float = np.inf) -> np.ndarray:
+    """Logarithms of the moduli of the outermost poles in the window (devices, betas, alphas).
 
-    A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
+    NaN where no cell knows them to the accuracy and to that share of themselves. A wall's value does not depend on the
+    window: cells lie on the whole map, and each is computed by itself.
     """
-    top, window = _SIDES[0], area.window
+    longest = max(area.alpha.shape[1], area.beta.shape[1])
+    sides = [side for side in _SIDES if side < 2 * longest or side == _SIDES[-1]]
+    top, window = sides[0], area.window
     first = [part.start // top for part in window]
     last = [-(-part.stop // top) for part in window]
-    shape = (area.d.size, *(top * (stop - start) for start, stop in zip(first, last, strict=True)))
-    out = MapPoles(np.empty(shape), np.full(shape, np.inf))
+    out = np.empty((area.d.size, *(top * (stop - start) for start, stop in zip(first, last, strict=True))))
     held = area.d != np.floor(area.d)
+    levels = [_Level(area, side, accuracy, share, out, [start * (top // side) for start in first]) for side in sides]
+
+    def follow(kind: bool, cells: np.ndarray) -> None:
+        with np.errstate(all="ignore"), work_beside() as begin:
+            for level in levels:
+                cells = level.solve_all(cells if level is levels[0] else level.split(cells), kind, begin)
+            levels[-1].forget(cells)
+
+    pieces = []
     for kind in (False, True):
-        pieces = np.flatnonzero(held == kind), *map(np.arange, first, last)
-        cells = np.stack([part.reshape(-1) for part in np.meshgrid(*pieces, indexing="ij")])
-        for side in _SIDES:
-            if cells.size:
-                level = _Level(area, side, accuracy, out, [start * (top // side) for start in first])
-                cells = level.solve_all(cells if side == top else level.split(cells), kind)
+        axes = np.flatnonzero(held == kind), *map(np.arange, first, last)
+        cells = np.stack([part.reshape(-1) for part in np.meshgrid(*axes, indexing="ij")])
+        # What is hard lies together: each thread gets its share of it. Two are needed to find poles and to write them.
+        count = min(max(1, processors() // 2), cells.shape[1])
+        pieces += [(kind, cells[:, k::count]) for k in range(count)]
+    run_in_threads(lambda piece: follow(*piece), pieces)
     inside = tuple(slice(w.start - top * start, w.stop - top * start) for w, start in zip(window, first, strict=True))
-    found = MapPoles(*(leaf[:, *inside] for leaf in out))
-    return found, np.stack(np.nonzero(~(found.error <= accuracy)))
+    return out[:, *inside]

@@ -27,8 +27,8 @@ from zwidth.loops.rigid.device import valid_wall
 from zwidth.loops.rigid.pole_step import halley_step, move_pole, newton_step
 from zwidth.words.types import Array
 
-# Steps on both starts, then on the larger of the two.
-_BOTH, _LARGER = 2, 3
+# Steps on both starts, then on the larger of the two; on both where that was not enough, next to double poles.
+_BOTH, _LARGER, _PATIENT = 2, 3, 10
 # A step after which a pole is within so much of where it began may be taken without looking again: N |P/P'| bounds
 # the distance before the step, N >= 3, and the step is an N-th of it.
 _AFTER = 1.4
@@ -36,9 +36,10 @@ _AFTER = 1.4
 _COUNTED, _RELATIVE = 4096.0, 2e-11
 # From the smallest radius that float64 has, to the last digit: where many poles are of nearly one size, the places of
 # crossovers depend on it.
-_SMALLEST, LONG, _POLISHING = -690.0, 62, 6
-# Enough to begin the steps from.
-SHORT = 14
+_SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
+_TOGETHER = 3
+# Off the real axis, of the angle of the first pair.
+_OFF = 0.1
 
 
 class Found(NamedTuple):
@@ -151,24 +152,32 @@ def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Arr
     return above.full & above.sure & ~below.full & below.sure
 
 
-def certify_both(tolerance: Array, loop: Loop, fractional: bool) -> tuple[Found, Found]:
-    """What both starts lead to, and whether it is the outermost pole."""
-    slow_re, slow_im, re, im = both_poles(_BOTH + _LARGER, loop, fractional)
-    one = certify_pole(slow_re, slow_im, tolerance, loop, fractional, False)
-    return one, certify_pole(re, im, tolerance, loop, fractional, False)
+def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> Found:
+    """What both starts lead to, or the slow one put on the real axis or off it, which steps do not leave or meet."""
+    (slow, turn), pair = both_starts(loop, fractional)
+    start = np.stack([slow, pair[0], slow]), np.stack([turn, pair[1], np.where(turn > 0, 0.0, _OFF * pair[1])])
+    at = repeat(_PATIENT, lambda at: halley_step(*at, loop, fractional), start, np)
+    found = certify_pole(*at, tolerance, loop, fractional, False)
+    best = np.where(found.proved, np.inf, np.nan_to_num(found.re, nan=-np.inf)).argmax(0)
+    return Found(*(leaf[best, np.arange(best.size)] for leaf in found))
 
 
-def search(tolerance: Array, loop: Loop, fractional: bool, low: Array | None = None, halvings: int = LONG) -> Found:
-    """The outermost pole by halvings of the interval that counts leave, from a lower end on; then a few steps."""
+def search(tolerance: Array, loop: Loop, fractional: bool) -> Found:
+    """The outermost pole by halvings of the interval that counts leave, then a few steps."""
     xp = namespace(loop.alpha)
+    # Of few walls NumPy has several radii counted in the time of one.
+    together = _TOGETHER if xp is np else 1
+    parts = 2**together
 
     def step(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        middle = 0.5 * (state[0] + state[1])
-        full = count(middle, loop, fractional).full
-        return xp.where(full, state[0], middle), xp.where(full, middle, state[1])
+        low, width = state[0], (state[1] - state[0]) / parts
+        radii = xp.stack([low + k * width for k in range(1, parts)])
+        full = count(radii, Loop(*(xp.broadcast_to(part, radii.shape) for part in loop)), fractional).full
+        low = low + width * (~full).sum(0)
+        return low, low + width
 
     high = _largest(loop)
-    _, radius = repeat(halvings, step, (0.0 * high + _SMALLEST if low is None else low, high), xp)
+    _, radius = repeat(-(-_HALVINGS // together), step, (0.0 * high + _SMALLEST, high), xp)
     best, im = np.inf, 0.0 * radius
     # On that circle the pole is at a crossover or at one of the ends.
     places = [0.0 * radius, 0.0 * radius + np.pi, *count(radius, loop, fractional).crossings]

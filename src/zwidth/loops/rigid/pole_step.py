@@ -29,10 +29,7 @@ _LONGEST = 1.0
 
 
 class Pair:
-    """A complex number by its parts: compiled loops want it so, and NumPy's arrays round alike at every place.
-
-    Single numbers take Python's own, which are several times faster there.
-    """
+    """A complex number by its parts, as compiled loops want it."""
 
     __slots__ = ("imag", "real")
 
@@ -59,6 +56,13 @@ class Pair:
     def conjugate(self) -> Pair:
         """The same above the real axis as below."""
         return Pair(self.real, -self.imag)
+
+
+def join(re: np.ndarray, im: np.ndarray) -> np.ndarray:
+    """A complex array."""
+    value = np.empty(np.broadcast_shapes(re.shape, im.shape), complex)
+    value.real, value.imag = re, im
+    return value
 
 
 def square(x: Any) -> Array:
@@ -89,11 +93,12 @@ def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
 def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     """Evaluate at ``e^(re + j im)``, |im| <= pi."""
     xp = namespace(re, loop.alpha)
-    number: Any = Pair
+    number: Any = join if xp is np else Pair
     if xp is np and not np.ndim(re):
+        # Python's own are several times faster for single numbers.
         number, re, im, loop = complex, float(re), float(im), Loop(*map(float, loop))
     power = loop.turns + 1.0 if fractional else loop.turns
-    size = xp.expm1(re) if number is Pair else float(np.expm1(re))
+    size = float(np.expm1(re)) if number is complex else xp.expm1(re)
     r = 1.0 + size
     sine, cosine = _half_turn(0.5 * im, xp)
     gap = number(size - 2.0 * r * sine * sine, 2.0 * r * sine * cosine)
@@ -126,7 +131,7 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     turning = power * (xp.abs(re) + xp.abs(im))
     rounding = up * width * (width + loop.em) * (_ROUNDING + turning) + _ROUNDING * sizes
     found = Value(lag * a + d, t1 + d1, t2 + d2, lead * z, lead * gap, epsilon(re) * rounding)
-    if number is Pair:
+    if number is not complex:
         return found
     # Unlike Python's numbers, NumPy's may be divided by zero.
     return found._replace(

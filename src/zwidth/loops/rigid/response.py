@@ -187,17 +187,8 @@ class StepResponse(NamedTuple):
     settling_time: float
 
 
-class _Samples(NamedTuple):
-    """State at the start of every period, and the wall's force before and behind the instant at which it changes."""
-
-    x: np.ndarray
-    v: np.ndarray
-    older: np.ndarray
-    newer: np.ndarray
-
-
-def _run(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> _Samples:
-    """Run the loop from rest, sample by sample.
+def _run(alpha: float, beta: float, delta: float, d: float, applied: float, periods: int) -> np.ndarray:
+    """Run the loop from rest: x and v at the start of every period, and the wall's force before and behind its change.
 
     In plain floats: a period takes a microsecond or two, less than importing a compiler for most runs.
     """
@@ -221,12 +212,12 @@ def _run(alpha: float, beta: float, delta: float, d: float, applied: float, peri
         first, second = applied + older, applied + newer
         x, v = x + xv0 * v + xf0 * first, c0 * v + xv0 * first
         x, v = x + xv1 * v + xf1 * second, c1 * v + xv1 * second
-    return _Samples(*np.array(rows).T)
+    return np.array(rows).T
 
 
-def _interpolate(samples: _Samples, fractions: np.ndarray, delta: float, f: float, applied: float) -> tuple[Array, ...]:
+def _interpolate(samples: Array, fractions: np.ndarray, delta: float, f: float, applied: float) -> tuple[Array, ...]:
     """Position, velocity and force at the instants ``fractions`` of every period; rows are periods."""
-    x, v, older, newer = (column[:, None] for column in samples)
+    x, v, older, newer = samples[:, :, None]
     x_bend, v_bend = advance(x, v, applied + older, np.float64(f), delta)
     before = fractions < f
     span = np.where(before, fractions, fractions - f)

@@ -211,13 +211,8 @@ def _lobe_end(lobe: LongLobe, ratio: Array, d: Array) -> Array:
     return repeat(_END_STEPS, step, start, xp)
 
 
-def long_row(beta: Array, lobe: LongLobe) -> Array:
-    """The limit for d >= 1; 0 where no alpha is stable, NaN for bad input."""
-    return long_row_point(beta, lobe)[0]
-
-
 def long_row_point(beta: Array, lobe: LongLobe) -> tuple[Array, Array]:
-    """The limit for d >= 1 and the frequency w there, of no meaning where no alpha is stable.
+    """The limit for d >= 1, 0 where no alpha is stable and NaN for bad input; and its frequency w, if there is one.
 
     b grows with w along the whole lobe, so Newton's method on sqrt(b), nearly linear in w, needs no bracket but the
     lobe itself. It is clipped to it: a midpoint at convergence would undo the last step.
@@ -304,7 +299,7 @@ def _short_limit(beta: Array, delta: Array, d: Array) -> Array:
 
 
 def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
-    return long_row(beta, long_lobe(device(delta, d)))
+    return long_row_point(beta, long_lobe(device(delta, d)))[0]
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:

@@ -9,7 +9,7 @@ import numpy as np
 from zwidth.arrays.evaluate import broadcast, check_scalars, evaluate, to_caller
 from zwidth.arrays.xp import is_traced
 from zwidth.loops.rigid.folding import NAMES
-from zwidth.loops.rigid.outermost_poles import find_poles, prove_radii
+from zwidth.loops.rigid.outermost_poles import find_poles
 from zwidth.loops.rigid.pole_search import traced_kernel
 from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.polynomial import check_has_poles
@@ -83,7 +83,7 @@ def spectral_radius(
         return radius_by_companion(*values)
     if is_traced(*values):
         return _exp(evaluate(traced_kernel, arguments, _has_fraction(d)))
-    return to_caller(prove_radii(broadcast(arguments), wanted)[0], values)
+    return to_caller(find_poles(broadcast(arguments), wanted).radius, values)
 
 
 def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Array:
@@ -126,8 +126,7 @@ def decay_rate(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike
     check_scalars(arguments)
     if is_traced(*values):
         return -evaluate(traced_kernel, arguments, _has_fraction(d))
-    rate = find_poles(broadcast(arguments), _DECAY_ACCURACY, with_rate=True).rate
-    return to_caller(np.array(rate), values)
+    return to_caller(find_poles(broadcast(arguments), _DECAY_ACCURACY, with_rate=True).rate, values)
 
 
 def _exp(value: Array) -> Array:

@@ -87,7 +87,12 @@ def is_stable(
         return evaluate(stable_kernel, arguments, classify_delays(d))
     check_scalars(arguments)
     if is_traced(*values):
-        return _traced(values, method)
+        if method == "certified":
+            raise InputError(
+                "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
+                "'auto', 'crossover' or 'companion'"
+            )
+        return unstable_poles(*values) == 0
     laid = fold_arguments(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
 
@@ -143,15 +148,6 @@ def _check(method: str, delay_model: str) -> None:
         check_choice("method", method, STABILITY_METHODS)
 
 
-def _traced(values: tuple[ArrayLike, ...], method: str) -> Array:
-    if method == "certified":
-        raise InputError(
-            "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
-            "'auto', 'crossover' or 'companion'"
-        )
-    return unstable_poles(*values) == 0
-
-
 def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray | None]:
     """Labels, what decided them, and statuses where they are not all OK."""
     if method == "companion":
@@ -164,10 +160,7 @@ def _decide(points: Points, method: str) -> tuple[np.ndarray, Method, np.ndarray
 
         proved = certified_stable(*points)
         return proved.stable, Method.CERTIFIED, proved.status
-    return _by_crossover(points), Method.CROSSOVER, None
-
-
-def _by_crossover(points: Points) -> np.ndarray:
     if points.is_dense:
-        return boundary_map(points)
-    return evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d)).reshape(points.shape)
+        return boundary_map(points), Method.CROSSOVER, None
+    stable = evaluate_columns(stable_kernel, points.columns(), classify_delays(points.d))
+    return stable.reshape(points.shape), Method.CROSSOVER, None

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 from bokeh.document import Document
-from bokeh.events import Tap
+from bokeh.events import DoubleTap, PressUp, Tap
 from bokeh.models import ColumnDataSource, DataRange1d
 from bokeh.plotting import figure
 
@@ -138,7 +138,9 @@ class Page:
             "force": self._draw_motion("contact", "force"),
         }
         self.plots["plane"].tags = [self.inputs, self.answer]
-        self.plots["plane"].on_event(Tap, self._tap)
+        # A click within 0.3 s of the last one, wherever that was, and a slow one have names of their own.
+        for click in (Tap, DoubleTap, PressUp):
+            self.plots["plane"].on_event(click, self._tap)
         for name, plot in self.plots.items():
             plot.name = name
             document.add_root(plot)

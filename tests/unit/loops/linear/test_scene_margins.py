@@ -168,3 +168,14 @@ def test_rigid_scenes_and_walls_out_of_range():
     np.testing.assert_array_equal(found.delay_margin, expected.delay_margin * 1e-3)
     for wall in ((np.nan, 0.0), (np.inf, 0.0), (1e-80, 0.0), (0.0, 1e160)):
         assert all(np.isnan(part) for part in FILTERED.margins(*wall))
+
+
+def test_a_zero_of_the_open_loop_is_no_crossover():
+    """At the antiresonance of an undamped tip L is 0 and its phase jumps: no factor brings a pole there."""
+    device = zwidth.Device(0.125, 0.0, zwidth.Coupling(mass=0.03, stiffness=32e3))
+    scene = zwidth.Scene(device, zwidth.Timing(period=1.3e-3, delay=1.3e-3))
+    factors = np.geomspace(1e-4, 1e4, 81)
+    assert not scene.is_stable(2.5e3 * factors, 4.4 * factors).any()
+    found = scene.margins(2.5e3, 4.4)
+    assert found.gain_margin == 0
+    assert np.isnan(found.phase_crossover)

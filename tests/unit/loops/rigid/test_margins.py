@@ -8,7 +8,6 @@ import pytest
 from compiling import QUICKLY
 
 import zwidth
-from zwidth import modulus_margin
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import device
 from zwidth.loops.rigid.modulus import squared_distance
@@ -161,7 +160,8 @@ def test_the_phase_margin_in_forty_digits():
 
 def test_the_modulus_margin_of_long_delay_and_strong_damping():
     # A minimum that samples over all frequencies missed; 60 digits give .0513099277...
-    assert modulus_margin(1.464471400554459e-06, 707.7238995101212, 746.0, 64) == pytest.approx(0.0513099277, abs=1e-10)
+    found = zwidth.margins(1.464471400554459e-06, 707.7238995101212, 746.0, 64)
+    assert found.modulus_margin == pytest.approx(0.0513099277, abs=1e-10)
 
 
 def test_no_frequency_comes_closer():
@@ -177,12 +177,11 @@ def test_no_frequency_comes_closer():
             alpha = 10 ** random.uniform(-8, 1) / (d + 1) * (1 + delta)
         w = np.concatenate([np.linspace(0, np.pi, 200 * (int(d) + 2))[1:], np.geomspace(1e-12, np.pi, 8000)])
         scanned = np.sqrt(squared_distance(w, alpha, beta, device(np.float64(delta), np.float64(d))).min())
-        found = modulus_margin(alpha, beta, delta, d)
-        assert found <= scanned * (1 + 1e-12), (alpha, beta, delta, d)
+        found = zwidth.margins(alpha, beta, delta, d)
+        assert found.modulus_margin <= scanned * (1 + 1e-12), (alpha, beta, delta, d)
         # And the distance is attained.
-        w = zwidth.margins(alpha, beta, delta, d).modulus_frequency
-        at = squared_distance(w, alpha, beta, device(np.float64(delta), np.float64(d)))
-        assert found == pytest.approx(np.sqrt(at), rel=1e-12)
+        at = squared_distance(found.modulus_frequency, alpha, beta, device(np.float64(delta), np.float64(d)))
+        assert found.modulus_margin == pytest.approx(np.sqrt(at), rel=1e-12)
 
 
 def test_the_distance_is_that_of_the_polynomials():
@@ -247,9 +246,10 @@ def test_the_margin_is_the_distance_of_p_over_its_open_loop():
     z = np.exp(1j * omega)
     for alpha, beta, delta, d in ((0.1, 0.2, 0.1, 0.0), (0.05, 0.1, 0.1, 1.5), (1e-3, 0.05, 0.5, 3.0)):
         ratio = np.polyval(zwidth.char_poly(alpha, beta, delta, d), z) / np.polyval(zwidth.char_poly(0, 0, delta, d), z)
-        assert modulus_margin(np.array([alpha]), beta, delta, d)[0] == pytest.approx(np.abs(ratio).min(), rel=1e-6)
+        found = zwidth.margins(np.array([alpha]), beta, delta, d).modulus_margin
+        assert found[0] == pytest.approx(np.abs(ratio).min(), rel=1e-6)
 
 
 def test_the_margin_vanishes_on_the_boundary():
     edge = zwidth.boundary(0.5, 0.3, 1.0)
-    assert modulus_margin(np.array([edge.alpha]), edge.beta, 0.3, 1.0)[0] < 1e-8
+    assert zwidth.margins(np.array([edge.alpha]), edge.beta, 0.3, 1.0).modulus_margin[0] < 1e-8
