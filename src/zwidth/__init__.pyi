@@ -38,8 +38,10 @@ from .loops.rigid.verdict import decide_stability as decide_stability
 from .loops.rigid.verdict import is_stable as is_stable
 from .pages.report.page import write_report as write_report
 from .parts import devices as devices
+from .parts.actuator import Actuator as Actuator
 from .parts.device import Coupling as Coupling
 from .parts.device import Device as Device
+from .parts.mode import Mode as Mode
 from .parts.operator import Operator as Operator
 from .parts.timing import Timing as Timing
 from .parts.velocity import FOAW as FOAW

@@ -7,6 +7,7 @@ arithmetic that bounds its own error, for labels where float64 cannot tell.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import flint
@@ -33,11 +34,16 @@ def _masses_and_links(scene: Any) -> tuple[list[list[float]], list[tuple[float, 
     return bodies, links
 
 
-def _rates(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, int]:
-    """A and B of ``(x, v)' = A (x, v) + B u`` as one table ``[[A, B], [0, 0]]``; bodies; which one the sensor sees."""
+def _rates(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, np.ndarray]:
+    """A and B of ``x' = A x + B u`` as one table ``[[A, B], [0, 0]]``; the size of A; what the sensor sees, as a row.
+
+    The state: positions and velocities of the bodies, position and velocity of each mode, the actuator's force and,
+    where it is of second order, its rate.
+    """
     bodies, links = _masses_and_links(scene)
-    n = len(bodies)
-    table = [[number(0)] * (2 * n + 1) for _ in range(2 * n + 1)]
+    n, modes, lag = len(bodies), scene.device.modes, scene.device.actuator
+    size = 2 * n + 2 * len(modes) + (lag.order if lag else 0)
+    table = [[number(0)] * (size + 1) for _ in range(size + 1)]
     for k, (mass, damping, stiffness) in enumerate(bodies):
         table[k][n + k] = number(1)
         table[n + k][k] -= number(stiffness) / number(mass)
@@ -48,9 +54,27 @@ def _rates(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, int]:
                 share = number(value) / number(bodies[at][0])
                 table[n + at][place + at] -= share
                 table[n + at][place + other] += share
-    table[n][2 * n] = 1 / number(bodies[0][0])
     tip = scene.device.coupling
-    return table, n, int(tip is not None and tip.sensor == "tip")
+    seen = np.zeros(size)
+    seen[int(tip is not None and tip.sensor == "tip")] = 1.0
+    acts = size if lag is None else size - lag.order
+    table[n][acts] = 1 / number(bodies[0][0])
+    turn = 2 * (flint.arb.pi() if number is _ball else np.pi)
+    for k, mode in enumerate(modes):
+        at, w = 2 * (n + k), turn * number(mode.frequency)
+        table[at][at + 1] = number(1)
+        table[at + 1][at], table[at + 1][at + 1] = -w * w, -2 * number(mode.damping_ratio) * w
+        table[at + 1][acts] = 1 / number(mode.mass)
+        seen[at] = 1.0
+    if lag is not None:
+        w = 1 / number(lag.time_constant) if lag.cutoff is None else turn * number(lag.cutoff)
+        if lag.order == 1:
+            table[acts][acts], table[acts][size] = -w, w
+        else:
+            table[acts][acts + 1] = number(1)
+            table[acts + 1][acts], table[acts + 1][acts + 1] = -w * w, -2 * number(lag.damping_ratio) * w
+            table[acts + 1][size] = w * w
+    return table, size, seen
 
 
 def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -77,12 +101,11 @@ def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:
 
 def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> np.ndarray:
     """One period of the closed loop; state: positions, velocities, filter, then the forces on their way."""
-    table, n, sensor = _rates(scene)
+    table, size, seen = _rates(scene)
     period, late = scene.timing.period, scene.whole_delay
     fraction = scene.d - late
     rate = np.array(table) * period
     step, rest, first = (scipy.linalg.expm(rate * part) for part in (1.0, 1.0 - fraction, fraction))
-    size = 2 * n
     newer, older = rest[:size, size], rest[:size, :size] @ first[:size, size]
     top, bottom = velocity_polynomials(scene)
     top, bottom = top / bottom[0], bottom / bottom[0]
@@ -90,7 +113,7 @@ def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> 
     queue = late + (1 if fraction else 0)
     total = size + order + queue
     force = np.zeros(total)
-    force[sensor] = -(stiffness + virtual_damping * top[0])
+    force[:size] = -(stiffness + virtual_damping * top[0]) * seen
     force[size : size + order] = -virtual_damping * (top[1:] - top[0] * bottom[1:])
 
     def sample(age: int) -> np.ndarray:
@@ -105,7 +128,7 @@ def closed_loop_matrix(scene: Any, stiffness: float, virtual_damping: float) -> 
     if order:
         matrix[size, size : size + order] = -bottom[1:]
         matrix[size + 1 : size + order, size : size + order - 1] = np.eye(order - 1)
-        matrix[size, sensor] += 1.0
+        matrix[size, :size] += seen
     for age in range(queue):
         matrix[size + order + age] = sample(age)
     return matrix
@@ -150,8 +173,8 @@ def _ball_filter(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly]:
 
 def ball_parts(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly, flint.acb_poly]:
     """``P = D + K N1 + B N2`` in SI units, in the precision of `flint.ctx`."""
-    table, n, sensor = _rates(scene, _ball)
-    size, late = 2 * n, scene.whole_delay
+    table, size, sees = _rates(scene, _ball)
+    late = scene.whole_delay
     fraction = _ball(scene.d) - late
     rate = flint.arb_mat(table) * _ball(scene.timing.period)
     step, rest, first = (_top((rate * part).exp(), size) for part in (_ball(1), 1 - fraction, fraction))
@@ -159,7 +182,7 @@ def ball_parts(scene: Any) -> tuple[flint.acb_poly, flint.acb_poly, flint.acb_po
 
     def answer(push: flint.arb_mat) -> flint.arb_poly:
         """``C adj(z - step) push`` as the change of the determinant."""
-        seen = flint.arb_mat(size, size, [push[i, 0] if j == sensor else 0 for i in range(size) for j in range(size)])
+        seen = flint.arb_mat(size, size, [push[i, 0] * sees[j] for i in range(size) for j in range(size)])
         return (step[0] - seen).charpoly() - own
 
     z = flint.acb_poly([0, 1])
@@ -283,12 +306,20 @@ def random_scene(kind: str, generator: np.random.Generator) -> zwidth.Scene:
             zwidth.VelocityFilter(np.convolve([1.0, -1.0], [1.0, 0.3]) / period / 1.3, [1.0, -0.2, 0.0]),
         )[generator.integers(0, 6)]
     device = zwidth.Device(mass, float(generator.choice([0.0, 10 ** draw(-1, 1.5)])), coupling)
+    if kind == "driven":
+        rate = 10 ** draw(-2, 1) / period
+        lag = zwidth.Actuator(rate) if draw() < 0.5 else zwidth.Actuator(rate, order=2, damping_ratio=10 ** draw(-1, 0))
+        modes = [
+            zwidth.Mode(10 ** draw(-2.5, -0.1) / period, 10 ** draw(-3, -0.7), mass * 10 ** draw(0, 2) * sign)
+            for sign in generator.choice([1.0, 1.0, -1.0], generator.integers(0, 3))
+        ]
+        device = replace(device, modes=modes, actuator=lag if draw() < 0.6 or not modes else None)
     whole, odd = int(generator.integers(0, 12)), float(draw(0, 8))
     periods = float(generator.choice([0, 1, whole, odd, 0.3, np.nextafter(3, 0)]))
     return zwidth.Scene(device, zwidth.Timing(period, periods * period), velocity=velocity, operator=hand)
 
 
-KINDS = ("device", "filter", "tip", "motor", "hand", "soft hand", "all")
+KINDS = ("device", "filter", "tip", "motor", "hand", "soft hand", "all", "driven")
 
 
 def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np.ndarray, float]:
@@ -296,9 +327,9 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
 
     The response of the device comes from its matrix, solved at every angle: no roots, no nodes of the library.
     """
-    table, n, sensor = _rates(scene)
+    table, size, seen = _rates(scene)
     late = scene.whole_delay
-    fraction, size = scene.d - late, 2 * n
+    fraction = scene.d - late
     rate = np.array(table) * scene.timing.period
     step, rest, first = (scipy.linalg.expm(rate * part) for part in (1.0, 1.0 - fraction, fraction))
     own, newer, older = step[:size, :size], rest[:size, size], rest[:size, :size] @ first[:size, size]
@@ -308,7 +339,7 @@ def row_ends(scene: Any, virtual_damping: float, angles: int = 4000) -> tuple[np
         """``-1/G - B F``: the stiffness, where it is real."""
         z = np.exp(1j * w)
         push = newer[None, :] + older[None, :] / z[:, None] if fraction else np.broadcast_to(newer, (w.size, size))
-        moved = np.linalg.solve(z[:, None, None] * np.eye(size) - own, push[..., None])[:, sensor, 0]
+        moved = np.linalg.solve(z[:, None, None] * np.eye(size) - own, push[..., None])[..., 0] @ seen
         return -(z**late) / moved - virtual_damping * np.polyval(top, z) / np.polyval(bottom, z)
 
     grid = np.unique(np.concatenate([np.geomspace(1e-6, 0.3, angles // 2), np.linspace(1e-3, np.pi - 1e-9, angles)]))

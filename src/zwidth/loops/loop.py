@@ -19,7 +19,8 @@ from zwidth.arrays.evaluate import FEW
 from zwidth.arrays.xp import is_jax, is_traced, namespace
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import Chain, chain_of, find_roots
+from zwidth.loops.linear.chain import Chain, chain_of
+from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.margins import linear_margins
 from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
 from zwidth.loops.linear.poles import is_marginal, log_size, poles_less_one

@@ -1,11 +1,13 @@
-"""The haptic device: a mass with viscous damping, rigid or with a compliance behind it."""
+"""The haptic device: a mass with viscous damping, rigid or with a compliance behind it, and what drives it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
+from zwidth.parts.actuator import Actuator
 from zwidth.parts.checks import check_fields
+from zwidth.parts.mode import Mode
 from zwidth.words.errors import InputError
 
 
@@ -51,13 +53,23 @@ class Device:
         mass: m in kg, > 0; with a coupling, of the motor's side.
         damping: b in N s/m, >= 0.
         coupling: the mass beyond a spring and damper, None for a rigid device.
+        actuator: the lag of amplifier and motor, None where a command acts at once.
+        modes: resonances that a command excites and the sensor sees, in any number.
     """
 
     mass: Any
     damping: Any = 0.0
     coupling: Coupling | None = None
+    actuator: Actuator | None = None
+    modes: tuple[Mode, ...] = ()
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.coupling is not None and not isinstance(self.coupling, Coupling):
-            raise InputError(f"coupling: got {self.coupling!r}; a zwidth.Coupling is needed, or None")
+        for name, kind in {"coupling": Coupling, "actuator": Actuator}.items():
+            part = getattr(self, name)
+            if part is not None and not isinstance(part, kind):
+                raise InputError(f"{name}: got {part!r}; a zwidth.{kind.__name__} is needed, or None")
+        modes = (self.modes,) if isinstance(self.modes, Mode) else self.modes
+        if not isinstance(modes, list | tuple) or not all(isinstance(mode, Mode) for mode in modes):
+            raise InputError(f"modes: got {self.modes!r}; a list of zwidth.Mode is needed")
+        object.__setattr__(self, "modes", tuple(modes))

@@ -1,7 +1,7 @@
 """A scene as configurations spell it, its parameters by dotted path: ``mass``, ``period``, ``velocity.cutoff``, ...
 
 Device, timing and wall go by bare names, for each name is one thing there; velocity estimate, hand and coupling go by
-their own: ``velocity.``, ``operator.``, ``coupling.``.
+their own: ``velocity.``, ``operator.``, ``coupling.``, ``actuator.``, ``modes.0.``.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 
 from zwidth.arrays.xp import is_jax
+from zwidth.parts.actuator import Actuator
 from zwidth.parts.device import Coupling, Device
 from zwidth.parts.operator import Operator
 from zwidth.parts.timing import Timing
@@ -43,14 +44,15 @@ AnyScene = TypeVar("AnyScene", bound=Parts)
 
 _BARE = ("device", "timing", "wall")
 # The parts that a scene need not have, in the order in which it is described; those of the device are fields of it.
-PARTS = {"operator": Operator, "coupling": Coupling}
-_OF_DEVICE = ("coupling",)
+PARTS = {"operator": Operator, "coupling": Coupling, "actuator": Actuator}
+_OF_DEVICE = ("coupling", "actuator")
 _NAMED = ("velocity", *(name for name in PARTS if name not in _OF_DEVICE))
 
 
 def find_parts(scene: Parts) -> dict[str, Any]:
     """The velocity estimate and the parts that a scene has, by name."""
     found = {name: getattr(scene, name) for name in _NAMED} | {name: getattr(scene.device, name) for name in _OF_DEVICE}
+    found |= {f"modes.{k}": mode for k, mode in enumerate(scene.device.modes)}
     return {name: part for name, part in found.items() if part is not None}
 
 
@@ -82,16 +84,17 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
     changed: dict[str, dict[str, Any]] = {}
     whole = {name: changes[name] for name in (*_BARE, *_NAMED) if name in changes}
     scene = replace(scene, **whole)
-    if "coupling" in changes:
-        scene = replace(scene, device=replace(scene.device, coupling=changes["coupling"]))
+    own = {name: changes[name] for name in (*_OF_DEVICE, "modes") if name in changes}
+    if own:
+        scene = replace(scene, device=replace(scene.device, **own))
     owners = {
         prefix + item.name: (name, item.name)
         for prefix, name, part in _parts(scene)
         for item in fields(part)
-        if item.name != "coupling"
+        if item.name not in (*_OF_DEVICE, "modes")
     }
     for path, value in changes.items():
-        if path in whole or path == "coupling":
+        if path in whole or path in own:
             continue
         if path not in owners:
             raise InputError(f"parameter: {describe_choice(path, tuple(owners))}")
@@ -102,16 +105,22 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
         changed["timing"].setdefault("period", None)
     if "wall" in changed and isinstance(scene.wall, NoWall):
         scene = replace(scene, wall=VirtualWall(0.0))
-    if scene.device.coupling is not None and "coupling" in changed:
-        coupling = replace(scene.device.coupling, **changed.pop("coupling"))
-        changed.setdefault("device", {})["coupling"] = coupling
+    for name in _OF_DEVICE:
+        if name in changed:
+            changed.setdefault("device", {})[name] = replace(getattr(scene.device, name), **changed.pop(name))
+    names = [f"modes.{k}" for k in range(len(scene.device.modes))]
+    if changed.keys() & set(names):
+        modes = zip(scene.device.modes, (changed.pop(name, {}) for name in names), strict=True)
+        changed.setdefault("device", {})["modes"] = tuple(replace(mode, **new) for mode, new in modes)
     return replace(scene, **{part: replace(getattr(scene, part), **own) for part, own in changed.items()})
 
 
 def spell_scene(scene: Any) -> dict[str, Any]:
     """The section ``scene`` of a configuration, with the keys that differ from their defaults."""
     parts = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
-    own = {name: value for name, value in spell_part(scene.device).items() if name not in PARTS}
+    own = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
+    if scene.device.modes:
+        parts["modes"] = [spell_part(mode) for mode in scene.device.modes]
     own |= {"damping": scene.device.damping} | spell_part(scene.timing) | spell_part(scene.wall)
     return own | spell_estimate(scene.velocity) | parts
 

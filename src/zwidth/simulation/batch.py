@@ -30,9 +30,10 @@ TOGETHER = 1 << 10
 
 
 def structure(scene: Parts) -> tuple[Any, ...]:
-    """What the scenes of one program share: their bodies, which of them is sensed, and FOAW's longest window."""
+    """What the scenes of one program share: bodies, modes and actuator, what is sensed, and FOAW's longest window."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
-    return *name_bodies(scene), sensor, scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
+    behind = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
+    return *name_bodies(scene), sensor, *behind, scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
@@ -82,7 +83,8 @@ class Batch:
             lane_of = np.zeros(1, int)
         course, options = self.course, self.options
         numbers = {name: part[places] for name, part in self.numbers.items()}
-        machine = Mechanics(*(part if name == "place" else part[own] for name, part in self.machine._asdict().items()))
+        shared = ("place", "motion")
+        machine = Mechanics(*(part if name in shared else part[own] for name, part in self.machine._asdict().items()))
         period, mass = self.periods[self.which[places]], self.masses[self.which[places]]
         force = period * period / mass
         late = self.late[own][lane_of]

@@ -16,7 +16,7 @@ import numpy as np
 from zwidth.simulation.lanes import Course, Given, Lanes, Options
 from zwidth.simulation.motion import BodyState, dot
 from zwidth.simulation.outlook import CYCLE
-from zwidth.simulation.period import Program, Reading, Work, control, forces_of, move, round_to
+from zwidth.simulation.period import Program, Reading, Work, control, forces_of, move, round_to, stored
 from zwidth.words.types import Array
 
 BLOCK = 128
@@ -74,14 +74,14 @@ class Inputs(NamedTuple):
 
 def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) -> State:
     """The state before the first sample: coming on a line, and no command on its way (T2)."""
-    count = lanes.place.shape[1]
-    body = np.zeros((count, x.size))
+    count, size = lanes.place.shape[:2]
+    body = np.zeros((size, x.size))
     # All bodies together: nothing is stretched.
-    body[0], body[count // 2] = x, v
+    body[0], body[np.argmax(lanes.motion[0, :, 0])] = x, v
     back = np.mod(-np.arange(rings[0]), rings[0])
     # What the program would have read.
     positions = round_to(lanes.resolution, x - back[:, None] * v)
-    zero, far = np.zeros(x.size), np.full((3, count // 2, x.size), np.inf)
+    zero, far = np.zeros(x.size), np.full((3, count, x.size), np.inf)
     program = Program(positions, _settle(lanes, positions[0], v), np.zeros((rings[1], x.size)), np.zeros(x.size, bool))
     turns = np.zeros((3, x.size))
     never = zero + np.nan
@@ -105,7 +105,7 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
     program, reading = control(lanes, options, state.program, given.k, sensed)
     forces = forces_of(lanes, options, program.commands, given.k)
     durations = given.durations if options.jitter else lanes.durations
-    motion = jnp.roll(lanes.place[0], state.body.x.shape[0] // 2, 0)
+    motion = lanes.motion[0]
 
     def substep(carry: tuple[BodyState, Work], j: Array) -> tuple[tuple[BodyState, Work], Frame | None]:
         body, work = carry
@@ -116,8 +116,7 @@ def _period(lanes: Lanes, options: Options, ends: Array, state: State, given: In
             for piece in reversed(range(options.pieces - 1)):
                 acting = jnp.where(durations[j, piece] > 0, forces[piece], acting)
             positions = jnp.stack([dot(row, body.x) for row in lanes.place])
-            energy = dot(body.x, jnp.stack([dot(row, body.x) for row in lanes.energy]))
-            frame = Frame(positions, dot(motion, body.x), acting, body.slip, work, energy)
+            frame = Frame(positions, dot(motion, body.x), acting, body.slip, work, stored(lanes, body.x))
 
         def one(carry: tuple[BodyState, Work], piece: Any) -> tuple[tuple[BodyState, Work], None]:
             number, force = piece

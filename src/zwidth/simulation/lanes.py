@@ -88,8 +88,9 @@ class Lanes(NamedTuple):
     late: Array  # whole periods of delay
     motor: Motor
     estimator: Estimator
-    rate: Array  # (n, n + 1, lanes)
+    rate: Array  # (n, n + forces, lanes)
     place: Array  # (bodies, n, lanes)
+    motion: Array
     energy: Array  # (n, n, lanes)
     durations: Array  # (substeps, pieces, lanes), without jitter
     pieces: Flow  # over these, (substeps, pieces, ..., lanes)
@@ -141,14 +142,15 @@ def cut_period(fractions: np.ndarray, substeps: int, pieces: int) -> np.ndarray:
 
 def find_longest_steps(machine: Mechanics) -> np.ndarray:
     """The longest steps with friction: powers of 2, 2 where the velocity is monotone under a constant force."""
-    fastest = np.abs(np.linalg.eigvals(machine.rate[:, :, :-1])).max(-1)
+    size = machine.rate.shape[1]
+    fastest = np.abs(np.linalg.eigvals(machine.rate[:, :, :size])).max(-1)
     steps = 0.5 ** np.maximum(0, np.ceil(np.log2(np.maximum(fastest, 1e-9) / _STEP)))
-    if machine.place.shape[0] == 1:
+    if size == 2:
         steps = np.where(machine.rate[:, 1, 0] == 0, 2.0, steps)
     if np.min(steps) * _MOST_STEPS < 1.0:
         raise InputError(
-            f"coupling.stiffness: a link whose motion turns by {fastest.max():.3g} radians a period takes "
-            f"{1 / np.min(steps):.0f} steps a period to follow with friction; leave the link or the friction out"
+            f"coupling.stiffness, modes, actuator: a motion that turns by {fastest.max():.3g} radians a period takes "
+            f"{1 / np.min(steps):.0f} steps a period to follow with friction; leave that part or the friction out"
         )
     return steps
 
@@ -164,6 +166,7 @@ def lay_machines(machine: Mechanics, durations: np.ndarray, which: np.ndarray, o
     return {
         "rate": _lay(machine.rate, which),
         "place": machine.place[..., None],
+        "motion": machine.motion[..., None],
         "energy": _lay(machine.energy, which),
         "durations": _lay(durations, which),
         "pieces": _lay(flow(machine.rate, machine.drain, durations), which),

@@ -33,7 +33,8 @@ class LaneGroup(NamedTuple):
     """Lanes of one structure at their last sample."""
 
     lanes: Any  # `Lanes` of numbers along the first axis, but for the motion over pieces and digits
-    plant: np.ndarray  # (lanes, m, m + 2): the bodies' map, and by the force before and after its change
+    plant: np.ndarray  # (lanes, m, m + 2): the bodies' map, and by the command before and after its change
+    pushed: np.ndarray  # (lanes, m): by a constant force on the device
     held: np.ndarray  # (lanes, m, m)
     halfway: np.ndarray  # (lanes, m, m + 1): the bodies' map until the force changes
     state: np.ndarray  # (lanes, n)
@@ -62,22 +63,25 @@ def _rows(part: Any, at: np.ndarray) -> Any:
     return part[at] if len(part) > 1 else np.broadcast_to(part, (at.size, *part.shape[1:]))
 
 
-def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The bodies' map over a period and until the force changes, from the map of each piece of it."""
+def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The bodies' map over a period and until the command changes, and what a push adds, piece by piece."""
     change = _rows(lanes.pieces.change, at)
     size = change.shape[-2]
     whole = np.concatenate([np.eye(size), np.zeros((size, 2))], 1)
     whole = halfway = np.broadcast_to(whole, (at.size, size, size + 2))
+    pushed = np.zeros((at.size, size, 1))
     for j in range(options.substeps):
         for piece in range(options.pieces):
             part = change[:, j, piece]
             # Of two pieces the first feels the older command.
             newer = piece + 1 == options.pieces
             force = np.eye(size + 2)[size + newer]
-            whole = whole + part[..., :-1] @ whole + part[..., -1:] * force
+            moves, commanded = part[..., :size], part[..., size : size + 1]
+            whole = whole + moves @ whole + commanded * force
+            pushed = pushed + moves @ pushed + part[..., -1:]
             if not newer:
-                halfway = halfway + part[..., :-1] @ halfway + part[..., -1:] * force
-    return whole, halfway[..., :-1]
+                halfway = halfway + moves @ halfway + commanded * force
+    return whole, halfway[..., :-1], pushed[..., 0]
 
 
 def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int, at: np.ndarray) -> LaneGroup:
@@ -91,16 +95,18 @@ def gather(lanes: Lanes, options: Options, state: Any, push: np.ndarray, k: int,
 
     parts = [body.x[:, at].T, program.filtered[:, at].T]
     parts += [recall(program.positions, window), recall(program.commands, late + 1)]
-    plant, halfway = _compose(lanes, options, at)
+    plant, halfway, pushed = _compose(lanes, options, at)
     size = plant.shape[1]
     held = plant[..., :size]
     if options.friction:
         # Over the longest digit, a period; what is held has no velocity.
-        motion, force = np.roll(own.place[:, 0], size // 2, -1), own.rate[..., -1]
-        held = np.eye(size) + _rows(lanes.digits.change[1, 0], at)[..., :-1]
+        motion, force = own.motion[:, 0], own.rate[..., -1]
+        held = np.eye(size) + _rows(lanes.digits.change[1, 0], at)[..., :size]
         held = held @ (np.eye(size) - force[..., :, None] * motion[..., None, :])
     touching, slip = program.touching[at] | own.bilateral, body.slip[at]
-    return LaneGroup(own, plant, held, halfway, np.concatenate(parts, 1), push[at], touching, slip, late, window)
+    return LaneGroup(
+        own, plant, pushed, held, halfway, np.concatenate(parts, 1), push[at], touching, slip, late, window
+    )
 
 
 def lay_loop(group: LaneGroup, seen: bool, touching: bool, held: bool) -> LoopMap:
@@ -124,7 +130,7 @@ def lay_loop(group: LaneGroup, seen: bool, touching: bool, held: bool) -> LoopMa
         A[:, :m, :m] = group.held
     else:
         before, after = group.plant[..., m], group.plant[..., m + 1]
-        pushed[:, :m] = before + after
+        pushed[:, :m] = group.pushed
         A[:, :m, sent + late] += before
         if late:
             A[:, :m, sent + late - 1] += after

@@ -48,7 +48,7 @@ def dot(row: Array, vector: Array) -> Array:
 
 
 def advance(
-    digits: Flow, held: Array, x: Array, force: Array, limit: Array, keep: Callable[[Array], Array] | None = None
+    digits: Flow, held: Array, x: Array, forces: Array, limit: Array, keep: Callable[[Array], Array] | None = None
 ) -> tuple[Array, Array, Array]:
     """The state after as long a time up to ``limit`` as ``keep`` holds at, that time, and what dampers have taken."""
 
@@ -61,7 +61,7 @@ def advance(
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
         k, x, time, lost = state
-        z = jnp.concatenate([x, force[None]])
+        z = jnp.concatenate([x, forces])
         longer, after = time + jnp.exp2(-k.astype(time.dtype)), x + times(pick(digits.change, k), z)
         taken = (longer <= limit) & (True if keep is None else keep(after))
         lost = jnp.where(taken, lost + dot(z, times(pick(digits.loss, k), z)), lost)
@@ -72,15 +72,15 @@ def advance(
     return jax.lax.while_loop(remain, step, (first, x, jnp.zeros_like(limit), jnp.zeros_like(limit)))[1:]
 
 
-def slide(lanes: Lanes, body: BodyState, force: Array, duration: Array) -> tuple[BodyState, Array, Array]:
-    """The motion under a constant force and friction; what dampers and friction have taken."""
-    motion = jnp.roll(lanes.place[0], lanes.place.shape[1] // 2, 0)
+def slide(lanes: Lanes, body: BodyState, forces: Array, duration: Array) -> tuple[BodyState, Array, Array]:
+    """The motion under constant forces, of which friction adds to the last; what dampers and friction have taken."""
+    motion, (*lead, force) = lanes.motion[0], forces
     pull = [dot(motion, column) for column in jnp.moveaxis(lanes.rate, 1, 0)]
     coulomb, static = lanes.motor.coulomb, lanes.motor.static
 
     def pressed(x: Array) -> Array:
         """The force on the first body but for friction: its acceleration, for its mass is the unit."""
-        return dot(pull[:-1], x) + force
+        return dot(pull[:-1], [*x, *lead]) + force
 
     def speed(x: Array) -> Array:
         return dot(motion, x)
@@ -94,7 +94,7 @@ def slide(lanes: Lanes, body: BodyState, force: Array, duration: Array) -> tuple
 
     def step(state: _Slide) -> _Slide:
         x, slip = state.body
-        held, driven = slip == 0, force - slip * coulomb
+        held, driven = slip == 0, jnp.stack([*lead, force - slip * coulomb])
         limit = jnp.minimum(state.left, lanes.longest)
         far, time, lost = advance(lanes.digits, held, x, driven, limit)
         side = jnp.sign(pressed(x) + pressed(far))
@@ -104,8 +104,8 @@ def slide(lanes: Lanes, body: BodyState, force: Array, duration: Array) -> tuple
             return jnp.where(held, static - side * pressed(x), slip * speed(x))
 
         def rises(x: Array) -> Array:
-            change = times(lanes.rate, jnp.concatenate([x, driven[None]]))
-            stuck = -side * dot(pull[:-1], change - lanes.rate[:, -1] * dot(motion, change))
+            change = times(lanes.rate, jnp.concatenate([x, driven]))
+            stuck = -side * dot(pull[: len(x)], change - lanes.rate[:, -1] * dot(motion, change))
             return jnp.where(held, stuck, slip * (pressed(x) - slip * coulomb))
 
         # A body just let go starts with rounding errors for a velocity and an acceleration: it leaves.

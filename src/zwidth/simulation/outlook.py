@@ -58,6 +58,9 @@ def foresee(
         return outlook
     late, window = (np.broadcast_to(np.asarray(part), push.size) for part in (lanes.late, lanes.estimator.window))
     finite = np.isfinite(state.body.x).all(0)
+    if lanes.rate.shape[1] > lanes.rate.shape[0] + 1:
+        # What friction holds goes on to feel what the actuator and the modes do: not known here.
+        known = known & (lanes.motor.static == 0)
     shapes = np.stack([late, window], 1)
     for shape in np.unique(shapes[known & finite], axis=0):
         at = np.flatnonzero(known & finite & (shapes == shape).all(1))
@@ -127,9 +130,9 @@ def _settles(group: LaneGroup, mode: tuple[bool, bool, bool], periods: int) -> n
     position = np.broadcast_to(np.eye(n)[0], group.state.shape)
     rows = [position, loop.command, loop.command - np.eye(n)[sent]]
     # The force on the held body, by the commands that act within the period.
-    motion = np.roll(lanes.place[:, 0], m // 2, -1)
+    motion = lanes.motion[:, 0]
     pull = np.zeros(group.state.shape)
-    pull[:, :m] = np.einsum("lm,lmk->lk", motion, lanes.rate[..., :-1])
+    pull[:, :m] = np.einsum("lm,lmk->lk", motion, lanes.rate[..., :m])
     rows += [pull + (np.eye(n)[sent + age - 1] if age else loop.command) for age in (late, late + 1)]
     rows = np.stack(rows, 1)
     fixed = np.zeros((len(reading), len(rows[0])))
@@ -194,7 +197,7 @@ def _is_restless(group: LaneGroup, unstable: np.ndarray) -> np.ndarray:
     """Whether there is no place where the device could come to rest."""
     lanes, motor, m, push, loose = group.lanes, group.lanes.motor, group.bodies, group.push, is_loose(group)
     alpha, quantum, bilateral = lanes.alpha, lanes.resolution, lanes.bilateral
-    force = group.plant[..., m] + group.plant[..., m + 1]
+    force = group.pushed
     way = np.eye(m) - group.plant[..., :m]
     way[loose] = np.eye(m)
     spring = np.where(loose, 0.0, 1.0 / solve_lanes(way, force[..., None])[:, 0, 0])
@@ -205,6 +208,9 @@ def _is_restless(group: LaneGroup, unstable: np.ndarray) -> np.ndarray:
     inside = np.where(quantum > 0, off > 0.5 * spring * quantum + 1e-9 * np.abs(push), unstable)
     inside |= ~bilateral & (place <= 0)
     outside = bilateral | (push > 0.5 * spring * quantum)
+    # Behind modes a command and a push bend the device differently.
+    if lanes.rate.shape[-1] > m + 1:
+        return loose & False
     # At the motor's limit it may leave for good or rest where the limit lets it; nothing stops who is pushed harder.
     bound = (alpha > 0) & (motor.static == 0) & inside & outside
     bound &= (np.abs(push) < motor.max_force) & np.isfinite(place)
@@ -274,8 +280,8 @@ def _repeats(group: LaneGroup, sensed: np.ndarray, periods: int) -> np.ndarray:
     for j in range(length[0]):
         own = slice(np.count_nonzero(length > j))
         room[own] = np.minimum(room[own], 0.5 - np.abs(body[0, own] / quantum[own] - again[j, own]))
-        forces = before[:, own] * (commands[j, own] + group.push[own])
-        forces += after[:, own] * (commands[j + 1, own] + group.push[own])
+        forces = before[:, own] * commands[j, own] + after[:, own] * commands[j + 1, own]
+        forces += group.pushed[own].T * group.push[own]
         body[:, own] = np.einsum("lnm,ml->nl", moves[own], body[:, own]) + forces
     values, vectors = np.linalg.eig(moves)
     share = solve_lanes(vectors, (body.T - group.state[:, :m])[..., None])[..., 0]

@@ -104,6 +104,11 @@ def forces_of(lanes: Lanes, options: Options, commands: Array, k: Array) -> list
     return [look_back(commands, k, lanes.late + age) for age in ages]
 
 
+def stored(lanes: Lanes, x: Array) -> Array:
+    """Kinetic and elastic energy."""
+    return dot(x, jnp.stack([dot(row, x) for row in lanes.energy]))
+
+
 def move(
     lanes: Lanes,
     options: Options,
@@ -115,17 +120,20 @@ def move(
     time: Array,
 ) -> tuple[BodyState, Work]:
     """The motion over one piece of a period, ``place`` its substep and its number, and what it costs."""
-    total = force + push + 0.0 * body.x[0]
+    none, at_once = 0.0 * body.x[0], lanes.rate.shape[1] == lanes.rate.shape[0] + 1
+    forces = jnp.stack([force + push + none] if at_once else [force + none, push + none])
     if options.friction:
-        after, lost, rubbed = slide(lanes, body, total, time)
+        after, lost, rubbed = slide(lanes, body, forces, time)
     elif options.jitter:
-        x, _, lost = advance(lanes.digits, np.zeros((), bool), body.x, total, time + 0.0 * total)
+        x, _, lost = advance(lanes.digits, np.zeros((), bool), body.x, forces, time + none)
         after, rubbed = BodyState(x, body.slip), 0.0
     else:
-        z = jnp.concatenate([body.x, total[None]])
+        z = jnp.concatenate([body.x, forces])
         x = body.x + times(lanes.pieces.change[place], z)
         after, rubbed = BodyState(x, body.slip), 0.0
         lost = dot(z, times(lanes.pieces.loss[place], z))
     way = dot(lanes.place[0], after.x - body.x)
-    moved = Work(work.wall + force * way, work.push + push * way, work.damping + lost, work.friction + rubbed)
+    # What an actuator or modes make of the command varies within the piece: its work by the balance of the others.
+    given = force * way if at_once else stored(lanes, after.x) - stored(lanes, body.x) + lost + rubbed - push * way
+    moved = Work(work.wall + given, work.push + push * way, work.damping + lost, work.friction + rubbed)
     return after, moved

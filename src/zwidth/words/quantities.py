@@ -111,6 +111,20 @@ class Parameter:
         return self.long_name[0].upper() + self.long_name[1:]
 
 
+# Modes that files, axes and the command line name; in Python there may be more.
+MOST_MODES = 3
+
+
+def _describe_mode(path: str, name: str, index: str) -> tuple[Parameter, ...]:
+    """The numbers of a mode."""
+    ratios = Range(0.0, 10.0, low_open=True)
+    return (
+        Parameter(f"{path}.frequency", f"frequency of {name}", f"f_{{{index}}}", POSITIVE, "Hz"),
+        Parameter(f"{path}.damping_ratio", f"damping ratio of {name}", rf"\zeta_{{{index}}}", ratios),
+        Parameter(f"{path}.mass", f"modal mass of {name}", f"m_{{{index}}}", ANY, "kg", note="negative beyond a node"),
+    )
+
+
 # In the order of a store's dimensions: a plane of walls lies together, at the end.
 _PARAMETERS = (
     Parameter("period", "sampling period T", "T", PERIODS, "s", (5e-5, 0.02), short_name="sampling period"),
@@ -175,6 +189,22 @@ _PARAMETERS = (
     ),
     Parameter("coupling.stiffness", "stiffness of the coupling", "k", POSITIVE, "N/m", (100.0, 1e6)),
     Parameter("coupling.damping", "damping of the coupling", "c", NOT_NEGATIVE, "N s/m", (0.0, 50.0)),
+    Parameter(
+        "actuator.cutoff", "corner frequency of the actuator", "f_a", POSITIVE, "Hz", (10.0, 5e3),
+        short_name="corner of the actuator",
+    ),
+    Parameter(
+        "actuator.time_constant", "time constant of the actuator", r"\tau_a", POSITIVE, "s", None,
+        "in place of the corner frequency", "time constant of the actuator",
+    ),
+    Parameter(
+        "actuator.order", "order of the actuator", "n_a", Range(1, 2), note="1 or 2", whole=True,
+    ),
+    Parameter(
+        "actuator.damping_ratio", "damping ratio of the actuator", r"\zeta_a", POSITIVE, slider=(0.05, 2.0),
+        note="of second order",
+    ),
+    *(each for k in range(MOST_MODES) for each in _describe_mode(f"modes.{k}", f"mode {k}", str(k))),
     Parameter("stiffness", "stiffness K of the virtual wall", "K", ANY, "N/m", (0.0, 50e3), short_name="stiffness"),
     Parameter(
         "alpha", "normalized stiffness of the virtual wall, K T^2/m", r"\alpha", ANY, slider=(0.0, 1.0),
@@ -197,7 +227,7 @@ OF_PARTS = tuple(name for name in PARAMETERS if "." in name)
 VARIABLES = {parameter.variable: parameter for parameter in _PARAMETERS}
 """The same by their names in a store."""
 _NOISE = Parameter("velocity.noise", "largest error of a measured position", "", POSITIVE, "m", note="one count")
-FIELDS = {**PARAMETERS, _NOISE.name: _NOISE}
+FIELDS = {**PARAMETERS, **{field.name: field for field in (_NOISE, *_describe_mode("mode", "a mode", "i"))}}
 """Every number that a part may have; the noise belongs to an estimate that has no stable walls, and is no axis."""
 WALL = ("alpha", "beta", "stiffness", "virtual_damping")
 

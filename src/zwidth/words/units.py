@@ -66,7 +66,8 @@ ANGULAR_STIFFNESS = Dimension(
 ANGULAR_DAMPING = Dimension({"N m s/rad": 0, "mN m s/rad": -3}, "2 mN m s/rad")
 SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
 FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
-_SCALES = (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED)
+RATIO = Dimension({"1": 0, "%": -2}, "2 %")
+_SCALES = (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED, RATIO)
 _OF_UNIT = {dimension.base: dimension for dimension in _SCALES}
 
 PERIOD_WORDS = ("periods", "period")
@@ -119,7 +120,8 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
     remedy = f"write a number and a unit, as in {dimension.example!r}"
-    allowed = f"it must be a number in {dimension.base} or a number with one of the units {names}"
+    plain = "a number" if dimension is RATIO else f"a number in {dimension.base}"
+    allowed = f"it must be {plain} or a number with one of the units {names}"
     if not isinstance(value, str):
         raise UnusableValueError(f"got {describe(value)}", allowed, remedy)
     if looks_like_number(value):

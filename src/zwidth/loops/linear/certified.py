@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import Chain, chain_of, rates
+from zwidth.loops.linear.chain import Chain, chain_of
 from zwidth.loops.rigid import certified
 from zwidth.parts.velocity import Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.words.errors import InputError
@@ -112,8 +112,8 @@ def _polynomials(scene: Any) -> BallPolynomials:
     whole = chain.whole + (1 if chain.d > chain.whole else 0)
     waiting = flint.arb_poly([0] * whole + device.coeffs())
     # F(1) is exactly 0 where a sum of exact fractions is; all other estimates are differences.
-    own, free = isinstance(scene.velocity, VelocityFilter), all(body.stiffness == 0 for body in chain.bodies)
-    rest = free and (not own or sum(map(Fraction, scene.velocity.numerator)) == 0)
+    own = isinstance(scene.velocity, VelocityFilter)
+    rest = chain.free and (not own or sum(map(Fraction, scene.velocity.numerator)) == 0)
     return BallPolynomials(waiting * bottom, answer * bottom * unit, answer * top * unit, rest)
 
 
@@ -123,6 +123,8 @@ def _exact(scene: Any, period: flint.arb) -> Any:
 
     def exact(part: Any) -> Any:
         """The same with balls for numbers, past the checks of these."""
+        if isinstance(part, tuple):
+            return tuple(map(exact, part))
         if isinstance(part, float) or not is_dataclass(part):
             return flint.arb(part) if isinstance(part, float) else part
         # Without what the part has computed from its numbers.
@@ -141,7 +143,7 @@ def _device(chain: Chain) -> tuple[flint.arb_poly, flint.arb_poly]:
     """Numerator and denominator of G without its whole periods of delay."""
     import flint
 
-    rate, push = (array.tolist() for array in rates(chain))
+    rate, push, _ = (array.tolist() for array in chain.realize())
     size = len(push)
 
     def flow(time: flint.arb) -> tuple[flint.arb_mat, flint.arb_mat]:

@@ -23,8 +23,9 @@ from zwidth.arrays.circle import CirclePoints, Jet, circle
 from zwidth.arrays.roots import bisect, false_position
 from zwidth.arrays.xp import within
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import Chain, find_roots
+from zwidth.loops.linear.chain import Chain
 from zwidth.loops.linear.curve import nodes_of
+from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.poles import log_radius
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import label_walls

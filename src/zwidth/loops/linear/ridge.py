@@ -21,7 +21,8 @@ from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import chain_of, flow, rates
+from zwidth.loops.linear.chain import chain_of
+from zwidth.loops.linear.held import flow
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import bound_intervals
 from zwidth.loops.rigid.device import classify_delays
@@ -303,7 +304,7 @@ def _inputs(scene: Any, whole: int, at: CirclePoints) -> tuple[Any, ...]:
     """What K_max depends on a parameter through: the unit of stiffness, the delay, the rates of the chain, F and F'."""
     delay = scene.timing.delay / scene.timing.period
     chain = chain_of(scene, (delay, whole))
-    return (scene.units.stiffness, delay, *rates(chain), *chain.estimate.jet(at))
+    return (scene.units.stiffness, delay, *chain.realize()[:2], *chain.estimate.jet(at))
 
 
 def _needed_slopes(
@@ -315,7 +316,7 @@ def _needed_slopes(
     """
     chain = scene.loop.chain
     # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
-    rate, push = (value + 1j * _TINY * by for value, by in zip(rates(chain), (by_rate, by_push), strict=True))
+    rate, push = (value + 1j * _TINY * by for value, by in zip(chain.realize(), (by_rate, by_push), strict=False))
     fraction = chain.d - chain.whole + 1j * _TINY * by_delay
     steps = (*flow(rate, push, 1.0), flow(rate, push, 1.0 - fraction)[1])
     (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))

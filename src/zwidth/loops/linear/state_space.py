@@ -15,7 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import Chain, sampled
+from zwidth.loops.linear.chain import Chain
+from zwidth.loops.linear.held import flow, sampled
 from zwidth.parts.velocity import Estimate
 
 
@@ -96,8 +97,8 @@ def closed_loop(chain: Chain, alpha: float, beta: float) -> Matrices:
     """From a force held on the device to the sampled position, in contact with the wall."""
     loop = open_loop(chain, alpha, beta)
     size = loop.A.shape[0]
-    bodies = 2 * len(chain.bodies)
+    A, _, held = chain.realize()
     filtered = size - delayed_device(chain).A.shape[0]
     push = np.zeros((size, 1))
-    push[filtered : filtered + bodies, 0] = sampled(chain).full
+    push[filtered : filtered + len(held), 0] = flow(A, held, 1.0)[1]
     return Matrices(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))

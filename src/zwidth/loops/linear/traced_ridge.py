@@ -19,7 +19,8 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import broadcast_traced
 from zwidth.arrays.xp import is_traced, nan_with_nan_slopes
-from zwidth.loops.linear.chain import Chain, chain_of, required_wall, respond
+from zwidth.loops.linear.chain import Chain, chain_of
+from zwidth.loops.linear.held import required_wall, respond
 from zwidth.loops.linear.ridge import Condition, moving_paths
 from zwidth.loops.rigid.exact_points import polish
 from zwidth.loops.rigid.ridge import RidgePoint

@@ -1,0 +1,190 @@
+"""A device under a force that is held over each period: discretized exactly, and by its roots (any loop).
+
+With ``x' = A x + B u`` and the first number of x what is sensed, the motion between samples is the matrix exponential.
+From held force to sampled position, with zeta = z - 1, Psi = e^A - 1 = A phi1(A) and Gamma(t) the answer to a force
+held for t (docs/theory/scenes.md, V2 to V4):
+
+    G(z) = C (zeta - Psi)^-1 (zeta Gamma(1 - f) + Gamma(1)) / z^(n+1),   d = n + f
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.circle import CirclePoints, circle, lag_jet
+from zwidth.arrays.xp import namespace
+from zwidth.loops.linear.chain import Chain, is_zero
+from zwidth.loops.linear.roots import LoopRoots
+from zwidth.loops.rigid.device import Plant, held_plant, undelayed_plant
+
+# Continuous zeros slower than this a period lead to sampled ones; Aberth's steps at most, and the last one's share.
+_SLOW, _MOST_STEPS, _ARRIVED = 0.1, 30, 1e-13
+# A rate that `Chain.check` allows is below 2^35.
+_DOUBLINGS = 36
+
+
+def flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
+    """``e^(A t) - 1`` and the answer ``Gamma(t)`` to a unit force held for t."""
+    phi1 = _matrix_phi1(rate * time)
+    # e^A - 1 = A phi1(A) keeps the digits of slow motions.
+    return rate * time @ phi1, time * (phi1 @ push)
+
+
+def _matrix_phi1(rate: Any) -> Any:
+    """``phi1(A) = 1 + A/2! + A^2/3! + ...``."""
+    if namespace(rate) is not np:
+        return _traced_phi1(rate)
+    return _known_phi1(rate.tobytes(), len(rate), rate.dtype.char)
+
+
+@lru_cache(maxsize=64)
+def _known_phi1(rate: bytes, size: int, kind: str) -> np.ndarray:
+    """Kept, for the same chain is asked at many delays and its motion over a whole period hangs on none of them."""
+    from scipy.linalg import expm
+
+    # The exponential of [[A, 1], [0, 0]] holds it.
+    top = np.concatenate([np.frombuffer(rate, kind).reshape(size, size), np.eye(size)], axis=1)
+    return expm(np.concatenate([top, np.zeros((size, 2 * size))], axis=0))[:size, size:]
+
+
+def _traced_phi1(rate: Any) -> Any:
+    """The series for A over a power of 2, then ``phi1(2 A) = phi1(A) (1 + A phi1(A)/2)``.
+
+    In two loops, because a program that is differentiated costs by its length: with JAX's own exponential, which holds
+    an approximant for each of five sizes, derivatives of `zwidth.Scene.max_stiffness` took 1.2 to 1.7 times as long to
+    compile.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    size = jax.lax.stop_gradient(jnp.abs(rate).sum(0).max())
+    doublings = jnp.ceil(jnp.log2(jnp.maximum(2.0 * size, 1.0)))
+    small, one = rate / 2.0**doublings, jnp.eye(rate.shape[0], dtype=rate.dtype)
+
+    def add(total: Any, k: Any) -> tuple[Any, None]:
+        return one + small @ total / k, None
+
+    def double(phi1: Any, k: Any) -> tuple[Any, None]:
+        return phi1 + jnp.where(k < doublings, 0.5 * 2.0**k, 0.0) * (small @ phi1 @ phi1), None
+
+    terms = jnp.arange(16, 1, -1, dtype=rate.dtype)
+    phi1, _ = jax.lax.scan(add, one, terms)
+    return jax.lax.scan(double, phi1, jnp.arange(_DOUBLINGS, dtype=rate.dtype))[0]
+
+
+class Sampled(NamedTuple):
+    """The chain between two samples; what the sensor sees is the first number of the state."""
+
+    psi: Any
+    full: Any
+    late: Any | None  # Gamma(1 - f), None for whole delays
+
+
+def respond(chain: Chain) -> Sampled | Plant:
+    """The chain between two samples, what `needed` is computed from at every angle."""
+    return _rigid_plant(chain) if chain.rigid else sampled(chain)
+
+
+def sampled(chain: Chain) -> Sampled:
+    """Discretize exactly."""
+    A, B, _ = chain.realize()
+    psi, full = flow(A, B, 1.0)
+    fraction = chain.d - chain.whole
+    late = None if is_zero(fraction) else flow(A, B, 1.0 - fraction)[1]
+    return Sampled(psi, full, late)
+
+
+def required_wall(chain: Chain, w: Any, parts: Sampled | Plant | None = None) -> Any:
+    """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
+    at: CirclePoints = circle(w)
+    parts = respond(chain) if parts is None else parts
+    if isinstance(parts, Plant):
+        # N(z)/z = a2 z + a1 + a0/z, around z = 1.
+        answer = parts.a2 * at.z + parts.a1 + parts.a0 / at.z
+        return -lag_jet(at, chain.whole).value * at.before * (at.before + parts.em) / answer
+    xp = namespace(parts.psi, w)
+    force = parts.full + 0j if parts.late is None else at.before * parts.late + parts.full
+    turns = chain.whole if parts.late is None else chain.whole + 1
+    moved = xp.linalg.solve(at.before * xp.eye(parts.psi.shape[0]) - parts.psi, force)
+    return -lag_jet(at, turns).value / moved[0]
+
+
+def _rigid_plant(chain: Chain) -> Plant:
+    fraction, delta = chain.d - chain.whole, chain.bodies[0].damping
+    return undelayed_plant(delta) if is_zero(fraction) else held_plant(delta, fraction)
+
+
+def find_roots(chain: Chain) -> LoopRoots:
+    """The loop of a chain by its roots."""
+    if chain.rigid:
+        return _rigid_loop(chain)
+    chain.check()
+    parts = sampled(chain)
+    seen, poles = chain.continuous
+    poles = -np.expm1(poles)
+    den = np.atleast_1d(np.poly(-poles)).real
+    top = _numerator(parts, parts.full, den)
+    lag = chain.whole
+    if parts.late is not None:
+        top = np.polyadd(np.append(_numerator(parts, parts.late, den), 0.0), top)
+        lag += 1
+    top = np.trim_zeros(top, "f")
+    # Zeros beside a soft mode's poles are lost in ``top``; they are nearly those of the continuous motion.
+    slow = np.expm1(seen)
+    slow = slow[np.abs(slow) < _SLOW]
+    zeros = np.roots(top).astype(complex)
+    zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
+    return LoopRoots(float(top[0]), lag, -_polished_zeros(parts, zeros), poles, chain.estimate)
+
+
+def _numerator(parts: Sampled, push: np.ndarray, den: np.ndarray) -> np.ndarray:
+    """The numerator in zeta of ``C (zeta - Psi)^-1 push``, by its Markov parameters."""
+    markov, state = [], push
+    for _ in range(den.size - 1):
+        markov.append(state[0])
+        state = parts.psi @ state
+    return np.convolve(den, markov)[: den.size - 1]
+
+
+def _polished_zeros(parts: Sampled, zeros: np.ndarray) -> np.ndarray:
+    """Aberth's steps on the determinant of ``[[zeta - Psi, push], [C, 0]]``, where no pole cancels a zero."""
+    size = parts.full.size
+    at_rest = np.zeros((size + 1, size + 1))
+    at_rest[:size, :size], at_rest[:size, size], at_rest[size, 0] = -parts.psi, parts.full, 1.0
+    growing = np.eye(size + 1)
+    growing[:, size] = np.append(np.zeros(size) if parts.late is None else parts.late, 0.0)
+    same = np.eye(zeros.size, dtype=bool)
+    for _ in range(_MOST_STEPS):
+        with np.errstate(all="ignore"):
+            slope = np.array([_relative_slope(at_rest + zeta * growing, growing) for zeta in zeros])
+            step = 1.0 / (slope - (1.0 / np.where(same, np.inf, zeros[:, None] - zeros)).sum(1))
+        step = np.where(np.isfinite(step), step, 0.0)
+        zeros = zeros - step
+        if np.all(np.abs(step) <= _ARRIVED * np.abs(zeros)):
+            break
+    return zeros
+
+
+def _relative_slope(matrix: np.ndarray, growing: np.ndarray) -> complex:
+    """The derivative of the determinant over itself; infinite on a zero."""
+    try:
+        return np.trace(np.linalg.solve(matrix, growing))
+    except np.linalg.LinAlgError:
+        return complex(np.inf)
+
+
+def _rigid_loop(chain: Chain) -> LoopRoots:
+    delta, fraction = np.float64(chain.bodies[0].damping), np.float64(chain.d - chain.whole)
+    if fraction == 0:
+        plant = undelayed_plant(delta)
+        # At delta = 0 the zero is at -1 exactly.
+        zeros = np.array([2.0 + plant.gap * -1.0 / plant.a2 + 0j])
+        return LoopRoots(float(plant.a2), chain.whole, zeros, np.array([0.0, plant.em], complex), chain.estimate)
+    plant = held_plant(delta, fraction)
+    root = np.sqrt(max(plant.a1 * plant.a1 - 4.0 * plant.a2 * plant.a0, 0.0))
+    far = -0.5 * (plant.a1 + root)
+    zeros = np.array([1.0 - far / plant.a2, 1.0 - plant.a0 / far], complex)
+    return LoopRoots(float(plant.a2), chain.whole + 1, zeros, np.array([0.0, plant.em], complex), chain.estimate)

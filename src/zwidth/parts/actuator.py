@@ -1,0 +1,65 @@
+"""What stands between the force that is commanded and the one that acts: amplifier, current loop and motor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from zwidth.parts.checks import check_fields
+from zwidth.words.errors import InputError
+
+
+def angular(frequency: Any) -> Any:
+    """``2 pi f``; balls bring a pi of their own."""
+    return 2.0 * (frequency.pi() if hasattr(frequency, "pi") else np.pi) * frequency
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """The lag between the commanded force and the one that acts, of first or second order.
+
+    ``tau F' + F = u``, or ``F''/w^2 + 2 zeta F'/w + F = u`` with ``w = 1/tau = 2 pi cutoff``. A hand and friction act
+    on the device without it.
+
+    Args:
+        cutoff: corner frequency in Hz, > 0; or
+        time_constant: tau in s, > 0.
+        order: 1 or 2.
+        damping_ratio: zeta of the second order, > 0; ``sqrt(1/2)`` where left out.
+
+    Example:
+        >>> import zwidth
+        >>> device, timing = zwidth.Device(0.1, 10, actuator=zwidth.Actuator(cutoff=300)), zwidth.Timing(period=1e-3)
+        >>> print(f"{zwidth.Scene(device, timing).max_stiffness().stiffness:.0f} N/m")
+        19466 N/m
+    """
+
+    # Forms that the explorer offers.
+    usual: ClassVar[dict[str, dict[str, float]]] = {
+        "first": {"cutoff": 300.0},
+        "second": {"cutoff": 300.0, "order": 2, "damping_ratio": 0.7},
+    }
+
+    cutoff: Any = None
+    time_constant: Any = None
+    order: int = 1
+    damping_ratio: Any = None
+
+    def __post_init__(self) -> None:
+        if (self.cutoff is None) == (self.time_constant is None):
+            raise InputError("actuator.cutoff: give either cutoff (Hz) or time_constant (s), and only one of them")
+        check_fields(self, "actuator")
+        if self.order == 1 and self.damping_ratio is not None:
+            raise InputError(
+                f"actuator.damping_ratio: got {self.damping_ratio!r} of an actuator of first order; leave it out, or "
+                "say order=2"
+            )
+        if self.order == 2 and self.damping_ratio is None:
+            object.__setattr__(self, "damping_ratio", 0.5**0.5)
+
+    @property
+    def rate(self) -> Any:
+        """w in rad/s."""
+        return angular(self.cutoff) if self.time_constant is None else 1.0 / self.time_constant
