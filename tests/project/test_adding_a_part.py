@@ -45,7 +45,7 @@ EDITS = {
         )
     },
     "parts/paths.py": {
-        '"coupling": Coupling}': '"coupling": Coupling, "mount": Mount}',
+        '"actuator": Actuator}': '"actuator": Actuator, "mount": Mount}',
         "from zwidth.parts.operator": f"{IMPORT}from zwidth.parts.operator",
     },
     "scenes/scene.py": {

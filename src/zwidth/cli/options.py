@@ -45,8 +45,9 @@ _SLIPS = {
 Command: TypeAlias = Callable[..., Any]
 
 # By path in a scene, as in configuration files, one part after the other.
-_PART_NAMES = tuple(dict.fromkeys(path.partition(".")[0] for path in OF_PARTS))
-_PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.partition(".")[0]))
+_PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
+_PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
+_MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 
 
 def doubts_of(given: dict[str, Any]) -> list[str]:
@@ -166,6 +167,7 @@ def _take_options(
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
     from zwidth.parts.device import Device
+    from zwidth.parts.mode import Mode
     from zwidth.parts.paths import PARTS
     from zwidth.parts.timing import Timing
     from zwidth.parts.wall import VirtualWall
@@ -183,7 +185,11 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
         return {name: given[name] for name in names if name in given}
 
     try:
-        parts = {name: _make_part(name, kind, own) for name, kind in PARTS.items() if (own := _own(given, name))}
+        parts: dict[str, Any] = {
+            name: _make_part(name, kind, own) for name, kind in PARTS.items() if (own := _own(given, name))
+        }
+        modes = [_make_part(name, Mode, own) for name in _MODES if (own := _own(given, name))]
+        parts |= {"modes": modes} if modes else {}
         scene = Scene(
             Device(**some("mass", "damping")),
             Timing(**some("period", "rate", "delay")),
@@ -214,7 +220,7 @@ def _make_part(name: str, kind: Any, given: dict[str, Any]) -> Any:
 
 def _own(given: dict[str, Any], name: str) -> dict[str, Any]:
     """What is given of one part, by the names of its fields."""
-    return {path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
+    return {path.rpartition(".")[2]: value for path, value in given.items() if path.startswith(f"{name}.")}
 
 
 def _make_velocity(options: dict[str, Any]) -> Any:

@@ -1,4 +1,4 @@
-"""The parts of a scene beside device and timing, as a configuration has them: velocity estimate, hand and coupling.
+"""The parts of a scene beside device and timing, as a configuration has them: velocity estimate, hand, coupling, ...
 
 Each section below has the keys of the part of that name in `zwidth.parts`, and gives that part.
 """
@@ -25,13 +25,14 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict, describe_parameter, find_kind
 from zwidth.config.values import Quantity, read_entries
 from zwidth.parts.checks import find_range
+from zwidth.parts.mode import Mode
 from zwidth.parts.paths import PARTS
 from zwidth.parts.velocity import ESTIMATES, FOAW
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe
 from zwidth.words.quantities import CHOICES, FIELDS
 
-PART_NAMES = ("velocity", *PARTS)
+PART_NAMES = ("velocity", *PARTS, "modes")
 
 NO_LINEAR_FORM = "FOAW chooses its window by the motion and has no linear form"
 SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such as 'windowed_difference'"
@@ -142,12 +143,14 @@ SimulatedVelocityField = Annotated[PartSection, _AnyEstimate(linear=False)]
 _SECTIONS: Any = {
     name: make_section(part, name, f"{'an' if name[0] in 'aeiou' else 'a'} {name}") for name, part in PARTS.items()
 }
+ModeSection: Any = make_section(Mode, "mode", "a mode")
 
 
 def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Strict]:
     """A base of what has a section for each of the parts that a scene need not have."""
     known: dict[str, Any] = {"velocity": ("How the velocity is estimated", VelocityField, no_estimate)}
     known |= {name: (_head(section.part)[:-1], section, no_part) for name, section in _SECTIONS.items()}
+    known["modes"] = "Resonances that the sensor sees", list[ModeSection], no_part
     keys: Any = {
         name: (form | None, Field(default=None, description=f"{words}; {absent} where left out.{more}"))
         for name, (words, form, absent) in known.items()
@@ -155,12 +158,15 @@ def make_parts_base(no_estimate: str, no_part: str, more: str = "") -> type[Stri
     return create_model("Parts", __base__=Strict, **keys)
 
 
-def list_parts(owner: Any) -> dict[str, PartSection]:
-    """The parts that a device, a scene or a study has, by name."""
+def list_parts(owner: Any) -> dict[str, Any]:
+    """The parts that a device, a scene or a study has, by name: a section each, of the modes a list of them."""
     found = {name: getattr(owner, name, None) for name in PART_NAMES}
-    return {name: section for name, section in found.items() if section is not None}
+    return {name: section for name, section in found.items() if section is not None and section != []}
 
 
 def build_parts(owner: Any) -> dict[str, Any]:
     """The same as parts of a scene."""
-    return {name: section.to_part() for name, section in list_parts(owner).items()}
+    return {
+        name: [each.to_part() for each in section] if isinstance(section, list) else section.to_part()
+        for name, section in list_parts(owner).items()
+    }

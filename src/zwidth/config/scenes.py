@@ -255,7 +255,7 @@ class PhysicalScene(_PhysicalPlant):
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
         if self.delay_model not in self.to_scene().loop.delay_models:
-            allowed = "velocity filters, hands and couplings are computed in the model 'held'"
+            allowed = "velocity filters, hands and other parts are computed in the model 'held'"
             yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
 
     @property

@@ -80,7 +80,7 @@ class Study(Strict):
     """Fields that the file's scene supplies where the study leaves them out."""
 
     takes_parts: ClassVar[bool] = False
-    """Whether it answers for a device with a velocity filter, a hand or a coupling; it then has the field device."""
+    """Whether it answers for a device with a velocity filter, a hand or another part; it then has the field device."""
 
     simulates: ClassVar[bool] = False
     """Whether it answers for a velocity estimate without a linear form."""

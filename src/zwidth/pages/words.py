@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.paths import find_parts
 from zwidth.words.formatting import plain, short, tell_apart, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
@@ -50,14 +51,16 @@ def scene_lines(scene: Scene) -> list[str]:
     velocity = type(scene.velocity).__name__
     parts, values = find_parts(scene), scene.parameters()
     # From the motor outwards.
-    for name in (name for name in dict.fromkeys(("velocity", "coupling", *parts)) if name in parts):
+    for name in (name for name in dict.fromkeys(("velocity", "actuator", "coupling", *parts)) if name in parts):
         own = {path: value for path, value in values.items() if path.startswith(f"{name}.")}
         if name == "velocity" and velocity == "BackwardDifference" and not own:
             continue
-        words = [f"{path.partition('.')[2].replace('_', ' ')} {_spell(path, own[path])}" for path in own if own[path]]
+        named = {path.removeprefix(f"{name}.").replace("_", " "): path for path in own if own[path]}
+        words = [f"{key} {_spell(path, own[path])}" for key, path in named.items()]
         if name == "coupling":
             words.append(f"sensor at the {parts[name].sensor}")
-        lines.append(row(name, ", ".join([*([velocity] if name == "velocity" else []), *words])))
+        words = [velocity, *words] if name == "velocity" else words
+        lines.append(row(name.replace("modes.", "mode "), ", ".join(words)))
     return lines
 
 
@@ -68,7 +71,7 @@ def unit_of(path: str) -> str:
 
 def _spell(path: str, value: Any) -> str:
     unit = unit_of(path)
-    return with_unit(value, unit) if unit else short(value)
+    return with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
 
 
 def stability_word(stable: bool, marginal: bool = False) -> str:
@@ -143,7 +146,7 @@ def passivity_words(scene: Scene, verdict: Assessment) -> str:
     """Whether a wall is passive; with a coupling a wall that misses the condition may still be."""
     stiffness, margin = scene.wall.stiffness, verdict.passivity_margin
     if verdict.passive is None:
-        return "not known: the sensor is not where the force acts"
+        return f"not known {find_obstacle(**vars(scene.device)).partition(':')[0]}"
     if stiffness < 0:
         return "no, and no damping makes a negative stiffness passive"
     dampings = scene.device.damping + abs(scene.wall.virtual_damping) + stiffness * scene.timing.period

@@ -38,8 +38,10 @@ class Actuator:
 
     # Forms that the explorer offers.
     usual: ClassVar[dict[str, dict[str, float]]] = {
-        "first": {"cutoff": 300.0},
-        "second": {"cutoff": 300.0, "order": 2, "damping_ratio": 0.7},
+        "first order": {"cutoff": 300.0},
+        "second order": {"cutoff": 300.0, "order": 2, "damping_ratio": 0.7},
+        "first order, time constant": {"time_constant": 0.5e-3},
+        "second order, time constant": {"time_constant": 0.5e-3, "order": 2, "damping_ratio": 0.7},
     }
 
     cutoff: Any = None

@@ -61,7 +61,8 @@ class Device:
     damping: Any = 0.0
     coupling: Coupling | None = None
     actuator: Actuator | None = None
-    modes: tuple[Mode, ...] = ()
+    # A list is as good.
+    modes: Any = ()
 
     def __post_init__(self) -> None:
         check_fields(self)

@@ -117,7 +117,7 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 
 def spell_scene(scene: Any) -> dict[str, Any]:
     """The section ``scene`` of a configuration, with the keys that differ from their defaults."""
-    parts = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
+    parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
     own = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
     if scene.device.modes:
         parts["modes"] = [spell_part(mode) for mode in scene.device.modes]

@@ -10,7 +10,7 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
 from zwidth.loops.linear.margins import open_loop_response
-from zwidth.loops.linear.passivity import has_condition
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.poles import log_size, poles_less_one
 from zwidth.loops.linear.rows import Island
 from zwidth.loops.linear.state_space import Matrices, closed_loop, delayed_device, open_loop
@@ -245,15 +245,12 @@ class SceneAnswers:
 
         Colgate's condition for any velocity estimate and delay, with the largest need proved over all frequencies
         (`loops.linear.passivity`); exact for a rigid device, whatever the hand. With a coupling and the sensor at the
-        motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip there is
-        no such condition, and InputError says so. A wall that pushes has at most its K T.
+        motor the motor's own damping counts, which is sufficient and not necessary; with the sensor at the tip, with an
+        actuator and with modes there is no such condition, and InputError says so. A wall that pushes has at most its
+        K T.
         """
-        if not has_condition(self.device):
-            raise InputError(
-                "coupling.sensor: 'tip' has no passivity condition of this kind: force and sensed motion are not those "
-                "of one point, so that no damping of the motor bounds the energy; ask is_stable with the hand as "
-                "operator"
-            )
+        if obstacle := find_obstacle(**vars(self.device)):
+            raise InputError(f"passivity {obstacle}")
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         return self.loop.passivity_margin(alpha, beta) * self.units.virtual_damping
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.loops.linear.passivity import has_condition
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import StiffestWall, stiffest_wall
@@ -39,7 +39,7 @@ class Assessment:
     stiffness_limit: float  # the upper end of that interval of K which holds the wall or is the nearest to it
     virtual_damping_lower: float  # the ends of that interval of B which holds the wall or is the nearest to it
     virtual_damping_upper: float
-    passive: bool | None  # whatever the hand; with a coupling True is proved and False is not, None with its tip sensed
+    passive: bool | None  # whatever the hand; with a coupling True is proved and False is not; None without a condition
     passivity_margin: float  # the device's damping in excess of what a passive wall needs, in N s/m
     alpha_max: float  # the stiffest stable wall of this device (`zwidth.Scene.max_stiffness`)
     beta_at_max: float
@@ -88,7 +88,7 @@ def assess(scene: Scene) -> Assessment:
         raise InputError(
             f"delay_model: got {scene.timing.delay_model!r}, which has no poles; use 'held' to judge a single wall"
         )
-    stands, best, known = scene.margins(), scene.max_stiffness(), has_condition(scene.device)
+    stands, best, known = scene.margins(), scene.max_stiffness(), not find_obstacle(**vars(scene.device))
     margin = float(scene.passivity_margin()) if known else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
     row, column = (tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
@@ -254,6 +254,10 @@ def _ideals(scene: Scene) -> list[tuple[str, str, Scene]]:
     if coupling is not None:
         rigid = scene.replace(coupling=None, mass=scene.device.mass + coupling.mass)
         found.append(("coupling", "no compliance between motor and tip", rigid))
+    if scene.device.actuator is not None:
+        found.append(("actuator", "an actuator without lag", scene.replace(actuator=None)))
+    if scene.device.modes:
+        found.append(("modes", "no resonances", scene.replace(modes=())))
     return found
 
 

@@ -57,7 +57,7 @@ class Scene(SceneAnswers):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
-        device: mass and damping, rigid or with a coupling.
+        device: mass and damping, rigid or with a coupling, modes and an actuator.
         timing: period and delay.
         wall: the wall that `zwidth.assess` judges, and that the questions below mean where no other is named. It may be
             left out.

@@ -73,7 +73,7 @@ def worst_motion(
         tried does so beyond rounding; OUT_OF_RANGE; these with NaN in arrays of length 1.
 
     Raises:
-        InputError: the sensor is at the tip of a coupling; the wall is not one of finite numbers, or not said.
+        InputError: no passivity condition is known for the device; the wall is not one of finite numbers, or not said.
 
     Numerics:
         A sinusoid at that frequency under a window, of 8, 16, ... periods, until it gives energy: some 3 to 9

@@ -71,7 +71,7 @@ class Motion:
         time: instants in s, ``substeps`` a period, the first 0; of one axis where all share a period.
         position, velocity: of the device, the body that the forces act on, in m and m/s; positive into the wall.
         tip_position, hand_position: of the bodies behind a coupling and behind a grasp; None without.
-        wall_force: that acts from the instant on, in N.
+        wall_force: that acts from the instant on, in N; with an actuator, what it is commanded then.
         sticking: whether friction holds the device.
         measured, estimated_velocity, command, contact: what the program made of the last sample.
         wall_work, push_work: energy given by the wall and by the hand's push since the start, in J.

@@ -16,6 +16,7 @@ from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_pa
 from zwidth.config.scenes import AnyScene, PhysicalScene, find_second_period, is_with_parts
 from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS
 from zwidth.parts.timing import Timing
@@ -87,7 +88,7 @@ class Axes(_Axes):
 
     @property
     def given_of_parts(self) -> tuple[str, ...]:
-        """Those of them that belong to a velocity filter, a hand or a coupling."""
+        """Those of them that belong to a velocity filter, a hand or another part."""
         return tuple(name for name in self.given if name in OF_PARTS)
 
     @property
@@ -261,11 +262,11 @@ class SweepStudy(_Parts, _Swept):
             return
         for index, name in enumerate(self.outputs):
             if name not in OUTPUTS_WITH_PARTS:
-                allowed = f"with a velocity filter, a hand or a coupling there are {listing(OUTPUTS_WITH_PARTS)}"
+                allowed = f"with a velocity filter, a hand or another part there are {listing(OUTPUTS_WITH_PARTS)}"
                 yield ("outputs", index), problem(f"got {name!r}", allowed, "choose from these")
-            elif name == "passive" and self.coupling is not None and self.coupling.sensor == "tip":
-                allowed = "it is known where the force acts on the body whose position is sensed"
-                yield ("outputs", index), problem("got 'passive' with the sensor at the tip", allowed, "remove it")
+            elif name == "passive" and (obstacle := find_obstacle(**build_parts(self))):
+                allowed = "it is known where a command acts at once, on the body whose position is sensed"
+                yield ("outputs", index), problem(f"got 'passive' {obstacle.partition(':')[0]}", allowed, "remove it")
         if {"mass"} <= set(given) and {"period", "rate"} & set(given):
             yield from self._find_part_faults()
 
@@ -286,6 +287,8 @@ class SweepStudy(_Parts, _Swept):
         """Whether the part that an axis belongs to is there, and has such a key."""
         part, _, key = name.partition(".")
         section = getattr(self, part)
+        if part == "modes":
+            return int(key.partition(".")[0]) < len(section or ())
         kind = section.part if section is not None else PARTS.get(part, BackwardDifference)
         # A part that has no section is there where it needs no numbers.
         needed = section is None and any(item.default is MISSING for item in fields(kind))

@@ -194,7 +194,7 @@ _PARAMETERS = (
         short_name="corner of the actuator",
     ),
     Parameter(
-        "actuator.time_constant", "time constant of the actuator", r"\tau_a", POSITIVE, "s", None,
+        "actuator.time_constant", "time constant of the actuator", r"\tau_a", POSITIVE, "s", (2e-5, 0.02),
         "in place of the corner frequency", "time constant of the actuator",
     ),
     Parameter(

@@ -66,9 +66,9 @@ ANGULAR_STIFFNESS = Dimension(
 ANGULAR_DAMPING = Dimension({"N m s/rad": 0, "mN m s/rad": -3}, "2 mN m s/rad")
 SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
 FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
-RATIO = Dimension({"1": 0, "%": -2}, "2 %")
-_SCALES = (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED, RATIO)
-_OF_UNIT = {dimension.base: dimension for dimension in _SCALES}
+RATIO = Dimension({"": 0}, "0.02")
+_SCALES = (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED)
+_OF_UNIT = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
 
 PERIOD_WORDS = ("periods", "period")
 
@@ -120,8 +120,9 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
     remedy = f"write a number and a unit, as in {dimension.example!r}"
-    plain = "a number" if dimension is RATIO else f"a number in {dimension.base}"
-    allowed = f"it must be {plain} or a number with one of the units {names}"
+    allowed = f"it must be a number in {dimension.base} or a number with one of the units {names}"
+    if dimension is RATIO:
+        allowed, remedy = "it must be a number without a unit", f"write a number, as {dimension.example}"
     if not isinstance(value, str):
         raise UnusableValueError(f"got {describe(value)}", allowed, remedy)
     if looks_like_number(value):
@@ -135,10 +136,12 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     if periods and unit in PERIOD_WORDS:
         return float(f"{mantissa}e{exponent or 0}"), "periods"
     amount = dimension.in_base(mantissa, int(exponent or 0), unit)
-    if amount is None:
+    if amount is None and dimension is not RATIO:
         raise UnusableValueError(
             f"got {describe(value)}", f"the units allowed are {names}", suggestion(unit, units, remedy)
         )
+    if amount is None:
+        raise UnusableValueError(f"got {describe(value)}", allowed, remedy)
     return amount, dimension.base
 
 

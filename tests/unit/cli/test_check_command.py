@@ -276,7 +276,7 @@ def test_nothing_on_an_undamped_device_is_just_passive():
         (["--coupling-mass", "50 g", "--coupling-stiffness", "20 kN/m"], "not proved, for want of"),
         (
             ["--coupling-mass", "50 g", "--coupling-stiffness", "20 kN/m", "--coupling-sensor", "tip"],
-            "not known: the sensor is not where the force acts",
+            "not known with the sensor at the tip",
         ),
     ],
 )

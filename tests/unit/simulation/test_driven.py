@@ -134,7 +134,7 @@ def test_energy_is_that_of_wall_and_push_less_losses(parts):
     # The work of the push by its way, of the damper to ground by its speed; the rest is the wall's and the links'.
     way = np.asarray(motion.position) - 1e-3
     np.testing.assert_allclose(np.asarray(motion.push_work), 0.5 * way, atol=1e-9 * 0.5e-3)
-    assert np.all(np.diff(np.asarray(motion.damping_loss)) > -1e-15)
+    assert np.all(np.diff(np.asarray(motion.damping_loss, float)) > -1e-15)
 
 
 def test_the_wall_work_of_a_lag_is_that_of_the_force_that_acts():
@@ -143,10 +143,10 @@ def test_the_wall_work_of_a_lag_is_that_of_the_force_that_acts():
     substeps = 256
     motion = scene.simulate(800.0, 2.0, periods=60, start_position=1e-3, substeps=substeps)
     w, step = 2 * np.pi * 150.0, 1e-3 / substeps
-    command, force = np.asarray(motion.force), [0.0]
+    command, force = np.asarray(motion.wall_force), [0.0]
     for u in command[:-1]:
         force.append(u + (force[-1] - u) * np.exp(-w * step))
-    work = np.cumsum(0.5 * (np.array(force)[1:] + force[:-1]) * np.diff(np.asarray(motion.position)))
+    work = np.cumsum(0.5 * (np.array(force)[1:] + force[:-1]) * np.diff(np.asarray(motion.position, float)))
     found = np.asarray(motion.wall_work)[1:]
     assert np.abs(found - work).max() < 1e-4 * np.abs(found).max()
 

@@ -28,9 +28,28 @@ _NODES, _ROUNDS, _MOST = 129, 80, 1 << 18
 _PROVED = 1e-13
 
 
-def has_condition(device: Any) -> bool:
-    """Whether force and sensed motion are those of one point, which the condition is about."""
-    return device.coupling is None or device.coupling.sensor == "motor"
+def find_obstacle(*, coupling: Any = None, actuator: Any = None, modes: Any = (), **_: Any) -> str:
+    """Why parts of a device have no such condition; nothing where they have.
+
+    It is about a force that acts as it is commanded, and the motion of the point where it does.
+    """
+    if actuator is not None:
+        return (
+            "with an actuator: no passivity condition of this kind is known where the force lags behind the command; "
+            "ask is_stable with the hand as operator, or leave the actuator out"
+        )
+    if modes:
+        return (
+            "with modes: no passivity condition of this kind is known where the sensor sees more than the body that "
+            "the hand holds; ask is_stable with the hand as operator, or leave the modes out"
+        )
+    if coupling is not None and coupling.sensor == "tip":
+        return (
+            "with the sensor at the tip: there is no passivity condition of this kind, for force and sensed motion are "
+            "not those of one point and no damping of the motor bounds the energy; ask is_stable with the hand as "
+            "operator"
+        )
+    return ""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.loops.linear.curve import end_lines
-from zwidth.loops.linear.passivity import has_condition
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
 from zwidth.scenes.assessment import Assessment, passive_edge
@@ -137,7 +137,7 @@ def step_motion(scene: Scene, periods: int) -> Curve:
 
 def passive_set(scene: Scene) -> Curve | None:
     """The edge of the passive walls, None where no condition is known; empty where no wall is passive."""
-    if not has_condition(scene.device):
+    if find_obstacle(**vars(scene.device)):
         return None
     return passive_edge(scene, min(_DIRECTIONS, 1 + scene.loop.draws // 5))
 

@@ -1,0 +1,104 @@
+"""Actuators and modes: what they refuse, and that every question about a scene knows them."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import any_loop
+import numpy as np
+import pytest
+
+import zwidth
+
+
+@pytest.fixture
+def scene():
+    device = zwidth.Device(
+        0.1,
+        2.0,
+        zwidth.Coupling(0.05, 2e4, 1.0, "tip"),
+        zwidth.Actuator(300.0, order=2, damping_ratio=0.6),
+        [zwidth.Mode(180.0, 0.05, 0.8), zwidth.Mode(330.0, 0.05, -3.0)],
+    )
+    hand = zwidth.Operator(0.2, 3.0, 100.0)
+    return zwidth.Scene(device, zwidth.Timing(1e-3, 0.3e-3), velocity=zwidth.LowPass(cutoff=80.0), operator=hand)
+
+
+@pytest.mark.parametrize(
+    "make, words",
+    [
+        (lambda: zwidth.Actuator(), "actuator.cutoff: give either cutoff"),
+        (lambda: zwidth.Actuator(100, 1e-3), "actuator.cutoff: give either cutoff"),
+        (lambda: zwidth.Actuator(-1), "actuator.cutoff: got -1"),
+        (lambda: zwidth.Actuator(100, order=3), "actuator.order: got 3"),
+        (lambda: zwidth.Actuator(100, damping_ratio=0.7), "of first order; leave it out, or say order=2"),
+        (lambda: zwidth.Actuator("100 N"), "actuator.cutoff: got '100 N'"),
+        (lambda: zwidth.Mode(100, 0.0, 1), "mode.damping_ratio: got 0;"),
+        (lambda: zwidth.Mode(100, "2 N", 1), "it must be a number without a unit"),
+        (lambda: zwidth.Mode(100, 0.1, 0), "mode.mass: got 0.0; a mass is needed"),
+        (lambda: zwidth.Device(1, modes=[3]), "modes: got \\[3\\]; a list of zwidth.Mode is needed"),
+        (lambda: zwidth.Device(1, actuator=cast(Any, 3)), "actuator: got 3; a zwidth.Actuator is needed, or None"),
+    ],
+)
+def test_bad_numbers_are_named(make, words):
+    with pytest.raises(zwidth.InputError, match=words):
+        make()
+
+
+@pytest.mark.parametrize("part", ["actuator", "modes"])
+def test_what_is_too_fast_for_the_period_is_refused(part):
+    parts = {"actuator": zwidth.Actuator(1e8), "modes": [zwidth.Mode(1e8, 0.1, 1)]}[part]
+    scene = zwidth.Scene(zwidth.Device(0.1, 1.0), zwidth.Timing(1e-3)).replace(**{part: parts})
+    with pytest.raises(zwidth.InputError, match=f"{part}.*rings 1e\\+05 times a period"):
+        scene.is_stable(1e3, 1.0)
+
+
+@pytest.mark.parametrize("path", ["actuator.cutoff", "modes.0.frequency", "modes.1.mass", "modes.0.damping_ratio"])
+def test_sensitivities_are_slopes_of_the_stiffest_wall(scene, path):
+    value = scene.parameters()[path]
+
+    def stiffest(share: float) -> float:
+        return float(scene.replace(**{path: value * (1.0 + share)}).max_stiffness().stiffness)
+
+    h = 1e-4
+    around = (8.0 * (stiffest(h) - stiffest(-h)) - (stiffest(2 * h) - stiffest(-2 * h))) / (12.0 * h * value)
+    assert scene.sensitivities().per[path] == pytest.approx(around, rel=1e-6)
+
+
+def test_traced_slopes_are_the_same(scene):
+    import jax
+
+    with jax.enable_x64():
+        slope = jax.grad(lambda value: scene.replace(**{"modes.1.mass": value}).max_stiffness().stiffness)(-3.0)
+    assert float(slope) == pytest.approx(scene.sensitivities().per["modes.1.mass"], rel=1e-7)
+
+
+def test_certified_verdicts_are_those_of_balls(scene):
+    top = scene.max_stiffness()
+    stiffness = np.array([0.5, 1.0 - 1e-10, 1.0 + 1e-10]) * top.stiffness
+    expected = [any_loop.count_outside(scene, each, float(top.virtual_damping)) == 0 for each in stiffness]
+    found = scene.is_stable(stiffness, top.virtual_damping, method="certified")
+    assert found.tolist() == expected == [True, True, False]
+
+
+@pytest.mark.parametrize("part", ["actuator", "modes"])
+def test_no_passivity_is_claimed(scene, part):
+    alone = zwidth.Scene(zwidth.Device(0.1, 2.0), scene.timing, zwidth.VirtualWall(1e3, 1.0))
+    alone = alone.replace(**{part: getattr(scene.device, part)})
+    with pytest.raises(zwidth.InputError, match=f"passivity with {'an ' if part == 'actuator' else ''}{part}"):
+        alone.passivity_margin()
+    assert zwidth.assess(alone).passive is None
+
+
+def test_a_fast_actuator_and_a_heavy_mode_are_not_felt():
+    plain = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1.5e-3))
+    wall = plain.max_stiffness().stiffness
+    for part in ({"actuator": zwidth.Actuator(1e6)}, {"modes": [zwidth.Mode(100.0, 0.5, 1e9)]}):
+        assert plain.replace(**part).max_stiffness().stiffness == pytest.approx(wall, rel=1e-3)
+
+
+def test_a_lag_of_a_third_period_costs_what_a_delay_of_it_does():
+    plain = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3))
+    lag = plain.replace(actuator=zwidth.Actuator(time_constant=1e-4)).max_stiffness().stiffness
+    late = plain.replace(delay=1e-4).max_stiffness().stiffness
+    assert lag == pytest.approx(late, rel=0.02)
