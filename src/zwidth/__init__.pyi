@@ -58,6 +58,7 @@ from .scenes.assessment import Limit as Limit
 from .scenes.assessment import assess as assess
 from .scenes.assessment import assess_many as assess_many
 from .scenes.assessment import limits_of as limits_of
+from .scenes.recommendation import Recommendation as Recommendation
 from .scenes.robust import Interval as Interval
 from .scenes.robust import RobustStiffness as RobustStiffness
 from .scenes.robust import RobustWall as RobustWall

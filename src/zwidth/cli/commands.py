@@ -76,7 +76,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     """Print the stiffest stable wall of a device.
 
     The device is given by --delta and --d, or by its physical data and parts; then what a little more of each of them
-    would change is printed as well.
+    would change is printed as well. `zwidth recommend` says which softer wall to set.
     """
     from zwidth.parts.device import Device
     from zwidth.parts.timing import Timing
@@ -120,6 +120,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
             *words.scene_lines(scene),
             *lines,
             *(row(label, with_unit(value, unit)) for label, value, unit in labels),
+            row("what to set", "at wanted margins: zwidth recommend, with the same options"),
         ]
         lines += [*(slope.line() for slope in slopes), *words.note_lines(notes)]
     words.tell(result, lines, as_json)

@@ -9,9 +9,17 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import Parsed, json_option, number_or_text, quantity_type, read_share, velocity_options
+from zwidth.cli.options import (
+    Parsed,
+    figure_option,
+    json_option,
+    number_or_text,
+    quantity_type,
+    read_share,
+    velocity_options,
+)
 from zwidth.pages.words import row, tell
-from zwidth.words.errors import InputError, UnusableValueError
+from zwidth.words.errors import UnusableValueError
 from zwidth.words.quantities import POSITIVE
 
 if TYPE_CHECKING:
@@ -79,7 +87,7 @@ _SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
 @click.option("--unknown-cutoff", is_flag=True, help="Find the velocity's cut-off, too; needs --buzz at B > 0.")
-@click.option("--figure", metavar="FILE.png", type=click.Path(path_type=Path), help="Draw what the fit rests on.")
+@figure_option
 @click.option("--yaml", "as_yaml", is_flag=True, help="Print a configuration for `zwidth run`.")
 @json_option
 def fit(
@@ -108,8 +116,6 @@ def fit(
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if as_json and as_yaml:
         raise click.UsageError("give one of --json and --yaml")
-    if figure is not None and figure.suffix not in (".png", ".svg", ".pdf"):
-        raise click.UsageError(f"--figure: got {str(figure)!r}; name a file that ends with .png, .svg or .pdf")
     units, points = LINEAR, ()
     if walls:
         for name, value in {**columns, "max-delay": max_delay, "resample": resample or None}.items():
@@ -154,8 +160,6 @@ def _draw(found: DeviceFit, source: str, points: tuple[Any, ...], units: AxisUni
     from zwidth import figures
     from zwidth.fitting.evidence import gather_evidence
 
-    if not file.parent.is_dir():
-        raise InputError(f"--figure: there is no folder {file.parent}; make it first")
     evidence: dict[str, Any] = gather_evidence(found, source, points, units)
     drawn = figures.draw_device_fit(**evidence, step=found.resolution)
     figures.save(drawn, file.with_suffix(""), (file.suffix[1:],))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import MISSING, fields
 from functools import wraps
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
@@ -115,6 +116,16 @@ def read_share(text: str) -> float:
     """A share: ``2%`` or ``0.02``."""
     text = text.strip()
     return float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+
+
+def _read_figure(text: str) -> Path:
+    """The file of a picture, in a folder that there is."""
+    file = Path(text)
+    if file.suffix not in (".png", ".svg", ".pdf"):
+        raise ValueError(f"got {text!r}; name a file that ends with .png, .svg or .pdf")
+    if not file.parent.is_dir():
+        raise ValueError(f"there is no folder {file.parent}; make it first")
+    return file
 
 
 def flag_of(path: str) -> str:
@@ -241,6 +252,7 @@ def _make_velocity(options: dict[str, Any]) -> Any:
     return part(**given)
 
 
+figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
 velocity_options = _take_options(
     "velocity", [path for path in _PARTS if path.startswith("velocity.")], (), _make_velocity

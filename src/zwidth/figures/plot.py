@@ -6,6 +6,7 @@
     nyquist     the open loop around -1, with its gain crossover
     poles       in the unit circle
     motion      a simulated motion: position and velocity over time
+    recommendation  the wall to set among the stable ones, and its response to a step of force
 
 The look is applied while drawing; matplotlib's settings stay as they are. An Axes without a figure of yours belongs to
 one that pyplot does not know: ``zwidth.figures.save(ax, path)`` or ``ax.figure.savefig(path)`` write it.
@@ -25,10 +26,18 @@ from zwidth.arrays.evaluate import as_float64
 from zwidth.figures import style
 from zwidth.figures.grid import scale_axis
 from zwidth.figures.motion import draw_motion, draw_step
-from zwidth.figures.stable_set import draw_stable_set, name_wall, tabulate_walls, trace_outlines
-from zwidth.figures.table import stack
+from zwidth.figures.stable_set import (
+    draw_recommendation,
+    draw_stable_set,
+    name_wall,
+    tabulate_walls,
+    trace_outlines,
+)
+from zwidth.figures.table import Table, stack
+from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.assessment import passive_edge
+from zwidth.scenes.recommendation import Recommendation
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError
@@ -37,6 +46,7 @@ from zwidth.words.types import ArrayLike
 
 _ANGLES = 181
 _FREQUENCIES = 2000
+_PERIODS, _MOST_PERIODS = 100, 20_000
 
 
 def _axes(ax: Axes | None, width: float = 5.6, height: float = 4.0) -> Axes:
@@ -71,12 +81,45 @@ def region(
     """
     outlines, walls = [], []
     for label, each in (scene if isinstance(scene, Mapping) else {"": scene}).items():
-        outlines += trace_outlines(each, label=label)
-        if passive:
-            edge = tabulate_walls(each, *passive_edge(each, _ANGLES))
-            outlines.append({"label": label, "number": len(outlines) + 1, "piece": "passive", **edge})
+        outlines += _trace(each, label, passive=passive)
         walls.append({"label": label, "wall": "stiffest", **tabulate_walls(each, *each.max_stiffness()[:2])})
     return draw_stable_set(stack(outlines), stack(walls), _axes(ax), normalized=normalized)[0]
+
+
+def _trace(scene: Scene, label: str, *, passive: bool) -> list[dict[str, Any]]:
+    """The outlines of the stable walls, and of the passive ones where they are asked for."""
+    outlines = list(trace_outlines(scene, label=label))
+    if passive:
+        edge = tabulate_walls(scene, *passive_edge(scene, _ANGLES))
+        outlines.append({"label": label, "number": len(outlines) + 1, "piece": "passive", **edge})
+    return outlines
+
+
+@style.house_style()
+def recommendation(
+    found: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
+) -> np.ndarray:
+    """Draw the wall that `zwidth.Scene.recommend` found among the stable ones, and its response to a step of 1 N.
+
+    Args:
+        found: what it returned; without a wall the stable walls alone are drawn.
+        axes: an Axes of yours for the walls alone, or two.
+        response: columns of a step study of this wall, in SI units; computed at the samples where left out.
+    """
+    scene, told, top = found.scene, found.as_dict(), found.stiffest
+    outlines = stack(_trace(scene, "", passive=not find_obstacle(**vars(scene.device)) and scene.device.damping > 0))
+    if found.verdict is None:
+        wall = {"label": "", "wall": "stiffest", **tabulate_walls(scene, *top[:2])}
+        return draw_stable_set(outlines, stack([wall]), axes)
+    K, B = found.stiffness, found.virtual_damping
+    if response is None:
+        # As long as the slowest motion takes to decay, or so many periods.
+        decay = told["recommended"]["decay_time"] or 0.0
+        periods = int(min(max(_PERIODS, 1.5 * decay / scene.timing.period), _MOST_PERIODS))
+        response = stack([_tabulate_step(scene, K, B, periods)])
+    elif np.isfinite(response["settling_time_s"][0]):
+        told["recommended"]["settling_time"] = float(response["settling_time_s"][0])
+    return draw_recommendation(told, outlines, response, axes)
 
 
 @style.house_style()
@@ -124,12 +167,17 @@ def step(
         periods: how many sampling periods.
     """
     K, B = map(float, resolve_wall(scene.wall, stiffness, virtual_damping))
-    columns = {**tabulate_walls(scene, K, B), "label": name_wall(K, B)}
-    columns |= {"time_s": np.arange(periods) * scene.timing.period, "position_m": scene.state_space(K, B).step(periods)}
-    columns["final_position_m"] = 1.0 / K if K else math.nan
-    drawn = draw_step(stack([columns]), _axes(ax, 5.2, 3.4))[0]
+    drawn = draw_step(stack([_tabulate_step(scene, K, B, periods)]), _axes(ax, 5.2, 3.4))[0]
     drawn.lines[0].set(marker=".", markersize=3)
     return drawn
+
+
+def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, periods: int) -> dict[str, Any]:
+    """The response to 1 N at the samples, as columns of a step study."""
+    columns = {**tabulate_walls(scene, stiffness, virtual_damping), "label": name_wall(stiffness, virtual_damping)}
+    columns["time_s"] = np.arange(periods) * scene.timing.period
+    columns["position_m"] = scene.state_space(stiffness, virtual_damping).step(periods)
+    return columns | {"final_position_m": 1.0 / stiffness if stiffness else math.nan}
 
 
 @style.house_style()

@@ -206,16 +206,18 @@ def draw_recommendation(
 
     Args:
         found: the recommendation, as its JSON file holds it.
-        region: columns of a boundary study of the device, in SI units.
+        region: columns of a boundary study of the device, in SI units, or of a device with parts.
         response: columns of a step study of the device with this wall.
         axes: an Axes of yours for the region alone, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.5, 2)
     wall, maximum = found["recommended"], found["maximum"]
-    curve = np.asarray(region["curve"])
-    outlines = {name: region[name] for name in SI_COLUMNS} | {"number": np.zeros(curve.size, int)}
-    outlines |= {"label": np.full(curve.size, ""), "piece": np.where(curve == "passive", curve, "outline")}
-    kinds = np.array(["stiffest", f"recommended ({100 * wall['stiffness_fraction']:g} %)"])
+    outlines = {name: region[name] for name in (*SI_COLUMNS, *({"number", "piece"} & set(region)))}
+    if "piece" not in outlines:
+        curve = np.asarray(region["curve"])
+        outlines |= {"number": np.zeros(curve.size, int), "piece": np.where(curve == "passive", curve, "outline")}
+    outlines["label"] = np.full(len(outlines["piece"]), "")
+    kinds = np.array(["stiffest", f"recommended ({100 * wall['stiffness_fraction']:.3g} %)"])
     walls = {name: np.array([row[key] for row in (maximum, wall)]) for name, key in zip(SI_COLUMNS, _WALL, strict=True)}
     draw_stable_set(outlines, {"label": np.array(["", ""]), "wall": kinds, **walls}, panels[:1])
     factor, _ = style.si_unit(maximum["stiffness"], "N/m")

@@ -29,7 +29,7 @@ from zwidth.loops.linear.ridge import BoundRidge, SceneSensitivities, differenti
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
 from zwidth.loops.rigid.boundary import boundary_point, stable_region
-from zwidth.loops.rigid.margins import Margins, margins
+from zwidth.loops.rigid.margins import Margins, margins, margins_kernel
 from zwidth.loops.rigid.outermost_poles import outermost_poles
 from zwidth.loops.rigid.passivity import passivity_margin
 from zwidth.loops.rigid.poles import poles
@@ -278,9 +278,9 @@ class LinearLoop:
         """What a little more of each parameter of the scene buys of the stiffest wall, in SI units."""
         return differentiate(self.scene, *self.ridge(negative))
 
-    def margins(self, alpha: np.ndarray, beta: np.ndarray) -> Margins:
-        """All margins, in periods and radians a period."""
-        return linear_margins(self.chain, self.boundary, alpha, beta)
+    def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
+        """All margins, in periods and radians a period; that of the delay, which takes longest, may be left out."""
+        return linear_margins(self.chain, self.boundary, alpha, beta, with_delay)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """The device's own damping in excess of what passive walls need."""
@@ -369,8 +369,13 @@ class RigidLoop(LinearLoop):
         found = differentiate_rigid(make_plain(self.scene), negative)
         return super().sensitivities(negative) if found is None else found
 
-    def margins(self, alpha: np.ndarray, beta: np.ndarray) -> Margins:
-        return margins(alpha, beta, self.scene.delta, self.scene.d)
+    def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
+        device = self.scene.delta, self.scene.d
+        if with_delay:
+            return margins(alpha, beta, *device)
+        walls = np.broadcast_arrays(alpha, beta, *map(float, device))
+        with np.errstate(all="ignore"):
+            return margins_kernel(*walls, with_delay=False, with_modulus=False)
 
     def passivity_margin(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         return passivity_margin(alpha, beta, self.scene.own_delta, self.scene.d)

@@ -176,13 +176,8 @@ def check_lines(scene: Scene, verdict: Assessment, limits: list[Limit]) -> list[
 
 
 def limit_lines(limits: list[Limit]) -> list[str]:
-    lines = []
-    for limit in limits:
-        if isfinite(limit.stiffness):
-            less = " (it helps as it is)" if limit.gain < 1 else ""
-            words = f"{limit.words}: K_max {with_unit(limit.stiffness, 'N/m')}, {plain(limit.gain, 3)} times{less}"
-            lines.append(row("" if lines else "what limits it", words))
-    return lines
+    known = [limit for limit in limits if isfinite(limit.stiffness)]
+    return [row("" if k else "what limits it", limit.spell()) for k, limit in enumerate(known)]
 
 
 def friction_lines(rule: FrictionRule) -> list[str]:

@@ -3,19 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any, NamedTuple, TypeAlias
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.loops.linear.passivity import find_obstacle
-from zwidth.parts.velocity import FOAW, BackwardDifference, VelocityFilter, WindowedDifference
-from zwidth.scenes.scene import Scene
+from zwidth.parts.velocity import (
+    FOAW,
+    BackwardDifference,
+    Butterworth,
+    LowPass,
+    VelocityFilter,
+    WindowedDifference,
+)
+from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.stiffest import StiffestWall, stiffest_wall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import tell_apart, to_json
+from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.status import RidgeKind, Status
+
+if TYPE_CHECKING:
+    from zwidth.scenes.scene import Scene
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
@@ -84,10 +94,7 @@ def assess(scene: Scene) -> Assessment:
         >>> verdict.stable, verdict.passive
         (True, False)
     """
-    if scene.timing.delay_model != "held":
-        raise InputError(
-            f"delay_model: got {scene.timing.delay_model!r}, which has no poles; use 'held' to judge a single wall"
-        )
+    check_held(scene)
     stands, best, known = scene.margins(), scene.max_stiffness(), not find_obstacle(**vars(scene.device))
     margin = float(scene.passivity_margin()) if known else math.nan
     top = scene.normalize_walls(best.stiffness, best.virtual_damping)
@@ -117,6 +124,14 @@ def assess(scene: Scene) -> Assessment:
         frequency=slowest.angle / (2.0 * math.pi * period),
         **{name: float(getattr(stands, name)) for name in _MARGINS},
     )
+
+
+def check_held(scene: Scene) -> None:
+    """Refuse the delay model in which no wall can be judged."""
+    if scene.timing.delay_model != "held":
+        raise InputError(
+            f"delay_model: got {scene.timing.delay_model!r}, which has no poles; use 'held' to judge a single wall"
+        )
 
 
 def name_kind(wall: StiffestWall) -> str:
@@ -163,42 +178,57 @@ def assess_many(scenes: Iterable[Scene] | Mapping[str, Scene]) -> list[dict[str,
 def _record(name: str | int, scene: Scene) -> dict[str, Any]:
     head: dict[str, Any] = {"scene": name, "status": Status.OK.name, "message": ""}
     try:
-        if not isinstance(scene, Scene):
+        if not isinstance(scene, SceneAnswers):
             raise InputError(f"scene: got {scene!r}; a zwidth.Scene is needed")
         verdict = assess(scene).as_dict()
     except InputError as error:
         verdict, head = {}, head | {"status": Status.INVALID_INPUT.name, "message": str(error)}
-    own = scene.parameters() if isinstance(scene, Scene) else {}
+    own = scene.parameters() if isinstance(scene, SceneAnswers) else {}
     return head | own | verdict
 
 
-# "Ideal" sampling is so many times faster, or as much less as keeps window and delay within what a search affords.
-_FASTER = 64
+# What somebody can buy of a parameter, by its path: the factor on it, and the words.
+_STEPS = {
+    "delay": (0.5, "half the delay"),
+    "damping": (1.1, "10 % more damping of the device"),
+    "velocity.cutoff": (2.0, "a velocity filter twice as fast"),
+    "velocity.time_constant": (0.5, "a velocity filter twice as fast"),
+    "velocity.samples": (0.5, "a velocity window half as long"),
+    "actuator.cutoff": (2.0, "an amplifier twice as fast"),
+    "actuator.time_constant": (0.5, "an amplifier twice as fast"),
+    "coupling.stiffness": (2.0, "a link twice as stiff"),
+}
 
 
 class Limit(NamedTuple):
-    """One thing made ideal: its name, what was changed in words, K_max then in N/m, and by what factor it grew."""
+    """One thing that limits: its name, a step that can be bought, K_max then in N/m, and by what factor it grew."""
 
     name: str
     words: str
     stiffness: float
     gain: float
 
+    def spell(self) -> str:
+        """The step and what it buys."""
+        less = " (it helps as it is)" if self.gain < 1 else ""
+        return f"{self.words}: K_max {with_unit(self.stiffness, 'N/m')}, {plain(self.gain, 3)} times{less}"
+
 
 def limits_of(scene: Scene) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
-    Each thing that the scene has is made ideal by itself: the filter (the plain difference of two samples instead),
-    the delay (none), the sampling (64 times faster, or less where window and delay are long; both, and the filter, the
-    same in seconds) and the compliance (rigid, with the tip's mass added to the motor's).
+    Each thing that the scene has is improved by itself, by a step that somebody can buy: twice the rate (delay and
+    window the same in seconds), half the delay, a tenth more damping, a filter or an amplifier twice as fast (without a
+    filter where twice its cut-off is beyond half the rate), a window half as long, a link twice as stiff, or the
+    structure behind the modes.
 
     Args:
         scene: a scene of plain numbers.
 
     Returns:
         One record each, the largest gain first. What makes the wall softer is listed as well, with a gain below 1: a
-        tip that is loose may help. The sampling of a filter given by its coefficients is left out, for nobody knows
-        what it were at another rate. NaN where a K_max cannot be computed; those come last.
+        filter may help as it is. A filter given by its coefficients has no steps, and no rate but its own. NaN where a
+        K_max cannot be computed; those come last.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section VII (what damping, mass, rate and delay change of a rigid device).
@@ -207,13 +237,13 @@ def limits_of(scene: Scene) -> list[Limit]:
         >>> import zwidth
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=30))
-        >>> [limit.name for limit in zwidth.limits_of(scene)]
-        ['delay', 'velocity', 'period']
+        >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
+        ['a velocity filter twice as fast', 'half the delay']
     """
     now = _stiffness(scene)
     found = []
-    for name, words, ideal in _ideals(scene):
-        stiffness = _stiffness(ideal)
+    for name, words, improved in _improve(scene):
+        stiffness = _stiffness(improved)
         found.append(Limit(name, words, stiffness, stiffness / now))
     # NaN is larger than nothing.
     return sorted(found, key=lambda limit: (not limit.gain >= 0, -limit.gain))
@@ -232,41 +262,46 @@ def describe_islands(scene: Scene) -> list[str]:
 
 
 def _stiffness(scene: Scene) -> float:
+    """K_max in N/m; NaN where there is none or it cannot be computed."""
     try:
         wall = stiffest_wall(scene)
     except InputError:
-        # Many times faster a long delay may be more periods than the model is computed for.
+        # At twice the rate a long delay may be more periods than the model is computed for.
         return float("nan")
     return float(wall.stiffness) if wall.status == Status.OK else float("nan")
 
 
-def _ideals(scene: Scene) -> list[tuple[str, str, Scene]]:
-    """The scene with one thing ideal, for each thing it has."""
-    found = []
-    if "velocity" in scene.parts_beyond:
-        found.append(("velocity", "the velocity unfiltered", scene.replace(velocity=BackwardDifference())))
-    if scene.timing.delay > 0:
-        found.append(("delay", "no delay", scene.replace(delay=0.0)))
-    faster = _affordable_rate(scene)
-    if faster > 1:
-        found.append(("period", f"sampled {faster} times faster", _sample_faster(scene, faster)))
-    coupling = scene.device.coupling
-    if coupling is not None:
-        rigid = scene.replace(coupling=None, mass=scene.device.mass + coupling.mass)
-        found.append(("coupling", "no compliance between motor and tip", rigid))
-    if scene.device.actuator is not None:
-        found.append(("actuator", "an actuator without lag", scene.replace(actuator=None)))
+def _improve(scene: Scene) -> Iterator[tuple[str, str, Scene]]:
+    """The scene with one thing improved, for each thing it has: the part's name, the step in words, the scene."""
+    if _can_sample_faster(scene):
+        same = ", the delay the same in seconds" if scene.timing.delay else ""
+        yield "period", f"twice the rate{same}", _sample_faster(scene, 2)
+    values = scene.parameters()
+    for path, (factor, words) in _STEPS.items():
+        if not (now := values.get(path)):
+            continue
+        better = max(1, round(factor * now)) if isinstance(now, int) else factor * now
+        if better == now:
+            continue
+        improved = scene.replace(**{path: better})
+        if path == "velocity.cutoff" and isinstance(scene.velocity, LowPass | Butterworth):
+            try:
+                improved.check_parts()
+            except InputError:
+                # Beyond half the rate there is no filter.
+                improved, words = scene.replace(velocity=BackwardDifference()), "no velocity filter"
+        yield path.partition(".")[0], words, improved
     if scene.device.modes:
-        found.append(("modes", "no resonances", scene.replace(modes=())))
-    return found
+        stiffer = tuple(replace(mode, frequency=math.sqrt(2.0) * mode.frequency) for mode in scene.device.modes)
+        yield "modes", "a structure twice as stiff", scene.replace(modes=stiffer)
 
 
-def _affordable_rate(scene: Scene) -> int:
-    """How many times faster the sampling may be, 1 where nobody knows what the filter were then."""
+def _can_sample_faster(scene: Scene) -> bool:
+    """Whether twice the rate can be computed; nobody knows what a filter of coefficients were then."""
     if isinstance(scene.velocity, VelocityFilter):
-        return 1
+        return False
     window = scene.velocity.samples if isinstance(scene.velocity, WindowedDifference) else 1
-    return int(min(_FASTER, scene.loop.most_periods / (window + scene.d)))
+    return 2 * (window + scene.d) <= scene.loop.most_periods
 
 
 def _sample_faster(scene: Scene, faster: int) -> Scene:

@@ -21,6 +21,7 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.answers import SceneAnswers
+from zwidth.scenes.recommendation import Recommendation, recommend
 from zwidth.scenes.stiffest import (
     BestDamping,
     Goal,
@@ -331,6 +332,42 @@ class Scene(SceneAnswers):
             25.8 N s/m, spectral radius 0.759
         """
         return find_best_damping(self, stiffness, goal, negative_damping)
+
+    def recommend(
+        self,
+        *,
+        stiffness_fraction: float | None = None,
+        gain_margin: float | None = None,
+        phase_margin: float | None = None,
+        passive: bool = False,
+    ) -> Recommendation:
+        """The stiffest wall that keeps some distance from trouble: the one to set on this device.
+
+        Args:
+            stiffness_fraction: at most this share of K_max, between 0 and 1; 0.75 where nothing is asked for.
+            gain_margin: at least this factor on stiffness and damping together, > 1.
+            phase_margin: at least so many degrees, > 0.
+            passive: whether the wall must be passive.
+
+        Returns:
+            Recommendation: ``stiffness`` and ``virtual_damping``; ``limited_by``, what allows no more; ``verdict``,
+            what `zwidth.assess` says of the wall; ``steps``, what could be bought for a stiffer one; ``code("c")``, the
+            wall for a control loop. ``status`` is UNREACHABLE, and there is no wall, where nothing softer keeps what is
+            asked for either.
+
+        Numerics:
+            A share of K_max alone is in closed form, with the damping of the stiffest wall where it is stable. Margins
+            take a search over K and B: each wall is judged by `margins` and `passivity_margin` themselves, and K lies
+            within 2e-4 of the largest that was found; 0.3 s for a rigid device, some seconds with other parts.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> found = scene.recommend(phase_margin=30)
+            >>> print(f"{found.stiffness:.0f} N/m and {found.virtual_damping:.1f} N s/m")
+            8009 N/m and 33.4 N s/m
+        """
+        return recommend(self, stiffness_fraction, gain_margin, phase_margin, passive)
 
     def simulate(
         self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None, **options: Any

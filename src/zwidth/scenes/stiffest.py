@@ -220,19 +220,21 @@ def find_best_damping(
     columns = soft_dampings(scene, stiffness, negative_damping)
     if not columns:
         return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-    best = min((_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))
+    best = min((find_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))
     return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)
 
 
-def _lowest(cost: Callable[[np.ndarray], np.ndarray], low: float, high: float) -> float:
+def find_lowest(
+    cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, steps: int = _STEPS
+) -> float:
     """Where a function with kinks and several dips is lowest: samples, then golden section around the lowest dips."""
-    grid = np.linspace(low, high, _SAMPLES)
+    grid = np.linspace(low, high, samples)
     # On the boundary itself nothing is gained.
     values = np.pad(cost(grid[1:-1]), 1, constant_values=math.inf)
     dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
     dips = dips[np.argsort(values[dips])][:_DIPS]
     left, middle, right, value = grid[dips - 1], grid[dips], grid[dips + 1], values[dips]
-    for _ in range(_STEPS):
+    for _ in range(steps):
         upwards = right - middle > middle - left
         trial = middle + _GOLDEN * np.where(upwards, right - middle, left - middle)
         reached = cost(trial)

@@ -90,7 +90,7 @@ def test_the_words_of_a_scene_with_parts():
     ]
     assert "cutoff 100.0 Hz" in out[2]
     assert "K_max = 11.94 kN/m at B = 27.02 N s/m" in out[10]
-    assert out[13].startswith("what limits it        no delay: K_max")
+    assert out[13].startswith("what limits it        half the delay: K_max")
 
 
 def test_every_scene_has_the_same_keys():
@@ -119,9 +119,10 @@ def test_how_far_it_is_to_the_boundary(wall, words, name):
 def test_a_rigid_scene_says_what_limits_it_too():
     out = run("check", *WALL, *DEVICE, *RATE).stdout
     assert "\npassive               " in out
-    first, second = out.splitlines()[-2:]
-    assert first.startswith("what limits it        no delay: K_max 82.58 kN/m, 4.16 times")
-    assert second.startswith("                      sampled 64 times faster: ")
+    first, second, third = out.splitlines()[-3:]
+    assert first.startswith("what limits it        half the delay: K_max 34.23 kN/m, 1.72 times")
+    assert second.startswith("                      twice the rate, the delay the same in seconds: ")
+    assert third.startswith("                      10 % more damping of the device: ")
 
 
 def test_rate_and_period_are_one_thing():

@@ -5,11 +5,11 @@ from click.testing import CliRunner
 
 import zwidth
 from zwidth.cli.commands import cli
-from zwidth.studies.recommend import spell_answer
 from zwidth.words.formatting import plain, with_unit
 
 HEAD = "version: 1\nname: small\n"
 STUDY = "studies: [{kind: recommend, name: best, stiffness_fraction: %s}]\n"
+MARGINS = "studies: [{kind: recommend, name: best, phase_margin: %g, passive: %s}]\n"
 SCENES = {
     "rigid": ("{mass: 0.1, damping: 10, period: 1e-3, delay: 1 ms}", zwidth.BackwardDifference()),
     "filter": (
@@ -52,10 +52,9 @@ def test_a_recommendation_is_told_again_whenever_the_run_is(name, run):
     assert run(f"scene: {scene}\n" + STUDY % 0.5, "--resume") == told
 
 
-def test_a_recommendation_that_is_not_stable_says_so():
-    best = {"stiffness_fraction": 0.5, "stiffness": 5e3, "virtual_damping": 20.0, "stable": False}
-    found = {"recommended": best, "maximum": {"stiffness": 10e3}}
-    first, second = spell_answer(found, None)
-    assert first.startswith("K = 5.000 kN/m, B = 20.00 N s/m: 50 % of")
-    assert second == "NOT stable; choose another stiffness_fraction"
-    assert spell_answer({**found, "recommended": {**best, "stiffness": None}}, None) == ()
+def test_a_study_asks_for_margins(run):
+    first, _ = run("scene: {mass: 0.1, damping: 10, period: 1e-3}\n" + MARGINS % (30, "true"))
+    found = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3)).recommend(phase_margin=30, passive=True)
+    assert " ".join(first.split()) == f"best {found.lines()[0]}"
+    (told,) = run("scene: {mass: 0.1, period: 1e-3}\n" + MARGINS % (30, "true"), "--overwrite")
+    assert "no wall: none was found that keeps a phase margin of 30 degrees and passivity" in told

@@ -1,9 +1,21 @@
-"""What limits a scene: each ideal scene is what its record says."""
+"""What limits a scene: each step is a scene that somebody could have, and what its record says."""
 
 import numpy as np
 import pytest
 
-from zwidth import Coupling, Device, LowPass, Scene, Timing, VelocityFilter, WindowedDifference, limits_of
+from zwidth import (
+    Actuator,
+    Butterworth,
+    Coupling,
+    Device,
+    LowPass,
+    Mode,
+    Scene,
+    Timing,
+    VelocityFilter,
+    WindowedDifference,
+    limits_of,
+)
 from zwidth.scenes import assessment
 
 RIGID = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3))
@@ -13,38 +25,64 @@ def test_a_filter_and_a_compliance():
     scene = RIGID.replace(velocity=LowPass(cutoff=100.0), coupling=Coupling(0.05, 2e4, 1.0))
     found = limits_of(scene)
     now = scene.max_stiffness().stiffness
-    ideals = {
-        "velocity": RIGID.replace(coupling=scene.device.coupling),
-        "delay": scene.replace(delay=0.0),
-        "coupling": RIGID.replace(velocity=scene.velocity, mass=0.15),
-        "period": scene.replace(period=1e-3 / 64),
+    better = {
+        "velocity": scene.replace(velocity=LowPass(cutoff=200.0)),
+        "delay": scene.replace(delay=0.5e-3),
+        "coupling": scene.replace(coupling=Coupling(0.05, 4e4, 1.0)),
+        "period": scene.replace(period=0.5e-3),
+        "damping": scene.replace(damping=11.0),
     }
-    assert {limit.name for limit in found} == set(ideals)
+    assert {limit.name for limit in found} == set(better)
     gains = [limit.gain for limit in found]
     assert gains == sorted(gains, reverse=True)
     for limit in found:
-        assert limit.stiffness == pytest.approx(ideals[limit.name].max_stiffness().stiffness, rel=1e-12)
+        assert limit.stiffness == pytest.approx(better[limit.name].max_stiffness().stiffness, rel=1e-12)
         assert limit.gain == pytest.approx(limit.stiffness / now, rel=1e-12)
 
 
 def test_what_cannot_be_computed_comes_last(monkeypatch):
     scene = RIGID.replace(velocity=LowPass(cutoff=100.0), coupling=Coupling(0.05, 2e4, 1.0))
-    first, *others = [limit.name for limit in limits_of(scene)]
+    names = [limit.name for limit in limits_of(scene)]
     known = assessment._stiffness
-    assert first == "delay"
-    monkeypatch.setattr(assessment, "_stiffness", lambda of: np.nan if of.timing.delay == 0 else known(of))
-    assert [limit.name for limit in limits_of(scene)] == [*others, first]
+    monkeypatch.setattr(assessment, "_stiffness", lambda of: np.nan if of.timing.delay == 0.5e-3 else known(of))
+    names.remove("delay")
+    assert [limit.name for limit in limits_of(scene)] == [*names, "delay"]
 
 
 def test_only_what_the_scene_has():
-    assert [limit.name for limit in limits_of(RIGID.replace(delay=0.0))] == ["period"]
+    assert [limit.name for limit in limits_of(RIGID.replace(delay=0.0, damping=0.0))] == ["period"]
     coefficients = VelocityFilter([500.0, 0.0, -500.0], [1.0, 0.0, 0.0])
-    assert {limit.name for limit in limits_of(RIGID.replace(velocity=coefficients))} == {"velocity", "delay"}
+    assert {limit.name for limit in limits_of(RIGID.replace(velocity=coefficients))} == {"delay", "damping"}
+
+
+@pytest.mark.parametrize("velocity", [LowPass(cutoff=300.0, order=2), Butterworth(250.0)])
+def test_a_filter_that_cannot_be_twice_as_fast_is_left_out(velocity):
+    scene = RIGID.replace(velocity=velocity)
+    (limit,) = [limit for limit in limits_of(scene) if limit.name == "velocity"]
+    assert limit.words == "no velocity filter"
+    assert limit.stiffness == RIGID.max_stiffness().stiffness
 
 
 def test_a_window_keeps_its_length_in_seconds():
     scene = RIGID.replace(velocity=WindowedDifference(15, coded_period=2e-3))
-    (limit,) = [limit for limit in limits_of(scene) if limit.name == "period"]
-    assert limit.words == "sampled 8 times faster"
-    same = scene.replace(period=1e-3 / 8, velocity=WindowedDifference(120, coded_period=2e-3 / 8))
-    assert limit.stiffness == pytest.approx(same.max_stiffness().stiffness, rel=1e-12)
+    found = {limit.name: limit for limit in limits_of(scene)}
+    assert found["period"].words == "twice the rate, the delay the same in seconds"
+    same = scene.replace(period=0.5e-3, velocity=WindowedDifference(30, coded_period=1e-3))
+    assert found["period"].stiffness == pytest.approx(same.max_stiffness().stiffness, rel=1e-12)
+    half = scene.replace(velocity=WindowedDifference(8, coded_period=2e-3))
+    assert found["velocity"].stiffness == pytest.approx(half.max_stiffness().stiffness, rel=1e-12)
+
+
+def test_amplifier_and_structure():
+    device = Device(0.1, 10.0, actuator=Actuator(cutoff=300.0), modes=[Mode(200.0, 0.1, 0.5)])
+    scene = Scene(device, Timing(1e-3))
+    found = {limit.name: limit for limit in limits_of(scene)}
+    faster = scene.replace(**{"actuator.cutoff": 600.0})
+    assert found["actuator"].words == "an amplifier twice as fast"
+    assert found["actuator"].stiffness == pytest.approx(faster.max_stiffness().stiffness, rel=1e-12)
+    stiffer = scene.replace(**{"modes.0.frequency": 200.0 * np.sqrt(2.0)})
+    assert found["modes"].stiffness == pytest.approx(stiffer.max_stiffness().stiffness, rel=1e-12)
+
+
+def test_a_window_too_long_for_twice_the_rate_has_no_such_step():
+    assert "period" not in {limit.name for limit in limits_of(RIGID.replace(velocity=WindowedDifference(70)))}

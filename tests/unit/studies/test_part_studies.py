@@ -61,7 +61,7 @@ def test_a_recommendation_with_the_sensor_at_the_tip_leaves_passivity_open():
     best = json.loads(outcome.documents["recommendation.json"])["recommended"]
     assert best["stable"] is True
     assert best["passive"] is None
-    assert "is passive: not known, the sensor is not where the force acts." in outcome.documents["recommendation.md"]
+    assert "is passive: not known with the sensor at the tip." in outcome.documents["recommendation.md"]
 
 
 def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
@@ -82,7 +82,7 @@ def test_a_recommendation_has_a_stable_wall_and_the_damping_that_goes_with_it():
     assert best["spectral_radius"] == pytest.approx(np.abs(scene.poles(*wall)).max(), rel=1e-9)
     assert best["decay_time"] == pytest.approx(-1e-3 * np.log(50) / np.log(best["spectral_radius"]))
     assert outcome.notes == ()
-    assert len(outcome.figures[""]()) == 1
+    assert len(outcome.figures[""]()) == 2
 
 
 def test_a_recommendation_is_of_walls_that_soft_ones_lead_to():

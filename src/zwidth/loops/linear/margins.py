@@ -300,7 +300,9 @@ def _is_first_loss(chain: Chain, alpha: float, beta: float, margin: float) -> bo
     return all(log < 0 for log in logs[:-1]) and logs[-1] > 0
 
 
-def linear_margins(chain: Chain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray) -> Margins:
+def linear_margins(
+    chain: Chain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray, with_delay: bool = True
+) -> Margins:
     """All margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
     stable = label_walls(boundary, alpha, beta)
     inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
@@ -311,8 +313,8 @@ def linear_margins(chain: Chain, boundary: Boundary, alpha: np.ndarray, beta: np
         if not inside[place]:
             continue
         found = margins_of(OpenLoop.lay_out(boundary.loop, a, b, boundary.w), good)
-        delay = 0.0
-        if good:
+        delay = 0.0 if with_delay else np.nan
+        if good and with_delay:
             loops = loops or DelayedLoops.lay_out(chain)
             delay = delay_margin(loops, a, b)
         out[(slice(None), *place)] = found._replace(delay_margin=delay)

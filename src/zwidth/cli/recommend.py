@@ -1,0 +1,54 @@
+"""`zwidth recommend`: the wall to set on a device, what would allow a stiffer one, and the code of its loop."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from zwidth.cli.commands import cli
+from zwidth.cli.options import Parsed, figure_option, json_option, read_share, scene_options
+from zwidth.pages import words
+from zwidth.pages.words import row
+
+
+@cli.command()
+@scene_options(wall=False, required=True)
+@click.option(
+    "--stiffness-fraction",
+    type=Parsed("SHARE", read_share, "write a share, as 60% or 0.6"),
+    help="At most this share of K_max.  [default: 75% where nothing else is asked for]",
+)
+@click.option(
+    "--gain-margin", type=click.FloatRange(1.0, min_open=True), help="At least this factor on K and B together."
+)
+@click.option(
+    "--phase-margin", type=click.FloatRange(0.0, 180.0, min_open=True, max_open=True), help="At least so many degrees."
+)
+@click.option("--passive", is_flag=True, help="Only walls that are passive, whatever the hand.")
+@figure_option
+@click.option("--code", type=click.Choice(("c", "python")), help="Print the wall as a program for the loop, alone.")
+@json_option
+def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wanted: Any) -> None:
+    """Say which wall to set on a device: the stiffest one that keeps the margins asked for.
+
+    Then what else is known of that wall, and what would allow a stiffer one.
+    """
+    if code and as_json:
+        raise click.UsageError("give --code or --json: each has all of the output")
+    found = scene.recommend(**wanted)
+    if figure is not None:
+        from zwidth.figures import plot, save
+
+        save(plot.recommendation(found), figure.with_suffix(""), (figure.suffix[1:],))
+    if code:
+        click.echo(found.code(code), nl=False)
+        return
+    notes = [*words.coded_period_notes(scene), *found.notes]
+    lines = [*words.scene_lines(scene), *(row("" if k else "set", text) for k, text in enumerate(found.lines()))]
+    if found.verdict is not None:
+        lines.append(row("slowest pole", words.pole_words(found.verdict.time_constant, found.verdict.frequency)))
+    lines += [row("" if k else "what buys stiffness", step.spell()) for k, step in enumerate(found.steps)]
+    lines += [row("wrote", str(figure))] if figure is not None else []
+    words.tell(found.as_dict() | {"notes": notes}, lines + words.note_lines(notes), as_json)

@@ -1,0 +1,314 @@
+"""The wall to set on a device: as stiff as what is wanted of it allows, and what would allow more."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from zwidth.arrays.roots import false_position
+from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.loops.rigid.response import decay_time
+from zwidth.parts.checks import check_number
+from zwidth.parts.wall import NoWall, VirtualWall
+from zwidth.scenes.assessment import Assessment, Limit, assess, check_held, describe_islands, limits_of, name_kind
+from zwidth.scenes.stiffest import StiffestWall, choose_damping, find_lowest, soft_dampings, stiffest_wall
+from zwidth.scenes.wall_code import write_wall
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
+from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
+from zwidth.words.status import Status
+
+# Dampings tried at a stiffness, and steps of golden section round the best of them.
+_SAMPLES, _STEPS = 18, 14
+# Stiffnesses tried downwards from the most that is allowed, each this much of the one before; and how close to the
+# stiffest that keeps all margins the wall lies.
+_DOWN, _TRIALS, _CLOSE = 0.25, 15, 1e-4
+
+RANGES = {"gain_margin": Range(1.0, low_open=True), "phase_margin": Range(0.0, 180.0, True, True)}
+_OTHER_DAMPING = "with the damping of the stiffest wall this share of its stiffness is not stable: B is another one"
+_UNITS = {
+    "stiffness": "N/m",
+    "damping": "N s/m",
+    "virtual_damping": "N s/m",
+    "mass": "kg",
+    "time": "s",
+    "frequency": "Hz",
+}
+_WALL = ("stiffness", "virtual_damping")
+_JUDGED = (
+    *("alpha", "beta", "virtual_damping_lower", "virtual_damping_upper", "spectral_radius", "passive"),
+    *("passivity_margin", "time_constant", "frequency", "gain_margin", "phase_margin", "delay_margin"),
+)
+
+
+class Wanted(NamedTuple):
+    """What is asked of a wall; None where nothing is."""
+
+    stiffness_fraction: float | None = None  # at most this share of K_max
+    gain_margin: float | None = None  # at least, a factor
+    phase_margin: float | None = None  # at least, in degrees
+    passive: bool = False
+
+    @classmethod
+    def check(
+        cls, stiffness_fraction: float | None, gain_margin: float | None, phase_margin: float | None, passive: bool
+    ) -> Wanted:
+        """What is asked, with the usual share of K_max where nothing else is; or `InputError`."""
+        ranges = {"stiffness_fraction": FRACTION, **RANGES}
+        given = dict(zip(ranges, (stiffness_fraction, gain_margin, phase_margin), strict=True))
+        for name, value in given.items():
+            number = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+            if value is not None and not (number and math.isfinite(value) and ranges[name].holds(value)):
+                raise InputError(f"{name}: got {value!r}; a number {ranges[name]} is needed")
+        if not isinstance(passive, bool | np.bool_):
+            raise InputError(f"passive: got {passive!r}; True or False is needed")
+        if gain_margin is None and phase_margin is None and not passive and stiffness_fraction is None:
+            given["stiffness_fraction"] = RECOMMENDED_SHARE
+        return cls(**given, passive=bool(passive))
+
+    def spell(self, name: str) -> str:
+        """One of them in words."""
+        return {
+            "gain_margin": f"a gain margin of {self.gain_margin:g}" if self.gain_margin else "",
+            "phase_margin": f"a phase margin of {self.phase_margin:g} degrees" if self.phase_margin else "",
+            "passive": "passivity",
+        }[name]
+
+
+@dataclass(frozen=True)
+class Recommendation:
+    """A wall to set on a device; from `zwidth.Scene.recommend`.
+
+    Attributes:
+        scene: the device with this wall as its own, for `zwidth.assess`, `zwidth.simulate` and pictures.
+        stiffest: the stiffest stable wall of the device.
+        wanted: what was asked of the wall.
+        limited_by: which of that allows no stiffer wall: "stiffness_fraction", "gain_margin", "phase_margin" or
+            "passive"; "" where there is no wall.
+        status: code of `zwidth.Status`; where it is not OK there is no wall to set.
+        reason: why there is none.
+        notes: what else to know, in sentences.
+    """
+
+    scene: Any
+    stiffest: StiffestWall
+    wanted: Wanted
+    limited_by: str
+    status: Status
+    reason: str = ""
+    notes: tuple[str, ...] = ()
+
+    @property
+    def stiffness(self) -> float:
+        """K in N/m; NaN where there is no wall."""
+        return float(self.scene.wall.stiffness) if self.status == Status.OK else math.nan
+
+    @property
+    def virtual_damping(self) -> float:
+        """B in N s/m; NaN where there is no wall."""
+        return float(self.scene.wall.virtual_damping) if self.status == Status.OK else math.nan
+
+    @cached_property
+    def verdict(self) -> Assessment | None:
+        """What `zwidth.assess` finds of the wall; None where there is none."""
+        return assess(self.scene) if self.status == Status.OK else None
+
+    @cached_property
+    def steps(self) -> list[Limit]:
+        """What would allow a stiffer wall, in steps that can be bought, by `zwidth.limits_of`: the best first."""
+        known = limits_of(self.scene) if self.stiffest.status == Status.OK else []
+        return [step for step in known if step.gain > 1.0]
+
+    def code(self, language: Literal["c", "python"] = "c") -> str:
+        """The wall with its velocity estimate as the difference equations of a control loop.
+
+        Args:
+            language: "c" (C99 without any library) or "python".
+
+        Returns:
+            A text: a state, a function that begins at rest and one that turns a position in m, positive into the wall,
+            into the force on the device in N, once a period. Forces are those of `zwidth.simulate` with
+            ``contact="unilateral"`` but for rounding.
+
+        Raises:
+            InputError: there is no wall, or no such language.
+        """
+        if self.status != Status.OK:
+            raise InputError(f"code: there is no wall: {self.reason}")
+        return write_wall(self.scene, language)
+
+    def lines(self) -> tuple[str, ...]:
+        """The wall in two lines, what to set and how far that is from trouble; in one why there is none."""
+        verdict = self.verdict
+        if verdict is None:
+            return (f"no wall: {self.reason}",)
+        K, B, largest = with_unit(self.stiffness, "N/m"), with_unit(self.virtual_damping, "N s/m"), self.stiffest[0]
+        share = 100.0 * self.stiffness / float(largest)
+        first = f"K = {K}, B = {B}: {share:.4g} % of the stiffest stable wall, {with_unit(float(largest), 'N/m')}"
+        if self.limited_by != "stiffness_fraction":
+            first += f"; {self.wanted.spell(self.limited_by)} allows no more"
+        lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper)
+        delay = verdict.delay_margin
+        apart = (
+            f"gain {plain(verdict.gain_margin)}",
+            f"phase {plain(verdict.phase_margin)} degrees",
+            f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
+        )
+        rest = f"margins: {', '.join(apart)}; passive: {self.spell_passive()}"
+        return first, f"stable for B from {lower} to {upper} N s/m; {rest}"
+
+    def spell_passive(self) -> str:
+        """Whether the wall is passive, or why that is not known."""
+        passive = None if self.verdict is None else self.verdict.passive
+        obstacle = find_obstacle(**vars(self.scene.device)).partition(":")[0]
+        return {True: "yes", False: "no", None: f"not known {obstacle}".rstrip()}[passive]
+
+    def as_dict(self) -> dict[str, Any]:
+        """All of it as plain JSON values in SI units, with the normalized ones beside them; None where not known."""
+        scene, verdict, top = self.scene, self.verdict, self.stiffest
+        judged = {} if verdict is None else verdict.as_dict()
+        device = {name: value for name, value in scene.parameters().items() if name not in _WALL}
+        constant = math.nan if verdict is None or not verdict.stable else verdict.time_constant
+        alpha, beta = scene.normalize_walls(top.stiffness, top.virtual_damping)
+        found = {
+            "units": _UNITS,
+            "device": {**device, "velocity": type(scene.velocity).__name__, "delta": float(scene.delta), "d": scene.d},
+            "maximum": {
+                "stiffness": float(top.stiffness),
+                "virtual_damping": float(top.virtual_damping),
+                "alpha": float(alpha),
+                "beta": float(beta),
+                "frequency": float(top.frequency),
+                "kind": name_kind(top),
+            },
+            "wanted": self.wanted._asdict(),
+            "recommended": {
+                "stiffness_fraction": self.stiffness / float(top.stiffness),
+                "limited_by": self.limited_by,
+                "stiffness": self.stiffness,
+                "virtual_damping": self.virtual_damping,
+                **{name: judged.get(name) for name in _JUDGED},
+                "stable": verdict is not None and verdict.stable,
+                "decay_time": float(decay_time(1.0 / np.float64(constant))),
+                # Of the response to a step, where one is drawn.
+                "settling_time": None,
+            },
+            "steps": [step._asdict() for step in self.steps],
+            "reason": self.reason,
+            "notes": list(self.notes),
+        }
+        if self.limited_by == "stiffness_fraction":
+            # As it was given: the quotient may have another last digit.
+            found["recommended"]["stiffness_fraction"] = self.wanted.stiffness_fraction
+        return to_json(found)
+
+
+def recommend(
+    scene: Any,
+    stiffness_fraction: float | None,
+    gain_margin: float | None,
+    phase_margin: float | None,
+    passive: bool,
+) -> Recommendation:
+    """See `zwidth.Scene.recommend`."""
+    check_held(scene)
+    wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive)
+    bare = scene.replace(wall=NoWall())
+    top, notes = stiffest_wall(bare), describe_islands(bare)
+    if top.status != Status.OK:
+        status = Status(int(top.status))
+        return Recommendation(bare, top, wanted, "", status, status.message, tuple(notes))
+    most = (wanted.stiffness_fraction or 1.0) * float(top.stiffness)
+    usual = choose_damping(bare, top, most)
+    limit, stiffness, damping = "stiffness_fraction", most, usual
+    surplus = _measure(bare, wanted)
+    if surplus is not None and not (wanted.stiffness_fraction and min(surplus(most, usual).values()) >= 0):
+        stiffness, damping = _search(bare, surplus, most)
+        if math.isnan(stiffness):
+            asked = " and ".join(wanted.spell(name) for name in surplus(most, usual))
+            undamped = wanted.passive and bare.device.damping == 0
+            why = "without damping of the device no wall is passive" if undamped else "ask for less"
+            reason = f"none was found that keeps {asked}, however soft; {why}"
+            return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
+        spare = surplus(stiffness, damping)
+        if stiffness < most:
+            limit = min(spare, key=lambda name: float(spare[name]))
+    elif not np.all(bare.is_stable(stiffness, damping)):
+        share = most / float(top.stiffness)
+        reason = f"none was found that is stable at {share:g} of the largest stiffness; choose another share"
+        return Recommendation(bare, top, wanted, "", Status.UNREACHABLE, reason, tuple(notes))
+    elif damping != top.virtual_damping:
+        notes.append(_OTHER_DAMPING)
+    wall = VirtualWall(check_number("stiffness", stiffness), check_number("virtual_damping", damping))
+    return Recommendation(bare.replace(wall=wall), top, wanted, limit, Status.OK, notes=tuple(notes))
+
+
+Surplus = Callable[[float, Any], dict[str, np.ndarray]]
+
+
+def _measure(scene: Any, wanted: Wanted) -> Surplus | None:
+    """By how much walls have more than is wanted, by its name, negative for too little; None where nothing is."""
+    own = float(scene.device.damping)
+    if not (wanted.gain_margin or wanted.phase_margin or wanted.passive):
+        return None
+
+    def surplus(stiffness: float, damping: Any) -> dict[str, np.ndarray]:
+        alpha, beta = np.broadcast_arrays(*scene.normalize_walls(stiffness, damping))
+        stable, found = scene.loop.labels(alpha, beta), {}
+        if wanted.gain_margin or wanted.phase_margin:
+            margins = scene.loop.margins(alpha, beta, with_delay=False)
+            with np.errstate(all="ignore"):
+                gain = np.abs(np.log(margins.gain_margin))
+            if wanted.gain_margin:
+                found["gain_margin"] = gain / math.log(wanted.gain_margin) - 1.0
+            if wanted.phase_margin:
+                found["phase_margin"] = np.asarray(margins.phase_margin) / wanted.phase_margin - 1.0
+        if wanted.passive:
+            found["passive"] = np.asarray(scene.passivity_margin(stiffness, damping)) / (own or 1.0)
+        return {name: np.where(stable & ~np.isnan(value), value, -1.0) for name, value in found.items()}
+
+    return surplus
+
+
+def _search(scene: Any, surplus: Surplus, most: float) -> tuple[float, float]:
+    """K and B of the stiffest wall that has all that is wanted, from the most downwards; NaN where none was found."""
+    dampings: dict[float, float] = {}
+
+    def spare(log_stiffness: Any) -> np.float64:
+        """The most that any damping leaves to spare of what is scarcest."""
+        stiffness, unit = math.exp(float(log_stiffness)), scene.units.virtual_damping
+
+        def cost(beta: Any) -> np.ndarray:
+            return -np.min(list(surplus(stiffness, beta * unit).values()), axis=0)
+
+        columns = soft_dampings(scene, stiffness)
+        best = [find_lowest(cost, low, high, _SAMPLES, _STEPS) for low, high in columns]
+        values = [float(cost(beta)) for beta in best]
+        if not values:
+            return np.float64(-1.0)
+        dampings[stiffness] = best[int(np.argmin(values))] * unit
+        return np.float64(-min(values))
+
+    high, above = np.float64(math.log(most)), spare(math.log(most))
+    if above >= 0:
+        return most, dampings[math.exp(float(high))]
+    for _ in range(_TRIALS):
+        low = high + math.log(_DOWN)
+        below = spare(low)
+        if below >= 0:
+            break
+        high, above = low, below
+    else:
+        return math.nan, math.nan
+    edge = false_position(spare, low, high, below, above, 40, 0.3 * _CLOSE)
+    # On the safe side of the edge, or, where that is not proved, at the wall that is known to be.
+    for place in (edge - _CLOSE, low):
+        if spare(place) >= 0:
+            stiffness = math.exp(float(place))
+            return stiffness, dampings[stiffness]
+    return math.nan, math.nan

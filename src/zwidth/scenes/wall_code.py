@@ -1,0 +1,143 @@
+"""A wall with its velocity estimate as the difference equations of a control loop, in C or in Python.
+
+The estimate is a difference over a window and first- and second-order sections in powers of ``zeta = z - 1``: a filter
+that is slow beside the period keeps its digits there, which the coefficients of z lose. A section
+
+    (b2 zeta^2 + b1 zeta + b0)/(zeta^2 + a1 zeta + a0)
+
+has the states ``p = zeta W`` and ``q = W`` with ``zeta^2 W = w = u - a1 p - a0 q``, so that ``y = b2 w + b1 p + b0 q``.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.parts.velocity import Estimate
+from zwidth.words.errors import check_choice
+from zwidth.words.formatting import with_unit
+
+# A root is real whose imaginary part is no more of it than rounding.
+_ROUNDED = 1e-13
+
+_CALLED = (
+    "x is the position in m, 0 at the surface of the wall and positive inside of it; the force on the device is",
+    "in N, and 0 outside of the wall.",
+)
+
+
+class Section(NamedTuple):
+    """``top/bottom`` in powers of zeta, highest first and of one length, 2 or 3; the bottom begins with 1."""
+
+    top: tuple[float, ...]
+    bottom: tuple[float, ...]
+
+
+def find_sections(estimate: Estimate) -> list[Section]:
+    """What follows the window's difference; zeros at z = 1 come first, so that what comes after them stays small."""
+    behind = [1.0] * abs(estimate.lag)
+    zeros = _find_factors(np.append(estimate.zeros, behind if estimate.lag < 0 else []))
+    poles = _find_factors(np.append(estimate.poles, behind if estimate.lag > 0 else []))
+    if any(len(factor) == 3 for factor in (*zeros, *poles)):
+        zeros, poles = _pair(zeros), _pair(poles)
+    poles.sort(key=len, reverse=True)
+    zeros.sort(key=lambda factor: (-len(factor), abs(factor[-1])))
+    # There are no more zeros than poles: each factor of the top finds a bottom that is as long.
+    zeros += [(1.0,)] * (len(poles) - len(zeros))
+    pairs = zip(zeros, poles, strict=True)
+    return [Section((0.0,) * (len(bottom) - len(top)) + top, bottom) for top, bottom in pairs]
+
+
+def _find_factors(roots: np.ndarray) -> list[tuple[float, ...]]:
+    """Real factors by roots that are given by their offsets from 1: ``zeta + offset``, or of a complex pair."""
+    known: list[complex] = roots.tolist()
+    pairs = [one for one in known if one.imag > _ROUNDED * abs(one)]
+    real = [one.real for one in known if abs(one.imag) <= _ROUNDED * abs(one)]
+    return [(1.0, 2.0 * one.real, abs(one) ** 2) for one in pairs] + [(1.0, one) for one in real]
+
+
+def _pair(factors: list[tuple[float, ...]]) -> list[tuple[float, ...]]:
+    """Two factors with one root each as one with two."""
+    single = sorted((factor for factor in factors if len(factor) == 2), key=lambda factor: abs(factor[1]))
+    both = [tuple(np.polymul(*two).tolist()) for two in zip(single[::2], single[1::2], strict=False)]
+    return [factor for factor in factors if len(factor) == 3] + both + single[2 * len(both) :]
+
+
+class WallProgram(NamedTuple):
+    """What a loop does; statements are C and Python alike, but for ``@`` before what is kept to the next sample."""
+
+    head: str
+    window: int
+    states: list[str]
+    start: list[str]  # the states at rest
+    force: list[str]  # from the position x to the velocity v
+    law: str
+
+
+def write_wall(scene: Any, language: str = "c") -> str:
+    """See `zwidth.scenes.recommendation.Recommendation.code`."""
+    check_choice("language", language, ("c", "python"))
+    program = lay_program(scene)
+    return _write_c(program) if language == "c" else _write_python(program)
+
+
+def lay_program(scene: Any) -> WallProgram:
+    """The wall of a scene and its velocity estimate as statements."""
+    period = float(scene.timing.period)
+    estimate = scene.velocity.estimate(period)
+    count, gain = estimate.window, float(estimate.gain) / period
+    if count > 1:
+        force = [f"u = (x - @past[@next]) / {count}", "@past[@next] = x", f"@next = (@next + 1) % {count}"]
+    else:
+        force = ["u = x - @x" if count else "u = x", "@x = x"]
+    # Behind a difference all is 0 at rest.
+    sections = find_sections(estimate)
+    start, states = [] if count or not sections else ["u = x"], []
+    for number, (top, bottom) in enumerate(sections):
+        *inner, last = names = [f"@{name}{number}" for name in "pq"[3 - len(bottom) :]]
+        states += [name[1:] for name in names]
+        start += [f"{name} = 0.0" for name in inner] + [f"{last} = " + ("0.0" if count else f"u / {bottom[-1]!r}")]
+        start += [] if count or number == len(sections) - 1 else [f"u = {top[-1]!r} * {last}"]
+        if top == (1.0, 1.0) and bottom[-1] != 0:
+            # A zero at z = 0: the low-pass as people write it.
+            force += [f"{last} += {bottom[-1]!r} * (u - {last})", f"u = {last}"]
+            start = [line if line != f"{last} = u / {bottom[-1]!r}" else f"{last} = u" for line in start]
+            gain /= bottom[-1]
+            continue
+        back = "".join(f" - {factor!r} * {name}" for factor, name in zip(bottom[1:], names, strict=True))
+        parts = [f"{factor!r} * {name}" for factor, name in zip(top, ("w", *names), strict=True) if factor]
+        force += [f"w = u{back}", f"u = {' + '.join(parts)}", *(f"{last} += {name}" for name in inner)]
+        force.append(f"{names[0]} += w")
+    K, B = float(scene.wall.stiffness), float(scene.wall.virtual_damping)
+    wall = f"K = {with_unit(K, 'N/m')}, B = {with_unit(B, 'N s/m')}"
+    head = f"Virtual wall: {wall}, velocity by {type(scene.velocity).__name__}, {with_unit(1.0 / period, 'Hz')}."
+    return WallProgram(head, count, states, start, [*force, f"v = {gain!r} * u"], f"-({K!r} * x + {B!r} * v)")
+
+
+def _write_c(program: WallProgram) -> str:
+    """The wall as C99."""
+    count = program.window
+    members = [f"double past[{count}]", "int next"] if count > 1 else ["double x"]
+    begin = [f"for (int k = 0; k < {count}; k++) wall->past[k] = x", "wall->next = 0"] if count > 1 else ["wall->x = x"]
+    names = [name for name in "uvw" if any(line.startswith(f"{name} =") for line in program.force)]
+    start = [*(["double u"] if "u = x" in program.start else []), *begin, *program.start]
+    force = [f"double {', '.join(names)}", *program.force, f"return x > 0.0 ? {program.law} : 0.0"]
+    blocks = ["\n".join(f"    {line.replace('@', 'wall->')};" for line in lines) for lines in (start, force)]
+    kept = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
+    words = "\n   ".join([f"/* {program.head}", *_CALLED, "Call wall_start once, then wall_force once a period. */"])
+    opened = "void wall_start(Wall *wall, double x)\n{\n", "double wall_force(Wall *wall, double x)\n{\n"
+    functions = [f"{head}{block}\n}}\n" for head, block in zip(opened, blocks, strict=True)]
+    return "\n".join([words, f"typedef struct {{\n{kept}\n}} Wall;\n", *functions])
+
+
+def _write_python(program: WallProgram) -> str:
+    """The wall as a class of Python."""
+    count = program.window
+    begin = [f"@past = [x] * {count}", "@next = 0"] if count > 1 else ["@x = x"]
+    force = [*program.force, f"return {program.law} if x > 0.0 else 0.0"]
+    words = "\n    ".join([f'    """{program.head}\n', *_CALLED, "Make one, then call force once a period.", '"""'])
+    heads = "    def __init__(self, x=0.0):", "    def force(self, x):"
+    blocks = ["\n".join(f"        {line}" for line in lines) for lines in ([*begin, *program.start], force)]
+    functions = [f"{head}\n{block}\n".replace("@", "self.") for head, block in zip(heads, blocks, strict=True)]
+    return "\n".join([f"class Wall:\n{words}\n", *functions])

@@ -1,0 +1,70 @@
+"""`zwidth recommend`: what a person reads, what machines get, the picture and the program."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+
+DEVICE = ["--mass", "100 g", "--damping", "10", "--rate", "1 kHz", "--delay", "1 ms"]
+SCENE = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
+
+
+def recommend(*arguments, code=0):
+    result = CliRunner().invoke(cli, ["recommend", *DEVICE, *arguments])
+    assert result.exit_code == code, result.output
+    return result
+
+
+def test_a_person_reads_what_to_set_and_what_to_buy():
+    lines = recommend("--phase-margin", "30").stdout.splitlines()
+    found = SCENE.recommend(phase_margin=30)
+    assert lines[2:4] == [f"{'set':22}{found.lines()[0]}", f"{'':22}{found.lines()[1]}"]
+    assert "a phase margin of 30 degrees allows no more" in lines[2]
+    assert lines[5].startswith("what buys stiffness   half the delay: K_max 34.23 kN/m, 1.72 times")
+
+
+def test_machines_get_the_same():
+    printed = json.loads(recommend("--stiffness-fraction", "60%", "--json").stdout)
+    assert printed == json.loads(json.dumps(SCENE.recommend(stiffness_fraction=0.6).as_dict()))
+
+
+def test_a_program_stands_alone():
+    assert recommend("--code", "c").stdout == SCENE.recommend().code("c")
+    names = {}
+    exec(recommend("--code", "python").stdout, names)
+    assert names["Wall"](0.0).force(-1e-3) == 0.0
+    assert "give --code or --json" in recommend("--code", "c", "--json", code=2).output
+
+
+@pytest.mark.parametrize("ending", ["pdf", "png"])
+def test_a_picture(ending, tmp_path):
+    file = tmp_path / f"chart.{ending}"
+    assert recommend("--figure", str(file)).stdout.splitlines()[-1].endswith(str(file))
+    assert file.stat().st_size > 5000
+    assert "there is no folder" in recommend("--figure", str(tmp_path / "none" / "a.png"), code=2).output
+
+
+def test_no_wall_is_said():
+    result = CliRunner().invoke(cli, ["recommend", "--mass", "0.1", "--rate", "1 kHz", "--passive"])
+    assert "set                   no wall: none was found that keeps passivity" in result.stdout
+    assert "without damping of the device no wall is passive" in result.stdout
+
+
+@pytest.mark.parametrize("arguments", [["--gain-margin", "1"], ["--phase-margin", "0"], ["--stiffness-fraction", "x"]])
+def test_wrong_wishes_exit_with_2(arguments):
+    recommend(*arguments, code=2)
+
+
+def test_a_rigid_device_needs_no_jax():
+    program = (
+        "import sys; from zwidth.cli import main\n"
+        "try: main(sys.argv[1:])\nexcept SystemExit as end: assert not end.code\n"
+        "assert not {'jax', 'pydantic', 'matplotlib'} & set(sys.modules)"
+    )
+    for wanted in ([], ["--phase-margin", "30"]):
+        subprocess.run([sys.executable, "-c", program, "recommend", *DEVICE, *wanted], check=True, capture_output=True)

@@ -1,0 +1,133 @@
+"""The wall to set: the stiffest with all that is wanted, against walls on a grid judged one by one."""
+
+import json
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.scenes.recommendation import Wanted
+from zwidth.words.status import Status
+
+TIMING = zwidth.Timing(1e-3, 1e-3)
+RIGID = zwidth.Scene(zwidth.Device(0.1, 10.0), TIMING)
+FILTERED = RIGID.replace(velocity=zwidth.LowPass(cutoff=100.0))
+ISLANDS = RIGID.replace(velocity=zwidth.WindowedDifference(24))
+TIP = zwidth.Scene(zwidth.Device(0.1, 10.0, zwidth.Coupling(0.05, 20e3, 1.0, "tip")), TIMING)
+
+
+def keeps(scene, stiffness, damping, wanted):
+    """By the margins that users ask for."""
+    margins = scene.margins(stiffness, damping)
+    good = scene.is_stable(stiffness, damping)
+    if "gain_margin" in wanted:
+        good = good & (np.abs(np.log(margins.gain_margin)) >= np.log(wanted["gain_margin"]))
+    if "phase_margin" in wanted:
+        good = good & (margins.phase_margin >= wanted["phase_margin"])
+    return good & scene.is_passive(stiffness, damping) if wanted.get("passive") else good
+
+
+WANTED = [
+    {"gain_margin": 2.0},
+    {"phase_margin": 30.0},
+    {"phase_margin": 60.0, "passive": True},
+    {"passive": True},
+    {"gain_margin": 3.0, "phase_margin": 20.0},
+    {"gain_margin": 1.2, "stiffness_fraction": 0.95},
+]
+
+
+@pytest.mark.parametrize("wanted", WANTED, ids=str)
+@pytest.mark.parametrize("device", [(0.1, 10.0, 1e-3), (0.37, 1.2, 1.7e-3), (0.05, 40.0, 0.0)], ids=str)
+def test_no_stiffer_wall_has_what_is_wanted(device, wanted):
+    mass, damping, delay = device
+    scene = zwidth.Scene(zwidth.Device(mass, damping), zwidth.Timing(1e-3, delay))
+    found, top = scene.recommend(**wanted), scene.max_stiffness().stiffness
+    assert found.status == Status.OK
+    assert keeps(scene, found.stiffness, found.virtual_damping, wanted)
+    share = found.stiffness / top
+    assert share <= wanted.get("stiffness_fraction", 1.0)
+    if found.limited_by == "stiffness_fraction":
+        assert found.stiffness == wanted["stiffness_fraction"] * top
+        return
+    assert found.limited_by in wanted
+    units = scene.units
+    dampings = np.linspace(-2.0, 3.0, 801) * units.virtual_damping
+    for more in (1.001, 1.02, 1.1):
+        assert not np.any(keeps(scene, more * found.stiffness, dampings, wanted)), more
+
+
+@pytest.mark.parametrize("wanted", [{"gain_margin": 2.0}, {"phase_margin": 30.0, "passive": True}], ids=str)
+def test_with_a_filter_no_stiffer_wall_has_what_is_wanted(wanted):
+    found = FILTERED.recommend(**wanted)
+    assert keeps(FILTERED, found.stiffness, found.virtual_damping, wanted)
+    # A delay margin for each takes its time.
+    dampings = np.linspace(0.0, 50.0, 21)
+    assert not np.any(keeps(FILTERED, 1.003 * found.stiffness, dampings, wanted))
+
+
+def test_a_gain_margin_alone_is_that_share_of_the_stiffest_wall():
+    """The ray through the stiffest wall leaves the stable set there: K and B are both divided by the margin."""
+    top, found = RIGID.max_stiffness(), RIGID.recommend(gain_margin=2.0)
+    assert found.stiffness == pytest.approx(top.stiffness / 2, rel=2e-4)
+    assert found.virtual_damping == pytest.approx(top.virtual_damping / 2, rel=2e-2)
+
+
+def test_a_share_alone_has_the_damping_of_the_stiffest_wall():
+    found, top = RIGID.recommend(), RIGID.max_stiffness()
+    assert (found.stiffness, found.virtual_damping) == (0.75 * top.stiffness, top.virtual_damping)
+    assert found.wanted == Wanted(0.75)
+    assert found.limited_by == "stiffness_fraction"
+    assert found.verdict == zwidth.assess(
+        RIGID.replace(stiffness=found.stiffness, virtual_damping=found.virtual_damping)
+    )
+
+
+def test_the_wall_of_the_scene_does_not_matter():
+    own = RIGID.replace(stiffness=1e3, virtual_damping=3.0).recommend(phase_margin=25)
+    assert own.stiffness == RIGID.recommend(phase_margin=25).stiffness
+
+
+def test_what_no_wall_has_is_said_and_leaves_no_wall():
+    undamped = RIGID.replace(damping=0.0, delay=0.0)
+    found = undamped.recommend(passive=True)
+    assert found.status == Status.UNREACHABLE
+    assert np.isnan(found.stiffness)
+    assert found.verdict is None
+    reason = "none was found that keeps passivity, however soft; without damping of the device no wall is passive"
+    assert (found.reason, found.lines()) == (reason, (f"no wall: {reason}",))
+    known = json.loads(json.dumps(found.as_dict(), allow_nan=False))
+    assert known["recommended"]["stiffness"] is None
+    assert known["maximum"]["stiffness"] == undamped.max_stiffness().stiffness
+
+
+def test_steps_are_those_of_limits_that_help():
+    found = ISLANDS.recommend()
+    assert found.steps == [limit for limit in zwidth.limits_of(ISLANDS) if limit.gain > 1]
+    assert "island of stable walls" in found.notes[0]
+    assert not any("64" in step.words for step in found.steps)
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ({"gain_margin": 1.0}, "gain_margin: got 1.0; a number greater than 1 is needed"),
+        ({"phase_margin": 180}, "phase_margin: got 180; a number greater than 0 and less than 180 is needed"),
+        ({"phase_margin": "30"}, "phase_margin: got '30'"),
+        ({"stiffness_fraction": 1.5}, "stiffness_fraction: got 1.5; a number greater than 0 and less than 1"),
+        ({"stiffness_fraction": True}, "stiffness_fraction: got True"),
+        ({"passive": "yes"}, "passive: got 'yes'; True or False is needed"),
+    ],
+)
+def test_wrong_wishes_are_refused(wanted, message):
+    with pytest.raises(zwidth.InputError, match=message.replace("(", r"\(")):
+        RIGID.recommend(**wanted)
+
+
+def test_scenes_without_an_answer_say_why():
+    with pytest.raises(zwidth.InputError, match=r"coupling\.sensor: 'tip' has no passivity condition"):
+        TIP.recommend(passive=True)
+    with pytest.raises(zwidth.InputError, match="delay_model: got 'fractional_power'"):
+        RIGID.replace(delay_model="fractional_power").recommend()
+    with pytest.raises(zwidth.InputError, match="FOAW has no linear form"):
+        RIGID.replace(velocity=zwidth.FOAW(1e-6)).recommend()
