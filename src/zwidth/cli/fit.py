@@ -15,6 +15,7 @@ from zwidth.cli.options import (
     json_option,
     number_or_text,
     quantity_type,
+    read_period,
     read_share,
     velocity_options,
 )
@@ -78,6 +79,7 @@ _SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 @click.argument("logs", metavar="[LOG.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option("--buzz", "walls", type=_WALL, multiple=True, help="As 'K=3.2kN/m B=0 f=71Hz'; once for each wall.")
 @click.option("--period", type=quantity_type("s", POSITIVE), help="T, in s; of logs in place of --time.")
+@click.option("--rate", type=quantity_type("Hz", POSITIVE), help="1/T, in Hz; in place of the period.")
 @click.option("--noise", type=_SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
 @click.option("--time", help="Column of the time: its header, or HEADER:ms. Found by its name where left out.")
 @click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts, :deg.")
@@ -94,6 +96,7 @@ def fit(
     logs: tuple[Path, ...],
     walls: tuple[Any, ...],
     period: float | None,
+    rate: float | None,
     noise: float | None,
     max_delay: float | None,
     resample: bool,
@@ -112,6 +115,7 @@ def fit(
     """
     from zwidth.fitting.words import LINEAR, ROTARY, describe_fit, write_scene
 
+    period = read_period(period, rate)
     if bool(logs) == bool(walls):
         raise click.UsageError("give either --buzz, once for each wall, or a LOG.csv")
     if as_json and as_yaml:
@@ -122,7 +126,7 @@ def fit(
             if value is not None:
                 raise click.UsageError(f"--{name} belongs to a LOG.csv")
         if period is None:
-            raise click.UsageError("give --period")
+            raise click.UsageError("give --period or --rate")
         from zwidth.fitting.buzz import BuzzPoint, fit_buzz
 
         kinds = {wall.rotary for wall in walls} - {None}
@@ -138,7 +142,7 @@ def fit(
         if unknown_cutoff:
             raise click.UsageError("--unknown-cutoff belongs to --buzz; no velocity is estimated in a log")
         if columns["time"] is not None and period is not None:
-            raise click.UsageError("give one of --time and --period")
+            raise click.UsageError("give one of --time, --period and --rate")
         from zwidth.fitting.columns import fit_motions, read_log
 
         step = columns.pop("resolution")

@@ -43,6 +43,7 @@ _SLIPS = {
     "time_constant": (("{flag} '{value} ms'", "time_constant", 1e-3),),
     "cutoff": (("{flag} '{value} kHz'", "cutoff", 1e3),),
 }
+_BOTH = "--period and --rate are both given: they are one thing, give one of them"
 Command: TypeAlias = Callable[..., Any]
 
 # By path in a scene, as in configuration files, one part after the other.
@@ -175,6 +176,13 @@ def _take_options(
     return decorate
 
 
+def read_period(period: float | None, rate: float | None) -> float | None:
+    """The period in s, of the one that is given."""
+    if period is not None and rate is not None:
+        raise click.UsageError(_BOTH)
+    return period if rate is None else 1.0 / rate
+
+
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
     from zwidth.parts.device import Device
@@ -187,7 +195,9 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
 
     if not given and not required:
         return None
-    if "mass" not in given or ("period" in given) == ("rate" in given):
+    if {"period", "rate"} <= given.keys():
+        raise click.UsageError(_BOTH)
+    if "mass" not in given or not {"period", "rate"} & given.keys():
         raise click.UsageError("give --mass, and one of --period and --rate")
     for line in doubts_of(given):
         click.echo(f"zwidth: {line}", err=True)

@@ -35,6 +35,7 @@ from zwidth.figures.stable_set import (
 )
 from zwidth.figures.table import Table, stack
 from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.recommendation import Recommendation
@@ -132,7 +133,8 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
         values: of it, in SI units.
         ax: an Axes of yours.
     """
-    grid = as_float64("values", values)
+    known = PARAMETERS.get(parameter)
+    grid = as_float64("values", read_texts("values", values, known.unit) if known else values)
     if grid.ndim != 1 or not grid.size:
         raise InputError(f"values: got shape {grid.shape}; a list of values of {parameter} is needed")
     walls = [scene.replace(**{parameter: value}).max_stiffness() for value in grid.tolist()]
@@ -141,7 +143,6 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     factor, unit = style.si_unit(top, "N/m")
     ax.plot(grid, top * factor, color=style.BLUE, label="stiffest stable wall")
     ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
-    known = PARAMETERS.get(parameter)
     words = f"{known.words}  ${known.symbol}$  in {known.unit}" if known else style.literal(parameter)
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     scale_axis(ax, "x", grid)
@@ -151,8 +152,8 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
 @style.house_style()
 def step(
     scene: Scene,
-    stiffness: float | None = None,
-    virtual_damping: float | None = None,
+    stiffness: float | str | None = None,
+    virtual_damping: float | str | None = None,
     ax: Axes | None = None,
     *,
     periods: int = 100,
@@ -182,7 +183,10 @@ def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, perio
 
 @style.house_style()
 def nyquist(
-    scene: Scene, stiffness: float | None = None, virtual_damping: float | None = None, ax: Axes | None = None
+    scene: Scene,
+    stiffness: float | str | None = None,
+    virtual_damping: float | str | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the open loop of a wall over frequency, with the point -1 that it must leave on its left.
 
@@ -214,7 +218,10 @@ def nyquist(
 
 @style.house_style()
 def poles(
-    scene: Scene, stiffness: float | None = None, virtual_damping: float | None = None, ax: Axes | None = None
+    scene: Scene,
+    stiffness: float | str | None = None,
+    virtual_damping: float | str | None = None,
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the poles of the loop with a wall, in the unit circle.
 

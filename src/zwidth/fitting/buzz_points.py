@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.parts.checks import read_texts
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
 
@@ -37,7 +38,7 @@ def read_points(
     rows = []
     for k, point in enumerate(points):
         try:
-            row = [float(value) for value in point]
+            row = [float(read_texts(f"points[{k}]", *each)) for each in zip(point, ("N/m", "N s/m", "Hz"), strict=True)]
         except (TypeError, ValueError):
             row = []
         if len(row) != 3 or not np.all(np.isfinite(row)):

@@ -169,6 +169,7 @@ def normalize(
     return Normalized(*numbers)
 
 
+@accept_units
 def denormalize(
     *,
     mass: ArrayLike,

@@ -14,7 +14,7 @@ import numpy as np
 from zwidth.arrays.xp import frozen, is_jax, namespace
 from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe, short
-from zwidth.words.quantities import CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, Range
+from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, Range
 from zwidth.words.types import Array
 from zwidth.words.units import TIME, find_dimension, read_quantity, to_float
 
@@ -80,24 +80,43 @@ def accept_units(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 
 def _has_text(value: Any) -> bool:
-    return isinstance(value, str) or (isinstance(value, tuple) and any(isinstance(end, str) for end in value))
+    return isinstance(value, str) or (isinstance(value, list | tuple) and any(map(_has_text, value)))
+
+
+def _map_texts(read: Callable[[str], Any], value: Any) -> Any:
+    """What is read of a text, or of those in lists, tuples and arrays; anything else as it is."""
+    if isinstance(value, np.ndarray) and value.dtype.kind == "U":
+        value = value.tolist()
+    if isinstance(value, str):
+        return read(value)
+    if not _has_text(value):
+        return value
+    found = [_map_texts(read, each) for each in value]
+    return type(value)(*found) if hasattr(value, "_fields") else found
+
+
+def read_texts(field: str, value: Any, unit: str) -> Any:
+    """Texts with a unit, alone or in lists and arrays, as numbers in the SI unit; anything else as it is."""
+    return value if unit in ("", "1") else _map_texts(lambda text: check_number(field, text, unit, ANY), value)
 
 
 def _in_si(name: str, value: Any, period: Any) -> Any:
-    """A text, or a named tuple of texts, as numbers in the SI base unit; anything else as it is."""
-    if name not in PARAMETERS or PARAMETERS[name].unit == "1" or not _has_text(value):
+    """Texts as numbers in the SI base unit of an argument; anything else as it is."""
+    if name not in PARAMETERS or PARAMETERS[name].unit == "1":
         return value
-    if isinstance(value, tuple):
-        return type(value)(*(_in_si(name, end, period) for end in value))
-    try:
-        if name != "delay":
-            return read_quantity(value, find_dimension(PARAMETERS[name].unit))[0]
-        span = read_span(value, NOT_NEGATIVE)
-    except UnusableValueError as error:
-        raise InputError(f"{name}: {error}") from None
-    if span.unit == "periods" and (period is None or isinstance(period, tuple)):
-        raise InputError(f"{name}: got {value!r} without one period to count in; write it in seconds")
-    return span.seconds(period)
+    if name != "delay":
+        return read_texts(name, value, PARAMETERS[name].unit)
+
+    def read(text: str) -> float:
+        try:
+            span = read_span(text, NOT_NEGATIVE)
+        except UnusableValueError as error:
+            raise InputError(f"{name}: {error}") from None
+        if span.unit == "periods" and (period is None or np.ndim(period) != 0):
+            raise InputError(f"{name}: got {text!r} without one period to count in; write it in seconds")
+        return span.seconds(period)
+
+    return _map_texts(read, value)
 
 
 def check_fields(part: Any, owner: str = "") -> None:

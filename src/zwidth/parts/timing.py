@@ -40,7 +40,8 @@ class Timing:
 
     def __post_init__(self) -> None:
         if (self.period is None) == (self.rate is None):
-            raise InputError("timing: give either the period (s) or the rate (Hz), and only one of them")
+            both = "" if self.rate is None else "both are given; "
+            raise InputError(f"timing: {both}give either the period (s) or the rate (Hz), and only one of them")
         if self.rate is not None:
             object.__setattr__(self, "period", 1.0 / check_number("rate", self.rate))
             object.__setattr__(self, "rate", None)

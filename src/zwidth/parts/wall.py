@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from zwidth.parts.checks import check_fields
+from zwidth.parts.checks import check_fields, read_texts
 from zwidth.words.errors import InputError
 
 
@@ -37,8 +37,10 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any) -> tup
     """Which K and B a question means of a scene with this wall, the one rule for all of them.
 
     Neither given means the scene's own wall. Both given are what they say. K alone is a spring, B = 0, of a scene
-    without a wall; where there is one it could as well mean that wall's B, and is refused.
+    without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit.
     """
+    stiffness = read_texts("stiffness", stiffness, "N/m")
+    virtual_damping = read_texts("virtual_damping", virtual_damping, "N s/m")
     chosen = not isinstance(wall, NoWall)
     if stiffness is None and virtual_damping is None:
         if not chosen:

@@ -16,6 +16,7 @@ from zwidth.loops.linear.rows import Island
 from zwidth.loops.linear.state_space import Matrices, closed_loop, delayed_device, open_loop
 from zwidth.loops.rigid.margins import Margins
 from zwidth.loops.rigid.verdict import STABILITY_METHODS, Stability, StabilityMethod
+from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.stiffest import allows_negative
 from zwidth.words.errors import InputError, check_choice
@@ -56,7 +57,8 @@ class PoleTable(NamedTuple):
 class SceneAnswers:
     """The questions of `zwidth.Scene` about walls; of the scene they need its parts, loop and boundary.
 
-    Without a stiffness and a damping each means the scene's own wall (`zwidth.parts.wall.resolve_wall`).
+    Without a stiffness and a damping each means the scene's own wall (`zwidth.parts.wall.resolve_wall`). A quantity
+    may be a text with a unit, "10 kN/m".
     """
 
     def normalize_walls(
@@ -129,7 +131,9 @@ class SceneAnswers:
         found = self.loop.islands(-np.inf if allows_negative(self, negative_damping) else 0.0)
         return [Island(*(tuple(pair.tolist()) for pair in np.array(one) * units)) for one in found]
 
-    def state_space(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
+    def state_space(
+        self: Any, stiffness: float | str | None = None, virtual_damping: float | str | None = None
+    ) -> StateSpace:
         """The closed loop with one wall, from a force held on the device (N) to the sensed position (m).
 
         Exactly discretized, with the estimate and the forces on their way as states: A, B, C, D and the period dt.
@@ -137,7 +141,9 @@ class SceneAnswers:
         compliance = self.timing.period**2 / float(self.mass)
         return _realize(self, closed_loop, compliance, *self.normalize_walls(stiffness, virtual_damping))
 
-    def open_loop(self: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> StateSpace:
+    def open_loop(
+        self: Any, stiffness: float | str | None = None, virtual_damping: float | str | None = None
+    ) -> StateSpace:
         """The open loop L with one wall, as `state_space`; closed by negative feedback it is that loop."""
         return _realize(self, open_loop, 1.0, *self.normalize_walls(stiffness, virtual_damping))
 
@@ -154,7 +160,7 @@ class SceneAnswers:
         if frequency is None:
             raise InputError("frequency: none is given; give frequencies in Hz, up to half the sampling rate")
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
-        hertz = as_float64("frequency", frequency)
+        hertz = as_float64("frequency", read_texts("frequency", frequency, "Hz"))
         join_shapes([("frequency", hertz.shape), ("stiffness", alpha.shape), ("virtual_damping", beta.shape)])
         hertz, alpha, beta = np.broadcast_arrays(hertz, alpha, beta)
         w = 2.0 * np.pi * hertz * self.timing.period
@@ -203,12 +209,13 @@ class SceneAnswers:
             Array (n, 2) in N/m, or with the shape of the damping in front and NaN where a row has fewer intervals. The
             ends are not stable themselves.
         """
-        damping = self.wall.virtual_damping if virtual_damping is None else virtual_damping
+        given = self.wall.virtual_damping if virtual_damping is None else virtual_damping
+        damping = read_texts("virtual_damping", given, "N s/m")
         beta = as_float64("virtual_damping", damping) / self.units.virtual_damping
         both = self.loop.row(beta.reshape(-1)) * self.units.stiffness
         return both.reshape(*beta.shape, *both.shape[1:])
 
-    def stable_damping(self: Any, stiffness: float | None = None) -> np.ndarray:
+    def stable_damping(self: Any, stiffness: float | str | None = None) -> np.ndarray:
         """The stable intervals of the virtual damping at one stiffness, several where there are several.
 
         Args:
@@ -293,7 +300,9 @@ def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any
     return StateSpace(A, B, loop.C / scale, loop.D * unit, period)
 
 
-def to_control(scene: Any, stiffness: float | None = None, virtual_damping: float | None = None) -> control.StateSpace:
+def to_control(
+    scene: Any, stiffness: float | str | None = None, virtual_damping: float | str | None = None
+) -> control.StateSpace:
     """Return the closed loop of a scene and a wall as a model of python-control.
 
     From a force held on the device (N) to the sensed position (m), exactly discretized: ``scene.state_space``.

@@ -270,9 +270,9 @@ class Scene(SceneAnswers):
     def required(
         self,
         parameter: str,
-        stiffness: float,
+        stiffness: float | str,
         *,
-        within: tuple[float, float] | None = None,
+        within: tuple[Any, Any] | None = None,
         negative_damping: bool | None = None,
     ) -> RequiredValue:
         """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
@@ -303,7 +303,7 @@ class Scene(SceneAnswers):
         return require(self, parameter, stiffness, within, negative_damping)
 
     def best_damping(
-        self, stiffness: float | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
+        self, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
     ) -> BestDamping:
         """The virtual damping that suits a stiffness best.
 

@@ -10,9 +10,11 @@ import numpy as np
 
 from zwidth.arrays.xp import is_jax, is_traced
 from zwidth.loops.linear.margins import OpenLoop
+from zwidth.parts.checks import read_texts
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
 from zwidth.words.errors import InputError, check_choice, describe_choice
+from zwidth.words.quantities import FIELDS
 from zwidth.words.status import Status
 from zwidth.words.types import Array
 
@@ -97,11 +99,12 @@ class RequiredValue(NamedTuple):
 def require(
     scene: Any,
     parameter: str,
-    stiffness: float,
-    within: tuple[float, float] | None = None,
+    stiffness: Any,
+    within: tuple[Any, Any] | None = None,
     negative_damping: bool | None = None,
 ) -> RequiredValue:
     """See `zwidth.Scene.required`."""
+    stiffness = read_texts("stiffness", stiffness, "N/m")
     if not (isinstance(stiffness, int | float | np.number) and math.isfinite(stiffness) and stiffness > 0):
         raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in N/m)")
     now = _present_value(scene, parameter)
@@ -155,12 +158,12 @@ def _present_value(scene: Any, parameter: str) -> float:
     return float(known[parameter])
 
 
-def _range(parameter: str, now: float, within: tuple[float, float] | None) -> tuple[float, float]:
+def _range(parameter: str, now: float, within: tuple[Any, Any] | None) -> tuple[float, float]:
     if within is None:
         if not now > 0:
             raise InputError(f"within: {parameter} is 0 now; give the range to search, as within=(0.1, 10)")
         return now / _REACH, now * _REACH
-    low, high = (float(end) for end in within)
+    low, high = (float(end) for end in read_texts("within", within, FIELDS[parameter].unit))
     if not 0 < low < high < math.inf:
         raise InputError(f"within: got {within!r}; two finite numbers with 0 < low < high are needed")
     return low, high
@@ -197,11 +200,12 @@ class BestDamping(NamedTuple):
 
 
 def find_best_damping(
-    scene: Any, stiffness: float | None, goal: Goal, negative_damping: bool | None = None
+    scene: Any, stiffness: float | str | None, goal: Goal, negative_damping: bool | None = None
 ) -> BestDamping:
     """See `zwidth.Scene.best_damping`."""
     check_choice("goal", goal, get_args(Goal))
-    stiffness = float(resolve_wall(scene.wall, None, None)[0] if stiffness is None else stiffness)
+    given = resolve_wall(scene.wall, None, None)[0] if stiffness is None else stiffness
+    stiffness = float(read_texts("stiffness", given, "N/m"))
     if not (math.isfinite(stiffness) and stiffness > 0):
         raise InputError(f"stiffness: got {stiffness:g}; it must be finite and greater than 0 (in N/m)")
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import as_float64, join_shapes, processors
 from zwidth.arrays.xp import is_traced
-from zwidth.parts.checks import check_whole
+from zwidth.parts.checks import check_whole, read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.simulation.batch import TOGETHER, run_batch, structure
 from zwidth.simulation.lanes import Course
@@ -78,7 +78,7 @@ def simulate(
 
     Args:
         scenes: a `zwidth.Scene`, or a list or array of them. Its shape and those of the numbers below broadcast, as the
-            shape of the batch.
+            shape of the batch. Numbers may be texts with a unit, "2 N".
         stiffness: K in N/m.
         virtual_damping: B in N s/m. Neither means each scene's own wall, as for `zwidth.Scene.is_stable`.
         periods: how many sampling periods, >= 1.
@@ -222,7 +222,8 @@ def _read(
         given = {**given, "stiffness": own[..., 0], "virtual_damping": own[..., 1]}
     elif given["virtual_damping"] is None:
         given = {**given, "virtual_damping": 0.0}
-    arrays = {name: as_float64(name, value) for name, value in given.items()}
+    texts = {name: read_texts(name, value, _ARGUMENTS[name][0]) for name, value in given.items()}
+    arrays = {name: as_float64(name, value) for name, value in texts.items()}
     seeds, pushes = _read_seeds(seed), None
     shapes = {"scenes": which.shape, **{name: array.shape for name, array in arrays.items()}, "seed": seeds.shape}
     if history is not None:

@@ -18,6 +18,10 @@ _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-
 _NUMBER_TEXT = re.compile(r"\s*[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?\s*")
 
 
+# A comma in a number; and where it may part thousands.
+_COMMA, _THOUSANDS = re.compile(r"[0-9],[0-9]"), re.compile(r"\s*[-+]?[1-9][0-9]{0,2}(,[0-9]{3})+(?![0-9,])")
+
+
 class Dimension(NamedTuple):
     """The units of one kind of quantity, the base unit first, each with its power of ten over that.
 
@@ -120,6 +124,10 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
     if isinstance(value, int | float) and not isinstance(value, bool):
         return to_float(value), dimension.base
     remedy = f"write a number and a unit, as in {dimension.example!r}"
+    if isinstance(value, str) and _COMMA.search(value):
+        ways = [value.strip().replace(",", sign) for sign in ("", ".")]
+        meant = " or ".join(map(repr, ways if _THOUSANDS.match(value) else ways[1:]))
+        raise UnusableValueError(f"got {describe(value)}", "a number has no comma", f"write {meant}")
     allowed = f"it must be a number in {dimension.base} or a number with one of the units {names}"
     if dimension is RATIO:
         allowed, remedy = "it must be a number without a unit", f"write a number, as {dimension.example}"

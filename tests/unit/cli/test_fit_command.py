@@ -77,7 +77,7 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, 
     "arguments, words",
     [
         ([], "give either --buzz"),
-        ([*WALLS], "give --period"),
+        ([*WALLS], "give --period or --rate"),
         ([*WALLS, "--period", "1 ms", "--time", "t"], "--time belongs to a LOG.csv"),
         (["--buzz", "K=1 B=2"], "write K, B and f"),
         (["--buzz", "K=1 B=2 f=3 g=4"], "got"),
@@ -87,7 +87,7 @@ def test_the_configuration_can_be_run_and_says_where_its_numbers_are_from(more, 
         (["--buzz", "K=1 N/m f=3", "--buzz", "K=1Nm/rad f=3", "--period", "1 ms"], "fit them apart"),
         (["--buzz", "K=1 furlong/rad f=3", "--period", "1 ms"], "the units allowed are N m/rad"),
         ([*WALLS, "--period", "1 ms", "--noise", "much"], "write a share"),
-        (["LOG", "--time", "t", "--period", "1 ms"], "give one of --time and --period"),
+        (["LOG", "--time", "t", "--period", "1 ms"], "give one of --time, --period and --rate"),
         (["LOG", "--figure", "fit.txt"], "ends with .png"),
         ([*WALLS, "--period", "1 ms", "--resolution", "1mm"], "--resolution belongs to a LOG.csv"),
         ([*WALLS, "--period", "1 ms", "--resample"], "--resample belongs to a LOG.csv"),
@@ -174,6 +174,12 @@ def test_what_is_not_ok_is_told_first():
     assert first == "UNREACHABLE           do not rely on these numbers: the delay ends the range looked in"
     assert second == "fitted to             fit_log.csv"
     assert "# UNREACHABLE: do not rely on these numbers" in run(*arguments, "--yaml")
+
+
+def test_a_rate_stands_for_the_period():
+    assert run(*WALLS, "--rate", "1 kHz", "--json") == run(*WALLS, "--period", "1 ms", "--json")
+    result = CliRunner().invoke(cli, ["fit", *WALLS, "--rate", "1 kHz", "--period", "1 ms"])
+    assert "--period and --rate are both given" in result.output
 
 
 def test_a_figure_needs_a_folder(tmp_path):

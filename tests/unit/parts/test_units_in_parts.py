@@ -67,10 +67,57 @@ def test_functions_read_texts_with_units():
     assert arrays[0] == zwidth.max_stiffness(mass=0.07, period=1e-3)
 
 
+SCENE = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3))
+# The same question with texts and with numbers.
+QUESTIONS = {
+    "is_stable": (lambda *wall: SCENE.is_stable(*wall), ("10 kN/m", 40), (10e3, 40)),
+    "a list": (lambda *wall: SCENE.is_stable(*wall), (["10 kN/m", 30e3], "40 N s/m"), ([10e3, 30e3], 40)),
+    "an array": (lambda *wall: SCENE.is_stable(*wall), (np.array(["10 kN/m"]), 40), (np.array([10e3]), 40)),
+    "poles": (lambda *wall: SCENE.poles(*wall), ("10 N/mm", "40 N s/m"), (10e3, 40)),
+    "margins": (lambda *wall: SCENE.margins(*wall), ("10 kN/m", "0.04 kN s/m"), (10e3, 40)),
+    "stable_stiffness": (lambda B: SCENE.stable_stiffness(B), ("40 N s/m",), (40,)),
+    "stable_damping": (lambda K: SCENE.stable_damping(K), ("10 kN/m",), (10e3,)),
+    "best_damping": (lambda K: SCENE.best_damping(K), ("10 kN/m",), (10e3,)),
+    "required": (
+        lambda K, within: SCENE.required("damping", K, within=within).value,
+        ("25 kN/m", ("1 N s/m", "0.1 kN s/m")),
+        (25e3, (1, 100)),
+    ),
+    "frequency_response": (lambda *at: SCENE.frequency_response(*at), (10e3, 40, "0.1 kHz"), (10e3, 40, 100)),
+    "state_space": (lambda *wall: SCENE.state_space(*wall).A, ("10 kN/m", 40), (10e3, 40)),
+    "simulate": (
+        lambda K, x, push: SCENE.simulate(K, 40, start_position=x, push=push, periods=3).position,
+        ("10 kN/m", "0.1 mm", ["1 N", "2 N"]),
+        (10e3, 1e-4, [1, 2]),
+    ),
+    "denormalize": (
+        lambda mass, period: zwidth.denormalize(mass=mass, period=period, alpha=0.1),
+        ("100 g", "1 ms"),
+        (0.1, 1e-3),
+    ),
+    "fit_buzz": (
+        lambda *point: zwidth.fit_buzz([point, (6e3, 20.0, 50.0)], period=1e-3).mass,
+        ("5 kN/m", 0, "0.04 kHz"),
+        (5e3, 0, 40),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", QUESTIONS)
+def test_questions_read_texts_with_units(name):
+    ask, texts, numbers = QUESTIONS[name]
+    np.testing.assert_array_equal(ask(*texts), ask(*numbers))
+
+
 @pytest.mark.parametrize(
     ("make", "message"),
     [
         (lambda: zwidth.Device(mass="70 gramm"), "mass: got '70 gramm'; the units allowed are kg, g, mg"),
+        (lambda: SCENE.is_stable("10 kN", 40), "stiffness: got '10 kN'; the units allowed are N/m"),
+        (lambda: SCENE.is_stable("10,000 N/m", 40), "a number has no comma; write '10000 N/m' or '10.000 N/m'"),
+        (lambda: zwidth.Device(mass="10,000"), "mass: got '10,000'; a number has no comma; write '10000' or '10.000'"),
+        (lambda: zwidth.Device(mass="0,1 kg"), "a number has no comma; write '0.1 kg'$"),
+        (lambda: zwidth.Timing("1 ms", rate="1 kHz"), "timing: both are given; give either the period"),
         (lambda: zwidth.Device(mass="0.07"), r"mass: got the text '0.07'; .*drop the quotes \(it is then in kg\)"),
         (lambda: zwidth.Device(mass="-70 g"), "mass: got -0.07 kg; it must be greater than 0 kg"),
         (lambda: zwidth.Device(mass=None), "mass: got None; it must be a number in kg"),
