@@ -14,6 +14,7 @@ from zwidth.fitting.scenes import scene_of
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.formatting import to_json, with_unit
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -74,6 +75,7 @@ class RivalDevice(NamedTuple):
     cutoff: float | None = None
 
 
+@shown(("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "doubts"))
 @dataclass(frozen=True)
 class DeviceFit:
     """A device found from records of it.

@@ -28,6 +28,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.scenes.tolerances import borne_by
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import SI_RANGE
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array
 
@@ -51,6 +52,7 @@ _FARTHEST = (20.0, 1.5)
 _SOFTER, _ASTRAY = (1.0, 0.5, 0.1), 2e-3
 
 
+@shown()
 class SafeWall(NamedTuple):
     """K in N/m, B in N s/m, the share of drawn devices that bear it, and the `zwidth.Status`, with NaN if not OK."""
 

@@ -16,10 +16,12 @@ from zwidth.arrays.xp import is_jax, is_traced, namespace, nan_unless, within
 from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS, SI_RANGE, SIZES
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 
 
+@shown()
 class Normalized(NamedTuple):
     """The four dimensionless numbers that the stability of the wall depends on."""
 
@@ -29,6 +31,7 @@ class Normalized(NamedTuple):
     d: Array
 
 
+@shown(mass="kg", damping="N s/m", period="s", delay="s")
 class Physical(NamedTuple):
     """The same wall in SI units: kg, N s/m, s, s, N/m, N s/m."""
 

@@ -15,6 +15,13 @@ from zwidth.parts.device import Device
 from zwidth.parts.operator import Operator
 from zwidth.words.errors import InputError, describe_choice
 
+__all__ = ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
+
+
+def __dir__() -> list[str]:
+    """Its own names, and not those that it imports."""
+    return sorted(__all__)
+
 
 class Published(NamedTuple):
     """One number, its unit, where it was published, and what must be known to use it."""

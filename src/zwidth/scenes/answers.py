@@ -20,12 +20,14 @@ from zwidth.parts.checks import read_texts
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.stiffest import allows_negative
 from zwidth.words.errors import InputError, check_choice
+from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
 
 if TYPE_CHECKING:
     import control
 
 
+@shown(dt="s")
 class StateSpace(NamedTuple):
     """``x[k+1] = A x[k] + B u[k]``, ``y[k] = C x[k] + D u[k]``, a step every ``dt`` seconds."""
 
@@ -45,6 +47,7 @@ class StateSpace(NamedTuple):
         return found
 
 
+@shown(frequency="Hz", time_constant="s")
 class PoleTable(NamedTuple):
     """Poles, the slowest first, and the motions they stand for; arrays with a last axis of poles."""
 

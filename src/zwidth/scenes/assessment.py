@@ -22,6 +22,7 @@ from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.stiffest import StiffestWall, stiffest_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
+from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 
 if TYPE_CHECKING:
@@ -29,9 +30,27 @@ if TYPE_CHECKING:
 
 _MARGINS = ("gain_margin", "phase_margin", "delay_margin", "modulus_margin", "gain_crossover", "phase_crossover")
 
+# Of the fields below.
+_UNITS: dict[str, Any] = {
+    **dict.fromkeys(("stable_stiffness", "stiffness_limit", "stiffness_max"), "N/m"),
+    **dict.fromkeys(("stable_damping", "virtual_damping_lower", "virtual_damping_upper"), "N s/m"),
+    **dict.fromkeys(("passivity_margin", "virtual_damping_at_max"), "N s/m"),
+    **dict.fromkeys(("ridge_frequency", "frequency", "gain_crossover", "phase_crossover"), "Hz"),
+    **{"decay_rate": "1/s", "time_constant": "s", "phase_margin": "degrees", "delay_margin": "s"},
+}
+_MISSING = {
+    "passivity_margin": "no condition is known for these parts",
+    "delay_margin": "it could not be confirmed",
+    "phase_margin": "no frequency decides it",
+    **dict.fromkeys(
+        ("alpha_max", "beta_at_max", "stiffness_max", "virtual_damping_at_max", "ridge_frequency"), "no wall is stable"
+    ),
+}
+
 Intervals: TypeAlias = tuple[tuple[float, float], ...]
 
 
+@shown(missing=_MISSING, **_UNITS)
 @dataclass(frozen=True)
 class Assessment:
     """What `assess` finds of any scene; SI units unless a symbol is Greek. NaN where a quantity does not exist."""
@@ -200,6 +219,7 @@ _STEPS = {
 }
 
 
+@shown()
 class Limit(NamedTuple):
     """One thing that limits: its name, a step that can be bought, K_max then in N/m, and by what factor it grew."""
 

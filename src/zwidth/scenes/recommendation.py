@@ -21,6 +21,7 @@ from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
 # Dampings tried at a stiffness, and steps of golden section round the best of them.
@@ -80,6 +81,7 @@ class Wanted(NamedTuple):
         }[name]
 
 
+@shown(("stiffness", "virtual_damping", "limited_by", "status", "reason", "notes"))
 @dataclass(frozen=True)
 class Recommendation:
     """A wall to set on a device; from `zwidth.Scene.recommend`.
@@ -222,7 +224,8 @@ def recommend(
     top, notes = stiffest_wall(bare), describe_islands(bare)
     if top.status != Status.OK:
         status = Status(int(top.status))
-        return Recommendation(bare, top, wanted, "", status, status.message, tuple(notes))
+        reason = "no stiffness is stable at any damping" if status == Status.NO_BOUNDARY else status.message
+        return Recommendation(bare, top, wanted, "", status, reason, tuple(notes))
     most = (wanted.stiffness_fraction or 1.0) * float(top.stiffness)
     usual = choose_damping(bare, top, most)
     limit, stiffness, damping = "stiffness_fraction", most, usual

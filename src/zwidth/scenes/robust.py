@@ -24,6 +24,7 @@ from zwidth.parts.checks import accept_units
 from zwidth.scenes.stiffness import max_stiffness
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import SI_RANGE
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike
 
@@ -51,6 +52,7 @@ class Interval(NamedTuple):
 Uncertain: TypeAlias = Interval | ArrayLike
 
 
+@shown(attained="N/m", mass="kg", damping="N s/m", period="s", delay="s")
 class RobustStiffness(NamedTuple):
     """What every device of a box can render, the worst device found, and a `zwidth.Status`."""
 
@@ -64,6 +66,7 @@ class RobustStiffness(NamedTuple):
     status: Array
 
 
+@shown(limit="N/m")
 class RobustWall(NamedTuple):
     """One wall for a whole family of devices, in N/m and N s/m, the limit of such walls, and a `zwidth.Status`."""
 

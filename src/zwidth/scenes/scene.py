@@ -35,6 +35,7 @@ from zwidth.scenes.stiffest import (
 from zwidth.simulation.result import Motion
 from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
+from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
 
 _EXAMPLES = {
@@ -46,6 +47,7 @@ _EXAMPLES = {
 }
 
 
+@shown()
 class WallSI(NamedTuple):
     """Walls by stiffness in N/m and damping in N s/m."""
 

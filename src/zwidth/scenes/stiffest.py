@@ -15,13 +15,15 @@ from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import FIELDS
-from zwidth.words.status import Status
+from zwidth.words.showing import shown
+from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
 # By what share a row may end below the stiffest wall that is on it.
 _ROUNDED = 1e-6
 
 
+@shown(frequency="Hz", kind=RidgeKind)
 class StiffestWall(NamedTuple):
     """The stiffest stable wall: N/m, N s/m, Hz, and the codes of `zwidth.RidgeKind` and `zwidth.Status`."""
 
@@ -86,6 +88,7 @@ class Crossing(NamedTuple):
     enough: Side
 
 
+@shown()
 class RequiredValue(NamedTuple):
     """The value to choose, the side on which there is enough, and every crossing in the range, ascending."""
 
@@ -190,6 +193,7 @@ _SAMPLES, _DIPS, _STEPS = 66, 3, 52
 _GOLDEN = 0.3819660112501051
 
 
+@shown()
 class BestDamping(NamedTuple):
     """A virtual damping in N s/m, the spectral radius and the modulus margin there, and the `zwidth.Status`."""
 

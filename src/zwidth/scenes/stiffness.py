@@ -27,6 +27,7 @@ from zwidth.loops.rigid.ridge import ridge_kernel, slopes_kernel, stiffness_slop
 from zwidth.parts.checks import accept_units, in_periods
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LARGEST_DAMPING, LONGEST_DELAY, SI_RANGE
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
@@ -95,6 +96,13 @@ def move_max_stiffness(
     return value, (value / mass, -2.0 * value / period, found.by_delta * scale, found.by_d * scale)
 
 
+@shown(
+    stiffness_max="N/m",
+    per_mass="N/m per kg",
+    per_damping="N/m per N s/m",
+    per_period="N/m per s",
+    per_delay="N/m per s",
+)
 class Sensitivities(NamedTuple):
     """K_max in N/m and its derivatives: per kg, per N s/m, per s of period and per s of delay."""
 
@@ -170,6 +178,7 @@ _STEPS = 24
 _WEIGHT = 8
 
 
+@shown()
 class Requirement(NamedTuple):
     """The value asked for, in SI units, and a `zwidth.Status`.
 

@@ -14,6 +14,7 @@ import numpy as np
 from zwidth.parts.checks import check_whole
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError, check_choice, describe_choice
+from zwidth.words.showing import shown
 
 # Of the interval in which the share of all devices lies.
 _CONFIDENCE = 0.95
@@ -30,6 +31,9 @@ class Tolerance(NamedTuple):
     distribution: Literal["uniform", "normal"] = "uniform"
 
 
+@shown(
+    ("samples", "stable", "stable_low", "stable_high", "reliability", "stiffness", "stiffness_max"), stiffness_max="N/m"
+)
 @dataclass(frozen=True)
 class ToleranceEstimate:
     """What `simulate_tolerances` finds; of a share the interval holds the true one with 95 % confidence."""

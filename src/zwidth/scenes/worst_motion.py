@@ -17,6 +17,7 @@ from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import one_wall
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
 _SHORTEST, _LONGEST = 8, 1 << 22
@@ -33,6 +34,7 @@ _FORGOTTEN = 1e-30
 _NODES, _ROUNDS, _REACHED, _SAME = (1 << 10, 1 << 14, 1 << 18), 12, 1.0 - 1e-10, 1.0 - 1e-14
 
 
+@shown(time="s", position="m", velocity="m/s", force="N", energy="J", missing_damping="N s/m", frequency="Hz")
 class WorstMotion(NamedTuple):
     """A motion of the device over which its own damping and the wall give more energy than they take.
 

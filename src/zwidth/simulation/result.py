@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.words.errors import InputError
+from zwidth.words.showing import draw_line, shown
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
@@ -63,6 +64,25 @@ OF_WHOLE = {
 }
 
 
+def _draw(motion: Motion) -> str:
+    """A small picture of a single motion that was recorded."""
+    if motion.position is None or np.ndim(motion.position) != 1:
+        return ""
+    return draw_line(motion.time, motion.position, "position over time")
+
+
+@shown(
+    ("outcome", "time", *OF_WHOLE),
+    _draw,
+    {
+        "frequency": "the velocity does not turn twice in the tail",
+        "impact_velocity": "the wall is not entered from outside",
+        "trend": "nothing moves",
+    },
+    outcome=MotionKind,
+    time="s",
+    **{name: unit for name, (_, unit) in OF_WHOLE.items() if name != "outcome" and name != "status"},
+)
 @dataclass(frozen=True)
 class Motion:
     """One motion or many: arrays of the batch's shape, those over time with one more axis at the end.

@@ -14,6 +14,7 @@ from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import CrossingLine, curve_at, zeros_of
 from zwidth.loops.linear.rows import Island, StablePieces
+from zwidth.words.showing import shown
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
 _ROUNDS = 11
@@ -238,6 +239,7 @@ def _runs(held: np.ndarray, piece: np.ndarray) -> list[tuple[int, int]]:
     return runs
 
 
+@shown()
 class Outline(NamedTuple):
     """One closed outline of the stable set; a hole where unstable walls lie inside, an island where no soft ones do."""
 

@@ -28,6 +28,7 @@ from zwidth.loops.linear.rows import bound_intervals
 from zwidth.loops.rigid.device import classify_delays
 from zwidth.loops.rigid.ridge import slopes_kernel, stiffness_slopes
 from zwidth.words.errors import InputError
+from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
 
@@ -224,6 +225,7 @@ _ONE_SIDED = [-49 / 20, 6.0, -15 / 2, 20 / 3, -15 / 4, 6 / 5, -1 / 6]
 _AGREES = 1e-8
 
 
+@shown()
 class SceneSensitivities(NamedTuple):
     """K_max in N/m, its derivatives by dotted path in N/m per unit of the parameter, and the `zwidth.Status`."""
 

@@ -15,6 +15,7 @@ from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import curve_at, find_dips, zeros_of
 from zwidth.loops.linear.poles import log_size, poles_less_one
 from zwidth.words.quantities import WALL_RANGE
+from zwidth.words.showing import shown
 
 # Rows whose crossings are laid out at one time.
 _ROWS = 1 << 12
@@ -184,6 +185,7 @@ _HALVINGS = 48
 _NEAR, _MOST_BESIDE = 1e-9, 4
 
 
+@shown()
 class Island(NamedTuple):
     """A piece of the stable set without soft walls: its extent in stiffness and in damping."""
 

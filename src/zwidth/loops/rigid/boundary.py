@@ -28,6 +28,7 @@ from zwidth.loops.rigid.device import DelayClasses, classify_delays, valid_devic
 from zwidth.loops.rigid.polynomial import Wall, check_delay_model, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.ridge import ridge_kernel
 from zwidth.words.errors import InputError, check_choice
+from zwidth.words.showing import shown
 from zwidth.words.status import Status
 from zwidth.words.types import Array, ArrayLike, DelayModel, Vertices
 
@@ -84,6 +85,7 @@ def _boundary_kernel(omega: Array, delta: Array, d: Array, delay_model: str) -> 
     return Wall(curve.alpha + spoiled, curve.beta + spoiled)
 
 
+@shown()
 class BoundaryPoint(NamedTuple):
     """A wall on the edge of stability, or an array of them."""
 
@@ -222,6 +224,7 @@ class Piece(IntEnum):
     PLUS_ONE = 2
 
 
+@shown()
 class StableRegion(NamedTuple):
     """A closed outline: vertex k belongs to ``piece[k]``, and the last vertex joins the first along alpha = 0."""
 

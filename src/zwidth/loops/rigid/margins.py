@@ -16,6 +16,7 @@ from zwidth.arrays.xp import along, epsilon, frozen, namespace, nan_with_nan_slo
 from zwidth.loops.rigid.crossover import gain_crossover, stable_at
 from zwidth.loops.rigid.device import ANY, DeviceTerms, device, split_delay, valid_wall
 from zwidth.loops.rigid.modulus import SAMPLES_WEIGHT, find_angle, modulus, size_and_phase
+from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
 
 # Steps of false position at most; every sixth one halves the bracket.
@@ -30,6 +31,7 @@ _LEAST_MARGIN = float(np.finfo(np.float32).tiny)
 _NO_CROSSOVER = -1e-3
 
 
+@shown(phase_margin="degrees")
 class Margins(NamedTuple):
     """Margins of a wall and where they are taken, in radians a period; python-control's names in brackets."""
 

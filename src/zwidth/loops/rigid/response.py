@@ -29,6 +29,7 @@ from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.polynomial import coefficients
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import LONGEST_SETTLING
+from zwidth.words.showing import shown
 from zwidth.words.types import Array, Samples
 
 # The band round the final value that counts as settled, as in control textbooks.
@@ -176,6 +177,7 @@ def _find_peaks(found: Modes, time: np.ndarray, size: np.ndarray, allowed: float
     return -1.0
 
 
+@shown()
 class StepResponse(NamedTuple):
     """The response to a constant force that sets in at time 0; arrays of one time axis."""
 

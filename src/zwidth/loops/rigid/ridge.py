@@ -36,6 +36,7 @@ from zwidth.loops.rigid.ridge_newton import (
     wave,
 )
 from zwidth.words.errors import check_choice
+from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
@@ -173,6 +174,7 @@ RidgeMethod: TypeAlias = Literal["auto", "newton", "kkt"]
 _METHODS: tuple[str, ...] = ("auto", "newton", "kkt")
 
 
+@shown(omega="", kind=RidgeKind)
 class RidgePoint(NamedTuple):
     """The stiffest stable wall of a device, or an array of them."""
 

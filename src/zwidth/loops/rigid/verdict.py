@@ -15,6 +15,7 @@ from zwidth.loops.rigid.poles import radius_by_companion, unstable_poles
 from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.loops.rigid.row_limit import boundary_map
 from zwidth.words.errors import InputError, check_choice
+from zwidth.words.showing import shown
 from zwidth.words.status import Method, Status
 from zwidth.words.types import Array, ArrayLike, DelayModel
 
@@ -26,6 +27,7 @@ STABILITY_METHODS: tuple[str, ...] = get_args(StabilityMethod)
 _ROUGH = 2e-8
 
 
+@shown(method=Method)
 class Stability(NamedTuple):
     """Labels with their status and the `Method` that decided each point, all of the broadcast shape."""
 

@@ -1,0 +1,127 @@
+"""Results at the prompt and in notebooks: short, with units and names, and every NaN explained."""
+
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.words.showing import draw_line, spell_value
+from zwidth.words.status import RidgeKind, Status
+
+SCENE = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3), zwidth.VirtualWall(10e3, 40.0))
+MOTION: Any = SCENE.simulate(start_position=1e-4, periods=1000)
+# Nothing is stable where the estimate has the wrong sign and nothing damps.
+BACKWARDS = zwidth.VelocityFilter([-1000.0, 1000.0], [1.0, 0.0])
+NOWHERE = zwidth.Scene(zwidth.Device(0.1, 0.0), zwidth.Timing(1e-3, 1e-3), velocity=BACKWARDS)
+RESULTS: dict[str, Any] = {
+    "wall": SCENE.max_stiffness(),
+    "ridge": zwidth.alpha_max(0.1, 1),
+    "ridges": zwidth.alpha_max(np.linspace(0.0, 1.0, 1000), 1),
+    "margins": SCENE.margins(),
+    "best": SCENE.best_damping(),
+    "required": SCENE.required("damping", 25e3),
+    "slopes": SCENE.sensitivities(),
+    "poles": SCENE.pole_table(),
+    "model": SCENE.state_space(),
+    "verdict": zwidth.assess(SCENE),
+    "limit": zwidth.limits_of(SCENE)[0],
+    "recommendation": SCENE.recommend(),
+    "motion": MOTION,
+    "motions": zwidth.simulate(SCENE, np.linspace(1e3, 5e4, 30), 40.0, start_position=1e-4, periods=50),
+    "outline": SCENE.stable_region()[0],
+    "region": zwidth.stable_region(0.1, 1.0),
+    "normalized": SCENE.normalized,
+    "units": SCENE.units,
+    "label": zwidth.decide_stability(np.linspace(0.1, 0.3, 50), 0.4, 0.1, 1),
+    "robust": zwidth.robust_wall(mass=zwidth.Interval(0.09, 0.11), damping=10, period=1e-3),
+    "worst": zwidth.worst_motion(SCENE),
+    "tolerances": zwidth.simulate_tolerances(SCENE, {"mass": 0.1}, samples=100),
+    "response": zwidth.step_response(0.1, 0.4, 0.1, 1, periods=500),
+}
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_is_short_and_has_a_table(name):
+    result = RESULTS[name]
+    text = repr(result)
+    assert text.startswith(f"{type(result).__name__}(")
+    assert len(text) < 1200
+    assert not any(word in text for word in ("np.", "int32", "float64", "\n    array(["))
+    table = result._repr_html_()
+    assert table.startswith(f"<table><caption>{type(result).__name__}</caption>")
+    assert table.count("<table>") == table.count("</table>") == 1
+
+
+def test_units_and_names_in_place_of_numbers():
+    assert repr(RESULTS["wall"]) == (
+        "StiffestWall(stiffness=19.8649 kN/m, virtual_damping=41.5989 N s/m, frequency=93.1993 Hz, "
+        "kind=SMOOTH, status=OK)"
+    )
+    assert "alpha=array (1000), 0.144469 to 0.874821" in repr(RESULTS["ridges"])
+    assert "1000 OK" in repr(RESULTS["ridges"])
+
+
+def test_every_nan_has_a_reason():
+    nowhere = NOWHERE.max_stiffness()
+    assert Status(int(nowhere.status)) == Status.NO_BOUNDARY
+    assert "stiffness=NaN" in repr(nowhere)
+    assert f"status=NO_BOUNDARY: {Status.NO_BOUNDARY.message}" in repr(nowhere)
+    assert "impact_velocity=NaN, the wall is not entered from outside" in repr(MOTION)
+    assert "[OK, INVALID_INPUT]" in repr(zwidth.alpha_max(np.array([0.1, -1.0]), 1))
+    assert "stiffness_max=NaN, no wall is stable" in repr(zwidth.assess(NOWHERE.replace(stiffness=1e3)))
+    assert "reason=no stiffness is stable at any damping" in repr(NOWHERE.recommend())
+
+
+def test_a_motion_has_a_picture_and_many_have_none():
+    assert "<svg" in MOTION._repr_html_()
+    assert '<td style="text-align:left">REST</td>' in MOTION._repr_html_()
+    assert "<svg" not in RESULTS["motions"]._repr_html_()
+    unrecorded: Any = SCENE.simulate(start_position=1e-4, periods=10, record=False)
+    assert "<svg" not in unrecorded._repr_html_()
+
+
+def test_poles_are_a_table_of_poles():
+    assert RESULTS["poles"]._repr_html_().count("<tr>") == 1 + RESULTS["poles"].z.size
+
+
+@pytest.mark.parametrize(
+    ("value", "unit", "text"),
+    [
+        (0.1, "kg", "100 g"),
+        (np.float64(1.5e-40), "m", "1.5e-40 m"),
+        (np.array([]), "m", "[]"),
+        (np.array([1.0, np.nan] * 4), "m", "array (8), 1 m, 4 NaN"),
+        (np.full((2, 3), np.nan), "m", "array (2, 3), none of them finite"),
+        (np.array([True] * 5 + [False]), "", "array (6), 5 True"),
+        (np.int32(1), RidgeKind, "CORNER"),
+        (-np.inf, "N", "-inf N"),
+        ("", "", "''"),
+        (None, "m", "None"),
+        ({"mass": 1.0}, "", "{mass: 1}"),
+    ],
+)
+def test_values_in_words(value, unit, text):
+    assert spell_value(value, unit) == text
+
+
+def test_what_jax_traces_is_shown_as_it_is():
+    seen = []
+
+    def height(delta):
+        found = zwidth.alpha_max(delta, 1)
+        seen.append(repr(found))
+        return found.alpha
+
+    jax.jit(height)(0.1)
+    assert seen[0].startswith("RidgePoint(")
+
+
+def test_a_line_of_nothing_is_no_picture():
+    assert draw_line(np.arange(3.0), np.full(3, np.nan), "nothing") == ""
+    assert draw_line(np.arange(3.0), np.ones(3), "<flat>").count("&lt;flat&gt;") == 1
+
+
+def test_modules_show_their_own_names():
+    assert dir(zwidth.devices) == ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
