@@ -41,6 +41,7 @@ from .parts import devices as devices
 from .parts.actuator import Actuator as Actuator
 from .parts.device import Coupling as Coupling
 from .parts.device import Device as Device
+from .parts.linear_device import LinearDevice as LinearDevice
 from .parts.mode import Mode as Mode
 from .parts.operator import Operator as Operator
 from .parts.timing import Timing as Timing

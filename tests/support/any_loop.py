@@ -40,6 +40,8 @@ def _rates(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, np.nd
     The state: positions and velocities of the bodies, position and velocity of each mode, the actuator's force and,
     where it is of second order, its rate.
     """
+    if isinstance(scene.device, zwidth.LinearDevice):
+        return _companion(scene.device, number)
     bodies, links = _masses_and_links(scene)
     n, modes, lag = len(bodies), scene.device.modes, scene.device.actuator
     size = 2 * n + 2 * len(modes) + (lag.order if lag else 0)
@@ -75,6 +77,25 @@ def _rates(scene: Any, number: Any = float) -> tuple[list[list[Any]], int, np.nd
             table[acts + 1][acts], table[acts + 1][acts + 1] = -w * w, -2 * number(lag.damping_ratio) * w
             table[acts + 1][size] = w * w
     return table, size, seen
+
+
+def _companion(device: Any, number: Any) -> tuple[list[list[Any]], int, np.ndarray]:
+    """The same of a linear device that is not sampled, by its coefficients in a unit of time of about its own."""
+    bottom, top = (
+        [value / device.system.denominator[0] for value in part]
+        for part in (device.system.denominator, device.system.numerator)
+    )
+    size = len(bottom) - 1
+    table = [[number(0)] * (size + 1) for _ in range(size + 1)]
+
+    def exact(value: Any) -> Any:
+        return number(flint.fmpq(value.numerator, value.denominator)) if number is _ball else float(value)
+
+    for k in range(size - 1):
+        table[k][k + 1] = number(1)
+    table[size - 1] = [*(-exact(value) for value in bottom[:0:-1]), number(1)]
+    seen = np.array([exact(value) for value in top[::-1]] + [number(0)] * (size - len(top)), object)
+    return table, size, seen if number is _ball else seen.astype(float)
 
 
 def velocity_polynomials(scene: Any) -> tuple[np.ndarray, np.ndarray]:

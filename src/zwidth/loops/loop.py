@@ -19,7 +19,7 @@ from zwidth.arrays.evaluate import FEW
 from zwidth.arrays.xp import is_jax, is_traced, namespace
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import Chain, chain_of
+from zwidth.loops.linear.chain import AnyChain, chain_of
 from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.margins import linear_margins
 from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
@@ -156,8 +156,8 @@ class LinearLoop:
     most_periods: ClassVar[float] = 128
 
     @cached_property
-    def chain(self) -> Chain:
-        """Its masses, springs and dampers."""
+    def chain(self) -> AnyChain:
+        """Its masses, springs and dampers, or its linear system."""
         return chain_of(self.scene)
 
     @cached_property

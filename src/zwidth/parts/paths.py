@@ -15,6 +15,7 @@ import numpy as np
 from zwidth.arrays.xp import is_jax
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.device import Coupling, Device
+from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.operator import Operator
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity, name_estimate
@@ -29,7 +30,7 @@ class Parts(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
-    def device(self) -> Device: ...
+    def device(self) -> Device | LinearDevice: ...
     @property
     def timing(self) -> Timing: ...
     @property

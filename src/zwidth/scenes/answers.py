@@ -294,11 +294,12 @@ class SceneAnswers:
 def _realize(scene: Any, build: Callable[..., Matrices], unit: float, alpha: Any, beta: Any) -> StateSpace:
     """A loop with one wall, its states in m, m/s and N in place of units of the period and the mass."""
     chain, period, mass = scene.loop.chain, scene.timing.period, float(scene.mass)
-    loop, count = build(chain, *one_wall(*np.broadcast_arrays(alpha, beta))), len(chain.bodies)
-    waiting = delayed_device(chain).A.shape[0] - 2 * count
-    filtered = loop.A.shape[0] - 2 * count - waiting
-    parts = np.ones(filtered + count), np.full(count, 1.0 / period), np.full(waiting, mass / period**2)
-    scale = np.concatenate(parts)
+    loop = build(chain, *one_wall(*np.broadcast_arrays(alpha, beta)))
+    force = mass / period**2
+    own = np.array(chain.state_units(1.0 / period, force))
+    waiting = delayed_device(chain).A.shape[0] - own.size
+    filtered = loop.A.shape[0] - own.size - waiting
+    scale = np.concatenate([np.ones(filtered), own, np.full(waiting, force)])
     A, B = loop.A * scale[:, None] / scale, loop.B * scale[:, None] * unit
     return StateSpace(A, B, loop.C / scale, loop.D * unit, period)
 

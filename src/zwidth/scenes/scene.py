@@ -15,6 +15,7 @@ from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device
+from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.operator import Operator
 from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
@@ -75,7 +76,7 @@ class Scene(SceneAnswers):
         array([False,  True])
     """
 
-    device: Device
+    device: Device | LinearDevice
     timing: Timing
     wall: VirtualWall = field(default_factory=NoWall)
     velocity: Velocity = field(default_factory=BackwardDifference)
@@ -84,11 +85,15 @@ class Scene(SceneAnswers):
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
             self._move_up()
-        kinds = {"device": Device, "timing": Timing, "wall": VirtualWall, "velocity": Velocity}
+        kinds = {"device": Device | LinearDevice, "timing": Timing, "wall": VirtualWall, "velocity": Velocity}
         for name, kind in {**kinds, "operator": Operator | None}.items():
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {_EXAMPLES[name]}")
+        if self.operator is not None and not isinstance(self.device, Device):
+            raise InputError(
+                "operator: a hand holds a body, and of this device no body is known; make the hand a part of it"
+            )
 
     def _move_up(self) -> None:
         """Without a wall the velocity estimate is the third part, and the hand the fourth."""
@@ -108,7 +113,8 @@ class Scene(SceneAnswers):
         grasp = hand is None or (hand.rigid and isinstance(hand.stiffness, float) and hand.stiffness == 0)
         plain = isinstance(self.velocity, BackwardDifference) and self.velocity.coded_period is None
         within = {"velocity": plain, "operator": grasp}
-        return tuple(name for name in find_parts(self) if not within.get(name))
+        device = () if isinstance(self.device, Device) else ("device",)
+        return device + tuple(name for name in find_parts(self) if not within.get(name))
 
     @cached_property
     def loop(self) -> LinearLoop:

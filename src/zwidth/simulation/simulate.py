@@ -204,6 +204,11 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     for place, scene in np.ndenumerate(array):
         if not (hasattr(scene, "device") and hasattr(scene, "timing")):
             raise InputError(f"scenes: got {scene!r}; a zwidth.Scene or a list of them is needed")
+        if hasattr(scene.device, "system"):
+            raise InputError(
+                "device: got one given as a linear system, of which no body is known that touches, slips and starts; "
+                "simulate a zwidth.Device, or step scene.state_space(stiffness, virtual_damping)"
+            )
         if is_traced(scene.device.mass, scene.timing.period):
             raise InputError("scenes: got one of values that JAX traces; simulate outside of jit, vmap and grad")
         which[place] = known.setdefault(id(scene), len(known))

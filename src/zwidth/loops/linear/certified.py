@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import Chain, chain_of
+from zwidth.loops.linear.chain import AnyChain, chain_of
 from zwidth.loops.rigid import certified
+from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.velocity import Butterworth, LowPass, VelocityFilter, WindowedDifference
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
@@ -125,6 +126,9 @@ def _exact(scene: Any, period: flint.arb) -> Any:
         """The same with balls for numbers, past the checks of these."""
         if isinstance(part, tuple):
             return tuple(map(exact, part))
+        if isinstance(part, LinearDevice):
+            # Exact by itself.
+            return part
         if isinstance(part, float) or not is_dataclass(part):
             return flint.arb(part) if isinstance(part, float) else part
         # Without what the part has computed from its numbers.
@@ -139,7 +143,7 @@ def _exact(scene: Any, period: flint.arb) -> Any:
     return SimpleNamespace(**own)
 
 
-def _device(chain: Chain) -> tuple[flint.arb_poly, flint.arb_poly]:
+def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
     """Numerator and denominator of G without its whole periods of delay."""
     import flint
 
@@ -154,7 +158,10 @@ def _device(chain: Chain) -> tuple[flint.arb_poly, flint.arb_poly]:
             flint.arb_mat([[whole[i, size]] for i in range(size)]),
         )
 
-    step, full = flow(flint.arb(1))
+    if chain.sampled:
+        step, full = flint.arb_mat(rate), flint.arb_mat([[value] for value in push])
+    else:
+        step, full = flow(flint.arb(1))
     device = step.charpoly()
 
     def numerator(state: flint.arb_mat) -> flint.arb_poly:

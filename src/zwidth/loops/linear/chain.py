@@ -14,17 +14,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
 import numpy as np
 
 from zwidth.arrays.xp import namespace
+from zwidth.loops.linear.system import FASTEST, Realization, System
+from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import Parts
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import InputError
-
-# Faster links, modes and actuators than these, in radians or decays a period, leave no digits of e^A.
-_FASTEST = 1e4
 
 
 class Body(NamedTuple):
@@ -59,14 +58,6 @@ class Resonance(NamedTuple):
         return np.array([fast, w * w / fast if root.real else fast.conjugate()])
 
 
-class Realization(NamedTuple):
-    """``x' = A x + B u + push f``, the first number of x what is sensed; f a force held on the device itself."""
-
-    A: Any
-    B: Any
-    push: Any
-
-
 @dataclass(frozen=True)
 class Chain:
     """Bodies in a row, the sensor on one of them, and the wall's force on the first."""
@@ -80,6 +71,8 @@ class Chain:
     d: Any
     whole: int
     estimate: Estimate
+
+    sampled: ClassVar[bool] = False
 
     @property
     def rigid(self) -> bool:
@@ -95,6 +88,12 @@ class Chain:
     def free(self) -> bool:
         """Whether nothing pulls a device at rest back."""
         return all(body.stiffness == 0 for body in self.bodies)
+
+    def state_units(self, speed: float, force: float) -> list[float]:
+        """The units of the state's numbers in SI ones, with m a length: a speed's and a force's."""
+        count = len(self.bodies) + len(self.modes)
+        behind = 0 if self.actuator is None else 2 if isinstance(self.actuator, Resonance) else 1
+        return [1.0] * count + [speed] * count + [force, force * speed][:behind]
 
     def realize(self) -> Realization:
         """The matrices of its motion."""
@@ -129,7 +128,7 @@ class Chain:
         lag = self.actuator.rate if isinstance(self.actuator, Resonance) else self.actuator
         rates["actuator.cutoff: an actuator"] = [] if lag is None else [float(lag)]
         for what, found in rates.items():
-            if max(found, default=0.0) > _FASTEST:
+            if max(found, default=0.0) > FASTEST:
                 name = what.partition(".")[0]
                 raise InputError(
                     f"{what} that rings {max(found) / (2 * np.pi):.3g} times a period cannot be resolved; leave the "
@@ -137,13 +136,21 @@ class Chain:
                 )
 
 
-def chain_of(scene: Parts, delay: tuple[Any, int] | None = None) -> Chain:
-    """The chain of a scene, normalized by its period and by the mass the wall's force acts on.
+AnyChain: TypeAlias = Chain | System
+
+
+def chain_of(scene: Parts, delay: tuple[Any, int] | None = None) -> AnyChain:
+    """The bodies of a scene, or its linear system, normalized by its period and by the mass the wall's force acts on.
 
     ``delay`` is the delay in periods and its whole part, where a trace hides them.
     """
     device, timing, hand = scene.device, scene.timing, scene.operator
     period = timing.period
+    d, whole = delay or (timing.d, int(np.floor(timing.d)))
+    if isinstance(device, LinearDevice):
+        # In balls a float is exact.
+        mass = type(period)(device.mass) if hasattr(period, "mid") else device.mass
+        return System(device, period, mass, d, whole, scene.velocity.estimate(period))
     masses = [(device.mass, device.damping, 0.0)]
     links = []
     if device.coupling is not None:
@@ -167,7 +174,6 @@ def chain_of(scene: Parts, delay: tuple[Any, int] | None = None) -> Chain:
     actuator: Any = None if lag is None else lag.rate * period
     if lag is not None and lag.order == 2:
         actuator = Resonance(actuator, lag.damping_ratio, 1.0 / (actuator * actuator))
-    d, whole = delay or (timing.d, int(np.floor(timing.d)))
     return Chain(bodies, tied, modes, actuator, sensor, d, whole, scene.velocity.estimate(period))
 
 

@@ -16,8 +16,9 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.xp import namespace
-from zwidth.loops.linear.chain import Chain, is_zero
+from zwidth.loops.linear.chain import AnyChain, Chain, is_zero
 from zwidth.loops.linear.roots import LoopRoots
+from zwidth.loops.linear.system import System
 from zwidth.loops.rigid.device import Plant, held_plant, undelayed_plant
 
 # Continuous zeros slower than this a period lead to sampled ones; Aberth's steps at most, and the last one's share.
@@ -31,6 +32,11 @@ def flow(rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
     phi1 = _matrix_phi1(rate * time)
     # e^A - 1 = A phi1(A) keeps the digits of slow motions.
     return rate * time @ phi1, time * (phi1 @ push)
+
+
+def hold(chain: AnyChain, rate: Any, push: Any, time: Any) -> tuple[Any, Any]:
+    """The `flow` of a chain's matrices; those of a sampled one are it, whatever the time."""
+    return (rate - np.eye(len(push)), push) if chain.sampled else flow(rate, push, time)
 
 
 def _matrix_phi1(rate: Any) -> Any:
@@ -83,21 +89,21 @@ class Sampled(NamedTuple):
     late: Any | None  # Gamma(1 - f), None for whole delays
 
 
-def respond(chain: Chain) -> Sampled | Plant:
+def respond(chain: AnyChain) -> Sampled | Plant:
     """The chain between two samples, what `needed` is computed from at every angle."""
-    return _rigid_plant(chain) if chain.rigid else sampled(chain)
+    return _rigid_plant(chain) if isinstance(chain, Chain) and chain.rigid else sampled(chain)
 
 
-def sampled(chain: Chain) -> Sampled:
+def sampled(chain: AnyChain) -> Sampled:
     """Discretize exactly."""
     A, B, _ = chain.realize()
-    psi, full = flow(A, B, 1.0)
+    psi, full = hold(chain, A, B, 1.0)
     fraction = chain.d - chain.whole
-    late = None if is_zero(fraction) else flow(A, B, 1.0 - fraction)[1]
+    late = None if is_zero(fraction) else hold(chain, A, B, 1.0 - fraction)[1]
     return Sampled(psi, full, late)
 
 
-def required_wall(chain: Chain, w: Any, parts: Sampled | Plant | None = None) -> Any:
+def required_wall(chain: AnyChain, w: Any, parts: Sampled | Plant | None = None) -> Any:
     """``q = -1/G`` at ``e^(jw)``, one angle, without any root: what derivatives are taken of."""
     at: CirclePoints = circle(w)
     parts = respond(chain) if parts is None else parts
@@ -117,12 +123,18 @@ def _rigid_plant(chain: Chain) -> Plant:
     return undelayed_plant(delta) if is_zero(fraction) else held_plant(delta, fraction)
 
 
-def find_roots(chain: Chain) -> LoopRoots:
+def find_roots(chain: AnyChain) -> LoopRoots:
     """The loop of a chain by its roots."""
-    if chain.rigid:
+    if isinstance(chain, Chain) and chain.rigid:
         return _rigid_loop(chain)
     chain.check()
     parts = sampled(chain)
+    if isinstance(chain, System) and chain.sampled:
+        zeros, poles = chain.device.offsets
+        # Roots at z = 0 are periods of delay.
+        lag = chain.whole + int(np.sum(poles == 1)) - int(np.sum(zeros == 1))
+        gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
+        return LoopRoots(gain, lag, zeros[zeros != 1], poles[poles != 1], chain.estimate)
     seen, poles = chain.continuous
     poles = -np.expm1(poles)
     den = np.atleast_1d(np.poly(-poles)).real

@@ -23,7 +23,7 @@ from zwidth.arrays.circle import CirclePoints, Jet, circle
 from zwidth.arrays.roots import bisect, false_position
 from zwidth.arrays.xp import within
 from zwidth.loops.linear.boundary import Boundary
-from zwidth.loops.linear.chain import Chain
+from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.curve import nodes_of
 from zwidth.loops.linear.held import find_roots
 from zwidth.loops.linear.poles import log_radius
@@ -202,13 +202,13 @@ class Passage(NamedTuple):
 class DelayedLoops:
     """The loops of one chain at its own delay and at longer ones, up to one period more."""
 
-    chain: Chain
+    chain: AnyChain
     delays: np.ndarray
     loops: list[LoopRoots]
     nodes: list[np.ndarray]
 
     @classmethod
-    def lay_out(cls, chain: Chain) -> DelayedLoops:
+    def lay_out(cls, chain: AnyChain) -> DelayedLoops:
         """At every thirty-second of a period, whole ones among them."""
         own = float(chain.d)
         grid = (np.floor(own * _PARTS) + 1.0 + np.arange(_PARTS)) / _PARTS
@@ -217,7 +217,7 @@ class DelayedLoops:
         return cls(chain, delays, loops, [nodes_of(loop) for loop in loops])
 
 
-def loop_at(chain: Chain, delay: float) -> LoopRoots:
+def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
     """The loop of a chain at another delay."""
     return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
 
@@ -292,7 +292,7 @@ def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: fl
     return float(passed) + at.periods
 
 
-def _is_first_loss(chain: Chain, alpha: float, beta: float, margin: float) -> bool:
+def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) -> bool:
     """Whether the wall is stable at some delays before, and no longer beyond: poles counted, not followed."""
     wall = np.array([alpha]), np.array([beta])
     delays = [float(chain.d) + share * margin for share in (*_WITNESSES, _BEYOND)]
@@ -301,7 +301,7 @@ def _is_first_loss(chain: Chain, alpha: float, beta: float, margin: float) -> bo
 
 
 def linear_margins(
-    chain: Chain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray, with_delay: bool = True
+    chain: AnyChain, boundary: Boundary, alpha: np.ndarray, beta: np.ndarray, with_delay: bool = True
 ) -> Margins:
     """All margins of walls of one shape, periods and radians a period; NaN where a wall is out of range."""
     stable = label_walls(boundary, alpha, beta)

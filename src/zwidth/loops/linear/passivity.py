@@ -28,11 +28,16 @@ _NODES, _ROUNDS, _MOST = 129, 80, 1 << 18
 _PROVED = 1e-13
 
 
-def find_obstacle(*, coupling: Any = None, actuator: Any = None, modes: Any = (), **_: Any) -> str:
+def find_obstacle(*, coupling: Any = None, actuator: Any = None, modes: Any = (), system: Any = None, **_: Any) -> str:
     """Why parts of a device have no such condition; nothing where they have.
 
     It is about a force that acts as it is commanded, and the motion of the point where it does.
     """
+    if system is not None:
+        return (
+            "with a linear device: no passivity condition of this kind is known where damping is not that of one body; "
+            "ask is_stable of devices with the hands they meet"
+        )
     if actuator is not None:
         return (
             "with an actuator: no passivity condition of this kind is known where the force lags behind the command; "

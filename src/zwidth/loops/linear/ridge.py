@@ -22,7 +22,7 @@ from zwidth.arrays.evaluate import evaluate
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import chain_of
-from zwidth.loops.linear.held import flow
+from zwidth.loops.linear.held import hold
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import bound_intervals
 from zwidth.loops.rigid.device import classify_delays
@@ -306,6 +306,9 @@ def _inputs(scene: Any, whole: int, at: CirclePoints) -> tuple[Any, ...]:
     """What K_max depends on a parameter through: the unit of stiffness, the delay, the rates of the chain, F and F'."""
     delay = scene.timing.delay / scene.timing.period
     chain = chain_of(scene, (delay, whole))
+    if chain.sampled:
+        # Its period is that of the loop.
+        chain.check()
     return (scene.units.stiffness, delay, *chain.realize()[:2], *chain.estimate.jet(at))
 
 
@@ -320,7 +323,7 @@ def _needed_slopes(
     # An imaginary step so short that its square is nothing is a derivative without a difference, here of e^A.
     rate, push = (value + 1j * _TINY * by for value, by in zip(chain.realize(), (by_rate, by_push), strict=False))
     fraction = chain.d - chain.whole + 1j * _TINY * by_delay
-    steps = (*flow(rate, push, 1.0), flow(rate, push, 1.0 - fraction)[1])
+    steps = (*hold(chain, rate, push, 1.0), hold(chain, rate, push, 1.0 - fraction)[1])
     (psi, full, late), (by_psi, by_full, by_late) = ([f(x) for x in steps] for f in (np.real, lambda x: x.imag / _TINY))
     turns, slopes = chain.whole + 1, np.full((2, at.w.size), complex(np.nan, np.nan))
     exact, lag = scene.loop.roots.required_wall(at).value, lag_jet(at, turns)

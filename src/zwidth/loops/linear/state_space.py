@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import Chain
-from zwidth.loops.linear.held import flow, sampled
+from zwidth.loops.linear.chain import AnyChain
+from zwidth.loops.linear.held import hold, sampled
 from zwidth.parts.velocity import Estimate
 
 
@@ -65,7 +65,7 @@ def estimate_matrices(estimate: Estimate) -> Matrices:
     return in_series(difference, behind)
 
 
-def delayed_device(chain: Chain) -> Matrices:
+def delayed_device(chain: AnyChain) -> Matrices:
     """G: from the wall's force to the sampled position, with the forces that are on their way."""
     parts = sampled(chain)
     size = parts.psi.shape[0]
@@ -87,18 +87,18 @@ def delayed_device(chain: Chain) -> Matrices:
     return Matrices(A, B, C, np.zeros((1, 1)))
 
 
-def open_loop(chain: Chain, alpha: float, beta: float) -> Matrices:
+def open_loop(chain: AnyChain, alpha: float, beta: float) -> Matrices:
     """``L = (alpha + beta F) G``, from the position that the wall is given to the one that its force answers."""
     f = estimate_matrices(chain.estimate)
     return in_series(Matrices(f.A, f.B, beta * f.C, alpha + beta * f.D), delayed_device(chain))
 
 
-def closed_loop(chain: Chain, alpha: float, beta: float) -> Matrices:
+def closed_loop(chain: AnyChain, alpha: float, beta: float) -> Matrices:
     """From a force held on the device to the sampled position, in contact with the wall."""
     loop = open_loop(chain, alpha, beta)
     size = loop.A.shape[0]
     A, _, held = chain.realize()
     filtered = size - delayed_device(chain).A.shape[0]
     push = np.zeros((size, 1))
-    push[filtered : filtered + len(held), 0] = flow(A, held, 1.0)[1]
+    push[filtered : filtered + len(held), 0] = hold(chain, A, held, 1.0)[1]
     return Matrices(loop.A - loop.B @ loop.C, push, loop.C, np.zeros((1, 1)))

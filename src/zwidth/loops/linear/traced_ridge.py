@@ -19,7 +19,7 @@ import numpy as np
 from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import broadcast_traced
 from zwidth.arrays.xp import is_traced, nan_with_nan_slopes
-from zwidth.loops.linear.chain import Chain, chain_of
+from zwidth.loops.linear.chain import AnyChain, chain_of
 from zwidth.loops.linear.held import required_wall, respond
 from zwidth.loops.linear.ridge import Condition, moving_paths
 from zwidth.loops.rigid.exact_points import polish
@@ -134,7 +134,7 @@ def _solve(structure: Structure, scene: Any, start: Array, codes: Array) -> tupl
     return *(found * scales), close
 
 
-def _residual(chain: Chain, unknowns: Array, args: Any) -> Array:
+def _residual(chain: AnyChain, unknowns: Array, args: Any) -> Array:
     """The four equations, of order one; ``args`` is what they depend on beside the unknowns."""
     parts, moving, start, codes, scales = args
     alpha, beta, w1, w2 = unknowns * scales

@@ -92,5 +92,5 @@ def test_a_wall_that_pushes_and_one_that_is_not_finite():
 def test_with_the_sensor_at_the_tip_there_is_no_such_condition():
     coupling = zwidth.Coupling(0.05, 20e3, 1.0, "tip")
     scene = zwidth.Scene(zwidth.Device(0.1, 10.0, coupling), zwidth.Timing(1e-3))
-    with pytest.raises(InputError, match="'tip' has no passivity condition"):
+    with pytest.raises(InputError, match="with the sensor at the tip: there is no passivity condition"):
         scene.is_passive(1e3)
