@@ -16,16 +16,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from zwidth.loops.linear.chain import AnyChain, chain_of
+from zwidth.loops.linear.system import System
 from zwidth.loops.rigid import certified
 from zwidth.parts.linear_device import LinearDevice
-from zwidth.parts.velocity import Butterworth, LowPass, VelocityFilter, WindowedDifference
+from zwidth.parts.velocity import Butterworth, Estimate, LowPass, VelocityFilter, WindowedDifference
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
 if TYPE_CHECKING:
     import flint
 
-_FIRST_BITS, _MOST_BITS = 128, 8192
+_FIRST_BITS, _MOST_BITS, _FLOAT_BITS = 128, 8192, 60
+_NOTHING = Estimate(0, 0.0)
 
 
 class BallPolynomials(NamedTuple):
@@ -141,6 +143,35 @@ def _exact(scene: Any, period: flint.arb) -> Any:
     own = {item.name: getattr(made, item.name) for item in fields(made)}
     own |= {"timing": SimpleNamespace(period=period), "velocity": SimpleNamespace(estimate=lambda period: made.mass)}
     return SimpleNamespace(**own)
+
+
+def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
+    """The gain of the sampled response of a linear device, and ``1 - z`` of its zeros, right to float64.
+
+    What the aliases of fast poles leave of slow zeros is not to be had in floats: balls find it, where one precision is
+    not enough with twice as much.
+    """
+    import flint
+
+    bits = _FIRST_BITS
+    while bits <= _MOST_BITS:
+        with flint.ctx.workprec(bits):
+            ball = flint.arb(period)
+            response, _ = _device(System(device, ball, flint.arb(device.mass), *delay, _NOTHING))
+            coefficients = response.coeffs()
+            while coefficients and coefficients[-1].contains(0):
+                # What no precision tells from 0 is 0 once the others are known far beyond float64.
+                coefficients.pop()
+            if coefficients and coefficients[-1].rel_accuracy_bits() > _FLOAT_BITS:
+                try:
+                    offsets = flint.arb_poly(coefficients)(flint.arb_poly([1, -1]))
+                    roots = flint.acb_poly(offsets).roots(tol=2.0 ** (-bits // 3))
+                except ValueError:
+                    roots = None
+                if roots is not None and all(root.rel_accuracy_bits() > _FLOAT_BITS for root in roots):
+                    return float(coefficients[-1]), np.array([complex(root) for root in roots], complex)
+        bits *= 2
+    raise InputError("device: its zeros between samples cannot be told from each other; leave out what hardly answers")
 
 
 def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:

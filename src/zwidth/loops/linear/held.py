@@ -16,6 +16,7 @@ import numpy as np
 
 from zwidth.arrays.circle import CirclePoints, circle, lag_jet
 from zwidth.arrays.xp import namespace
+from zwidth.loops.linear.certified import prove_zeros
 from zwidth.loops.linear.chain import AnyChain, Chain, is_zero
 from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.system import System
@@ -135,6 +136,11 @@ def find_roots(chain: AnyChain) -> LoopRoots:
         lag = chain.whole + int(np.sum(poles == 1)) - int(np.sum(zeros == 1))
         gain = chain.device.gain * float(chain.mass) / float(chain.period) ** 2
         return LoopRoots(gain, lag, zeros[zeros != 1], poles[poles != 1], chain.estimate)
+    if isinstance(chain, System):
+        held = chain.d != chain.whole
+        gain, zeros = prove_zeros(chain.device, float(chain.period), (float(chain.d), chain.whole))
+        poles = -np.expm1(chain.device.poles * float(chain.period))
+        return LoopRoots(gain, chain.whole + held, zeros, poles, chain.estimate)
     seen, poles = chain.continuous
     poles = -np.expm1(poles)
     den = np.atleast_1d(np.poly(-poles)).real
@@ -149,6 +155,8 @@ def find_roots(chain: AnyChain) -> LoopRoots:
     slow = slow[np.abs(slow) < _SLOW]
     zeros = np.roots(top).astype(complex)
     zeros[np.argsort(np.abs(zeros))[: slow.size]] = slow
+    # Off the real line, which steps cannot leave: two real ones may have become a pair.
+    zeros *= 1.0 + 1e-6j * (1.0 - 2.0 * (np.arange(zeros.size) % 2))
     return LoopRoots(float(top[0]), lag, -_polished_zeros(parts, zeros), poles, chain.estimate)
 
 

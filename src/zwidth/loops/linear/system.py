@@ -58,11 +58,6 @@ class System:
         push = push * (self.mass / self.period)
         return Realization(rate * self.period, push, push)
 
-    @property
-    def continuous(self) -> tuple[np.ndarray, np.ndarray]:
-        """Its finite zeros and its poles, in radians a period, where it is not sampled."""
-        return self.device.zeros * self.period, self.device.poles * self.period
-
     def check(self) -> None:
         """Refuse what cannot be sampled at the loop's period."""
         if self.sampled:
@@ -84,14 +79,9 @@ class System:
 
 def _sections(device: LinearDevice) -> tuple[np.ndarray, np.ndarray]:
     """A and B of sections in series, each with one pole or two, so that no root depends on another's rounding."""
-    from scipy.signal import zpk2sos
-
-    parts = zpk2sos(device.zeros, device.poles, 1.0, pairing="minimal", analog=True)
     rate, push, seen, through = np.zeros((0, 0)), np.zeros(0), np.zeros(0), 1.0
-    for section in parts:
-        order = 2 if section[3] else 1
-        top, bottom = section[2 - order : 3], section[5 - order :]
-        top, bottom = top / bottom[0], bottom / bottom[0]
+    for top, bottom in _pair(device.zeros, device.poles):
+        order = bottom.size - 1
         own = np.eye(order, k=1)
         own[-1] = -bottom[:0:-1]
         sees = (top[1:] - top[0] * bottom[1:])[::-1]
@@ -101,6 +91,32 @@ def _sections(device: LinearDevice) -> tuple[np.ndarray, np.ndarray]:
         push = np.append(push, entry * through)
         seen, through = np.append(top[0] * seen, sees), top[0] * through
     return _see_first(rate, push * device.gain, seen)
+
+
+def _pair(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Numerator and denominator of each section, of one length, slow ones first: two poles each, a last real one alone.
+
+    A pair of zeros finds its section, for there are more poles than zeros.
+    """
+
+    def group(roots: np.ndarray) -> list[np.ndarray]:
+        real, pairs = (
+            np.sort(roots[roots.imag == 0])[::-1],
+            [np.array([z, z.conjugate()]) for z in roots[roots.imag > 0]],
+        )
+        return sorted([*pairs, *(real[k : k + 2] for k in range(0, real.size, 2))], key=lambda each: np.abs(each).min())
+
+    sections = sorted(group(poles), key=lambda each: each.size, reverse=True)
+    left, chosen = list(range(len(sections))), {}
+    for each in sorted(group(zeros), key=lambda each: each.size, reverse=True):
+        far = [abs(np.log((1e-300 + np.abs(sections[k]).max()) / (1e-300 + np.abs(each).max()))) for k in left]
+        far = [np.inf if sections[k].size < each.size else value for k, value in zip(left, far, strict=True)]
+        chosen[left.pop(int(np.argmin(far)))] = each
+    found = []
+    for k, own in enumerate(sections):
+        top = np.atleast_1d(np.poly(chosen.get(k, np.zeros(0)))).real
+        found.append((np.concatenate([np.zeros(own.size + 1 - top.size), top]), np.poly(own).real))
+    return found
 
 
 def _companion(device: LinearDevice) -> tuple[Any, Any]:
