@@ -97,7 +97,8 @@ class LinearDevice:
             return 1.0 / self.gain
         moving = np.abs(self.poles)[np.abs(self.poles) > 0]
         w = float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0
-        at, unit = (1j * w, w) if self.dt is None else (1j, 1.0 / self.dt)
+        # Beside the poles of undamped devices.
+        at, unit = (w * (0.3 + 1j), w) if self.dt is None else (0.3 + 1j, 1.0 / self.dt)
         size = abs(self.gain) * np.prod(np.abs(at - self.zeros)) / np.prod(np.abs(at - self.poles))
         return float(1.0 / (size * unit * unit))
 
@@ -122,8 +123,8 @@ def _read(given: Any) -> RationalResponse:
             f"device: got a numerator of degree {top.degree()} over a denominator of degree {bottom.degree()}; a force "
             "must not move the position at once, so the denominator's must be higher: add the lag that is missing"
         )
-    numbers = (tuple(Fraction(int(c.p), int(c.q)) for c in reversed(part.coeffs())) for part in (top, bottom))
-    return RationalResponse(*numbers, float(dt) if dt else None)
+    first, second = (tuple(Fraction(int(c.p), int(c.q)) for c in reversed(part.coeffs())) for part in (top, bottom))
+    return RationalResponse(first, second, float(dt) if dt else None)
 
 
 def _read_form(given: Any, flint: Any) -> tuple[Any, Any]:
@@ -140,7 +141,7 @@ def _read_form(given: Any, flint: Any) -> tuple[Any, Any]:
 
     def expand(roots: Any) -> Any:
         """The monic polynomial of real roots and conjugate pairs."""
-        known = np.asarray(roots, complex).ravel()
+        known: Any = np.asarray(roots, complex).ravel()
         found = flint.fmpq_poly([1])
         for root in known[known.imag >= 0].tolist():
             real, imag = exact(root.real), exact(root.imag)
@@ -186,4 +187,5 @@ def find_roots(polynomial: Polynomial, offsets: bool = False) -> np.ndarray:
     if offsets:
         whole = whole(flint.fmpz_poly([1, -1]))
     with flint.ctx.workprec(128):
-        return np.array([complex(root) for root, times in whole.complex_roots() for _ in range(times)], complex)
+        found: Any = whole.complex_roots()
+        return np.array([complex(root) for root, times in found for _ in range(times)], complex)

@@ -54,7 +54,7 @@ class Batch:
         # An adaptive window is no filter: its own numbers stand beside the chain's.
         adapts = isinstance(scenes[0].velocity, FOAW)
         plain = [replace_parameters(each, {"velocity": BackwardDifference()}) for each in scenes] if adapts else scenes
-        chains = [chain_of(each) for each in plain]
+        chains: Any = [chain_of(each) for each in plain]
         self.machine = mechanics(chains)
         self.estimates: list[Any] = (
             [each.velocity for each in scenes] if adapts else [chain.estimate for chain in chains]

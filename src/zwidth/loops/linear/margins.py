@@ -307,6 +307,8 @@ def linear_margins(
     stable = label_walls(boundary, alpha, beta)
     inside = within(alpha, WALL_RANGE) & within(beta, WALL_RANGE)
     loops: DelayedLoops | None = None
+    # What a sampled device does between its samples is not known.
+    with_delay = with_delay and not chain.sampled
     out = np.full((len(Margins._fields), *alpha.shape), np.nan)
     for place in np.ndindex(alpha.shape):
         a, b, good = float(alpha[place]), float(beta[place]), bool(stable[place])

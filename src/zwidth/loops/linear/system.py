@@ -99,7 +99,7 @@ def _pair(zeros: np.ndarray, poles: np.ndarray) -> list[tuple[np.ndarray, np.nda
     A pair of zeros finds its section, for there are more poles than zeros.
     """
 
-    def group(roots: np.ndarray) -> list[np.ndarray]:
+    def group(roots: Any) -> list[np.ndarray]:
         real, pairs = (
             np.sort(roots[roots.imag == 0])[::-1],
             [np.array([z, z.conjugate()]) for z in roots[roots.imag > 0]],
