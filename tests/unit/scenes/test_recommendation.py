@@ -125,13 +125,7 @@ def test_wrong_wishes_are_refused(wanted, message):
 
 
 def test_scenes_without_an_answer_say_why():
-<<<<<<< HEAD
     with pytest.raises(zwidth.InputError, match="with the sensor at the tip: there is no passivity condition"):
-=======
-    with pytest.raises(
-        zwidth.InputError, match="passivity with the sensor at the tip: there is no passivity condition"
-    ):
->>>>>>> 535beef (Tests of linear devices: every form, the same matrices as parts, random systems against balls)
         TIP.recommend(passive=True)
     with pytest.raises(zwidth.InputError, match="delay_model: got 'fractional_power'"):
         RIGID.replace(delay_model="fractional_power").recommend()
