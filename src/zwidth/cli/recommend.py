@@ -39,9 +39,10 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
         raise click.UsageError("give --code or --json: each has all of the output")
     found = scene.recommend(**wanted)
     if figure is not None:
-        from zwidth.figures import plot, save
+        from zwidth.figures import save
+        from zwidth.studies.recommend import draw
 
-        save(plot.recommendation(found), figure.with_suffix(""), (figure.suffix[1:],))
+        save(draw(found), figure.with_suffix(""), (figure.suffix[1:],))
     if code:
         click.echo(found.code(code), nl=False)
         return

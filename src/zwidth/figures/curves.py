@@ -10,7 +10,7 @@ from zwidth.figures import grid, style
 from zwidth.figures.plane import SMOOTH, Edges, boundary_level, find_outlines, panel_grid
 from zwidth.figures.stable_set import agrees, draw_region, fit_axes
 from zwidth.words.errors import InputError
-from zwidth.words.quantities import OUTPUTS, WALL
+from zwidth.words.quantities import OUTPUTS, VARIABLES, WALL
 
 if TYPE_CHECKING:
     import xarray
@@ -53,13 +53,14 @@ def draw_curves(
     picked = style.pick_evenly(data.sizes[several[0]], _CURVES) if several else [0]
     labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]
     colors = style.ordered_colors(len(picked))
-    few = data.sizes[x] <= 12
+    few, whole_numbers = data.sizes[x] <= 12, x in VARIABLES and VARIABLES[x].whole
     whole = np.concatenate([part[name].values.ravel() for part in parts])
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
         shown = [np.where(np.isfinite(curve[name].values), curve[name].values, np.nan) for curve in curves]
         for values, label, color in zip(shown, labels, colors, strict=True):
-            ax.plot(data[x].values, values, color=color, marker="o" if few else "", markersize=3.5, label=label)
+            look = style.POINTS if whole_numbers else {"marker": "o" if few else "", "markersize": 3.5}
+            ax.plot(data[x].values, values, color=color, label=label, **look)
         grid.scale_axis(ax, "x", data[x])
         ax.set_title(grid.title(part))
         ax.margins(y=0.06)

@@ -42,7 +42,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         over, label = _OVER[kind]
         for damping, color in colors.items():
             rows = select(table, damping_N_s_per_m=damping, estimate=kind)
-            look = {"color": color, "label": f"b = {damping:g}", **_dots(rows)}
+            look = {"color": color, "label": f"b = {damping:g}", **(style.POINTS if over == "samples" else _dots(rows))}
             ax.plot(rows[over], rows[_STIFFNESS] * factor, **look)
             (bare,) = select(table, damping_N_s_per_m=damping, estimate="backward_difference")[_STIFFNESS]
             look = {"linewidth": 0.9, "linestyle": style.DASHED, "label": f"difference, b = {damping:g}"}

@@ -14,6 +14,8 @@ from zwidth.figures.table import Table, curves
 
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
+# A force is held until the next one.
+_HELD: dict[str, Any] = {"drawstyle": "steps-post", "linewidth": 1.1}
 # A motion this much wider than the smallest is cut, so that the smallest is still seen.
 _CUT = 8.0
 _MOST_PANELS = 6
@@ -96,8 +98,7 @@ def _read_responses(table: Table) -> list[Any]:
 
 def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
     for each in responses:
-        # Steps are too short for dashes: lightness has to do.
-        look = {"color": each.look["color"], "linewidth": 1.1, "label": f"wall_force, {style.literal(each.label)}"}
+        look = {**each.look, **_HELD, "label": f"wall_force, {style.literal(each.label)}"}
         ax.plot(each.time * clock, each.wall_force, zorder=3, **look)
     ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
 
@@ -118,11 +119,10 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     for ax, (name, words, others) in zip(panels, quantities, strict=False):
         factor, unit = _limit(ax, "y", [getattr(each, one) for each in motions for one in (name, *others)], name[-1])
         for each in motions:
-            # Steps of a force are too short for dashes: lightness has to do.
-            look = each.look if name == "position_m" else {"color": each.look["color"], "linewidth": 1.1}
+            look = each.look if name == "position_m" else {**each.look, **_HELD}
             ax.plot(each.time_s * clock, getattr(each, name) * factor, label=each.label, zorder=3, **look)
             for other in others:
-                look = {"color": each.look["color"], "linewidth": 0.6}
+                look = {**each.look, "linewidth": 0.6}
                 ax.plot(each.time_s * clock, getattr(each, other) * factor, label=f"{other}, {each.label}", **look)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6, zorder=2)
         ax.set_ylabel(f"{words}  in {unit}")

@@ -1,15 +1,17 @@
-"""Pictures of scenes, straight into an Axes of yours or a new figure's: each function returns its Axes.
+"""Pictures of scenes, into an Axes of yours or pyplot's current one: each function returns its Axes.
 
     region      stable walls, islands and holes, with the stiffest wall and the passive set
     ridge       the stiffest stable wall over a parameter of the scene
     step        the response to a step of force
+    bode        size and phase of the open loop over frequency, with its margins
     nyquist     the open loop around -1, with its gain crossover
     poles       in the unit circle
     motion      a simulated motion: position and velocity over time
     recommendation  the wall to set among the stable ones, and its response to a step of force
 
-The look is applied while drawing; matplotlib's settings stay as they are. An Axes without a figure of yours belongs to
-one that pyplot does not know: ``zwidth.figures.save(ax, path)`` or ``ax.figure.savefig(path)`` write it.
+Without an Axes they draw into ``matplotlib.pyplot.gca()``; those with two panels make a figure of pyplot's. The look is
+applied while drawing; matplotlib's settings stay as they are. ``zwidth.figures.save(ax, path)`` or
+``ax.figure.savefig(path)`` write it.
 """
 
 from __future__ import annotations
@@ -50,13 +52,35 @@ _FREQUENCIES = 2000
 _PERIODS, _MOST_PERIODS = 100, 20_000
 
 
-def _axes(ax: Axes | None, width: float = 5.6, height: float = 4.0) -> Axes:
-    return style.panels(ax, 1, width, height)[0]
+__all__ = ["bode", "motion", "nyquist", "poles", "recommendation", "region", "ridge", "step"]
+
+
+def __dir__() -> list[str]:
+    """Its own names, and not those that it imports."""
+    return sorted(__all__)
+
+
+def _axes(ax: Axes | None) -> Axes:
+    """The Axes to draw into; pyplot is loaded where it is asked for its own."""
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    return plt.gca()
+
+
+def _two(axes: style.AnyAxes | None, rows: int, columns: int, size: tuple[float, float] | None) -> np.ndarray:
+    """Two Axes to draw into, of a new figure of pyplot's where none are given."""
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        axes = plt.figure(figsize=size, layout="constrained").subplots(rows, columns, sharex=rows == 2)
+    return np.asarray(axes, dtype=object).ravel()[:2]
 
 
 def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[float, float]) -> Axes:
     """Complex numbers in an Axes, with the unit circle."""
-    ax = _axes(ax, 4.4, 4.2)
+    ax = _axes(ax)
     ax.add_patch(Circle((0.0, 0.0), 1.0, fill=False, edgecolor=style.BLACK, linewidth=0.7))
     ax.set(xlim=real, ylim=imaginary, xlabel="real part", ylabel="imaginary part", aspect="equal")
     return ax
@@ -70,7 +94,7 @@ def region(
 
     Args:
         scene: one, or a mapping from labels to scenes.
-        ax: an Axes of yours.
+        ax: an Axes of yours; pyplot's current one where left out.
         normalized: over alpha and beta in place of K and B.
         passive: also the walls that are passive, with stiffness > 0 (dash-dotted).
 
@@ -104,14 +128,15 @@ def recommendation(
 
     Args:
         found: what it returned; without a wall the stable walls alone are drawn.
-        axes: an Axes of yours for the walls alone, or two.
+        axes: an Axes of yours for the walls alone, or two; a figure of pyplot's where left out.
         response: columns of a step study of this wall, in SI units; computed at the samples where left out.
     """
     scene, told, top = found.scene, found.as_dict(), found.stiffest
+    axes = _two(axes, 1, 2, (style.WIDTH, 3.5)) if axes is None and found.verdict is not None else axes
     outlines = stack(_trace(scene, "", passive=not find_obstacle(**vars(scene.device)) and scene.device.damping > 0))
     if found.verdict is None:
         wall = {"label": "", "wall": "stiffest", **tabulate_walls(scene, *top[:2])}
-        return draw_stable_set(outlines, stack([wall]), axes)
+        return draw_stable_set(outlines, stack([wall]), _axes(None) if axes is None else axes)
     K, B = found.stiffness, found.virtual_damping
     if response is None:
         # As long as the slowest motion takes to decay, or so many periods.
@@ -131,7 +156,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
         scene: the scene.
         parameter: its dotted path, as in `zwidth.Scene.replace`: "damping", "velocity.cutoff", ...
         values: of it, in SI units.
-        ax: an Axes of yours.
+        ax: an Axes of yours; pyplot's current one where left out.
     """
     known = PARAMETERS.get(parameter)
     grid = as_float64("values", read_texts("values", values, known.unit) if known else values)
@@ -139,13 +164,18 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
         raise InputError(f"values: got shape {grid.shape}; a list of values of {parameter} is needed")
     walls = [scene.replace(**{parameter: value}).max_stiffness() for value in grid.tolist()]
     top = np.array([float(wall.stiffness) for wall in walls])
-    ax = _axes(ax, 5.2, 3.6)
+    ax = _axes(ax)
     factor, unit = style.si_unit(top, "N/m")
-    ax.plot(grid, top * factor, color=style.BLUE, label="stiffest stable wall")
-    ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
-    words = f"{known.words}  ${known.symbol}$  in {known.unit}" if known else style.literal(parameter)
+    whole = known is not None and known.whole
+    ax.plot(grid, top * factor, color=style.BLUE, label="stiffest stable wall", **(style.POINTS if whole else {}))
+    if not whole:
+        ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
+    words = f"{known.words}  ${known.symbol}$" if known else style.literal(parameter)
+    words += f"  in {known.unit}" if known and known.unit not in ("", "1") else ""
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     scale_axis(ax, "x", grid)
+    if whole and ax.get_xscale() == "linear":
+        ax.set_xlim(*style.span(float(grid.min()), float(grid.max())))
     return ax
 
 
@@ -164,11 +194,11 @@ def step(
         scene: the scene.
         stiffness: K of the wall in N/m; the scene's own wall where neither is given.
         virtual_damping: B in N s/m.
-        ax: an Axes of yours.
+        ax: an Axes of yours; pyplot's current one where left out.
         periods: how many sampling periods.
     """
     K, B = map(float, resolve_wall(scene.wall, stiffness, virtual_damping))
-    drawn = draw_step(stack([_tabulate_step(scene, K, B, periods)]), _axes(ax, 5.2, 3.4))[0]
+    drawn = draw_step(stack([_tabulate_step(scene, K, B, periods)]), _axes(ax))[0]
     drawn.lines[0].set(marker=".", markersize=3)
     return drawn
 
@@ -179,6 +209,62 @@ def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, perio
     columns["time_s"] = np.arange(periods) * scene.timing.period
     columns["position_m"] = scene.state_space(stiffness, virtual_damping).step(periods)
     return columns | {"final_position_m": 1.0 / stiffness if stiffness else math.nan}
+
+
+def _frequencies(scene: Scene) -> np.ndarray:
+    """Frequencies in Hz that resolve an open loop, up to half the sampling rate."""
+    half = 0.5 / float(scene.timing.period)
+    slow, fast = np.geomspace(1e-4 * half, 0.05 * half, _FREQUENCIES), np.linspace(0.05 * half, half, _FREQUENCIES)
+    return np.concatenate([slow, fast[1:]])
+
+
+@style.house_style()
+def bode(
+    scene: Scene,
+    stiffness: float | str | None = None,
+    virtual_damping: float | str | None = None,
+    axes: style.AnyAxes | None = None,
+) -> np.ndarray:
+    """Draw size and phase of the open loop of a wall over frequency, with its gain and phase margin.
+
+    Args:
+        scene: the scene.
+        stiffness: K of the wall in N/m; the scene's own wall where neither is given.
+        virtual_damping: B in N s/m.
+        axes: two Axes of yours; a figure of pyplot's where left out.
+
+    Returns:
+        The Axes of size and phase; bars mark the margins where they are taken, as `zwidth.Scene.margins` has them.
+    """
+    hertz = _frequencies(scene)
+    found, known = (
+        scene.frequency_response(stiffness, virtual_damping, hertz),
+        scene.margins(stiffness, virtual_damping),
+    )
+    upper, lower = _two(axes, 2, 1, None)
+    gain, phase = float(known.gain_margin), float(known.phase_margin)
+    at_phase, at_gain = float(known.gain_crossover), float(known.phase_crossover)
+    # The turn that the margin is measured from, where the phase crosses -180 degrees.
+    angles = np.unwrap(np.angle(found))
+    angles = np.degrees(angles - 2.0 * np.pi * np.round((angles[0] + np.pi) / (2.0 * np.pi)))
+    upper.plot(hertz, np.abs(found), color=style.BLUE, label="$|L|$")
+    lower.plot(hertz, angles, color=style.BLUE, label="phase of $L$")
+    upper.axhline(1.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
+    lower.axhline(-180.0, color=style.GRAY, linewidth=0.6, zorder=0.5)
+    bar: dict[str, Any] = {"color": style.VERMILION, "marker": "_", "markersize": 7, "zorder": 4}
+    if np.isfinite(gain) and gain > 0:
+        upper.plot([at_gain] * 2, [1.0, 1.0 / gain], label=f"gain margin {gain:.3g}", **bar)
+    if np.isfinite(phase):
+        there = float(np.interp(at_phase, hertz, angles))
+        foot = there - (there + 180.0 + 180.0) % 360.0 + 180.0
+        lower.plot([at_phase] * 2, [foot, there], label=f"phase margin {phase:.3g}°", **bar)
+    upper.set(yscale="log", ylabel="$|L|$")
+    for ax in (upper, lower):
+        style.use_logarithmic(ax, "x", hertz, style.DECADES)
+        ax.set_xlim(hertz[0], hertz[-1])
+        ax.legend(loc="lower left", fontsize=7.5)
+    lower.set(xlabel="frequency  $f$  in Hz", ylabel="phase of $L$  in degrees")
+    return np.array([upper, lower])
 
 
 @style.house_style()
@@ -194,16 +280,12 @@ def nyquist(
         scene: the scene.
         stiffness: K of the wall in N/m; the scene's own wall where neither is given.
         virtual_damping: B in N s/m.
-        ax: an Axes of yours.
+        ax: an Axes of yours; pyplot's current one where left out.
 
     Returns:
         The Axes; a dot marks each gain crossover, where the loop meets the unit circle.
     """
-    half = 0.5 / float(scene.timing.period)
-    hertz = np.concatenate(
-        [np.geomspace(1e-4 * half, 0.05 * half, _FREQUENCIES), np.linspace(0.05 * half, half, _FREQUENCIES)]
-    )
-    found = scene.frequency_response(stiffness, virtual_damping, hertz)
+    found = scene.frequency_response(stiffness, virtual_damping, _frequencies(scene))
     ax = _complex_plane(ax, (-2.6, 1.6), (-2.2, 2.0))
     ax.plot(found.real, found.imag, color=style.BLUE, label="open loop $L$, up to half the sampling rate")
     size = np.abs(found)
@@ -229,7 +311,7 @@ def poles(
         scene: the scene.
         stiffness: K of the wall in N/m; the scene's own wall where neither is given.
         virtual_damping: B in N s/m.
-        ax: an Axes of yours.
+        ax: an Axes of yours; pyplot's current one where left out.
     """
     found: Any = np.asarray(scene.poles(stiffness, virtual_damping)).ravel()
     outside = np.abs(found) >= 1.0
@@ -251,7 +333,7 @@ def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ())
 
     Args:
         found: what `zwidth.simulate` returns, recorded.
-        ax: an Axes of yours.
+        ax: an Axes of yours; pyplot's current one where left out.
         labels: a name for each of several, in their order.
     """
     if not hasattr(found, "wall_force"):
@@ -266,4 +348,4 @@ def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ())
     touching = np.repeat(contact, rows.shape[-1] // contact.shape[-1], axis=1)
     columns = zip(list(labels) or [""] * len(rows), times, rows, touching, strict=True)
     names = ("label", "time_s", "position_m", "contact")
-    return draw_motion(stack(dict(zip(names, each, strict=True)) for each in columns), _axes(ax, 5.6, 3.4))[0]
+    return draw_motion(stack(dict(zip(names, each, strict=True)) for each in columns), _axes(ax))[0]

@@ -41,6 +41,9 @@ BETA_LABEL = r"normalized virtual damping  $\beta = B\,T/m$"
 DELTA_LABEL = r"normalized physical damping  $\delta = b\,T/m$"
 ALPHA_MAX_LABEL = r"maximum stable stiffness  $\alpha_{\max} = K_{\max}T^2\!/m$"
 
+# Of a whole number there is nothing between its values.
+POINTS: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 3.5}
+
 AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 
 WIDTH = 7.0  # inches: both columns of a journal page

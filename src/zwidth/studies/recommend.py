@@ -11,7 +11,8 @@ from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
-from zwidth.figures.table import stack
+from zwidth.figures.style import WIDTH, new_figure
+from zwidth.figures.table import Table, stack
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import Outcome
 from zwidth.studies.step import ResponseStudy
@@ -68,7 +69,7 @@ class RecommendStudy(ResponseStudy):
         table = response or stack(trace_outlines(bare, label=label))
         return Outcome(
             table=table,
-            figures={"": partial(figures.plot.recommendation, found, response=response)} if table else {},
+            figures={"": partial(draw, found, response)} if table else {},
             documents={
                 f"{stem}.json": json.dumps(told, indent=2, allow_nan=False) + "\n",
                 f"{stem}.md": _describe(found, told),
@@ -76,6 +77,13 @@ class RecommendStudy(ResponseStudy):
             answer=found.lines(),
             notes=tuple(notes),
         )
+
+
+def draw(found: Recommendation, response: Table | None = None) -> Any:
+    """Draw a recommendation into a figure that pyplot does not know, and return its Axes."""
+    columns = 1 if found.verdict is None else 2
+    _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
+    return figures.plot.recommendation(found, axes, response=response)
 
 
 def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:

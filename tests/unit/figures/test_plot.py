@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import matplotlib
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from matplotlib import cbook
@@ -15,6 +16,70 @@ TIMING = zwidth.Timing(period=1e-3, delay=1e-3)
 RIGID = zwidth.Scene(zwidth.Device(0.1, 10), TIMING)
 FILTERED = RIGID.replace(velocity=zwidth.LowPass(cutoff=100))
 WALL = 10e3, 20.0
+
+
+@pytest.fixture(autouse=True)
+def fresh():
+    """What draws into pyplot's current Axes begins with an empty one, and leaves none."""
+    plt.close("all")
+    yield
+    plt.close("all")
+
+
+def test_without_axes_pyplot_s_current_ones_are_drawn_into():
+    _, (left, right) = plt.subplots(1, 2)
+    plt.sca(left)
+    assert plot.region(RIGID) is left
+    plt.sca(right)
+    assert plot.nyquist(RIGID, *WALL) is right
+    assert plot.poles(RIGID, *WALL, ax=left) is left
+    assert len(plt.get_fignums()) == 1
+
+
+@pytest.mark.parametrize("wall", [WALL, (25e3, 40.0)])
+@pytest.mark.parametrize("scene", [RIGID, FILTERED])
+def test_bode_is_the_open_loop_with_its_margins(scene, wall):
+    upper, lower = plot.bode(scene, *wall)
+    (number,) = plt.get_fignums()
+    assert upper.figure is plt.figure(number)
+    hertz, size = line(upper, "$|L|$")
+    _, phase = line(lower, "phase of $L$")
+    found = scene.frequency_response(*wall, hertz)
+    np.testing.assert_allclose(size * np.exp(1j * np.radians(phase)), found, rtol=1e-9)
+    assert np.abs(np.diff(phase)).max() < 90.0
+    margins = scene.margins(*wall)
+    at, ends = line(upper, f"gain margin {margins.gain_margin:.3g}")
+    np.testing.assert_allclose(at, margins.phase_crossover)
+    np.testing.assert_allclose(ends, (1.0, 1.0 / margins.gain_margin))
+    at, ends = line(lower, f"phase margin {margins.phase_margin:.3g}°")
+    np.testing.assert_allclose(at, margins.gain_crossover)
+    assert ends[1] - ends[0] == pytest.approx(margins.phase_margin, abs=0.1)
+    assert (ends[0] + 180.0) / 360.0 == pytest.approx(round((ends[0] + 180.0) / 360.0), abs=1e-9)
+
+
+def test_a_recommendation_is_drawn_with_its_response():
+    found = FILTERED.recommend(stiffness_fraction=0.5)
+    walls, response = plot.recommendation(found)
+    assert len(plt.get_fignums()) == 1
+    at, _ = line(walls, "recommended (50 %)")
+    assert float(at[0]) * 1e3 == pytest.approx(found.stiffness)
+    time, position = np.asarray(response.lines[0].get_data())
+    expected = found.scene.state_space().step(time.size)
+    np.testing.assert_allclose(position * 1e-6, expected, rtol=1e-9, atol=1e-12)
+    (alone,) = plot.recommendation(RIGID.replace(damping=0.0).recommend(passive=True))
+    assert alone is plt.gca()
+
+
+def test_whole_numbers_are_points():
+    ax = plot.ridge(RIGID.replace(velocity=zwidth.WindowedDifference(1)), "velocity.samples", [1, 2, 3, 4])
+    (points,) = ax.lines
+    assert (points.get_linestyle(), points.get_marker()) == ("None", "o")
+    assert "in 1" not in ax.get_xlabel()
+
+
+def test_it_shows_its_own_names():
+    assert dir(plot) == sorted(plot.__all__)
+    assert "bode" in dir(plot)
 
 
 def line(ax, label):
