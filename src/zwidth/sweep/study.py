@@ -312,7 +312,10 @@ class SweepStudy(_Parts, _Swept):
         for name in given:
             part = name.partition(".")[0]
             if part in PARTS and part not in parts:
-                parts[part] = PARTS[part]()
+                # Of its axes alone.
+                parts[part] = PARTS[part](
+                    **{path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{part}.")}
+                )
         device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0))
         return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
