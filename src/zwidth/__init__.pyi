@@ -9,7 +9,11 @@ from .fitting.device_fit import ErrorBar as ErrorBar
 from .fitting.device_fit import FittedMotion as FittedMotion
 from .fitting.device_fit import FurtherExperiment as FurtherExperiment
 from .fitting.device_fit import RivalDevice as RivalDevice
+from .fitting.excite import Excitation as Excitation
+from .fitting.excite import excite as excite
 from .fitting.log import fit_log as fit_log
+from .fitting.respond import ResponseEstimate as ResponseEstimate
+from .fitting.respond import respond as respond
 from .fitting.safe_wall import SafeWall as SafeWall
 from .loops.normalization import denormalize as denormalize
 from .loops.normalization import normalize as normalize
@@ -42,6 +46,7 @@ from .parts.actuator import Actuator as Actuator
 from .parts.device import Coupling as Coupling
 from .parts.device import Device as Device
 from .parts.linear_device import LinearDevice as LinearDevice
+from .parts.measured import MeasuredDevice as MeasuredDevice
 from .parts.mode import Mode as Mode
 from .parts.operator import Operator as Operator
 from .parts.timing import Timing as Timing

@@ -231,6 +231,10 @@ class LinearLoop:
         """The stable intervals of beta at a stiffness: shape (intervals, 2)."""
         return stable_dampings(self.boundary, alpha)
 
+    def explain(self, alpha: float, beta: float) -> list[str]:
+        """What keeps a wall undecided, a sentence each: nothing, where there is a model."""
+        return []
+
     def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
         """Those above ``least`` whose walls lie in a piece of the stable set with soft walls."""
         column = np.maximum(stable_dampings(self.boundary, alpha), least).tolist()

@@ -16,6 +16,7 @@ from zwidth.arrays.xp import is_jax
 from zwidth.parts.actuator import Actuator
 from zwidth.parts.device import Coupling, Device
 from zwidth.parts.linear_device import LinearDevice
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.operator import Operator
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity, name_estimate
@@ -30,7 +31,7 @@ class Parts(Protocol):
     __dataclass_fields__: ClassVar[dict[str, Any]]
 
     @property
-    def device(self) -> Device | LinearDevice: ...
+    def device(self) -> Device | LinearDevice | MeasuredDevice: ...
     @property
     def timing(self) -> Timing: ...
     @property

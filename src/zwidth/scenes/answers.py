@@ -248,6 +248,15 @@ class SceneAnswers:
         walls = [np.asarray(part, float) for part in resolve_wall(self.wall, stiffness, virtual_damping)]
         return self.loop.decide(alpha, beta, method, tuple(np.broadcast_arrays(*walls)))
 
+    def explain_undecided(
+        self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
+    ) -> list[str]:
+        """Why the measured response of a device leaves one wall UNDECIDED, and at which frequencies to measure.
+
+        A sentence each; none where the wall is decided, as it is of every device that is a model.
+        """
+        return self.loop.explain(*one_wall(*np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))))
+
     def passivity_margin(
         self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
     ) -> Array:

@@ -13,9 +13,11 @@ from zwidth.loops.linear.border import Outline, outlines
 from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
+from zwidth.loops.measured.loop import MeasuredLoop
 from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.operator import Operator
 from zwidth.parts.paths import find_parts, list_parameters, replace_parameters
 from zwidth.parts.timing import Timing
@@ -61,7 +63,7 @@ class Scene(SceneAnswers):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:
-        device: mass and damping, rigid or with a coupling, modes and an actuator.
+        device: mass and damping, rigid or with a coupling, modes and an actuator; or its measured response.
         timing: period and delay.
         wall: the wall that `zwidth.assess` judges, and that the questions below mean where no other is named. It may be
             left out.
@@ -76,7 +78,7 @@ class Scene(SceneAnswers):
         array([False,  True])
     """
 
-    device: Device | LinearDevice
+    device: Device | LinearDevice | MeasuredDevice
     timing: Timing
     wall: VirtualWall = field(default_factory=NoWall)
     velocity: Velocity = field(default_factory=BackwardDifference)
@@ -85,7 +87,12 @@ class Scene(SceneAnswers):
     def __post_init__(self) -> None:
         if isinstance(self.wall, Velocity):
             self._move_up()
-        kinds = {"device": Device | LinearDevice, "timing": Timing, "wall": VirtualWall, "velocity": Velocity}
+        kinds = {
+            "device": Device | LinearDevice | MeasuredDevice,
+            "timing": Timing,
+            "wall": VirtualWall,
+            "velocity": Velocity,
+        }
         for name, kind in {**kinds, "operator": Operator | None}.items():
             part = getattr(self, name)
             if not isinstance(part, kind):
@@ -117,13 +124,15 @@ class Scene(SceneAnswers):
         return device + tuple(name for name in find_parts(self) if not within.get(name))
 
     @cached_property
-    def loop(self) -> LinearLoop:
+    def loop(self) -> LinearLoop | MeasuredLoop:
         """Its loop, normalized, that answers every question about its walls."""
+        if isinstance(self.device, MeasuredDevice):
+            return MeasuredLoop(self)
         return LinearLoop(make_plain(self)) if self.parts_beyond else RigidLoop(self)
 
     def check_parts(self) -> None:
         """Raise `InputError` for what its parts refuse only together, such as a cut-off beyond half the rate."""
-        _ = self.loop.roots
+        _ = self.loop.walls if isinstance(self.loop, MeasuredLoop) else self.loop.roots
 
     @cached_property
     def mass(self) -> Any:
@@ -215,9 +224,14 @@ class Scene(SceneAnswers):
             `islands` means it.
         """
         units = self.units
+        if isinstance(self.loop, MeasuredLoop):
+            found = self.loop.outline()
+            pieces = [] if found is None else [Outline(*found, False, False)]
+        else:
+            pieces = outlines(self.loop.border)
         return [
             Outline(piece.stiffness * units.stiffness, piece.virtual_damping * units.virtual_damping, *piece[2:])
-            for piece in outlines(self.loop.border)
+            for piece in pieces
         ]
 
     def max_stiffness(self, *, negative_damping: bool | None = None) -> StiffestWall:
@@ -420,4 +434,10 @@ class Scene(SceneAnswers):
             >>> scene.replace(**{"velocity.cutoff": 50}).parameters()["velocity.cutoff"]
             50.0
         """
+        at_rate = {"period", "rate", "delay", "timing"} & changes.keys()
+        if at_rate and isinstance(changes.get("device", self.device), MeasuredDevice):
+            raise InputError(
+                f"{min(at_rate)}: a measured response holds the rate and the delay that it was measured with; measure "
+                "again at others"
+            )
         return replace_parameters(self, changes)

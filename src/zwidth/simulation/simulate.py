@@ -11,6 +11,7 @@ import numpy as np
 from zwidth.arrays.evaluate import as_float64, join_shapes, processors
 from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole, read_texts
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
 from zwidth.simulation.batch import TOGETHER, run_batch, structure
 from zwidth.simulation.lanes import Course
@@ -209,6 +210,8 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
                 "device: got one given as a linear system, of which no body is known that touches, slips and starts; "
                 "simulate a zwidth.Device, or step scene.state_space(stiffness, virtual_damping)"
             )
+        if isinstance(scene.device, MeasuredDevice):
+            raise InputError("scenes: a measured response is no model to simulate; fit one to a log (zwidth.fit_log)")
         if is_traced(scene.device.mass, scene.timing.period):
             raise InputError("scenes: got one of values that JAX traces; simulate outside of jit, vmap and grad")
         which[place] = known.setdefault(id(scene), len(known))

@@ -1,0 +1,268 @@
+"""A frequency response with its deviation from records of commanded force and sampled position.
+
+A periodic force tells it best: periods are averaged, what their differences drift by is taken out, and what cycles of
+other phases leave of one another is the error of each line, that of encoder, friction and noise alike. Any other force
+that is rich enough is answered by averaged spectra of overlapping pieces (Welch).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, cast
+
+import numpy as np
+
+from zwidth.fitting.encoder import find_resolution
+from zwidth.fitting.recordings import Log, read_logs
+from zwidth.loops.measured.loop import MeasuredLoop
+from zwidth.parts.checks import check_number
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.scenes.scene import Scene
+from zwidth.scenes.stiffest import StiffestWall
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import POSITIVE
+from zwidth.words.types import ArrayLike
+
+# The radius that holds for some thousand lines at once: 4.5 standard errors of real and imaginary part, each of which
+# has half of the variance.
+SURE = 4.5 / np.sqrt(2.0)
+# What of a force is the same from period to period, of its range; a line with so little of the largest is none.
+_SAME, _EXCITED = 1e-5, 1e-3
+# Least samples of a period, and what share of a record must repeat.
+_SHORTEST, _REPEATED = 16, 0.3
+# Neighboring lines over which the error is averaged, to each side: few and many.
+_NARROW, _WIDE = 4, 24
+# Pieces of a record that does not repeat, at least, and their longest; below this coherence a line tells nothing.
+_PIECES, _LONGEST, _COHERENT = 8, 1 << 13, 0.1
+# Overlapping by half, pieces of Hann's window count so much less.
+_OVERLAP = 1.06
+# A motion of fewer steps of the encoder is not seen as it is.
+_STEPS = 20
+
+
+@dataclass(frozen=True)
+class ResponseEstimate:
+    """A measured response and what it rests on.
+
+    Attributes:
+        device: the `zwidth.MeasuredDevice`, with deviation.
+        period: of the samples, in s.
+        coherence: of each line, 0 to 1: what share of the motion's power follows the force.
+        cycle: period of the force, in s; None where it does not repeat.
+        records: stretches of one periodic force that count, or pieces of a force that does not repeat.
+        noise: of one sampled position in m, where the force repeats.
+        doubts: sentences on what makes the response doubtful.
+    """
+
+    device: MeasuredDevice
+    period: float
+    coherence: np.ndarray
+    cycle: float | None
+    records: int
+    noise: float
+    doubts: tuple[str, ...]
+
+
+def respond(
+    time: ArrayLike, position: ArrayLike, force: ArrayLike, *, cycle: Any = None, resolution: Any = None
+) -> ResponseEstimate:
+    """Find the frequency response of a device, with its deviation, from a log of commanded force and sampled position.
+
+    Args:
+        time: of the samples in s, evenly spaced, or their period alone. With lists of arrays for all three, several
+            logs.
+        position: that the program read, in m.
+        force: that the program commanded, in N: of that sample. `zwidth.excite` makes one.
+        cycle: period of the force in s; found from the force where left out, which must repeat itself exactly for that.
+        resolution: step of the encoder in m; found from the positions where left out.
+
+    Returns:
+        ResponseEstimate: ``device``, with a deviation of 4.5 standard errors; ``period``, ``coherence``, ``cycle``,
+        ``records``, ``noise``, ``doubts``.
+
+    Raises:
+        InputError: times are uneven, force or position never change, or nothing of the motion follows the force.
+
+    Numerics:
+        The first period of each stretch is left out, for what went before still moves in it. Errors are those among
+        stretches of other phases, else among periods, averaged over neighboring lines; one force that only repeats
+        meets the same steps of the encoder each time, so that then their whole error is added.
+
+    References:
+        Pintelon, Schoukens 2012, sections 2.5 and 4.3 (averages over periods and phases). Welch 1967, IEEE Trans. Audio
+        Electroacoustics 15:70-73.
+
+    Example:
+        >>> import zwidth
+        >>> record = zwidth.excite(period=1e-3, force=2.0, resolution=1e-5, duration=15)
+        >>> scene = zwidth.Scene(zwidth.Device(0.1, 5), zwidth.Timing(period=1e-3))
+        >>> motion = zwidth.simulate(scene, 0.0, 0.0, push_history=record.force, periods=record.force.size)
+        >>> found = zwidth.respond(1e-3, motion.position[: record.force.size], record.force)
+        >>> f"{found.device.frequency.size} lines from {found.records} stretches"
+        '409 lines from 5 stretches'
+    """
+    logs, period, _ = read_logs(time, position, force)
+    step = min(find_resolution(log.position) for log in logs)
+    step = step if resolution is None else check_number("resolution", resolution, "m")
+    given = None if cycle is None else int(np.round(check_number("cycle", cycle, "s", POSITIVE) / period))
+    doubts = []
+    if step and all(np.ptp(log.position) < _STEPS * step for log in logs):
+        doubts.append(
+            f"the position moves by less than {_STEPS} steps of {with_unit(step, 'm')}; push harder, for an encoder "
+            "hides smaller motions"
+        )
+    count = given or _find_period(logs[0].force)
+    if count is None:
+        return _average_pieces(logs, period, doubts)
+    stretches = [part for log in logs for part in _split(log, count, given is not None)]
+    if not stretches:
+        raise InputError(
+            f"cycle: no stretch of the force repeats after {count} samples; leave the cycle out, or record two periods "
+            "or more of each force"
+        )
+    return _average_periods(stretches, count, period, step, doubts)
+
+
+def find_nominal_limit(scene: Scene) -> StiffestWall:
+    """The stiffest wall by the measured curve itself, without its deviation, which max_stiffness keeps clear of."""
+    nominal, loop = replace(scene), cast("MeasuredLoop", scene.loop)
+    vars(nominal)["loop"] = loop.nominal
+    return nominal.max_stiffness()
+
+
+def _find_period(force: np.ndarray) -> int | None:
+    """After how many samples the force repeats itself; None where it does not."""
+    centered, size = force - force.mean(), 1 << int(np.ceil(np.log2(2 * force.size)))
+    spectrum = np.fft.rfft(centered, size)
+    alike = np.fft.irfft(np.abs(spectrum) ** 2, size)[: force.size // 2 + 1]
+    lags = np.flatnonzero((alike[1:-1] > alike[:-2]) & (alike[1:-1] >= alike[2:])) + 1
+    lags = lags[lags >= _SHORTEST]
+    tall = np.sort(lags[np.argsort(-alike[lags])][:20])
+    for lag in tall.tolist():
+        if sum(last - first for first, last in _find_runs(force, lag)) > _REPEATED * force.size:
+            return lag
+    return None
+
+
+def _find_runs(force: np.ndarray, count: int) -> list[tuple[int, int]]:
+    """First and one past the last sample of each stretch of two periods of so many samples or more."""
+    same = np.concatenate([[False], np.abs(force[count:] - force[:-count]) <= _SAME * np.ptp(force), [False]])
+    edges = np.flatnonzero(np.diff(same.astype(np.int8)))
+    ends = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
+    return [(first, last + count) for first, last in ends if last - first >= count]
+
+
+def _split(log: Log, count: int, trusted: bool) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Stretches of two periods or more that repeat one force, as force and position, shape (periods, count)."""
+    runs = _find_runs(log.force, count)
+    if trusted and not runs and log.force.size >= 2 * count:
+        # A loop that holds the device adds to the force: it repeats on average only.
+        runs = [(0, log.force.size)]
+    found = []
+    for first, last in runs:
+        first = last - (last - first) // count * count
+        shape = (last - first) // count, count
+        found.append((log.force[first:last].reshape(shape), log.position[first:last].reshape(shape)))
+    return found
+
+
+def _without_drift(position: np.ndarray) -> np.ndarray:
+    """Periods of a position without the parabola that carries each into the next one."""
+    count = position.shape[1]
+    steps = np.diff(position[-3:], axis=0).ravel()
+    at = np.arange(steps.size) - 0.5 * (steps.size - 1)
+    slope = float(at @ steps) / float(at @ at)
+    # Of a t + b t^2 a period makes a P + b (2 t P + P^2).
+    bend = 0.5 * slope / count
+    start = float(steps.mean()) - slope * 0.5 * (steps.size - 1)
+    rise = (start - bend * count**2) / count
+    t = np.arange(position.size) - (position.size - min(3, position.shape[0]) * count)
+    return position - (rise * t + bend * t**2).reshape(position.shape)
+
+
+def _average_periods(
+    stretches: list[tuple[np.ndarray, np.ndarray]], count: int, period: float, step: float, doubts: list[str]
+) -> ResponseEstimate:
+    kept = [(force[1:], _without_drift(position)[1:]) for force, position in stretches]
+    several = len(kept) > 1
+    # Each stretch one record, or the periods of a single one.
+    parts = [(f.mean(0), x.mean(0)) for f, x in kept] if several else list(zip(*kept[0], strict=True))
+    U, Y = (np.fft.rfft(np.array([part[k] for part in parts]))[:, 1 : (count + 1) // 2] for k in (0, 1))
+    power = (np.abs(U) ** 2).sum(0)
+    lines = np.flatnonzero(power > _EXCITED**2 * power.max())
+    U, Y, power = U[:, lines], Y[:, lines], power[lines]
+    G = (Y * U.conj()).sum(0) / power
+    records, rest = len(parts), Y - G * U
+    error = (np.abs(rest) ** 2).sum(0) / max(1, records - 1)
+    error = np.maximum(*(_smooth(error, size) for size in (_NARROW, _WIDE)))
+    if records == 1:
+        doubts.append("there is one period only behind the first, so that errors are not seen; record more of them")
+    if not several:
+        # The same steps of the encoder every time: their error is not seen, and no average takes it away.
+        error = error + records * count * step**2 / 12.0
+    deviation = SURE * np.sqrt(error / power)
+    total = (np.abs(Y) ** 2).sum(0)
+    coherence = 1.0 - np.minimum(1.0, (np.abs(rest) ** 2).sum(0) / np.maximum(total, 1e-300))
+    device = MeasuredDevice((lines + 1) / (count * period), G, deviation)
+    each = float(np.mean([len(f) for f, _ in kept])) if several else 1.0
+    noise = float(np.sqrt(np.median(error) * each / count))
+    _refuse_unmoved(device)
+    return ResponseEstimate(device, period, coherence, count * period, len(kept), noise, tuple(doubts))
+
+
+def _smooth(values: np.ndarray, reach: int) -> np.ndarray:
+    """Means over lines to both sides, fewer at the ends."""
+    sums = np.concatenate([[0.0], np.cumsum(values)])
+    k = np.arange(values.size)
+    low, high = np.maximum(k - reach, 0), np.minimum(k + reach + 1, values.size)
+    return (sums[high] - sums[low]) / (high - low)
+
+
+def _average_pieces(logs: tuple[Log, ...], period: float, doubts: list[str]) -> ResponseEstimate:
+    """Averaged spectra of a force that does not repeat; of the position's steps, for positions wander."""
+    from scipy.signal import csd, welch
+
+    least = min(log.force.size for log in logs)
+    size = min(_LONGEST, 1 << int(np.log2(max(2, 2 * least // (_PIECES + 1)))))
+    if size < 4 * _SHORTEST:
+        raise InputError(f"force: {least} samples that do not repeat are too few; record {_PIECES * 256} or more")
+    options: dict[str, Any] = {"fs": 1.0, "nperseg": size, "detrend": "linear"}
+    sums = [np.zeros(size // 2 + 1, complex) for _ in range(3)]
+    pieces = 0
+    for log in logs:
+        # One sample in front has no step.
+        f, x = log.force[1:], np.diff(log.position)
+        own = 2 * f.size // size - 1
+        pieces += own
+        sums[0] += own * welch(f, **options)[1]
+        sums[1] += own * welch(x, **options)[1]
+        sums[2] += own * csd(f, x, **options)[1]
+    forces, steps, both = (values[2:-1] for values in sums)
+    coherence = np.abs(both) ** 2 / np.maximum(np.real(forces * steps), 1e-300)
+    w = 2.0 * np.pi * np.arange(2, size // 2) / size
+    G = both / forces / (1.0 - np.exp(-1j * w))
+    error = np.abs(G) * np.sqrt((1.0 - np.minimum(coherence, 1.0)) / np.maximum(coherence, 1e-300) * _OVERLAP / pieces)
+    # The window mixes each line with its neighbors.
+    u = 4.0 * np.sin(0.5 * w) ** 2
+    bend = np.abs(np.diff(u * G, 2))
+    deviation = SURE * error + np.pad(bend, 1, mode="edge") / u
+    seen = np.flatnonzero(np.real(coherence) > _COHERENT)
+    if seen.size < _SHORTEST:
+        raise InputError("force: nothing of the motion follows it; check that both columns are of one axis")
+    seen = slice(seen[0], seen[-1] + 1)
+    doubts.append(
+        f"the force does not repeat: {pieces} pieces of {with_unit(size * period, 's')} were averaged, which blurs "
+        f"what turns within {plain(2.0 / (size * period), 2)} Hz; play a record of zwidth.excite for a sharper one"
+    )
+    device = MeasuredDevice(w[seen] / (2.0 * np.pi * period), G[seen], deviation[seen])
+    _refuse_unmoved(device)
+    return ResponseEstimate(device, period, np.real(coherence[seen]), None, pieces, float("nan"), tuple(doubts))
+
+
+def _refuse_unmoved(device: MeasuredDevice) -> None:
+    if np.all(np.abs(device.response) <= device.deviation):
+        raise InputError(
+            "force: at no frequency the motion follows it beyond its errors; check that both columns are of one axis, "
+            "push harder, or record longer"
+        )

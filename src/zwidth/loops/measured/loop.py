@@ -1,0 +1,254 @@
+"""The loop of a measured device: what samples of its response answer of `zwidth.loops.loop.LinearLoop`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+
+from zwidth.loops.linear.rows import Island
+from zwidth.loops.measured.curve import ResponseCurve
+from zwidth.loops.measured.intervals import DecidedWalls
+from zwidth.loops.rigid.margins import Margins
+from zwidth.loops.rigid.ridge import RidgePoint
+from zwidth.loops.rigid.verdict import Stability, StabilityMethod
+from zwidth.words.errors import InputError
+from zwidth.words.status import Method, RidgeKind, Status
+from zwidth.words.types import Array, DelayModel
+
+# What is asked of a model in words.
+_WORDS = {
+    "radius": "the spectral radius",
+    "slowest": "the slowest motion",
+    "passivity_margin": "passivity",
+    "vary": "a variation of parameters",
+}
+
+# Rows on each side of beta = 0, denser towards it, and again across those with stable walls; steps to the highest row.
+_ROWS, _DENSER, _AGAIN = 60, 5.0, 49
+_STEPS, _GOLDEN = 30, 0.3819660112501051
+_INSIDE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredLoop:
+    """Verdicts that hold for every response within the deviation; alpha and beta are arrays of one shape."""
+
+    scene: Any
+
+    delay_models: ClassVar[tuple[DelayModel, ...]] = ("held",)
+    draws: ClassVar[int] = 0
+    most_periods: ClassVar[float] = math.inf
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        what = _WORDS.get(name, name.replace("_", " "))
+        raise InputError(
+            f"device: {what} needs a model, and a measured response is none; fit one to a log (zwidth.fit_log), or ask "
+            "for stability, rows, columns, the stiffest wall, outlines and margins"
+        )
+
+    @cached_property
+    def walls(self) -> DecidedWalls:
+        """Which walls its curve decides."""
+        timing, device = self.scene.timing, self.scene.device
+        if timing.delay != 0:
+            raise InputError(
+                f"delay: got {timing.delay:g} s with a measured response, which holds every delay already; leave it out"
+            )
+        estimate = self.scene.velocity.estimate(timing.period)
+        unit = device.mass / timing.period**2
+        return DecidedWalls(ResponseCurve.lay_out(device, timing.period, unit, estimate))
+
+    @cached_property
+    def nominal(self) -> MeasuredLoop:
+        """The same without the deviation: what the measured curve itself says."""
+        loop = MeasuredLoop(self.scene)
+        curve = self.walls.curve
+        vars(loop)["walls"] = DecidedWalls(replace(curve, band=0.0 * curve.band))
+        return loop
+
+    def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
+        """Whether walls are stable, for every response in the band."""
+        return self.decide(alpha, beta).stable
+
+    def decide(
+        self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
+    ) -> Stability:
+        """Labels with status; UNDECIDED where lines are too far apart, too uncertain, or end too early."""
+        if method not in ("auto", "crossover"):
+            raise InputError(f"method: got {method!r}, which needs a model; a measured response decides by 'crossover'")
+        alpha, beta = np.broadcast_arrays(alpha, beta)
+        a, b = alpha.reshape(-1), beta.reshape(-1)
+        known = np.isfinite(a) & np.isfinite(b)
+        stable, status = np.zeros(a.size, bool), np.full(a.size, np.int32(Status.INVALID_INPUT))
+        status[known] = Status.UNDECIDED
+        rows, columns = np.unique(b[known]), np.unique(a[known])
+        by_row = rows.size <= columns.size
+        for fixed in rows if by_row else columns:
+            place = np.flatnonzero(known & ((b if by_row else a) == fixed))
+            decided = self.walls.row(float(fixed)) if by_row else self.walls.column(float(fixed))
+            value = (a if by_row else b)[place]
+            k = np.searchsorted(decided.low, value, side="left") - 1
+            inside = k >= 0
+            inside[inside] = value[inside] < decided.high[k[inside]]
+            status[place[inside]] = Status.OK
+            stable[place[inside]] = decided.stable[k[inside]]
+        shape, used = alpha.shape, np.full(alpha.shape, Method.CROSSOVER, np.int32)
+        return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
+
+    def row(self, beta: np.ndarray) -> np.ndarray:
+        """The intervals of alpha that are surely stable: shape (rows, intervals, 2), NaN where a row has fewer."""
+        rows = [self.walls.row(float(value)) for value in beta]
+        ends = [np.stack([one.low[one.stable], one.high[one.stable]], -1) for one in rows]
+        out = np.full((beta.size, max((part.shape[0] for part in ends), default=0), 2), np.nan)
+        for place, part in zip(out, ends, strict=True):
+            place[: part.shape[0]] = part
+        return out
+
+    def column(self, alpha: float) -> np.ndarray:
+        """The intervals of beta that are surely stable: shape (intervals, 2)."""
+        found = self.walls.column(alpha)
+        return np.stack([found.low[found.stable], found.high[found.stable]], -1)
+
+    def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
+        """Those above ``least`` in a piece with soft walls."""
+        column = np.maximum(self.column(alpha), least).tolist()
+        return [(low, high) for low, high in column if low < high and self.holds_softly(alpha, 0.5 * (low + high))]
+
+    def soft_row(self, beta: float) -> np.ndarray:
+        """The surely stable intervals of alpha below all walls of the row that are surely unstable."""
+        found = self.walls.row(beta)
+        first = found.low[~found.stable].min(initial=np.inf)
+        held = found.stable & (found.low < first)
+        return np.stack([found.low[held], found.high[held]], -1)
+
+    def holds_softly(self, alpha: float, beta: float) -> bool:
+        """Whether a wall is surely stable, and no softer one of its damping surely unstable."""
+        ends = self.soft_row(beta)
+        return bool(np.any((ends[:, 0] < alpha) & (alpha < ends[:, 1])))
+
+    def islands(self, least: float) -> list[Island]:
+        """None is named: between stable walls that softer ones do not lead to others may be undecided."""
+        return []
+
+    @cached_property
+    def _tops(self) -> tuple[np.ndarray, np.ndarray]:
+        """Dampings of rows across the plane, and the stiffest wall of each, 0 where there is none."""
+        most = max(self.walls.most_damping, 1e-300)
+        side = most * np.sinh(_DENSER * np.arange(1, _ROWS + 1) / _ROWS) / np.sinh(_DENSER)
+        beta = np.concatenate([-side[::-1], [0.0], side])
+        top = np.array([self._top(value) for value in beta.tolist()])
+        held = np.flatnonzero(top > 0)
+        if held.size:
+            ends = beta[[max(held[0] - 1, 0), min(held[-1] + 1, beta.size - 1)]]
+            new = np.setdiff1d(np.linspace(ends[0], ends[1], _AGAIN), beta)
+            top = np.append(top, [self._top(value) for value in new.tolist()])
+            order = np.argsort(np.append(beta, new))
+            beta, top = np.append(beta, new)[order], top[order]
+        return beta, top
+
+    def _top(self, beta: float) -> float:
+        return float(self.soft_row(beta)[:, 1].max(initial=0.0))
+
+    def outline(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """The stiffest surely stable wall of each damping and the softest, a closed curve for pictures; else None."""
+        beta, top = self._tops
+        beta, top = beta[top > 0], top[top > 0]
+        if not beta.size:
+            return None
+        low = np.array([self.soft_row(value)[0, 0] for value in beta.tolist()])
+        return np.concatenate([low, top[::-1], low[:1]]), np.concatenate([beta, beta[::-1], beta[:1]])
+
+    def stiffest(self, negative: bool) -> RidgePoint:
+        """The stiffest wall that `holds_softly`, with beta >= 0 unless negative ones count."""
+        beta, top = self._tops
+        top = np.where((beta < 0) & (not negative), 0.0, top)
+        best = int(np.argmax(top))
+        nan, kind = np.float64(np.nan), np.int32(RidgeKind.SMOOTH)
+        if not top[best] > 0:
+            return RidgePoint(nan, nan, nan, kind, np.int32(Status.UNDECIDED))
+        low, middle, high = (float(beta[k]) for k in (max(best - 1, 0), best, min(best + 1, beta.size - 1)))
+        low, value = low if negative else max(low, 0.0), float(top[best])
+        for _ in range(_STEPS):
+            upwards = high - middle > middle - low
+            trial = middle + _GOLDEN * ((high if upwards else low) - middle)
+            reached = self._top(trial)
+            better = reached > value
+            end = middle if better else trial
+            low, high = (end, high) if better == upwards else (low, end)
+            middle, value = (trial, reached) if better else (middle, value)
+        # Just inside: the end itself is not decided.
+        value *= 1.0 - _INSIDE
+        omega = self.walls.curve.w[self.walls.binding(value, middle)]
+        return RidgePoint(np.float64(value), np.float64(middle), np.float64(omega), kind, np.int32(Status.OK))
+
+    def explain(self, alpha: float, beta: float) -> list[str]:
+        """What keeps a wall undecided, a sentence each with the frequencies to measure; empty where it is decided."""
+        if self.decide(np.array([alpha]), np.array([beta])).status[0] == Status.OK:
+            return []
+        c, hertz = self.walls.curve, 1.0 / (2.0 * np.pi * self.scene.timing.period)
+        first, last, said = c.w[0] * hertz, c.w[-1] * hertz, []
+        if c.odd:
+            said.append(f"the first line, {first:.4g} Hz, is uncertain, or no mass, damper or spring; begin lower")
+        if not alpha > self.walls.ends(beta)[0]:
+            said.append(f"this wall is too soft for the first line; measure below {first:.4g} Hz")
+        if not alpha < self.walls.ends(beta)[1]:
+            said.append(f"this wall answers beyond the last line; measure above {last:.4g} Hz")
+        doubts = self.walls.doubts(alpha, beta)
+        for by_gap, remedy in ((True, "lines there are too far apart; measure more"), (False, "more force, or longer")):
+            places = np.flatnonzero(doubts & ((c.gap > c.band) == by_gap))
+            if places.size:
+                ends = c.w[places[[0, -1]]] * hertz
+                where = "measure anew from {:.4g} to {:.4g} Hz".format(*ends)
+                said.append(f"{where}: {remedy}" if by_gap else f"the deviation is too large; {where}, with {remedy}")
+        return said
+
+    def margins(self, alpha: np.ndarray, beta: np.ndarray) -> Margins:
+        """Margins on the measured curve in periods and radians a period; NaN for walls that are not surely decided.
+
+        The delay margin is that of a pure delay, phase over frequency.
+        """
+        decided = self.decide(alpha, beta)
+        out = np.full((len(Margins._fields), *np.shape(alpha)), np.nan)
+        for place in np.ndindex(np.shape(alpha)):
+            if np.asarray(decided.status)[place] == Status.OK:
+                stable = bool(np.asarray(decided.stable)[place])
+                out[(slice(None), *place)] = self._margins_of(float(alpha[place]), float(beta[place]), stable)
+        return Margins(*(part[()] for part in out))
+
+    def _margins_of(self, alpha: float, beta: float, stable: bool) -> Margins:
+        """The nearest crossovers of one wall, between points of the curve by straight lines."""
+        c = self.walls.curve
+        L = (alpha + beta * c.F) * c.S / c.u
+        with np.errstate(all="ignore"):
+            k, share = _zeros(L.imag)
+            at, real = c.w[k] + share * np.diff(c.w)[k], L.real[k] + share * np.diff(L.real)[k]
+            at, sizes = at[real < 0], -real[real < 0]
+            gain, gain_at = (np.inf if stable else 0.0), np.nan
+            if sizes.size:
+                nearest = int(np.argmin(np.abs(np.log(sizes))))
+                gain, gain_at = 1.0 / sizes[nearest], at[nearest]
+            k, share = _zeros(np.log(np.abs(L)))
+            at = c.w[k] + share * np.diff(c.w)[k]
+            turns: Any = np.angle(-L[k]) + share * np.angle(L[k + 1] / L[k])
+            phase, phase_at, delay = (np.inf if stable else np.nan), np.nan, np.inf if stable else 0.0
+            if at.size:
+                nearest = int(np.argmin(np.abs(turns)))
+                phase, phase_at = np.degrees(abs(turns[nearest])) * (1.0 if stable else -1.0), at[nearest]
+                delay = float(np.min(np.mod(turns, 2.0 * np.pi) / at)) if stable else 0.0
+        closest = int(np.argmin(np.abs(1.0 + L)))
+        return Margins(
+            float(gain), float(phase), delay, float(abs(1.0 + L[closest])), float(gain_at), float(phase_at),
+            float(c.w[closest]),
+        )  # fmt: skip
+
+
+def _zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Before which zeros values stand, and at what share of the step each lies."""
+    k = np.flatnonzero((values[:-1] > 0) != (values[1:] > 0))
+    return k, values[k] / (values[k] - values[k + 1])

@@ -1,0 +1,141 @@
+"""Tables of a frequency response as analyzers and programs write them, in SI units.
+
+The first line names the columns. One is the frequency, in Hz or rad/s; the response stands as real and imaginary part,
+as magnitude and phase, or as complex numbers in one column; a column of its deviation may follow.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import read_rows, split_title, suggestion
+from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE
+
+_MOST_BYTES = 2**28
+# What each column may be called.
+_NAMES = {
+    "frequency": ("frequency", "freq", "f", "omega", "w", "angular frequency"),
+    "real": ("real", "re", "real part"),
+    "imag": ("imag", "im", "imaginary", "imaginary part"),
+    "magnitude": ("magnitude", "mag", "gain", "amplitude", "abs", "modulus"),
+    "phase": ("phase", "arg", "angle"),
+    "response": ("response", "complex", "frf", "g", "h"),
+    "deviation": ("deviation", "radius", "uncertainty"),
+}
+_ANGULAR = ("rad/s", "1/s", "krad/s")
+_DECIBELS = re.compile(r"dB(?:\s*(?:\(?re\.?\s*)?(?:1\s*)?(m\s*/\s*N|mm\s*/\s*N|um\s*/\s*N|µm\s*/\s*N)\)?)?")
+
+
+class ResponseTable(NamedTuple):
+    """A frequency response: Hz, m/N, and its deviation in m/N, or None."""
+
+    frequency: np.ndarray
+    response: np.ndarray
+    deviation: np.ndarray | None
+
+
+def read_response_table(file: str | Path) -> ResponseTable:
+    """Read a table; raise `InputError` for columns or units that cannot be told, with what is allowed."""
+    file = Path(file)
+    rows, _ = read_rows(file, _MOST_BYTES)
+    if len(rows) < 2:
+        raise InputError(f"{file}: it has no lines of numbers; a line of column names and one a frequency are needed")
+    heads = [split_title(head) for head in rows[0][1]]
+    found: dict[str, int] = {}
+    for name, known in _NAMES.items():
+        places = [k for k, (head, _) in enumerate(heads) if head.lower() in known]
+        if len(places) > 1:
+            raise InputError(f"{file}: {name} may be any of {', '.join(rows[0][1][k] for k in places)}; rename one")
+        found |= {name: places[0]} if places else {}
+    parts = next((p for p in (("real", "imag"), ("magnitude", "phase"), ("response",)) if set(p) <= found.keys()), None)
+    if "frequency" not in found or parts is None:
+        raise InputError(
+            f"{file}: got the columns {', '.join(repr(head) for head in rows[0][1])}; needed are 'frequency [Hz]' and "
+            "'real [m/N]' with 'imag [m/N]', or 'magnitude [m/N]' with 'phase [deg]', or 'response [m/N]'"
+        )
+    columns = {
+        name: _read_column(file, rows, at, complex if name == "response" else float)
+        for name, at in found.items()
+        if name in ("frequency", "deviation", *parts)
+    }
+    units = {name: heads[at][1] for name, at in found.items()}
+    hertz = columns["frequency"] * _hertz(file, units["frequency"])
+    scale = _compliance(file, parts[0], units[parts[0]])
+    if parts[0] == "magnitude":
+        size = columns["magnitude"]
+        size = 10.0 ** (size / 20.0) if units["magnitude"].lower().startswith("db") else size
+        answer = size * np.exp(1j * columns["phase"] * _radians(file, units["phase"]))
+    else:
+        answer = columns["response"] if parts[0] == "response" else columns["real"] + 1j * columns["imag"]
+    if parts[0] == "real" and _compliance(file, "imag", units["imag"]) != scale:
+        raise InputError(f"{file}: real and imag have different units; write both in one")
+    band = None
+    if "deviation" in columns:
+        band = columns["deviation"] * _compliance(file, "deviation", units["deviation"])
+    return ResponseTable(hertz, answer * scale, band)
+
+
+def write_response_table(file: str | Path, table: ResponseTable, remarks: tuple[str, ...] = ()) -> None:
+    """Write a table that `read_response_table` reads back, with every digit."""
+    heads = ["frequency [Hz]", "real [m/N]", "imag [m/N]"]
+    columns = [table.frequency, np.real(table.response), np.imag(table.response)]
+    if table.deviation is not None:
+        heads, columns = [*heads, "deviation [m/N]"], [*columns, table.deviation]
+    lines = [f"# {remark}" for remark in remarks] + [",".join(heads)]
+    lines += [",".join(repr(float(value)) for value in line) for line in zip(*columns, strict=True)]
+    Path(file).write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _read_column(file: Path, rows: list[tuple[int, list[str]]], at: int, kind: type) -> np.ndarray:
+    """One column of finite numbers; complex ones may be written with i."""
+    values = []
+    for line, cells in rows[1:]:
+        text = cells[at] if at < len(cells) else ""
+        try:
+            value = kind(text.replace(" ", "").replace("i", "j") if kind is complex else text)
+        except ValueError:
+            value = math.nan
+        if "_" in text or not np.isfinite(value):
+            what = repr(text) if text else "nothing"
+            raise InputError(f"{file}:{line}: got {what} under {rows[0][1][at]!r}; a finite number is needed")
+        values.append(value)
+    return np.array(values)
+
+
+def _hertz(file: Path, unit: str) -> float:
+    if unit in _ANGULAR:
+        return (1e3 if unit[0] == "k" else 1.0) / (2.0 * math.pi)
+    size = RATE.in_base("1", 0, unit) if unit else None
+    if size is None:
+        raise InputError(f"{file}: frequency in {unit or 'no unit'}; {_remedy(unit, (*RATE.units, *_ANGULAR))}")
+    return size
+
+
+def _radians(file: Path, unit: str) -> float:
+    size = ANGLE.in_base("1", 0, unit) if unit else None
+    if size is None:
+        raise InputError(f"{file}: phase in {unit or 'no unit'}; {_remedy(unit, ('deg', 'rad'))}")
+    return size
+
+
+def _compliance(file: Path, name: str, unit: str) -> float:
+    """What one of a unit of length over force is in m/N; of decibels the unit that they are over."""
+    decibels = _DECIBELS.fullmatch(unit) if name == "magnitude" else None
+    if decibels:
+        unit = decibels[1] or "m/N"
+    length, _, force = (unit or "m/N").partition("/")
+    sizes = LENGTH.in_base("1", 0, length.strip()), FORCE.in_base("1", 0, force.strip())
+    if sizes[0] is None or sizes[1] is None:
+        known = ("m/N", "mm/N", "um/N", *(("dB",) if name == "magnitude" else ()))
+        raise InputError(f"{file}: {name} in {unit}; {_remedy(unit, known)}")
+    return float(f"{sizes[0] / sizes[1]:.15g}")
+
+
+def _remedy(unit: str, known: tuple[str, ...]) -> str:
+    return suggestion(unit, known, f"write one of {', '.join(known)} in brackets behind the name")
