@@ -91,7 +91,7 @@ def respond(
 
     References:
         Pintelon, Schoukens 2012, sections 2.5 and 4.3 (averages over periods and phases). Welch 1967, IEEE Trans. Audio
-        Electroacoustics 15:70-73.
+            Electroacoustics 15:70-73.
 
     Example:
         >>> import zwidth

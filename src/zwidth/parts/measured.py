@@ -112,8 +112,7 @@ class MeasuredDevice:
         Args:
             file: with a column ``frequency [Hz]`` or ``[rad/s]``; and ``real [m/N]`` and ``imag [m/N]``, or
                 ``magnitude`` in m/N, mm/N, um/N or dB and ``phase`` in deg or rad, or complex numbers under
-                ``response``; and, where
-                it is known, ``deviation [m/N]``.
+                ``response``; and, where it is known, ``deviation [m/N]``.
         """
         return cls(*read_response_table(file))
 
