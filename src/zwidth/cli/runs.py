@@ -72,14 +72,16 @@ _FIGURE_SIZE = Parsed("WxH", _read_figure_size, "write width x height from 1 to 
 @click.option("--scheduler", metavar="ADDRESS", help="A dask.distributed scheduler to compute sweeps.")
 @click.option("--shard", type=_SHARD, help="Compute every n-th chunk of sweeps only, as one of n jobs.")
 @click.option("--memory", type=_SIZE, default="256 MiB", show_default=True, help="Memory for a chunk of a sweep.")
+@click.option("--size", type=_FIGURE_SIZE, help="Width and height of the studies' figures in inches, as in 7x4.5.")
 @click.option("--dry-run", is_flag=True, help="Print the plan and do nothing.")
-def run(path: Path, dry_run: bool, **options: Any) -> None:
+def run(path: Path, dry_run: bool, size: tuple[float, float] | None, **options: Any) -> None:
     """Run the studies of a CONFIG file.
 
     Data, figures and a record of the run go into one folder, the results of each sweep into a store DIR/STUDY.zarr.
     Ctrl-C keeps what is done; --resume goes on.
     """
     from zwidth.cli.runs import reporter
+    from zwidth.figures.style import style_sheet
     from zwidth.runs.run import run as run_studies
 
     if dry_run:
@@ -88,7 +90,7 @@ def run(path: Path, dry_run: bool, **options: Any) -> None:
     command = _spell_resume_command(path, **options)
     with _interrupt_on_sigterm() as stopped_by:
         try:
-            with reporter() as progress:
+            with reporter() as progress, style_sheet(None, size):
                 # The options are those of `zwidth.run`, by their names.
                 result = run_studies(path, progress=progress, **options)
         except KeyboardInterrupt:

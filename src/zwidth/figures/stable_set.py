@@ -173,9 +173,10 @@ def draw_stable_set(
     name_axes(ax, unit)
     ax.margins(0.04)
     if alone and np.isfinite(rows[names[0]]).any():
-        # Room for words to the right of the stiffest wall.
-        low, high = ax.get_xlim()
-        ax.set_xlim(low, high + 0.28 * (high - low))
+        # Room for words to the right of the stiffest wall, as wide as they are in a narrow panel too.
+        (low, high), spec = ax.get_xlim(), ax.get_subplotspec()
+        width = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
+        ax.set_xlim(low, high + 0.28 * max(1.0, 5.6 / width) * (high - low))
     handles = [style.line(style.literal(label), color=color) for label, color in colors.items() if not alone]
     handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
     if not alone:

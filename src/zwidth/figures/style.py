@@ -57,6 +57,9 @@ _RC = dict(rc_params_from_file(Path(__file__).with_name("house.mplstyle"), use_d
 # What a user's style sheet changes of it, and the size of new figures that a user wants.
 _changes: ContextVar[Any] = ContextVar("changes", default=None)
 _size: ContextVar[tuple[float, float] | None] = ContextVar("size", default=None)
+_width: ContextVar[float | None] = ContextVar("width", default=None)
+# Narrower, in inches, panels stand below each other: beside each other their labels would have no room.
+_ONE_COLUMN = 5.0
 
 
 @contextmanager
@@ -84,9 +87,24 @@ def style_sheet(file: Path | None, size: tuple[float, float] | None = None) -> I
             _changes.reset(token)
 
 
+@contextmanager
+def figure_width(width: float | None) -> Iterator[None]:
+    """Let new figures have this width in inches, type as large as ever."""
+    token = _width.set(width)
+    try:
+        yield
+    finally:
+        _width.reset(token)
+
+
 def new_figure(width: float, height: float, rows: int = 1, columns: int = 1, **keywords: Any) -> tuple[Figure, Any]:
     """A figure of its own, unknown to pyplot, and its axes as a 2-D array."""
-    engine = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05)
+    engine, wanted = ConstrainedLayoutEngine(w_pad=0.06, h_pad=0.06, wspace=0.04, hspace=0.05), _width.get()
+    if wanted is not None:
+        narrow = wanted < _ONE_COLUMN and columns > 1 and not {"width_ratios", "height_ratios"} & set(keywords)
+        rows, columns, height = (rows * columns, 1, height * columns) if narrow else (rows, columns, height)
+        # Labels stay as high as they are: a panel is not as flat as it is narrow.
+        width, height = wanted, height * min(1.0, max(wanted * (2.0 if narrow else 1.0) / width, 0.9))
     figure = Figure(figsize=_size.get() or (width, height), layout=engine)
     return figure, figure.subplots(rows, columns, squeeze=False, **keywords)
 
@@ -140,11 +158,12 @@ def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: An
         columns -= 1
         drawn.remove()
         drawn = figure.legend(handles=handles, loc=place, ncols=columns, **keywords)
+    longest = max((len(text.get_text()) for text in drawn.get_texts()), default=0)
     for text in drawn.get_texts() if share > 1.0 else ():
         bare = text.get_text().replace(r"\$", "")
         if "$" not in bare:
             plain = text.get_text().replace(r"\$", "$")
-            text.set_text(literal(fill(plain, max(int(0.9 * len(plain) / share), 12))))
+            text.set_text(literal(fill(plain, max(int(0.9 * longest / share), 12))))
 
 
 def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> None:

@@ -13,8 +13,9 @@ from typing import Any, Literal, TypeAlias
 
 from zwidth.config.reader import read_mapping, write_yaml
 from zwidth.config.study import Study
+from zwidth.figures.style import figure_width
 from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
-from zwidth.studies.document import Config, load_config
+from zwidth.studies.document import Config, FigureLook, load_config
 from zwidth.studies.outcome import ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
 from zwidth.sweep.files import holding, hopeless
@@ -246,7 +247,9 @@ class _Run:
         with self.record.staging(study.name) as stage:
             try:
                 outcome = study.compute(self.config.scene, alone)
-                outcome.write(stage, study.name)
+                look = self.config.figure or FigureLook()
+                with figure_width(look.inches):
+                    outcome.write(stage, study.name, look.formats)
             except Exception as caught:
                 error = caught
             told = {"notes": list(outcome.notes), "answer": list(outcome.answer), "error": _describe_error(error)}
@@ -318,6 +321,8 @@ def _list_inputs(config: Config, names: dict[str, str]) -> dict[str, dict[str, A
     for study in config.studies:
         if isinstance(study, ComputedStudy):
             found[study.name] = rename_inputs(found[study.name], names)
+            if config.figure is not None:
+                found[study.name]["figure"] = _spell(config.figure)
             if study.reads_scene and config.scene is not None:
                 found[study.name]["scene"] = _spell(config.scene)
     return found

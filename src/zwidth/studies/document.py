@@ -9,7 +9,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import iter_modules
-from typing import Annotated, Any, ClassVar, Union
+from typing import Annotated, Any, ClassVar, Literal, Union
 
 from pydantic import (
     BeforeValidator,
@@ -31,7 +31,9 @@ from zwidth.config.fields import Name, Strict, find_kind, members
 from zwidth.config.reader import read_model
 from zwidth.config.scenes import AnyScene, NormalizedScene, PhysicalScene, SceneField, is_normalized, read_scene
 from zwidth.config.study import KINDS, Study, register
+from zwidth.config.values import Quantity
 from zwidth.words.formatting import describe
+from zwidth.words.quantities import Range
 from zwidth.words.units import looks_like_number
 
 FORMAT_VERSION = 1
@@ -97,6 +99,28 @@ class _Place:
     folder: Path = field(compare=False)
 
 
+class FigureLook(Strict):
+    """How the figures of a run are written."""
+
+    what: ClassVar[str] = "the look of figures"
+
+    width: Annotated[float, Quantity("m", Range(0.05, 0.5))] | None = None
+    """Width of every figure, as 85 mm of a journal's column; type is no smaller for it."""
+
+    format: Literal["png", "svg", "pdf"] | None = None
+    """Kind of file; PNG and SVG where left out."""
+
+    @property
+    def formats(self) -> tuple[str, ...]:
+        """The endings of the files."""
+        return ("png", "svg") if self.format is None else (self.format,)
+
+    @property
+    def inches(self) -> float | None:
+        """The width as matplotlib counts it."""
+        return None if self.width is None else self.width / 0.0254
+
+
 class Config(Strict):
     """A configuration file, checked and complete: every study holds the values that it runs with."""
 
@@ -113,6 +137,9 @@ class Config(Strict):
 
     scene: SceneField | None = None
     """Device, timing and wall that supply what a study leaves out."""
+
+    figure: FigureLook | None = None
+    """Width and kind of the figures of studies; `zwidth figures` has options for those of sweeps."""
 
     studies: Annotated[tuple[Annotated[Study, _OfAnyKind], ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeAlias
@@ -46,7 +46,7 @@ class Outcome:
     answer: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
 
-    def write(self, folder: Path, name: str) -> None:
+    def write(self, folder: Path, name: str, formats: Sequence[str] = ("png", "svg")) -> None:
         """Write everything, data before figures."""
         for file, text in self.documents.items():
             (folder / file).write_text(text, encoding="utf-8")
@@ -55,7 +55,7 @@ class Outcome:
         if self.arrays:
             np.savez_compressed(folder / f"{name}.npz", **self.arrays)  # pyright: ignore[reportArgumentType]
         for addition, draw in self.figures.items():
-            figures.save(draw(), folder / f"{name}{addition}")
+            figures.save(draw(), folder / f"{name}{addition}", formats)
 
 
 class ComputedStudy(Study):

@@ -11,7 +11,7 @@ from zwidth.config.scenes import AnyDevice, AnyScene, AnyWall, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
-from zwidth.figures.style import WIDTH, new_figure
+from zwidth.figures.style import WIDTH, house_style, new_figure
 from zwidth.figures.table import Table, stack
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import Outcome
@@ -79,6 +79,7 @@ class RecommendStudy(ResponseStudy):
         )
 
 
+@house_style()
 def draw(found: Recommendation, response: Table | None = None) -> Any:
     """Draw a recommendation into a figure that pyplot does not know, and return its Axes."""
     columns = 1 if found.verdict is None else 2

@@ -1,0 +1,82 @@
+"""The width and the kind of a run's figures, as a configuration and the command line ask for them."""
+
+import pytest
+from click.testing import CliRunner
+from matplotlib.text import Text
+from PIL import Image
+
+import zwidth
+from zwidth.cli.commands import cli
+from zwidth.figures import style
+from zwidth.studies.recommend import draw
+
+SCENE = {"mass": 0.1, "damping": 10, "period": 1e-3, "delay": 1e-3}
+STUDIES = [
+    {"kind": "recommend", "name": "best"},
+    {"kind": "step", "name": "answer", "walls": [{"stiffness": 1e4, "virtual_damping": 40}]},
+]
+CONFIG = {"version": 1, "name": "small", "scene": SCENE, "studies": STUDIES}
+
+
+@pytest.mark.parametrize("ending", ["png", "pdf", "svg"])
+def test_figures_have_the_width_and_the_kind_that_are_asked_for(ending, tmp_path):
+    found = zwidth.run({**CONFIG, "figure": {"width": "85 mm", "format": ending}}, out=tmp_path / "r")
+    assert found.ok
+    drawn = sorted(file.name for file in (tmp_path / "r").glob("*.*") if file.suffix in (".png", ".svg", ".pdf"))
+    assert drawn == [f"answer.{ending}", f"best.{ending}"]
+    if ending == "png":
+        for name in drawn:
+            with Image.open(tmp_path / "r" / name) as picture:
+                assert picture.width == int(85 / 25.4 * style.PNG_DPI)
+
+
+def test_another_look_is_another_run(tmp_path):
+    assert zwidth.run(CONFIG, out=tmp_path / "r").ok
+    with pytest.raises(zwidth.ZwidthError):
+        zwidth.run({**CONFIG, "figure": {"width": 0.085}}, out=tmp_path / "r", resume=True)
+
+
+def test_type_is_legible_at_that_width():
+    """No text is smaller than 7 points, and no label stands out of the figure."""
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
+    with style.figure_width(85 / 25.4):
+        axes = draw(scene.recommend())
+    figure = style.figure_of(axes)
+    assert len(axes) == 2
+    assert figure.get_figwidth() == pytest.approx(85 / 25.4)
+    # The first time, ticks come to be that the layout then knows of.
+    for _ in range(2):
+        figure.draw_without_rendering()
+    for text in figure.findobj(Text):
+        if isinstance(text, Text) and text.get_text() and text.get_visible():
+            assert float(text.get_fontsize()) >= 7.0, text.get_text()
+    for text in [each for ax in axes for each in (ax.xaxis.label, ax.yaxis.label, *ax.texts)]:
+        box = text.get_window_extent()
+        assert -1 <= box.x0 < box.x1 <= figure.bbox.width + 1, text.get_text()
+
+
+@pytest.mark.parametrize(
+    ("look", "words"),
+    [
+        ("{width: 85}", "figure.width: got 85 m; it must be at least 0.05"),
+        ("{format: jpg}", "figure.format: got 'jpg'; allowed are 'png', 'svg', 'pdf'"),
+        ("{size: 3}", "figure.size: unknown key"),
+        ("wide", "figure: got 'wide'; the look of figures is a mapping"),
+    ],
+)
+def test_a_look_that_there_is_not(look, words, tmp_path):
+    file = tmp_path / "c.yaml"
+    file.write_text(f"version: 1\nname: c\nfigure: {look}\nstudies: [{{kind: ridge, name: r, delta: 0.1, d: 1}}]\n")
+    with pytest.raises(zwidth.ConfigError, match=words):
+        zwidth.load_config(file)
+
+
+def test_size_on_the_command_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "c.yaml").write_text(
+        "version: 1\nname: c\nstudies: [{kind: ridge, name: r, delta: {linear: {start: 0, stop: 1, num: 5}}, d: 1}]\n"
+    )
+    result = CliRunner().invoke(cli, ["run", "c.yaml", "--size", "4x3"])
+    assert result.exit_code == 0, result.output
+    with Image.open(tmp_path / "runs" / "c" / "r.png") as picture:
+        assert picture.size == (4 * style.PNG_DPI, 3 * style.PNG_DPI)
