@@ -166,3 +166,38 @@ def test_versions_that_could_not_be_installed_are_not_taken_for_installed(projec
 @pytest.mark.parametrize("arguments", [[], ["older"]])
 def test_which_versions_must_be_said(project, arguments):
     assert calls_of(project, "test-versions", *arguments) == (2, [])
+
+
+STEPS = ("scripts/setup", "scripts/test", "scripts/test-processors", "scripts/test-package", "scripts/test-versions")
+TOOLS = (".venv/bin/ruff", ".venv/bin/lint-imports", ".venv/bin/pyright", "bin/chromium")
+
+
+@pytest.mark.parametrize("failing", [(), ("pyright",), ("test", "test-versions")])
+def test_every_step_of_the_checks_runs_even_when_others_fail(tmp_path, failing):
+    (tmp_path / ".ci").mkdir()
+    shutil.copy(ROOT / ".ci" / "run", tmp_path / ".ci")
+    calls = tmp_path / "calls"
+    for name in (*STEPS, *TOOLS):
+        last = Path(name).name
+        stand_in(tmp_path / name, calls, f"echo 'this is {last}'\n{'exit 3' if last in failing else ''}\n")
+    done = subprocess.run(
+        [tmp_path / ".ci" / "run"],
+        env={**os.environ, "PATH": f"{tmp_path / 'bin'}{os.pathsep}{os.environ['PATH']}"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=LONGEST,
+    )
+    called = calls.read_text(encoding="utf-8").splitlines()
+    assert called[0] == "setup test dev"
+    tools = ["lint-imports ", "pyright ", "ruff check", "ruff format --check"]
+    tests = ["test ", "test-package ", "test-processors ", "test-versions oldest"]
+    assert sorted(called[1:]) == tools + tests
+    # What runs beside the tests is told as well.
+    assert all(f"this is {Path(name).name}" in done.stdout for name in (*STEPS, *TOOLS) if "chromium" not in name)
+    assert done.returncode == (1 if failing else 0)
+    assert done.stdout.count("FAILED (exit 3)") == len(failing)
+    last = done.stdout.splitlines()[-1]
+    names = {"pyright": "types", "test": "tests", "test-versions": "oldest versions"}
+    told = set(last.removeprefix("==> failed: ").split(",")) if failing else last
+    assert told == ({names[name] for name in failing} if failing else "==> all steps passed")
