@@ -10,11 +10,13 @@ from typing import Any
 LONGEST = 300.0
 
 
-def wait_for(condition: Callable[[], Any], complaint: Callable[[], object] | str = "nothing happened") -> Any:
-    """The first true answer of a condition."""
+def wait_for(
+    condition: Callable[[], Any], complaint: Callable[[], object] | str = "nothing happened", pause: float = 0.01
+) -> Any:
+    """The first true answer of a condition, which is asked again after a pause: longer where asking costs much."""
     end = time.monotonic() + LONGEST
     while not (answer := condition()):
         if time.monotonic() > end:
             raise AssertionError(f"{complaint if isinstance(complaint, str) else complaint()} in {LONGEST:g} s")
-        time.sleep(0.01)
+        time.sleep(pause)
     return answer

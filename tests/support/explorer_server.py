@@ -1,0 +1,57 @@
+"""`zwidth explore` as a program of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from typing import Any
+
+import pytest
+from waiting import LONGEST
+
+
+class Server:
+    """A running command."""
+
+    def __init__(self, folder, *arguments):
+        command = [sys.executable, "-m", "zwidth", "explore", "--no-browser", *arguments]
+        self.process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        out: Any = self.process.stdout
+        line = out.readline()
+        if not line.startswith("http://127.0.0.1:"):
+            self.process.kill()
+            pytest.fail(f"{line}{self.process.communicate()}")
+        self.address = line.split()[0]
+        self.host = self.address.split("/")[2]
+
+    def end(self):
+        self.process.send_signal(signal.SIGINT)
+        try:
+            return (*self.process.communicate(timeout=LONGEST), self.process.returncode)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.communicate()
+            raise
+
+    def get(self, path="", **headers):
+        request = urllib.request.Request(f"{self.address}{path}", headers=headers)
+        try:
+            with urllib.request.urlopen(request, timeout=LONGEST) as answer:
+                return answer.status, answer.headers, answer.read().decode()
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, error.headers, error.read().decode()
+
+
+@contextlib.contextmanager
+def serve(folder):
+    """A server that stops when it is told, says so, and leaves nothing behind."""
+    running = Server(folder)
+    yield running
+    out, err, code = running.end()
+    assert (out, err, code) == ("stopped\n", "", 0)
+    assert list(folder.iterdir()) == []
