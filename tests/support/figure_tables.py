@@ -68,6 +68,15 @@ def grid_map(deltas=(0.1,)):
     return {"alpha": alpha, "beta": beta, "delta": np.array(deltas), "d": np.array([1.0]), **outputs}
 
 
+def measured_response():
+    frequency = np.geomspace(1.0, 400.0, 60)
+    answer = 1.0 / (-0.1 * (2 * np.pi * frequency) ** 2 + 40j * np.pi * frequency)
+    loop = 5e3 * answer
+    columns = {"real_m_per_N": answer.real, "imag_m_per_N": answer.imag, "deviation_m_per_N": np.full(60, 2e-6)}
+    return {"frequency_Hz": frequency, **columns, "open_loop_real": loop.real, "open_loop_imag": loop.imag}
+
+
+RESPONSE = measured_response()
 BOUNDARY = stack([outline(0.5), outline(1.0), outline(0.5, 2.0), outline(1.0, 2.0), path(), path(2.0)])
 RIDGE = stack([ridge(), ridge(0.5), ridge(0.5, "fractional_power")])
 LIMITS = {("held", 0.0): 4.0, ("held", 0.5): 2.5, ("fractional_power", 0.5): 2.5}
@@ -98,6 +107,8 @@ EVERY_FIGURE = {
     "draw_ridge": (RIDGE,),
     "draw_slope": (RIDGE, SLOPES),
     "draw_passivity_cost": (COSTS,),
+    "draw_response": (RESPONSE,),
+    "draw_response without a wall": ({name: RESPONSE[name] for name in list(RESPONSE)[:4]},),
     "draw_step": (stack([response("first"), response("second", np.nan)]),),
     "draw_step normalized": (stack([response("first", physical=False)]),),
     "draw_map of radius": (grid_map(), "spectral_radius"),

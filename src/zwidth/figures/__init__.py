@@ -21,6 +21,7 @@ JSON file, too):
     draw_energy           what wall and hand have given, and what damping and friction have taken
     draw_limit_cycles     amplitude of the buzz over two parameters (from arrays)
     draw_limit_cycle_curves  amplitude and frequency of the buzz over one parameter (from arrays)
+    draw_response         a measured frequency response with its band, and the open loop of a wall
     draw_device_fit       a fitted device: motion, residuals, and the boundary with its band (from several tables)
 
 From the dataset of a sweep, as `zwidth.open_dataset` gives it, or a part of one:

@@ -20,6 +20,7 @@ from .over_damping import draw_ridge as draw_ridge
 from .over_damping import draw_slope as draw_slope
 from .over_damping import draw_zero_stiffness as draw_zero_stiffness
 from .plane import draw_plane as draw_plane
+from .response import draw_response as draw_response
 from .stable_set import draw_recommendation as draw_recommendation
 from .stable_set import draw_stable_set as draw_stable_set
 from .style import house_style as house_style

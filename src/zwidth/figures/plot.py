@@ -38,6 +38,7 @@ from zwidth.figures.stable_set import (
 from zwidth.figures.table import Table, stack
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.checks import read_texts
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.assessment import passive_edge
 from zwidth.scenes.recommendation import Recommendation
@@ -213,6 +214,8 @@ def _tabulate_step(scene: Scene, stiffness: float, virtual_damping: float, perio
 
 def _frequencies(scene: Scene) -> np.ndarray:
     """Frequencies in Hz that resolve an open loop, up to half the sampling rate."""
+    if isinstance(scene.device, MeasuredDevice):
+        return scene.device.frequency
     half = 0.5 / float(scene.timing.period)
     slow, fast = np.geomspace(1e-4 * half, 0.05 * half, _FREQUENCIES), np.linspace(0.05 * half, half, _FREQUENCIES)
     return np.concatenate([slow, fast[1:]])

@@ -153,15 +153,9 @@ def _lay_lines(count: int, period: float, spacing: np.ndarray) -> np.ndarray:
 def _answer_at(scene: Scene, w: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The measured response between its lines in m/N, the velocity estimate, and the gap there in m/N."""
     c = cast("MeasuredLoop", scene.loop).walls.curve
-    inside = np.clip(w, c.w[0], c.w[-1])
-    u = 4.0 * np.sin(0.5 * w) ** 2
-    S = np.interp(inside, c.w, np.real(c.S)) + 1j * np.interp(inside, c.w, np.imag(c.S))
-    unit = scene.units.stiffness * u
-    return (
-        S / unit,
-        np.interp(inside, c.w, np.real(c.F)) + 1j * np.interp(inside, c.w, np.imag(c.F)),
-        np.interp(inside, c.w, np.maximum(c.gap - 0.5 * c.band, 0.0)) / unit,
-    )
+    S, F = c.at(np.clip(w, c.w[0], c.w[-1]))
+    unit = scene.units.stiffness * 4.0 * np.sin(0.5 * w) ** 2
+    return S / unit, F, np.interp(w, c.w, np.maximum(c.gap - 0.5 * c.band, 0.0)) / unit
 
 
 def _lay_second(scene: Scene, limit: StiffestWall, count: int) -> tuple[np.ndarray, np.ndarray]:

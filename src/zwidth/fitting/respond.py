@@ -7,11 +7,13 @@ that is rich enough is answered by averaged spectra of overlapping pieces (Welch
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
 
+from zwidth.fitting.columns import LoggedMotion
 from zwidth.fitting.encoder import find_resolution
 from zwidth.fitting.recordings import Log, read_logs
 from zwidth.loops.measured.loop import MeasuredLoop
@@ -122,6 +124,23 @@ def respond(
             "or more of each force"
         )
     return _average_periods(stretches, count, period, step, doubts)
+
+
+def respond_to_logs(
+    motions: Sequence[LoggedMotion], *, period: float | None = None, cycle: Any = None
+) -> ResponseEstimate:
+    """`respond` of logs that are read, all of one axis.
+
+    Raises:
+        InputError: an axis turns, or as `respond` says.
+    """
+    if any(motion.rotary for motion in motions):
+        raise InputError(
+            "position, force: got an angle and a torque; a response is in m/N: give position and force at the handle"
+        )
+    times = [period if motion.time is None else motion.time for motion in motions]
+    positions, forces = [motion.position for motion in motions], [motion.force for motion in motions]
+    return respond(times, positions, forces, cycle=cycle, resolution=motions[0].resolution)  # pyright: ignore[reportArgumentType]
 
 
 def find_nominal_limit(scene: Scene) -> StiffestWall:

@@ -15,13 +15,14 @@ from typing import Any, ClassVar, NamedTuple, get_args
 
 import numpy as np
 
+from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import FEW
 from zwidth.arrays.xp import is_jax, is_traced, namespace
 from zwidth.loops.linear.border import Border
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.chain import AnyChain, chain_of
 from zwidth.loops.linear.held import find_roots
-from zwidth.loops.linear.margins import linear_margins
+from zwidth.loops.linear.margins import linear_margins, open_loop_response
 from zwidth.loops.linear.passivity import PassivityCondition, passivity_margins
 from zwidth.loops.linear.poles import is_marginal, log_size, poles_less_one
 from zwidth.loops.linear.poles import spectral_radius as linear_radius
@@ -281,6 +282,10 @@ class LinearLoop:
     def sensitivities(self, negative: bool) -> SceneSensitivities:
         """What a little more of each parameter of the scene buys of the stiffest wall, in SI units."""
         return differentiate(self.scene, *self.ridge(negative))
+
+    def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> Array:
+        """``L = (alpha + beta F) G`` at angles."""
+        return open_loop_response(self.roots, alpha, beta, circle(w)).value
 
     def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
         """All margins, in periods and radians a period; that of the delay, which takes longest, may be left out."""

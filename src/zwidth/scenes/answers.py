@@ -7,9 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.arrays.evaluate import are_numbers, as_float64, join_shapes
-from zwidth.loops.linear.margins import open_loop_response
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.poles import log_size, poles_less_one
 from zwidth.loops.linear.rows import Island
@@ -170,7 +168,7 @@ class SceneAnswers:
         # Half the sampling rate is half a turn, whatever the rounding of the quotient.
         w = np.where(np.abs(w - np.pi) < 1e-14, np.pi, w)
         inside = (w > 0) & (w <= np.pi)
-        value = open_loop_response(self.loop.roots, alpha, beta, circle(np.where(inside, w, 1.0))).value
+        value = self.loop.open_loop(alpha, beta, np.where(inside, w, 1.0))
         return np.where(inside, value, complex(np.nan, np.nan))[()]
 
     def is_stable(

@@ -55,6 +55,16 @@ class ResponseCurve:
         """How far S may be from the curve."""
         return self.band + self.gap
 
+    def at(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """S and F at other angles, by straight lines; NaN beyond the ends."""
+
+        def between(values: np.ndarray) -> np.ndarray:
+            return np.interp(w, self.w, values, np.nan, np.nan)
+
+        parts = (self.S, self.F)
+        S, F = (between(np.real(part)) + 1j * between(np.imag(part)) for part in parts)
+        return S, F
+
     @classmethod
     def lay_out(cls, device: Any, period: float, stiffness: float, estimate: Estimate) -> ResponseCurve:
         """The curve of a `MeasuredDevice` at a period, its response times the unit of stiffness."""

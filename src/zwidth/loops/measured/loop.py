@@ -208,7 +208,12 @@ class MeasuredLoop:
                 said.append(f"{where}: {remedy}" if by_gap else f"the deviation is too large; {where}, with {remedy}")
         return said
 
-    def margins(self, alpha: np.ndarray, beta: np.ndarray) -> Margins:
+    def open_loop(self, alpha: np.ndarray, beta: np.ndarray, w: np.ndarray) -> np.ndarray:
+        """``L = (alpha + beta F) G`` at angles between the first line and the last; NaN at others."""
+        S, F = self.walls.curve.at(w)
+        return (alpha + beta * F) * S / (4.0 * np.sin(0.5 * w) ** 2)
+
+    def margins(self, alpha: np.ndarray, beta: np.ndarray, *, with_delay: bool = True) -> Margins:
         """Margins on the measured curve in periods and radians a period; NaN for walls that are not surely decided.
 
         The delay margin is that of a pure delay, phase over frequency.
