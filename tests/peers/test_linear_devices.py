@@ -41,7 +41,8 @@ def pair(request):
 
 def test_poles_are_those_of_its_feedback(pair):
     scene, device, wall = pair
-    poles = control.feedback(device, wall).poles()
+    loop: Any = control.feedback(device, wall)
+    poles = loop.poles()
     assert scene.spectral_radius() == pytest.approx(np.abs(poles).max(), rel=1e-7)
     found = np.sort(np.abs(scene.poles()))[::-1]
     np.testing.assert_allclose(found[:4], np.sort(np.abs(poles))[::-1][:4], rtol=1e-6)
