@@ -31,11 +31,11 @@ from zwidth.loops.linear.roots import LoopRoots
 from zwidth.loops.linear.rows import Island, bound_intervals, label_walls, stable_dampings
 from zwidth.loops.rigid.boundary import boundary_point, stable_region
 from zwidth.loops.rigid.margins import Margins, margins, margins_kernel
-from zwidth.loops.rigid.outermost_poles import outermost_poles
+from zwidth.loops.rigid.outermost_poles import slowest_pole
 from zwidth.loops.rigid.passivity import passivity_margin
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.ridge import RidgePoint, alpha_max
-from zwidth.loops.rigid.spectral_radius import decay_rate, spectral_radius
+from zwidth.loops.rigid.spectral_radius import spectral_radius
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod, decide_stability, is_stable
 from zwidth.parts.paths import AnyScene, list_parameters, replace_parameters
 from zwidth.words.errors import InputError, ZwidthError
@@ -126,10 +126,6 @@ class RigidVariants(Variants):
         split = [np.array_split(array.ravel(), pieces if pieces <= _MOST_PIECES else 1) for array in whole]
         found = np.concatenate([np.asarray(function(*piece)) for piece in zip(*split, strict=True)], -1)
         return found.reshape(*found.shape[:-1], *whole[0].shape)
-
-
-# Poles of which outermost rigid ones are found, and proved to so many digits.
-_POLE_ACCURACY = 1e-9
 
 
 class SlowestMotion(NamedTuple):
@@ -336,13 +332,10 @@ class RigidLoop(LinearLoop):
         return spectral_radius(alpha, beta, self.scene.delta, self.scene.d)
 
     def slowest(self, alpha: float, beta: float) -> SlowestMotion:
-        wall = alpha, beta, float(self.scene.delta), float(self.scene.d)
         with np.errstate(all="ignore"):
-            slowest = outermost_poles([np.array([value]) for value in wall], _POLE_ACCURACY)
+            slowest = slowest_pole((alpha, beta, float(self.scene.delta), float(self.scene.d)))
         # A row is stable right above K = 0, where nothing but the pole at z = 1 comes to the circle.
-        marginal = alpha == 0 and bool(self.row(np.array([beta])).size)
-        rate, angle = float(decay_rate(*wall)), abs(float(slowest.im[0]))
-        return SlowestMotion(marginal, float(spectral_radius(*wall)), rate, angle)
+        return SlowestMotion(alpha == 0 and bool(self.row(np.array([beta])).size), *slowest)
 
     def row(self, beta: np.ndarray) -> np.ndarray:
         end = np.asarray(boundary_point(self.scene.delta, self.scene.d, beta=beta).alpha)

@@ -48,6 +48,8 @@ PIECE = BLOCK >> 3
 
 
 _NONE = np.empty(0)
+# Of the pole of one wall, its radius and its rate.
+SLOWEST_ACCURACY = 1e-9
 
 
 class OutermostPoles(NamedTuple):
@@ -198,6 +200,18 @@ def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPole
 
 def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, few: int = FEW) -> WallPoles:
     """The outermost poles of equally long columns; as for `outermost_poles`, bad walls among them."""
+    return _find_listed(columns, accuracy, with_rate, few)[0]
+
+
+def slowest_pole(wall: tuple[float, float, float, float]) -> tuple[float, float, float]:
+    """The spectral radius of one wall, its rate of decay and the angle of that pole."""
+    poles, found = _find_listed([np.array([value]) for value in wall], SLOWEST_ACCURACY, True, FEW)
+    return float(poles.radius[0]), float(poles.rate[0]), abs(float(found.im[0]))
+
+
+def _find_listed(
+    columns: list[np.ndarray], accuracy: float, with_rate: bool, few: int
+) -> tuple[WallPoles, OutermostPoles]:
     columns, status = usable(columns)
     found, bad = outermost_poles(columns, accuracy, few), status != Status.OK
     rate = rates(found, columns, accuracy) if with_rate else _NONE
@@ -205,7 +219,7 @@ def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = Fal
     found.error[bad] = np.inf
     radius = np.where(np.isinf(found.error), np.nan, found.re)
     _to_radii(radius, accuracy, columns)
-    return WallPoles(radius, found.error <= accuracy, rate)
+    return WallPoles(radius, found.error <= accuracy, rate), found
 
 
 def find_poles(arrays: list[np.ndarray], accuracy: float, with_rate: bool = False) -> WallPoles:
