@@ -207,13 +207,9 @@ def evaluate_columns(
             result = kernel(*(part[0] if part.size == 1 else part for part in parts), *static)
         # A copy: a view of an argument, or of one value, could not be written to. One point has its axis first, too.
         shape = (_length(parts),)
-        most = 0 if shape == (1,) else 1
-        return tree_map(
-            lambda leaf: (
-                np.array(np.broadcast_to(leaf, shape)) if np.ndim(leaf) <= most else leaf if most else leaf[None]
-            ),
-            result,
-        )
+        if shape == (1,):
+            return tree_map(lambda leaf: np.array(leaf)[None], result)
+        return tree_map(lambda leaf: leaf if np.ndim(leaf) > 1 else np.array(np.broadcast_to(leaf, shape)), result)
 
     return at_once(*columns) if count <= few else map_blocks(at_once, columns, few, within=nullcontext)
 

@@ -179,8 +179,9 @@ def run_lanes(
 ) -> tuple[State, np.ndarray, Reading | None, Frame | None]:
     """The last state, the last positions, and what is recorded along a first axis of periods (and of substeps)."""
     edges = course.periods - course.tail * np.arange(2, -1, -1) // 2
-    state: Any = jax.tree.map(jnp.asarray, begin(lanes, given.position, given.velocity, rings))
-    lanes, ends = jax.tree.map(jnp.asarray, lanes), jnp.asarray(edges)
+    # All arrays in one go: one by one they cost as much as the motion.
+    state: Any = begin(lanes, given.position, given.velocity, rings)
+    state, lanes, ends = jax.device_put((state, lanes, edges))
     recorded: Any = deque(maxlen=None if options.record else CYCLE // BLOCK + 1)
     for first in range(0, course.periods, BLOCK):
         inputs = Inputs(
