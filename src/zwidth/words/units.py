@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from decimal import Decimal
 from typing import Any, NamedTuple
 
 from zwidth.words.errors import UnusableValueError
@@ -79,6 +80,17 @@ PERIOD_WORDS = ("periods", "period")
 
 def find_dimension(unit: str) -> Dimension:
     return _OF_UNIT[unit]
+
+
+def spell_exactly(value: float, unit: str) -> str:
+    """A quantity in SI units as the shortest text that is read back as the same float64: ``0.1, "kg"`` as ``100 g``."""
+    number = Decimal(repr(float(value)))
+    powers = {name: power for name, power in find_dimension(unit).powers.items() if not power % 3}
+    fitting = [name for name, power in powers.items() if abs(number.scaleb(-power)) >= 1]
+    # The first name of a power is the usual one.
+    chosen = max(fitting, key=lambda name: powers[name]) if fitting else unit
+    digits = number.scaleb(-powers[chosen]).normalize()
+    return f"{digits:{'f' if -6 < digits.adjusted() < 15 else ''}} {chosen}"
 
 
 def looks_like_number(text: str) -> bool:

@@ -16,7 +16,9 @@ from zwidth.words.units import (
     STIFFNESS,
     TIME,
     TORQUE,
+    find_dimension,
     read_quantity,
+    spell_exactly,
 )
 
 
@@ -100,3 +102,27 @@ def test_spans():
     assert Span(1.1e-3, "s").seconds(1e-4) == 1.1e-3
     assert str(Span(100.0, "periods")) == "100 periods"
     assert str(Span(0.1 + 0.2, "s")) == "0.30000000000000004 s"
+
+
+@pytest.mark.parametrize(
+    "value, unit, text",
+    [
+        (0.1, "kg", "100 g"),
+        (0.0007, "s", "700 us"),
+        (19863.4, "N/m", "19.8634 kN/m"),
+        (-5.0, "N/m", "-5 N/m"),
+        (0.0, "N s/m", "0 N s/m"),
+        (1000.0, "Hz", "1 kHz"),
+        (1e-5, "m", "10 um"),
+        (1 / 3, "s", "333.3333333333333 ms"),
+        (5e-324, "N/m", None),
+        (1.7976931348623157e308, "N/m", None),
+    ],
+)
+def test_a_spelled_quantity_is_read_back_bit_by_bit(value, unit, text):
+    spelled = spell_exactly(value, unit)
+    assert text is None or spelled == text
+    mantissa, _, shown = spelled.partition(" ")
+    assert len(mantissa) <= 25
+    digits, _, exponent = mantissa.partition("E")
+    assert find_dimension(unit).in_base(digits, int(exponent or 0), shown) == value

@@ -8,7 +8,10 @@ from dataclasses import dataclass, fields, replace
 from math import isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import parse_qsl, urlencode
 
+from zwidth.config.reader import read_mapping
+from zwidth.pages.words import unit_of
 from zwidth.parts.device import Device
 from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
@@ -17,9 +20,10 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.runs.record import CONFIG_FILE, RUN_FILE, Record
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import choose_damping
-from zwidth.studies.document import load_config
+from zwidth.studies.document import Config, load_config
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
+from zwidth.words.units import spell_exactly
 
 # Beyond so many, the poles cannot follow a drag.
 _MOST_POLES = 80
@@ -63,6 +67,7 @@ def _make_slider(parameter: Parameter) -> Slider:
 
 # The units of the page, and how many of them are one SI unit.
 _SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
+_BARE = ("device", "timing", "wall")
 _DEVICE, _WALL = ("mass", "damping", "period", "delay", "delta", "d"), ("stiffness", "virtual_damping", "alpha", "beta")
 # By the path in a scene. A range that begins at 0 is cubic on the page, one above logarithmic.
 SLIDERS = {name: _make_slider(PARAMETERS[name]) for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider}
@@ -126,7 +131,7 @@ class Controls:
                 raise InputError(f"{str(name)[:40]!r}: the page has no such number now")
             if isinstance(value, bool) or not isinstance(value, int | float) or not -_LARGEST <= value <= _LARGEST:
                 raise InputError(f"{SLIDERS[name].label}: got {str(value)[:40]!r}; a finite number is needed")
-            number = round(value) if SLIDERS[name].whole else float(value) / SLIDERS[name].per_si
+            number = round(value) if SLIDERS[name].whole else _round(float(value) / SLIDERS[name].per_si, 15)
             new = replace(new, scene=new.scene.replace(**{_NORMALIZED.get(name, name): number}))
         return new.check()
 
@@ -161,10 +166,17 @@ class Controls:
         """The device and wall in the other units; normalized it is rigid, its parts are left out."""
         scene, (mass, period) = self.scene, self.scale
         if not self.normalized:
-            return replace(normalized_controls(*scene.normalized), scale=(float(scene.mass), scene.timing.period))
+            numbers = (_round(float(number), 12) for number in scene.normalized)
+            return replace(normalized_controls(*numbers), scale=(float(scene.mass), scene.timing.period))
         rate, (stiffness, damping) = mass / period, self.wall
-        wall = VirtualWall(stiffness * rate / period, damping * rate)
-        return Controls(Scene(Device(mass, scene.damping * rate), Timing(period, float(scene.d) * period), wall))
+        numbers = stiffness * rate / period, damping * rate, scene.damping * rate, float(scene.d) * period
+        *wall, own, delay = (_round(float(number), 12) for number in numbers)
+        return Controls(Scene(Device(mass, own), Timing(period, delay), VirtualWall(*wall)))
+
+
+def _round(value: float, digits: int) -> float:
+    """A number without the last digits, which are the rounding of a change of units."""
+    return float(f"{value:.{digits}g}")
 
 
 def _find_form(part: Any) -> str:
@@ -193,9 +205,14 @@ def read_controls(path: Path | None) -> Controls:
     given: Any = load_config(path).scene
     if given is None:
         raise InputError(f"{path}: scene: missing; the page shows the scene of a configuration, add one")
+    return _show_scene(given, path)
+
+
+def _show_scene(given: Any, origin: Any) -> Controls:
+    """The scene of a configuration; where it has no wall, one well inside of the stable set, if there is one."""
     if given.delay_model != "held":
         raise InputError(
-            f"{path}: scene.delay_model: got {given.delay_model!r}; the page computes the model 'held' alone, "
+            f"{origin}: scene.delay_model: got {given.delay_model!r}; the page computes the model 'held' alone, "
             "zwidth run draws both"
         )
     controls = (
@@ -203,11 +220,53 @@ def read_controls(path: Path | None) -> Controls:
     )
     wall = (given.wall.alpha, given.wall.beta) if given.wall and controls.normalized else controls.wall
     if given.wall is None:
-        # Well inside of the stable set, if there is one.
         best = controls.scene.max_stiffness()
-        wall, half = (0.0, 0.0), 0.5 * float(best.stiffness)
-        wall = (half, choose_damping(controls.scene, best, half)) if isfinite(half) else wall
+        half = _round(0.5 * float(best.stiffness), 4)
+        wall = (half, _round(choose_damping(controls.scene, best, half), 4)) if isfinite(half) else (0.0, 0.0)
     return replace(controls, scene=replace(controls.scene, wall=VirtualWall(*wall))).check()
+
+
+def to_link(controls: Controls) -> str:
+    """The scene as the part of an address behind its ``#``, which any explorer opens: ``mass=100+g&damping=...``."""
+    section = _spell_section(controls).items()
+    texts = {name: own if isinstance(own, str) else json.dumps(own, separators=(",", ":")) for name, own in section}
+    return urlencode(texts, safe="/{}[]:,")
+
+
+def read_link(link: str) -> Controls:
+    """The view that `to_link` has spelled."""
+    try:
+        section = {name: _read_value(text) for name, text in parse_qsl(link, strict_parsing=True, max_num_fields=99)}
+    except (ValueError, RecursionError):
+        raise InputError("address: what follows its # is no scene; remove it, or copy the whole address") from None
+    walls = {"kind": "boundary", "name": "stable_walls"}
+    document = {"version": 1, "name": "explored", "scene": section, "studies": [walls]}
+    return _show_scene(read_mapping(document, Config).scene, "address")
+
+
+def _read_value(text: str) -> Any:
+    """A number, a list or a part as JSON has it, else the text."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text
+
+
+def _spell_section(controls: Controls) -> dict[str, Any]:
+    """The section ``scene`` of a configuration; quantities have their units."""
+    if controls.normalized:
+        return {name: value for name, value in controls.shown().items() if name != "mode"}
+    return _add_units(spell_scene(controls.scene))
+
+
+def _add_units(value: Any, path: str = "") -> Any:
+    """Numbers of a section as texts with units, found by their paths."""
+    if isinstance(value, dict):
+        return {name: _add_units(part, f"{path}.{name}".lstrip(".")) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_add_units(part, f"{path}.{k}") for k, part in enumerate(value)]
+    unit = unit_of(path)
+    return spell_exactly(value, unit) if unit else value
 
 
 def to_yaml(controls: Controls) -> str:
@@ -217,27 +276,32 @@ def to_yaml(controls: Controls) -> str:
     if not scene.parts_beyond:
         studies[0] |= {"passivity": True} if scene.operator is None else {}
         studies.append({"kind": "step", "name": "response"})
-    # JSON is YAML of one line.
+    # JSON is YAML of one line, and a quantity needs no quotes.
     lines = ["version: 1", "name: explored", "scene:"]
-    own = {name: value for name, value in controls.shown().items() if name != "mode"}
-    section = own if controls.normalized else spell_scene(scene)
-    lines += [f"  {name}: {json.dumps(value)}" for name, value in section.items()]
+    for name, value in _spell_section(controls).items():
+        lines.append(f"  {name}: {value if isinstance(value, str) else json.dumps(value)}")
     return "\n".join([*lines, "studies:", *(f"  - {json.dumps(study)}" for study in studies)]) + "\n"
 
 
 def to_python(controls: Controls) -> str:
     """A script that builds the scene, judges its wall and draws the stable set."""
     parts = spell_part(controls.scene)
-    text = "zwidth.Scene(\n" + "".join(f"    {name}={_spell(part)},\n" for name, part in parts.items()) + ")"
+    units = not controls.normalized
+    paths = {name: "" if name in _BARE else name for name in parts}
+    text = "".join(f"    {name}={_spell(part, paths[name], units)},\n" for name, part in parts.items())
     normalized = {"notes": "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "unit": "(alpha)"}
     normalized |= {"x": "normalized stiffness alpha", "y": "normalized damping beta"}
     physical = {"notes": "", "unit": "N/m", "x": "stiffness K in N/m", "y": "virtual damping B in N s/m"}
-    return _SCRIPT.format(scene=text, **(normalized if controls.normalized else physical))
+    return _SCRIPT.format(scene=f"zwidth.Scene(\n{text})", **(physical if units else normalized))
 
 
-def _spell(part: Any) -> str:
-    """A part as Python writes it."""
-    if not hasattr(part, "__dataclass_fields__"):
-        return repr(part)
-    given = ", ".join(f"{name}={_spell(value)}" for name, value in spell_part(part).items())
-    return f"zwidth.{type(part).__name__}({given})"
+def _spell(value: Any, path: str, units: bool) -> str:
+    """A part, or a number of one, as Python writes it."""
+    if hasattr(value, "__dataclass_fields__"):
+        given = spell_part(value).items()
+        words = (f"{name}={_spell(own, f'{path}.{name}'.lstrip('.'), units)}" for name, own in given)
+        return f"zwidth.{type(value).__name__}({', '.join(words)})"
+    if isinstance(value, tuple) and any(hasattr(own, "__dataclass_fields__") for own in value):
+        return f"[{', '.join(_spell(own, f'{path}.{k}', units) for k, own in enumerate(value))}]"
+    unit = unit_of(path)
+    return json.dumps(spell_exactly(value, unit)) if units and unit else repr(value)  # pyright: ignore

@@ -5,7 +5,7 @@ K and B stand for alpha and beta where the scene is normalized (m = 1, T = 1).
 
 from __future__ import annotations
 
-from math import ceil, floor, inf, isfinite, log10
+from math import atan2, ceil, floor, inf, isfinite, log10, nan, pi
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from zwidth.loops.linear.curve import end_lines
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.loops.linear.roots import affine_polynomial
 from zwidth.loops.rigid.poles import companion
+from zwidth.pages.words import pole_words
 from zwidth.scenes.assessment import Assessment, passive_edge
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import MotionKind
@@ -113,15 +114,47 @@ def frame(curve: Curve, wall: tuple[float, float]) -> tuple[Range, Range]:
     return ranges[0], ranges[1]
 
 
-def nyquist_curve(scene: Scene) -> np.ndarray:
-    """The open loop L up to half the sampling rate, complex."""
-    return scene.frequency_response(frequency=np.geomspace(1e-4, 1.0, 600) * 0.5 / scene.timing.period)
+def point_at(wall: tuple[float, float], across: Range, up: Range) -> dict[str, list[Any]]:
+    """An arrow at the border of a chart towards a wall that lies beyond it; nothing where the chart holds the wall."""
+    sides = [int(value > high) - int(value < low) for value, (low, high) in zip(wall, (across, up), strict=True)]
+    if not any(sides):
+        return {"x": [], "y": [], "angle": [], "text": [], "align": []}
+    place = [
+        min(max(value, low + 0.03 * (high - low)), high - 0.03 * (high - low))
+        for value, (low, high) in zip(wall, (across, up), strict=True)
+    ]
+    # A triangle points upwards before it is turned.
+    turn, align = atan2(sides[1], sides[0]) - 0.5 * pi, "left" if place[0] < 0.5 * sum(across) else "right"
+    return {"x": [place[0]], "y": [place[1]], "angle": [turn], "text": ["your wall"], "align": [align]}
 
 
-def crossover(scene: Scene, verdict: Assessment) -> complex:
-    """The open loop where its magnitude is 1, the frequency of which the verdict has; NaN without one."""
-    hertz = verdict.gain_crossover
-    return complex(scene.frequency_response(frequency=hertz)) if isfinite(hertz) else complex("nan+nanj")
+def name_islands(scene: Scene) -> dict[str, list[Any]]:
+    """A name above each island of stable walls, in the order in which the verdict notes them."""
+    islands = scene.islands()
+    names = [f"island {k}" if len(islands) > 1 else "island" for k, _ in enumerate(islands, start=1)]
+    x, y = [0.5 * sum(one.stiffness) for one in islands], [one.virtual_damping[1] for one in islands]
+    return {"x": x, "y": y, "text": names}
+
+
+def open_loop(scene: Scene, verdict: Assessment) -> dict[str, dict[str, Any]]:
+    """The open loop L up to half the sampling rate as Nyquist curve and Bode plot, and where margins are taken."""
+    cross, turned = verdict.gain_crossover, verdict.phase_crossover
+    frequency = np.geomspace(1e-4, 1.0, 600) * 0.5 / scene.timing.period
+    curve, (place,) = np.split(scene.frequency_response(frequency=np.append(frequency, cross)), [-1])
+    # Between two points a long delay turns by more than half a turn: it is known, and left out meanwhile.
+    delayed = 2.0 * np.pi * frequency * scene.timing.delay
+    phase = np.unwrap(np.angle(curve * np.exp(1j * delayed))) - delayed
+    # At the lowest frequency from -270 to 90 degrees.
+    phase = np.degrees(phase - 2.0 * np.pi * np.floor((phase[0] / np.pi + 1.5) / 2.0))
+    with np.errstate(divide="ignore"):
+        gain = 20.0 * np.log10(np.abs(curve))
+    at_cross = {"hertz": [cross], "gain": [0.0], "phase": [float(np.interp(cross, frequency, phase))]}
+    return {
+        "nyquist": {"x": np.real(curve), "y": np.imag(curve)},
+        "bode": {"x": frequency, "gain": gain, "phase": phase},
+        "crossover": {"x": [place.real], "y": [place.imag], **at_cross},
+        "turned": {"hertz": [turned], "gain": [-20.0 * log10(verdict.gain_margin) if turned > 0 else nan]},
+    }
 
 
 def length_of(scene: Scene, verdict: Assessment) -> int:
@@ -183,6 +216,38 @@ def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
             for name, value in zip(found, (line[:, 0], line[:, 1], *named, text), strict=True):
                 found[name].append(value)
     return found
+
+
+def caption_poles(poles: np.ndarray, word: str) -> str:
+    """Where the poles lie, in words that agree with the verdict's."""
+    outside, count = int((np.abs(poles) > 1.0).sum()), poles.size
+    if word == "stable":
+        return f"Stable: all {count} lie inside the circle."
+    if word == "marginal":
+        return f"Marginal: of {count}, one stands on the circle, at z = 1; without stiffness nothing pulls back."
+    return f"Unstable: {outside} of {count} outside of the circle." if outside else "Not stable: one on the circle."
+
+
+def caption_curves(verdict: Assessment, normalized: bool) -> dict[str, str]:
+    """What Nyquist curve, Bode plot and step response of a wall show, by the names of their captions."""
+    word, hertz, margins = word_of(verdict).capitalize(), "per period" if normalized else "Hz", []
+    around = "leave the cross at −1 outside" if verdict.stable else "go around the cross at −1"
+    if isfinite(verdict.phase_margin):
+        margins.append(f"phase {plain(verdict.phase_margin, 3)}° at {plain(verdict.gain_crossover)} {hertz} (circle)")
+    if verdict.gain_margin > 0 and isfinite(verdict.phase_crossover):
+        decibel = plain(20.0 * log10(verdict.gain_margin), 3)
+        margins.append(f"gain {decibel} dB at {plain(verdict.phase_crossover)} {hertz} (diamond)")
+    slowest = pole_words(verdict.time_constant, verdict.frequency)
+    if normalized and isfinite(verdict.time_constant):
+        verb = "decays" if verdict.time_constant >= 0 else "grows"
+        slowest = f"{verb} with time constant {plain(abs(verdict.time_constant))} periods"
+    return {
+        "nyquist_words": f"{word}: "
+        + ("a pole at z = 1" if verdict.marginal else f"curve and mirror image {around}")
+        + ".",
+        "bode_words": f"Margins: {', '.join(margins) or 'none, |L| is never 1 or the wall has no stiffness'}.",
+        "step_words": f"Under a constant push from 0 on, in the wall. The slowest motion {slowest}.",
+    }
 
 
 def normalized_lines(verdict: Assessment) -> list[str]:

@@ -2,113 +2,49 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
-from collections.abc import Iterator
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
-from threading import Lock
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from bokeh.document import Document
 from bokeh.events import DoubleTap, PressUp, Tap
-from bokeh.models import ColumnDataSource, DataRange1d
+from bokeh.models import ColumnDataSource, DataRange1d, Span
 from bokeh.plotting import figure
 
 from zwidth.figures import style
 from zwidth.pages.explorer import model
-from zwidth.pages.explorer.controls import Controls, to_python, to_yaml
-from zwidth.pages.words import check_lines, list_slopes
+from zwidth.pages.explorer.controls import Controls, read_link, to_link, to_python, to_yaml
+from zwidth.pages.explorer.details import IMPORTING, Update, Wish, compute_details, show_outlines
 from zwidth.parts.wall import VirtualWall
-from zwidth.scenes.assessment import Assessment, assess, limits_of
-from zwidth.scenes.scene import Scene
 from zwidth.words.errors import ZwidthError
 
-# Held while JAX is being imported: what looks for it meanwhile would find half of it.
-IMPORTING = Lock()
-
-# What a part of the page shows: the columns of a source, or a text, by name.
-Update = dict[str, Any]
-# A message holds some dozen numbers.
-_LONGEST_MESSAGE = 4000
-_POINTS = ("edge", "passive", "ridge", "best", "wall", "poles", "nyquist", "crossover", "step")
+# A message holds some dozen numbers, or an address.
+_LONGEST_MESSAGE = 16_000
+_POINTS = ("edge", "passive", "ridge", "best", "wall", "poles", "nyquist", "step")
 _COLUMNS = dict.fromkeys(_POINTS, ("x", "y")) | {
     "area": ("xs", "ys"),
+    "away": ("x", "y", "angle", "text", "align"),
+    "islands": ("x", "y", "text"),
+    "bode": ("x", "gain", "phase"),
+    "crossover": ("x", "y", "hertz", "gain", "phase"),
+    "turned": ("hertz", "gain"),
     "contours": ("xs", "ys", "x", "y", "text"),
     "contact": ("x", "position", "force"),
 }
 # What hangs on the device and takes its time: another device's is taken away at once.
-_OF_DEVICE = ("contours", "passive", "ridge", "best")
-# Ink, edge, passive, ridge and the rest on a light page and on a dark one.
-_LIGHT = {"ink": style.BLACK, "faint": "#565656", "edge": style.BLUE, "passive": "#00735A", "ridge": style.VERMILION}
-_DARK = {"ink": "#F2F2F2", "faint": "#A6A6A6", "edge": style.SKY, "passive": "#2FC79C", "ridge": style.ORANGE}
+_OF_DEVICE = ("contours", "passive", "ridge", "best", "islands")
+# What is drawn, on a light page and on a dark one.
+_INKS = ("paper", "ink", "faint", "edge", "passive", "ridge")
+_LIGHT = dict(zip(_INKS, ("#FFFFFF", style.BLACK, "#565656", style.BLUE, "#00735A", style.VERMILION), strict=True))
+_DARK = dict(zip(_INKS, ("#1E2328", "#F2F2F2", "#A6A6A6", style.SKY, "#2FC79C", style.ORANGE), strict=True))
+# What files call the curves of a figure, where that is not the name of their source.
+_NAMES = {"edge": "stable", "ridge": "stiffest as b grows", "best": "stiffest", "wall": "your wall", "bode": "L"}
+_NAMES |= {"nyquist": "L", "crossover": "|L| = 1", "turned": "phase -180 degrees"}
 _TURN = np.linspace(0.0, 2.0 * np.pi, 361)
-
-
-@dataclass(frozen=True)
-class Wish:
-    """What is to be computed."""
-
-    scene: Scene
-    normalized: bool
-    across: model.Range
-    up: model.Range
-    outline: bool  # of a device that has changed
-    contact: bool
-    costly: bool  # what takes seconds in a scene with parts
-
-
-def compute_details(wish: Wish) -> Iterator[Update]:
-    """The parts in the order in which they are wanted; whoever asks may stop after each."""
-    scene, quick = wish.scene, wish.scene.loop.outline() is not None
-    if wish.outline and not quick:
-        yield show_outlines(model.outlines(scene))
-    verdict = assess(scene)
-    own = model.normalized_lines(verdict) if wish.normalized else None
-    lines = own or check_lines(scene, verdict, [])
-    yield {"word": model.word_of(verdict), "verdict": "\n".join(lines), **_wall_curves(wish, verdict)}
-    if wish.outline:
-        passive = model.passive_set(scene)
-        x, y = passive if passive is not None else (np.empty(0), np.empty(0))
-        yield {"passive": {"x": x, "y": y}, "contours": model.contours(scene, wish.across, wish.up)}
-    if not own:
-        yield {"verdict": "\n".join(check_lines(scene, verdict, limits_of(scene)))}
-    if wish.contact or (wish.costly and not quick):
-        with IMPORTING:
-            import jax  # noqa: F401
-    if quick or wish.costly:
-        x, y = model.ridge_path(scene)
-        yield {"ridge": {"x": x, "y": y}}
-        yield {"slopes": "\n".join([] if wish.normalized else [slope.line() for slope in list_slopes(scene)])}
-    if wish.contact:
-        time, position, force, text = model.contact_motion(scene, 2 * model.length_of(scene, verdict))
-        position = position * _length(wish)
-        yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}
-
-
-def show_outlines(outlines: list[model.Curve]) -> Update:
-    """All outlines, closed, as one line and as one area: what lies within two of them is a hole."""
-    xs, ys = ([np.append(outline[axis], outline[axis][:1]) for outline in outlines] for axis in (0, 1))
-    x, y = (np.concatenate([np.append(ring, np.nan) for ring in rings] or [np.empty(0)]) for rings in (xs, ys))
-    return {"area": {"xs": [[xs]], "ys": [[ys]]}, "edge": {"x": x, "y": y}}
-
-
-def _length(wish: Wish) -> float:
-    """How many of the units of length that the page shows are one of the scene's: it shows millimeters."""
-    return 1.0 if wish.normalized else 1e3
-
-
-def _wall_curves(wish: Wish, verdict: Assessment) -> Update:
-    scene = wish.scene
-    curve, cross = model.nyquist_curve(scene), model.crossover(scene, verdict)
-    time, position = model.step_motion(scene, model.length_of(scene, verdict))
-    best = verdict.stiffness_max, verdict.virtual_damping_at_max
-    return {
-        "nyquist": {"x": np.real(curve), "y": np.imag(curve)},
-        "crossover": {"x": [cross.real], "y": [cross.imag]},
-        "step": {"x": time, "y": position * _length(wish)},
-        "best": {"x": [best[0]], "y": [best[1]]},
-    }
 
 
 class Page:
@@ -116,7 +52,8 @@ class Page:
 
     def __init__(self, document: Document, controls: Controls, executor: Executor) -> None:
         self.document, self.controls, self.executor = document, controls, executor
-        self.generation, self.serial, self.dark = 0, 0, False
+        self.start, self.generation, self.serial = controls, 0, 0
+        self.dark: bool | None = None
         self.device: tuple[Any, ...] = ()
         self.drawn = False
         self.options = {"contact": False, "costly": False}
@@ -128,11 +65,15 @@ class Page:
         self.answer = ColumnDataSource({"json": []}, name="answer")
         self.inputs.on_change("data", lambda _, __, data: self.receive(data))
         self.inks: list[tuple[Any, str, str]] = []
+        # What a figure shows of its sources: their names, and the columns across and up.
+        self.curves: dict[figure, list[tuple[str, str, str]]] = {}
         self.frame: tuple[model.Range, model.Range] | None = None
         self.plots = {
             "plane": self._draw_plane(),
             "poles": self._draw_poles(),
             "nyquist": self._draw_nyquist(),
+            "gain": self._draw_bode("gain", 0.0),
+            "phase": self._draw_bode("phase", -180.0),
             "step": self._draw_motion("step", "y"),
             "contact": self._draw_motion("contact", "position"),
             "force": self._draw_motion("contact", "force"),
@@ -141,6 +82,9 @@ class Page:
         # A click within 0.3 s of the last one, wherever that was, and a slow one have names of their own.
         for click in (Tap, DoubleTap, PressUp):
             self.plots["plane"].on_event(click, self._tap)
+        for axis in (self.plots["plane"].x_range, self.plots["plane"].y_range):
+            for end in ("start", "end"):
+                axis.on_change(end, lambda attr, old, new: self._point_at_wall())
         for name, plot in self.plots.items():
             plot.name = name
             document.add_root(plot)
@@ -150,14 +94,16 @@ class Page:
         tools = "pan,wheel_zoom,box_zoom,reset"
         plot = figure(height=height, sizing_mode="stretch_width", tools=tools, output_backend="canvas", **keywords)
         plot.toolbar.logo, plot.toolbar.autohide, plot.toolbar.active_drag = None, True, None  # pyright: ignore
-        plot.background_fill_color = plot.border_fill_color = None  # pyright: ignore
         plot.outline_line_color = None  # pyright: ignore
+        self.inks += [(plot, "background_fill_color", "paper"), (plot, "border_fill_color", "paper")]
         return plot
 
     def _add(self, plot: figure, glyph: str, source: str, color: str, *, parts: str = "line", **keywords: Any) -> Any:
         """A glyph whose colors follow the light."""
         drawn = getattr(plot, glyph)(source=self.sources.get(source) or ColumnDataSource(), **keywords)
         self.inks += [(drawn.glyph, f"{part}_color", color) for part in parts.split()]
+        if glyph in ("line", "scatter") and source != "away":
+            self.curves.setdefault(plot, []).append((source, keywords["x"], keywords["y"]))
         return drawn
 
     def _draw_plane(self) -> figure:
@@ -176,6 +122,14 @@ class Page:
         mark = {"x": "x", "y": "y", "fill_color": None, "line_width": 2}
         self._add(plot, "scatter", "best", "ridge", marker="diamond", size=13, legend_label="stiffest", **mark)
         self._add(plot, "scatter", "wall", "ink", marker="circle_cross", size=17, legend_label="your wall", **mark)
+        # A wall beyond the border has an arrow there; islands have their names.
+        arrow = {"marker": "triangle", "angle": "angle", "size": 15, "parts": "line fill"}
+        self._add(plot, "scatter", "away", "ink", x="x", y="y", **arrow)
+        words = {"x": "x", "y": "y", "text": "text", "parts": "text"}
+        beside = {"text_align": "align", "y_offset": 12, "text_baseline": "top", "text_font_size": "12px"}
+        self._add(plot, "text", "away", "ink", **words, **beside)
+        above = {"text_align": "center", "text_baseline": "bottom", "y_offset": -3, "text_font_size": "12px"}
+        self._add(plot, "text", "islands", "edge", **words, **above)
         legend = plot.legend[0]
         legend.update(ncols=2, label_text_font_size="11px", background_fill_alpha=0.0, border_line_color=None)
         legend.update(padding=2, spacing=2, margin=0, glyph_height=16)
@@ -184,7 +138,7 @@ class Page:
 
     def _draw_circle(self, seen: list[str]) -> figure:
         """A plane of complex numbers with the unit circle; the ranges hold what is named."""
-        plot = self._new(280, match_aspect=True)
+        plot = self._new(330, match_aspect=True)
         circle = plot.line(np.cos(_TURN), np.sin(_TURN), line_width=1.5)
         self.inks.append((circle.glyph, "line_color", "faint"))
         plot.x_range, plot.y_range = (DataRange1d(renderers=[circle]) for _ in "xy")
@@ -209,13 +163,26 @@ class Page:
         plot.xaxis.axis_label, plot.yaxis.axis_label = "Re L", "Im L"
         return plot
 
+    def _draw_bode(self, column: str, critical: float) -> figure:
+        plot = self._new(170, x_axis_type="log")
+        self._add(plot, "line", "bode", "edge", x="x", y=column, line_width=2)
+        line = Span(location=critical, dimension="width", line_dash=[4, 4], line_width=1.5)
+        self.inks.append((line, "line_color", "ridge"))
+        plot.add_layout(line)
+        mark = {"size": 11, "fill_color": None, "line_width": 2, "x": "hertz"}
+        self._add(plot, "scatter", "crossover", "ink", y=column, marker="circle", **mark)
+        if column == "gain":
+            self._add(plot, "scatter", "turned", "ink", y=column, marker="diamond", **mark)
+        return plot
+
     def _draw_motion(self, source: str, column: str) -> figure:
         plot = self._new(220)
         self._add(plot, "line", source, "edge", x="x", y=column, line_width=2)
         return plot
 
     def _paint(self) -> None:
-        inks = _DARK if self.dark else _LIGHT
+        # Until the browser has said which, paper has no color.
+        inks = (_DARK if self.dark else _LIGHT) | ({"paper": None} if self.dark is None else {})
         for glyph, name, ink in self.inks:
             setattr(glyph, name, inks[ink])
         for plot in self.plots.values():
@@ -228,8 +195,11 @@ class Page:
 
     def _name_axes(self) -> None:
         normalized = self.controls.normalized
+        hertz = "cycles per period" if normalized else "frequency in Hz"
         names = {
             "plane": ("alpha", "beta") if normalized else ("stiffness K in N/m", "damping B in N s/m"),
+            "gain": (hertz, "|L| in dB"),
+            "phase": (hertz, "phase in degrees"),
             "step": ("time in periods", "position") if normalized else ("time in s", "position in mm/N"),
             "contact": ("time in periods", "position") if normalized else ("time in s", "position in mm"),
             "force": ("time in periods", "wall force") if normalized else ("time in s", "wall force in N"),
@@ -247,25 +217,33 @@ class Page:
         except (ValueError, TypeError, KeyError, RecursionError):
             self.tell({"error": "the page sent something that is no message; reload it"})
             return
-        self.serial = message.get("serial", 0)
+        self.serial, wanted, link = (message.get(name) for name in ("serial", "csv", "open"))
+        if wanted in tuple(self.plots):
+            self.tell({"csv": self.table(wanted)})
+            return
         if message.get("dark") in (True, False) and message["dark"] != self.dark:
             self.dark = message["dark"]
             self._paint()
         for name in self.options:
             self.options[name] = bool(message.get(name, self.options[name]))
-        self.update(message.get("set", {}), rest=bool(message.get("rest")))
+        link = link if isinstance(link, str) else None
+        self.update(message.get("set", {}), rest=bool(message.get("rest")), link=link)
 
     def _tap(self, event: Any) -> None:
         names = ("alpha", "beta") if self.controls.normalized else ("stiffness", "virtual_damping")
         place = [float(f"{value:.4g}") if isinstance(value, int | float) else value for value in (event.x, event.y)]
         self.update(dict(zip(names, place, strict=True)), rest=True)
 
-    def update(self, changes: dict[str, Any], *, rest: bool) -> None:
-        """Show what follows a drag at once, and have the rest computed where the slider rests."""
+    def update(self, changes: dict[str, Any], *, rest: bool, link: str | None = None) -> None:
+        """Show what follows a drag at once, and have the rest computed where the slider rests.
+
+        A link is the scene to begin with, as the page's address has it; an empty one is that of the first visit.
+        """
         self.generation += 1
         try:
             with IMPORTING:
-                controls = self.controls.change(changes)
+                before = self.controls if link is None else read_link(link) if link else self.start
+                controls = before.change(changes)
                 self._show_at_once(controls, rest)
         except Exception as error:
             self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
@@ -297,12 +275,38 @@ class Page:
             for axis, (low, high) in zip(
                 (self.plots["plane"].x_range, self.plots["plane"].y_range), frame, strict=True
             ):
-                axis.update(start=low, end=high)
+                axis.update(start=low, end=high, reset_start=low, reset_end=high)
+        self._point_at_wall()
         word = "stable" if stable else "UNSTABLE"
         radius = f"spectral radius {np.abs(poles).max():.6f}"
-        recipes = {"yaml": to_yaml(controls), "python": to_python(controls)} if rest else {}
+        spell = {"yaml": to_yaml, "python": to_python, "link": to_link} if rest else {}
+        recipes = {name: spelled(controls) for name, spelled in spell.items()}
         said = {"error": "", "word": word, "radius": radius, "busy": True, **recipes}
-        self.tell({**said, "state": controls.shown(), "frame": frame})
+        self.tell(
+            {**said, "poles_words": model.caption_poles(poles, word.lower()), "state": controls.shown(), "frame": frame}
+        )
+
+    def _point_at_wall(self) -> None:
+        plane = self.plots["plane"]
+        across, up = ((axis.start, axis.end) for axis in (plane.x_range, plane.y_range))  # pyright: ignore
+        arrow = model.point_at(self.controls.wall, across, up)
+        if arrow != self.sources["away"].data:
+            self._fill({"away": arrow})
+
+    def table(self, name: str) -> str:
+        """The points of a figure as CSV: the curve, which of its pieces, and the two numbers, with eight digits."""
+        plot, buffer = self.plots[name], io.StringIO()
+        writer = csv.writer(buffer, lineterminator="\n")
+        writer.writerow(["curve", "piece", plot.xaxis.axis_label, plot.yaxis.axis_label])
+        for source, *columns in self.curves[plot]:
+            x, y = (np.asarray(self.sources[source].data[column], float) for column in columns)
+            known = np.isfinite(x) & np.isfinite(y)
+            # A curve of several pieces has a gap between them.
+            pieces = 1 + np.cumsum(~known & np.append(known[1:], False))
+            pieces -= pieces[known][0] - 1 if known.any() else 0
+            for row in zip(pieces[known], x[known], y[known], strict=True):
+                writer.writerow([_NAMES.get(source, source), row[0], *(f"{value:.8g}" for value in row[1:])])
+        return buffer.getvalue()
 
     def _fill(self, update: Update) -> None:
         for name, columns in update.items():
@@ -321,7 +325,8 @@ class Page:
                 self._hand_over(generation, update)
             self._hand_over(generation, {"busy": False})
         except Exception as error:
-            self._hand_over(generation, {"error": _explain(error), "busy": False})
+            # What belongs to the wall before goes.
+            self._hand_over(generation, {"error": _explain(error), "verdict": "", "busy": False})
 
     def close(self) -> None:
         self.generation += 1

@@ -95,6 +95,7 @@ def test_configurations_set_their_own_scene_or_say_why_not(file):
         )
     if given.wall is None:
         assert controls.scene.is_stable(*controls.wall)
+        assert controls.wall == tuple(float(f"{value:.4g}") for value in controls.wall)
 
 
 @pytest.mark.parametrize(

@@ -92,7 +92,8 @@ def test_the_step_response_is_that_of_the_library():
 
 def test_the_crossover_lies_on_the_unit_circle(scene):
     verdict = zwidth.assess(scene)
-    cross = model.crossover(scene, verdict)
+    shown = model.open_loop(scene, verdict)["crossover"]
+    cross = complex(shown["x"][0], shown["y"][0])
     assert abs(cross) == pytest.approx(1.0, rel=1e-9)
     # The sign of the margin is the verdict's.
     assert abs(np.degrees(np.angle(-cross))) == pytest.approx(abs(verdict.phase_margin), rel=1e-6)
@@ -149,3 +150,64 @@ def test_normalized_words_have_the_numbers_of_the_verdict():
     for number in (verdict.alpha_max, verdict.beta_at_max, verdict.stiffness_limit, verdict.gain_margin):
         assert f"{number:.4g}" in text
     assert "N/m" not in text
+
+
+@pytest.mark.parametrize("delay", [0, 2, 70])
+def test_the_bode_plot_is_that_of_the_loop(delay):
+    """Without its delay the loop never turns by half a turn between two frequencies: the reference is unwrapped so."""
+    scene = Controls().change({"delay": delay}).scene
+    shown = model.open_loop(scene, zwidth.assess(scene))["bode"]
+    prompt = scene.replace(delay=0).frequency_response(frequency=shown["x"])
+    np.testing.assert_allclose(shown["gain"], 20 * np.log10(np.abs(prompt)), atol=1e-6)
+    late = 360 * shown["x"] * delay * 1e-3
+    np.testing.assert_allclose(shown["phase"], np.degrees(np.unwrap(np.angle(prompt))) - late, atol=1e-5)
+
+
+def test_the_margins_stand_on_the_bode_plot():
+    scene = Controls().scene
+    verdict = zwidth.assess(scene)
+    shown = model.open_loop(scene, verdict)
+    assert shown["crossover"]["phase"][0] + 180 == pytest.approx(verdict.phase_margin, abs=0.01)
+    loop = scene.frequency_response(frequency=shown["turned"]["hertz"])
+    assert shown["turned"]["gain"] == pytest.approx(20 * np.log10(np.abs(loop)), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wall, x, y, angle",
+    [
+        ((5, 5), None, None, None),
+        ((100, 5), 9.7, 5, -90),
+        ((-1, 5), 0.3, 5, 90),
+        ((5, 11), 5, 9.7, 0),
+        ((-1, -1), 0.3, 0.3, 135),
+    ],
+)
+def test_an_arrow_at_the_border_points_to_the_wall(wall, x, y, angle):
+    arrow = model.point_at(wall, (0.0, 10.0), (0.0, 10.0))
+    if angle is None:
+        assert arrow["x"] == []
+        return
+    assert (arrow["x"], arrow["y"]) == ([pytest.approx(x)], [pytest.approx(y)])
+    assert np.degrees(arrow["angle"][0]) % 360 == pytest.approx(angle % 360)
+
+
+def test_islands_are_named_above_themselves():
+    scene = Controls().scene.replace(velocity=zwidth.WindowedDifference(24))
+    (island,) = scene.islands()
+    named = model.name_islands(scene)
+    assert (named["text"], named["y"]) == (["island"], [island.virtual_damping[1]])
+    assert island.stiffness[0] < named["x"][0] < island.stiffness[1]
+    assert model.name_islands(Controls().scene)["text"] == []
+
+
+@pytest.mark.parametrize("stiffness, word, outside", [(10e3, "Stable", 0), (30e3, "Unstable", 2), (0, "Marginal", 0)])
+def test_captions_follow_the_verdict(stiffness, word, outside):
+    scene = Controls().scene.replace(stiffness=stiffness)
+    verdict = zwidth.assess(scene)
+    poles = model.caption_poles(scene.poles(), model.word_of(verdict))
+    assert poles.startswith(f"{word}: {f'{outside} of 4' if outside else ''}")
+    captions = model.caption_curves(verdict, False)
+    assert captions["nyquist_words"].startswith(f"{word}: ")
+    assert ("go around" in captions["nyquist_words"]) == (word == "Unstable")
+    assert ("phase" in captions["bode_words"]) == (word != "Marginal")
+    assert {"Stable": "decays", "Unstable": "grows", "Marginal": "neither"}[word] in captions["step_words"]

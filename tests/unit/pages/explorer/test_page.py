@@ -100,7 +100,7 @@ def test_parts_show_their_ridge_and_slopes_on_demand(page, monkeypatch):
         {"json": ['{"set": 1}']},
         {"json": [7]},
         {"json": ["[" * 3000]},
-        {"json": ['{"set": {"mass": 100}}' + " " * 5000]},
+        {"json": ['{"set": {"mass": 100}}' + " " * 20_000]},
         {"x": [1.0]},
         None,
     ],
@@ -126,11 +126,13 @@ def test_what_goes_wrong_while_computing_is_said(page, monkeypatch):
     def fail(scene):
         raise ZeroDivisionError("far away")
 
-    monkeypatch.setattr("zwidth.pages.explorer.page.assess", fail)
+    monkeypatch.setattr("zwidth.pages.explorer.details.assess", fail)
     say(page, rest=True)
     page.queue.work()
     assert page.texts["error"] == "ZeroDivisionError: far away"
     assert page.texts["busy"] is False
+    # Nothing is left that is of the wall before.
+    assert page.texts["verdict"] == ""
 
 
 def test_a_dark_page_has_other_inks(page):
@@ -138,3 +140,31 @@ def test_a_dark_page_has_other_inks(page):
     dark = [getattr(glyph, name) for glyph, name, _ in page.inks]
     say(page, dark=False)
     assert all(before != getattr(glyph, name) for before, (glyph, name, _) in zip(dark, page.inks, strict=True))
+
+
+def test_a_figure_is_a_table(page):
+    say(page, set={"velocity": "WindowedDifference"})
+    say(page, set={"velocity.samples": 24}, rest=True)
+    page.queue.work()
+    say(page, csv="plane")
+    rows = [line.split(",") for line in page.texts["csv"].splitlines()]
+    assert rows[0] == ["curve", "piece", "stiffness K in N/m", "damping B in N s/m"]
+    pieces = [[row for row in rows if row[:2] == ["stable", number]] for number in ("1", "2", "3")]
+    outlines = page.controls.scene.stable_region()
+    assert [len(piece) for piece in pieces] == [*(one.stiffness.size + 1 for one in outlines), 0]
+    for piece, outline in zip(pieces, outlines, strict=False):
+        np.testing.assert_allclose([float(row[2]) for row in piece[:-1]], outline.stiffness, rtol=1e-7, atol=1e-7)
+    assert ["your wall", "1", "10000", "40"] in rows
+    say(page, csv="gain")
+    assert page.texts["csv"].splitlines()[0] == "curve,piece,frequency in Hz,|L| in dB"
+
+
+def test_an_address_is_opened_and_an_empty_one_is_the_first_visit(page):
+    say(page, open="mass=200+g&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m", rest=True)
+    assert page.controls.scene.mass == 0.2
+    assert page.texts["link"] == "mass=200+g&damping=0+N+s/m&period=2+ms&stiffness=1+kN/m&virtual_damping=3+N+s/m"
+    say(page, open="mass=heavy&period=1+ms")
+    assert "scene.mass: got 'heavy'" in page.texts["error"]
+    assert page.controls.scene.mass == 0.2
+    say(page, open="", rest=True)
+    assert page.controls == Controls()

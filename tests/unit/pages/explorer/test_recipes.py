@@ -6,7 +6,15 @@ import matplotlib.pyplot as plt
 import pytest
 
 import zwidth
-from zwidth.pages.explorer.controls import Controls, normalized_controls, read_controls, to_python, to_yaml
+from zwidth.pages.explorer.controls import (
+    Controls,
+    normalized_controls,
+    read_controls,
+    read_link,
+    to_link,
+    to_python,
+    to_yaml,
+)
 
 VIEWS = {
     "rigid": Controls(),
@@ -18,6 +26,14 @@ VIEWS = {
     "all": Controls().change({"velocity": "Butterworth", "operator": "grasp", "coupling": "tip"}),
     "filter": Controls(
         Controls().scene.replace(velocity=zwidth.VelocityFilter([500, 0, -500], [1, 0, 0])),
+    ),
+    "lagging": Controls().change({"actuator": "second order"}),
+    "ringing": Controls(
+        zwidth.Scene(
+            zwidth.Device(0.1, 1 / 3, modes=(zwidth.Mode(frequency=80, damping_ratio=0.02, mass=0.5),)),
+            zwidth.Timing(period=1e-3),
+            zwidth.VirtualWall(1000 / 7, 0),
+        )
     ),
     "slow": Controls(Controls().scene.replace(velocity=zwidth.LowPass(time_constant=1e-5, coded_period=1e-4))),
 }
@@ -43,3 +59,40 @@ def test_the_script_runs_and_has_the_view_s_scene(capsys, view):
     verdict = zwidth.assess(scene)
     word = "stable" if verdict.stable else "UNSTABLE"
     assert f"{word} spectral radius {verdict.spectral_radius:.6f}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("view", VIEWS)
+def test_the_address_is_the_view(view):
+    link = to_link(VIEWS[view])
+    assert read_link(link) == VIEWS[view]
+    # No browser spells these signs otherwise.
+    assert not set(link) & set(' "<>`#')
+
+
+@pytest.mark.parametrize(
+    "link, says",
+    [
+        ("nonsense", "address: what follows its # is no scene"),
+        ("a=1&" * 200, "address: what follows its # is no scene"),
+        ("modes=" + "[" * 100_000, "address: what follows its # is no scene"),
+        ("mass=-1&period=1+ms", "scene.mass: got -1 kg"),
+        ("mass=NaN&period=1+ms", "scene.mass: got .nan"),
+        ("mass=100+g&period=1+ms&stiffness=1&delay=10+s", "delay"),
+        ("mass=100+g&period=1+ms&delay_model=fractional_power", "address: scene.delay_model"),
+        ("file=/etc/passwd", "scene.file: unknown key"),
+    ],
+)
+def test_an_address_that_is_no_scene_is_refused(link, says):
+    with pytest.raises((zwidth.InputError, zwidth.ConfigError)) as refusal:
+        read_link(link)
+    assert says in str(refusal.value)
+
+
+def test_what_is_copied_has_units_and_no_digits_of_rounding():
+    view = Controls().change({"mass": 70.1, "delay": 0.7, "stiffness": 12340, "velocity": "LowPass"})
+    assert "mass: 70.1 g\n" in to_yaml(view)
+    assert "delay: 700 us\n  stiffness: 12.34 kN/m\n" in to_yaml(view)
+    assert 'Timing(period="1 ms", delay="700 us")' in to_python(view)
+    assert 'LowPass(cutoff="100 Hz")' in to_python(view)
+    there_and_back = Controls().change({"mode": "normalized"}).change({"mode": "physical"})
+    assert to_link(there_and_back) == to_link(Controls())

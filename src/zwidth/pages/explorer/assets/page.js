@@ -5,7 +5,10 @@ const by = id => document.getElementById(id);
 const STEPS = 1000;
 const LABELS = { mode: "numbers", velocity: "velocity estimate", coupling: "compliance" };
 const fields = {};
-let inputs = null, serial = 0, answered = 0, waiting = {}, rests = false, scheduled = false;
+const CAPTIONS = ["poles_words", "nyquist_words", "bode_words", "step_words", "contact_words"];
+let inputs = null, serial = 0, answered = 0, waiting = {}, sent = {}, rests = false, scheduled = false;
+// What is being moved, and what the newest entry of the history came from: a whole drag is one entry.
+let moved = "", entry = "", opens = false, asked = [0, ""];
 
 // A slider's place, 0 to STEPS, and its value: logarithmic above 0, cubic from 0, linear through 0.
 function valueAt(field, place) {
@@ -38,17 +41,24 @@ function addSlider(form, name) {
   const slide = rest => {
     field.number.value = valueAt(field, Number(field.range.value));
     field.range.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
+    moved = name;
     send({ [name]: Number(field.number.value) }, rest);
   };
   field.range.addEventListener("input", () => slide(false));
   field.range.addEventListener("change", () => slide(true));
-  field.number.addEventListener("change", () => field.number.value !== "" && send({ [name]: field.number.valueAsNumber }, true));
+  field.number.addEventListener("input", () => doubt(field.number.value !== String(field.shown)));
+  field.number.addEventListener("keydown", event => { if (event.key === "Escape") send({}, true); });
+  field.number.addEventListener("change", () => {
+    moved = "";
+    if (Number.isFinite(field.number.valueAsNumber)) send({ [name]: field.number.valueAsNumber }, true);
+    else refuse([name], `${label}: no number; write one, or press Escape`);
+  });
   fields[name] = field;
 }
 function addChoice(form, name) {
   const select = element("select", { id: name });
   for (const [value, text] of Object.entries(start.choices[name])) select.append(element("option", { value, textContent: text }));
-  select.addEventListener("change", () => send({ [name]: select.value }, true));
+  select.addEventListener("change", () => { moved = ""; send({ [name]: select.value }, true); });
   fields[name] = { select, row: addRow(form, name, LABELS[name] ?? name, select) };
 }
 function build() {
@@ -84,21 +94,50 @@ function flush() {
     scheduled = false;
     serial += 1;
     const message = { serial, rest: rests, set: waiting, dark: dark.matches, contact: by("contact-wanted").checked, costly: by("costly").checked };
-    waiting = {};
+    if (opens) asked = [serial, location.hash];
+    if (opens) message.open = location.hash.slice(1);
+    [sent, waiting, opens] = [waiting, {}, false];
     rests = false;
     inputs.data = { json: [JSON.stringify(message)] };
   });
 }
+// An entry that is not the scene's: what the page shows is of the scene before it.
+function doubt(is) {
+  document.body.classList.toggle("stale", is);
+  by("stale").hidden = !is;
+}
+function refuse(names, why) {
+  by("error").textContent = why;
+  doubt(true);
+  for (const name of names) fields[name]?.number?.setAttribute("aria-invalid", true);
+}
+function accept() {
+  by("error").textContent = "";
+  doubt(false);
+  for (const field of Object.values(fields)) field.number?.removeAttribute("aria-invalid");
+}
+function remember(link, number) {
+  const [first, hash] = asked, back = number <= first;
+  // Who goes back quickly is further than the answer is.
+  if (opens || (back && location.hash !== hash)) return;
+  if (location.hash !== `#${link}`) history[back || (moved && moved === entry) ? "replaceState" : "pushState"](null, "", `#${link}`);
+  entry = moved || "-";
+}
 function show(answer) {
-  for (const id of ["error", "word", "radius", "contact_words"]) if (id in answer) by(id).textContent = answer[id];
+  for (const id of ["word", "radius", ...CAPTIONS]) if (id in answer) by(id).textContent = answer[id];
   for (const id of ["verdict", "slopes"]) if (id in answer) showLines(by(id), answer[id]);
   for (const id of ["yaml", "python"]) if (id in answer) by(id).value = answer[id];
   if ("word" in answer) by("word").dataset.word = answer.word;
   if ("busy" in answer) document.body.classList.toggle("busy", answer.busy);
+  if (answer.error && answer.state) refuse(Object.keys(sent), answer.error);
+  else if (answer.error) by("error").textContent = answer.error;
+  else if ("error" in answer) accept();
   if (answer.frame) for (const [k, names] of [[0, ["stiffness", "alpha"]], [1, ["virtual_damping", "beta"]]])
     for (const name of names) Object.assign(fields[name], { low: answer.frame[k][0], high: answer.frame[k][1], linear: true });
   if (answer.state) showState(answer.state);
-  if ("state" in answer || "error" in answer) answered = Math.max(answered, answer.serial);
+  if ("link" in answer) remember(answer.link, answer.serial);
+  if ("csv" in answer) download(new Blob([answer.csv], { type: "text/csv" }), "csv");
+  if ("state" in answer || "error" in answer || "csv" in answer) answered = Math.max(answered, answer.serial);
   flush();
 }
 // Lines of the commands: a label of 20 characters or more, two spaces, and what is said.
@@ -112,12 +151,13 @@ function showLines(box, text) {
 function showState(state) {
   for (const [name, field] of Object.entries(fields)) {
     field.row.hidden = !((name === "rate" ? "period" : name) in state);
-    if (field.row.hidden || name in waiting) continue;
+    if (field.row.hidden || name in waiting || field.number?.getAttribute("aria-invalid")) continue;
     if (field.select) field.select.value = state[name];
     else if (field.rate) { if (document.activeElement !== field.rate) field.rate.value = Number((1e3 / state.period).toPrecision(6)); }
     else {
       if (document.activeElement !== field.range) field.range.value = placeOf(field, state[name]);
-      if (document.activeElement !== field.number) field.number.value = Number(state[name].toPrecision(10));
+      field.shown = Number(state[name].toPrecision(10));
+      if (document.activeElement !== field.number || !document.body.classList.contains("stale")) field.number.value = field.shown;
       field.range.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
     }
   }
@@ -130,17 +170,31 @@ function moveWall(event) {
   const name = names[steps[0]], field = fields[name];
   const value = field.number.valueAsNumber + steps[1] * (event.shiftKey ? 10 : 1) * (field.high - field.low) / 200;
   field.number.value = Number(value.toPrecision(6));
+  moved = "plane";
   send({ [name]: field.number.valueAsNumber }, true);
 }
-async function copy(event) {
-  const area = by(event.target.dataset.copy);
-  area.select();
+async function copy(text, area) {
+  area?.select();
   try {
-    await navigator.clipboard.writeText(area.value);
+    await navigator.clipboard.writeText(text);
     by("copied").textContent = "copied";
   } catch {
-    by("copied").textContent = "the text is selected; copy it with Ctrl-C";
+    by("copied").textContent = area ? "the text is selected; copy it with Ctrl-C" : "copy it from the browser's own line";
   }
+}
+function download(blob, kind) {
+  const link = element("a", { href: URL.createObjectURL(blob), download: `zwidth-${by("figure").value}.${kind}` });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 60_000);
+  by("copied").textContent = `saved ${link.download}`;
+}
+async function save(kind) {
+  const name = by("figure").value;
+  by("copied").textContent = by(name).offsetParent === null ? "simulate a hit first" : document.body.matches(".busy, .stale") ? "not yet: it is being computed" : "";
+  if (by("copied").textContent) return;
+  if (kind === "csv") return void (inputs.data = { json: [JSON.stringify({ serial: ++serial, csv: name })] });
+  const view = Bokeh.index.get(Bokeh.documents[0].get_model_by_name(name));
+  download(await view.export(kind).to_blob(), kind);
 }
 
 const dark = window.matchMedia("(prefers-color-scheme: dark)");
@@ -148,13 +202,21 @@ dark.addEventListener("change", () => send({}, true));
 build();
 by("plane").addEventListener("keydown", moveWall);
 for (const id of ["contact-wanted", "costly"]) by(id).addEventListener("change", () => send({}, true));
-for (const button of document.querySelectorAll("[data-copy]")) button.addEventListener("click", copy);
+by("plane").addEventListener("pointerdown", () => { moved = ""; });
+by("address").addEventListener("click", () => copy(location.href));
+for (const button of document.querySelectorAll("[data-copy]")) button.addEventListener("click", () => copy(by(button.dataset.copy).value, by(button.dataset.copy)));
+for (const button of document.querySelectorAll("[data-save]")) button.addEventListener("click", () => save(button.dataset.save));
+function openAddress() {
+  [opens, waiting, moved] = [true, {}, ""];
+  send({}, true);
+}
+window.addEventListener("hashchange", openAddress);
 Bokeh.set_log_level("error");
 Bokeh.embed.embed_items({}, start.items).then(() => {
   const figures = Bokeh.documents[0];
   inputs = figures.get_model_by_name("inputs");
   const answer = figures.get_model_by_name("answer");
   answer.connect(answer.properties.data.change, () => answer.data.json.forEach(text => show(JSON.parse(text))));
-  figures.on_event("connection_lost", () => { by("error").textContent = "zwidth explore has ended; start it again"; });
-  send({}, true);
+  figures.on_event("connection_lost", () => refuse([], "zwidth explore has ended; start it again"));
+  openAddress();
 }, error => { by("error").textContent = `the page could not connect: ${error}`; });

@@ -1,0 +1,174 @@
+"""What the explorer's page keeps: its scene in the address, entries that are wrong, and figures as files."""
+
+from __future__ import annotations
+
+import csv
+import io
+import signal
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import open_page
+from waiting import LONGEST, wait_for
+
+import zwidth
+
+pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
+
+SETTLED = (
+    "inputs !== null && !scheduled && !rests && Object.keys(waiting).length === 0 && answered === serial"
+    " && !document.body.classList.contains('busy') && location.hash !== ''"
+)
+
+
+@pytest.fixture(scope="module")
+def address(tmp_path_factory):
+    command = [sys.executable, "-m", "zwidth", "explore", "--no-browser"]
+    with subprocess.Popen(
+        command, cwd=tmp_path_factory.mktemp("explore"), stdout=subprocess.PIPE, text=True
+    ) as running:
+        out: Any = running.stdout
+        yield out.readline().split()[0]
+        running.send_signal(signal.SIGINT)
+        running.wait(LONGEST)
+
+
+@pytest.fixture
+def page(browser, address):
+    with open_page(browser, viewport={"width": 1280, "height": 900}, accept_downloads=True) as opened:
+        opened.goto(address)
+        settle(opened)
+        yield opened
+        assert opened.asked == []
+        assert opened.complaints == []
+
+
+def settle(page, condition="true"):
+    wait_for(lambda: page.evaluate(f"{SETTLED} && ({condition})"), lambda: f"{condition}; {page.inner_text('header')}")
+
+
+def enter(page, name, text):
+    page.fill(f"[id='{name}']", text)
+    page.press(f"[id='{name}']", "Enter")
+    settle(page)
+
+
+def value_of(page, name):
+    return float(page.input_value(f"[id='{name}']"))
+
+
+def data_of(page, name):
+    return page.evaluate(
+        "name => Object.fromEntries(Object.entries(Bokeh.documents[0].get_model_by_name(`${name} data`).data)"
+        ".map(([column, values]) => [column, Array.from(values)]))",
+        name,
+    )
+
+
+def test_the_address_brings_the_scene_back(page, browser):
+    first = page.url
+    assert first.endswith(
+        "#mass=100+g&damping=10+N+s/m&period=1+ms&delay=1+ms&stiffness=10+kN/m&virtual_damping=40+N+s/m"
+    )
+    page.select_option("#velocity", "LowPass")
+    settle(page)
+    enter(page, "velocity.cutoff", "80")
+    enter(page, "stiffness", "5000")
+    last = page.url
+    page.reload()
+    settle(page)
+    assert (value_of(page, "velocity.cutoff"), value_of(page, "stiffness"), page.url) == (80, 5000, last)
+    with open_page(browser) as other:
+        other.goto(last)
+        settle(other)
+        assert other.input_value("#yaml") == page.input_value("#yaml")
+        assert other.inner_text("#radius") == page.inner_text("#radius")
+    page.go_back()
+    settle(page, "document.getElementById('stiffness').valueAsNumber === 10000")
+    assert value_of(page, "velocity.cutoff") == 80
+    for _ in range(2):
+        page.go_back()
+    settle(page, "document.getElementById('velocity').value === 'BackwardDifference'")
+    assert page.url == first
+    page.go_forward()
+    settle(page, "document.getElementById('velocity').value === 'LowPass'")
+
+
+def test_one_drag_is_one_step_back(page):
+    before, length = page.url, page.evaluate("history.length")
+    page.focus("#damping-slider")
+    for _ in range(4):
+        page.keyboard.press("ArrowRight")
+        settle(page)
+    assert page.evaluate("history.length") == length + 1
+    page.go_back()
+    settle(page, f"location.href === {before!r}")
+    assert value_of(page, "damping") == 10
+
+
+def test_an_address_that_is_no_scene_is_said(page, address):
+    page.goto(f"{address}#mass=heavy")
+    wait_for(lambda: "scene.mass: got 'heavy'" in page.inner_text("#error"), lambda: page.inner_text("header"))
+    assert page.is_visible("#stale")
+
+
+@pytest.mark.parametrize("entry, says", [("-5", "mass: got -0.005 kg"), ("", "no number")])
+def test_the_badge_is_stale_while_an_entry_is_wrong(page, entry, says):
+    badge = page.inner_text("#word")
+    page.fill("#mass", entry)
+    # As soon as it is another text.
+    assert page.is_visible("#stale")
+    page.press("#mass", "Tab")
+    wait_for(lambda: says in page.inner_text("#error"), lambda: page.inner_text("header"))
+    assert page.get_attribute("#mass", "aria-invalid") == "true"
+    assert (page.input_value("#mass"), page.inner_text("#word"), page.is_visible("#stale")) == (entry, badge, True)
+    page.press("#mass", "Escape")
+    settle(page, "document.getElementById('mass').value === '100'")
+    assert (page.is_visible("#stale"), page.inner_text("#error")) == (False, "")
+    assert page.get_attribute("#mass", "aria-invalid") is None
+
+
+def test_an_arrow_points_at_a_wall_beyond_the_chart(page):
+    assert data_of(page, "away")["x"] == []
+    enter(page, "stiffness", "1e6")
+    across = page.evaluate(
+        "(() => { const r = Bokeh.documents[0].get_model_by_name('plane').x_range; return [r.start, r.end] })()"
+    )
+    (x,) = data_of(page, "away")["x"]
+    assert across[0] + 0.9 * (across[1] - across[0]) < x < across[1] < 1e6
+    # The chart moved by hand counts as well.
+    enter(page, "stiffness", "10000")
+    settle(page)
+    assert data_of(page, "away")["x"] == []
+    page.evaluate("Bokeh.documents[0].get_model_by_name('plane').x_range.setv({start: 15000, end: 20000})")
+    wait_for(lambda: data_of(page, "away")["angle"] == [pytest.approx(np.pi / 2)], lambda: str(data_of(page, "away")))
+
+
+def test_figures_are_saved_as_they_are_seen(page, tmp_path):
+    files = {}
+    for kind in ("png", "svg", "csv"):
+        with page.expect_download() as waiting:
+            page.focus(f"[data-save={kind}]")
+            page.keyboard.press("Enter")
+        files[kind] = tmp_path / waiting.value.suggested_filename
+        waiting.value.save_as(files[kind])
+    assert [file.name for file in files.values()] == ["zwidth-plane.png", "zwidth-plane.svg", "zwidth-plane.csv"]
+    assert files["png"].read_bytes()[:4] == b"\x89PNG"
+    words = list(ET.parse(files["svg"]).getroot().itertext())
+    assert "stiffness K in N/m" in words
+    rows = list(csv.DictReader(io.StringIO(files["csv"].read_text(encoding="utf-8"))))
+    edge = [
+        (float(row["stiffness K in N/m"]), float(row["damping B in N s/m"])) for row in rows if row["curve"] == "stable"
+    ]
+    scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(1e-3, 1e-3))
+    region, units = zwidth.stable_region(scene.delta, scene.d), scene.units
+    ring = np.stack([region.alpha * units.stiffness, region.beta * units.virtual_damping], -1)
+    np.testing.assert_allclose(edge, [*ring, ring[0]], rtol=1e-7, atol=1e-7)
+    # What is not there yet has no file.
+    page.select_option("#figure", "force")
+    page.click("[data-save=png]")
+    assert page.inner_text("#copied") == "simulate a hit first"
