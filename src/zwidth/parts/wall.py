@@ -39,8 +39,10 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any) -> tup
     Neither given means the scene's own wall. Both given are what they say. K alone is a spring, B = 0, of a scene
     without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit.
     """
-    stiffness = read_texts("stiffness", stiffness, "N/m")
-    virtual_damping = read_texts("virtual_damping", virtual_damping, "N s/m")
+    # Most questions are of numbers, in which there is no text to look for.
+    if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
+        stiffness = read_texts("stiffness", stiffness, "N/m")
+        virtual_damping = read_texts("virtual_damping", virtual_damping, "N s/m")
     chosen = not isinstance(wall, NoWall)
     if stiffness is None and virtual_damping is None:
         if not chosen:
