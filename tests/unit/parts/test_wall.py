@@ -18,10 +18,14 @@ HERTZ = np.array([5.0, 50.0])
 
 
 def draw(picture):
+    from matplotlib.figure import Figure
+
     from zwidth import plot
 
     return lambda scene, *wall: [
-        line.get_xydata().tolist() for line in getattr(plot, picture)(scene, *wall).lines if line.get_label()[0] != "_"
+        line.get_xydata().tolist()
+        for line in getattr(plot, picture)(scene, *wall, ax=Figure().subplots()).lines
+        if line.get_label()[0] != "_"
     ]
 
 
