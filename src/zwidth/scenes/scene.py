@@ -113,7 +113,7 @@ class Scene(SceneAnswers, SceneOptima):
         return device + tuple(name for name in find_parts(self) if not within.get(name))
 
     @cached_property
-    def loop(self) -> LinearLoop | MeasuredLoop:
+    def loop(self) -> LinearLoop:
         """Its loop, normalized, that answers every question about its walls."""
         if isinstance(self.device, MeasuredDevice):
             return MeasuredLoop(self)

@@ -26,8 +26,8 @@ _SMOOTH = 0.25
 MOST_TURN = 0.5
 # By what share of itself the curve may change between points, and how many are laid between two lines at most.
 _STEP, _MOST = 0.005, 32
-# By what the first line's phase may miss those of a mass, a damper or a spring.
-_PHASE = 0.6
+# By what the first line's phase may miss those of a mass, a damper or a spring, told apart by so many lines or more.
+_PHASE, _FIRST = 0.8, 4
 # Beyond the last line the response is at most so many times that of the lines from this share of the band on, unless it
 # has risen there by so much against a mass: then a resonance is in sight, and nothing is known.
 _BEYOND, _LAST, _RISEN = 2.0, 0.8, 1.2
@@ -97,18 +97,27 @@ class ResponseCurve:
             values[starts] = np.maximum(values[starts], values[starts - 1])
         below, above = np.linspace(0.0, w[0], _ACROSS), np.linspace(w[-1], np.pi, _ACROSS)
         slow, fast = (float(np.abs(estimate.jet(circle(part)).value).max()) for part in (below, above))
-        sure = np.arcsin(min(1.0, r[0] / max(abs(G[0]), 1e-300)))
-        phase = np.angle(1j * G[0]) - 0.5 * np.pi
         return cls(
             at, _square(at), np.append(inner, S[-1]), F, band, gap,
             float(abs(G[0]) - r[0]), _bound_beyond(w, np.abs(G), r), slow, fast,
-            not -np.pi - _PHASE <= phase - sure <= phase + sure <= _PHASE,
+            _is_odd(w, G, r),
         )  # fmt: skip
 
 
 def _square(w: np.ndarray) -> np.ndarray:
     """``|z - 1|^2``."""
     return 4.0 * np.sin(0.5 * w) ** 2
+
+
+def _is_odd(w: np.ndarray, G: np.ndarray, r: np.ndarray) -> bool:
+    """Whether the first line moves like neither mass, damper nor spring: a quarter turn behind for each power of w."""
+    few = min(w.size, max(_FIRST, int(np.sum(w <= 1.5 * w[0]))))
+    if r[0] >= abs(G[0]) or not np.all(G[:few]):
+        return True
+    power = np.polyfit(np.log(w[:few]), np.log(np.abs(G[:few])), 1)[0]
+    phase = np.angle(1j * G[0]) - 0.5 * np.pi
+    away = abs(phase - 0.5 * np.pi * np.clip(power, -2.0, 0.0)) + np.arcsin(r[0] / abs(G[0]))
+    return bool(away > _PHASE)
 
 
 def _bound_beyond(w: np.ndarray, size: np.ndarray, r: np.ndarray) -> float:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
+from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.rows import Island
+from zwidth.loops.loop import LinearLoop
 from zwidth.loops.measured.curve import ResponseCurve
 from zwidth.loops.measured.intervals import DecidedWalls
 from zwidth.loops.rigid.margins import Margins
@@ -17,15 +18,7 @@ from zwidth.loops.rigid.ridge import RidgePoint
 from zwidth.loops.rigid.verdict import Stability, StabilityMethod
 from zwidth.words.errors import InputError
 from zwidth.words.status import Method, RidgeKind, Status
-from zwidth.words.types import Array, DelayModel
-
-# What is asked of a model in words.
-_WORDS = {
-    "radius": "the spectral radius",
-    "slowest": "the slowest motion",
-    "passivity_margin": "passivity",
-    "vary": "a variation of parameters",
-}
+from zwidth.words.types import Array
 
 # Rows on each side of beta = 0, denser towards it, and again across those with stable walls; steps to the highest row.
 _ROWS, _DENSER, _AGAIN = 60, 5.0, 49
@@ -34,22 +27,15 @@ _INSIDE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredLoop:
+class MeasuredLoop(LinearLoop):
     """Verdicts that hold for every response within the deviation; alpha and beta are arrays of one shape."""
 
-    scene: Any
-
-    delay_models: ClassVar[tuple[DelayModel, ...]] = ("held",)
-    draws: ClassVar[int] = 0
-    most_periods: ClassVar[float] = math.inf
-
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("_"):
-            raise AttributeError(name)
-        what = _WORDS.get(name, name.replace("_", " "))
+    @cached_property
+    def chain(self) -> AnyChain:
+        """Refused, and with it every question that poles or matrices answer."""
         raise InputError(
-            f"device: {what} needs a model, and a measured response is none; fit one to a log (zwidth.fit_log), or ask "
-            "for stability, rows, columns, the stiffest wall, outlines and margins"
+            "device: poles, motions, passivity and sensitivities need a model, and a response is none; fit one "
+            "to a log (zwidth.fit_log), or ask for stability, rows, columns, the stiffest wall, outlines and margins"
         )
 
     @cached_property
@@ -74,7 +60,7 @@ class MeasuredLoop:
 
     def labels(self, alpha: np.ndarray, beta: np.ndarray) -> Array:
         """Whether walls are stable, for every response in the band."""
-        return self.decide(alpha, beta).stable
+        return self.decide(alpha, beta, "auto", (alpha, beta)).stable
 
     def decide(
         self, alpha: np.ndarray, beta: np.ndarray, method: StabilityMethod = "auto", exact: Any = ()
@@ -114,11 +100,6 @@ class MeasuredLoop:
         """The intervals of beta that are surely stable: shape (intervals, 2)."""
         found = self.walls.column(alpha)
         return np.stack([found.low[found.stable], found.high[found.stable]], -1)
-
-    def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
-        """Those above ``least`` in a piece with soft walls."""
-        column = np.maximum(self.column(alpha), least).tolist()
-        return [(low, high) for low, high in column if low < high and self.holds_softly(alpha, 0.5 * (low + high))]
 
     def soft_row(self, beta: float) -> np.ndarray:
         """The surely stable intervals of alpha below all walls of the row that are surely unstable."""
@@ -189,7 +170,8 @@ class MeasuredLoop:
 
     def explain(self, alpha: float, beta: float) -> list[str]:
         """What keeps a wall undecided, a sentence each with the frequencies to measure; empty where it is decided."""
-        if self.decide(np.array([alpha]), np.array([beta])).status[0] == Status.OK:
+        wall = np.array([alpha]), np.array([beta])
+        if self.decide(*wall, "auto", wall).status[0] == Status.OK:
             return []
         c, hertz = self.walls.curve, 1.0 / (2.0 * np.pi * self.scene.timing.period)
         first, last, said = c.w[0] * hertz, c.w[-1] * hertz, []
@@ -218,7 +200,7 @@ class MeasuredLoop:
 
         The delay margin is that of a pure delay, phase over frequency.
         """
-        decided = self.decide(alpha, beta)
+        decided = self.decide(alpha, beta, "auto", (alpha, beta))
         out = np.full((len(Margins._fields), *np.shape(alpha)), np.nan)
         for place in np.ndindex(np.shape(alpha)):
             if np.asarray(decided.status)[place] == Status.OK:

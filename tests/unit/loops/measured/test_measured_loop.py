@@ -207,3 +207,24 @@ def test_a_response_that_tells_nothing_gives_no_wall():
     assert np.isnan(top.stiffness)
     assert scene.stable_region() == []
     assert scene.stable_stiffness(20.0).shape == (0, 2)
+
+
+@pytest.mark.parametrize("scene", SCENES.values(), ids=SCENES)
+def test_a_wrong_sign_decides_nothing(scene):
+    turned = zwidth.Scene(zwidth.MeasuredDevice(DENSE, -response(scene, DENSE)), zwidth.Timing(PERIOD))
+    found = turned.decide_stability(np.geomspace(10, 1e5, 50), 10.0)
+    assert (found.status == Status.UNDECIDED).all()
+    assert "first line" in turned.explain_undecided(5e3, 10.0)[0]
+
+
+def test_a_device_on_a_spring_is_one_too():
+    hand = zwidth.Operator(mass=0.05, damping=2.0, stiffness=4e3)
+    scene = zwidth.Scene(zwidth.Device(0.1, 1.0), zwidth.Timing(PERIOD, 1e-3), operator=hand)
+    known, found = scene.max_stiffness(), measured(scene, DENSE).max_stiffness()
+    assert (1 - NEAR) * known.stiffness < found.stiffness < known.stiffness
+    walls = random_walls(scene, np.random.default_rng(1))
+    decided = measured(scene, DENSE).decide_stability(*walls)
+    sure = decided.status == Status.OK
+    # Softer walls than the spring are left open.
+    assert sure.mean() > 0.4
+    np.testing.assert_array_equal(decided.stable[sure], scene.is_stable(*walls)[sure])
