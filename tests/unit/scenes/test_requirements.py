@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from compiling import SOON
+from compiling import QUICKLY
 
 import zwidth
 from zwidth import max_stiffness, required, sensitivities
@@ -104,7 +104,7 @@ def test_derivatives_are_those_of_the_inverse_function(x64):
     def needed(stiffness, mass):
         return required("damping", stiffness, mass=mass, period=1e-3, delay=1e-3).value
 
-    slopes = jax.jit(jax.grad(needed, (0, 1)), compiler_options=SOON)
+    slopes = jax.jit(jax.grad(needed, (0, 1)), compiler_options=QUICKLY)
     by_stiffness, by_mass = slopes(float(wanted[0]), 0.1)
     np.testing.assert_allclose(by_stiffness, 1 / gain.per_damping[0], rtol=1e-10)
     np.testing.assert_allclose(by_mass, -gain.per_mass[0] / gain.per_damping[0], rtol=1e-10)

@@ -11,7 +11,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import tolerances as tol
-from compiling import SOON
+from compiling import QUICKLY
 from mpmath import mpf
 
 import oracles
@@ -154,7 +154,7 @@ def along(delay):
         (first, second), (_, third) = jax.jvp(slope, (0.0,), (1.0,))
         return first, second, third
 
-    return jax.jit(jax.vmap(jax.vmap(derivatives, (None, 0)), (0, None)), compiler_options=SOON)
+    return jax.jit(jax.vmap(jax.vmap(derivatives, (None, 0)), (0, None)), compiler_options=QUICKLY)
 
 
 @pytest.mark.parametrize("delay", ["held", "fractional_power"])
@@ -179,7 +179,7 @@ def test_derivatives(delay, x64):
 def test_derivatives_in_omega_beside_pi(x64):
     # Both parts are even about pi: the slope is the second derivative times the distance.
     slope = jax.jit(
-        jax.jacfwd(lambda omega, delta, d: jnp.stack(zwidth.boundary(omega, delta, d)), 0), compiler_options=SOON
+        jax.jacfwd(lambda omega, delta, d: jnp.stack(zwidth.boundary(omega, delta, d)), 0), compiler_options=QUICKLY
     )
     for delta, d in ((0.5, 0.0), (0.0, 0.5), (0.3, 0.5), (0.7, 1.0), (0.2, 4.0), (2.0, 37.25)):
         with mp.workdps(80):
@@ -353,7 +353,7 @@ def test_derivatives_of_a_point(x64):
         return found.alpha, found.omega
 
     points = np.array([(0.1, 1.0, 0.3), (0.7, 2.4, 0.1), (0.0, 0.0, 0.5), (np.nan, 1.0, 0.1), (0.1, 1.0, 50.0)])
-    gradient = jax.jit(jax.vmap(jax.value_and_grad(stiffest, has_aux=True)), compiler_options=SOON)
+    gradient = jax.jit(jax.vmap(jax.value_and_grad(stiffest, has_aux=True)), compiler_options=QUICKLY)
     (value, omega), slope = gradient(jnp.asarray(points))
     np.testing.assert_array_equal(np.isnan(value), [False, False, False, True, True])
     assert np.isnan(slope[3:]).all()

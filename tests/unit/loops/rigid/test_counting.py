@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mpmath as mp
 import numpy as np
 import pytest
-from compiling import SOON
+from compiling import QUICKLY
 from flint import acb, acb_poly, arb, ctx
 
 from zwidth.loops.rigid import counting
@@ -360,7 +360,7 @@ def test_traced_counts_are_the_direct_ones(x64):
     assert (direct[40:50] == -1)[radius[40:50] == 1].all()
     assert direct[65] == -1
     for traced in (jax.vmap(count_poles), count_poles):
-        found = jax.jit(traced, compiler_options=SOON)(zeros, poles, gain, lag, radius)
+        found = jax.jit(traced, compiler_options=QUICKLY)(zeros, poles, gain, lag, radius)
         np.testing.assert_array_equal(found, direct)
 
 
@@ -369,7 +369,7 @@ def test_traced_numbers_in_lists_and_plain_numbers_alone(x64):
         return count_poles([gain], [1.0], 0.1 * gain, 3), count_poles([0.2], [1.0, 0.9], 0.01, 3)
 
     gain = np.linspace(-2, 2, 20)
-    traced, plain = jax.jit(jax.vmap(mixed), compiler_options=SOON)(gain)
+    traced, plain = jax.jit(jax.vmap(mixed), compiler_options=QUICKLY)(gain)
     assert traced.tolist() == [count_poles([g], [1.0], 0.1 * g, 3) for g in gain]
     assert (plain == count_poles([0.2], [1.0, 0.9], 0.01, 3)).all()
 
@@ -379,7 +379,7 @@ def test_single_precision_is_traced_with_its_own_rounding():
     rng = np.random.default_rng(90)
     zeros, poles, gain = (rng.normal(size=shape).astype(np.float32) for shape in ((1000, 2), (1000, 3), (1000,)))
     direct = count_poles(zeros, poles, gain, 4)
-    single = jax.jit(count_poles, compiler_options=SOON)(zeros, poles, gain, 4)
+    single = jax.jit(count_poles, compiler_options=QUICKLY)(zeros, poles, gain, 4)
     assert single.dtype == np.int32
     told = np.asarray(single) >= 0
     np.testing.assert_array_equal(np.asarray(single)[told], direct[told])

@@ -8,7 +8,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 import tolerances as tol
-from compiling import SOON
+from compiling import QUICKLY
 from scipy.optimize import linprog
 
 import zwidth
@@ -168,7 +168,7 @@ def test_points_out_of_range():
 
 @pytest.mark.parametrize("d", [0, 2.3])
 def test_derivatives(d, x64):
-    gradient = jax.jit(jax.vmap(jax.grad(lambda wall: zwidth.passivity_margin(*wall, d=d))), compiler_options=SOON)
+    gradient = jax.jit(jax.vmap(jax.grad(lambda wall: zwidth.passivity_margin(*wall, d=d))), compiler_options=QUICKLY)
     walls = np.array([(0.3, 0.2, 2.0), (0.3, -0.2, 2.0), (0.3, 0.2, -1.0)])
     got = np.asarray(gradient(walls))
     assert np.isnan(got[2]).all()
@@ -187,8 +187,8 @@ def test_second_derivatives(x64):
 
     d = np.array([0.001, 1.001, 2.3, 0.1, 0.5, 300.2])
     walls = np.stack([0.3 / (d + 0.5), 0.4 + 0 * d, 1.0 + 0 * d, d], axis=-1)
-    hessian = np.asarray(jax.jit(jax.vmap(jax.hessian(margin)), compiler_options=SOON)(walls))
-    gradient = jax.jit(jax.vmap(jax.grad(margin)), compiler_options=SOON)
+    hessian = np.asarray(jax.jit(jax.vmap(jax.hessian(margin)), compiler_options=QUICKLY)(walls))
+    gradient = jax.jit(jax.vmap(jax.grad(margin)), compiler_options=QUICKLY)
     for k in range(4):
         step = np.zeros_like(walls)
         step[:, k] = 1e-5 / (d + 0.5) if k == 0 else 1e-5
@@ -328,7 +328,7 @@ def test_far_out_is_refused():
 
 
 def test_a_traced_delay():
-    margin = jax.jit(lambda d: zwidth.passivity_margin(0.1, 0.4, 1.0, d))
+    margin = jax.jit(lambda d: zwidth.passivity_margin(0.1, 0.4, 1.0, d), compiler_options=QUICKLY)
     for d in (0.0, 1.0, 2.3, 0.1):
         # In single precision, as the ambient one is.
         assert float(margin(d)) == pytest.approx(zwidth.passivity_margin(0.1, 0.4, 1.0, d), abs=1e-6)

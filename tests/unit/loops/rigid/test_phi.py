@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
+from compiling import QUICKLY
 from mpmath import hyp1f1, mp, mpf
 
 from zwidth.loops.rigid.device import phi_functions
@@ -40,7 +41,7 @@ def derivative(name, order):
 
     for _ in range(order):
         function = jax.grad(function)
-    return jax.jit(jax.vmap(function))
+    return jax.jit(jax.vmap(function), compiler_options=QUICKLY)
 
 
 def errors(name, order, arguments, got):

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import tolerances as tol
-from compiling import SOON
+from compiling import QUICKLY
 
 import zwidth
 from zwidth.loops.rigid.ridge import slope_kernel, stiffness_slope
@@ -66,7 +66,7 @@ def test_is_the_limit_of_the_ridge(model):
 
 @cache
 def compiled_slopes(model):
-    return jax.jit(jax.vmap(jax.value_and_grad(lambda d: slope_kernel(d, model))), compiler_options=SOON)
+    return jax.jit(jax.vmap(jax.value_and_grad(lambda d: slope_kernel(d, model))), compiler_options=QUICKLY)
 
 
 def slopes_of_slope(d, model):

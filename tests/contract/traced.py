@@ -1,0 +1,78 @@
+"""Cases inside `jit`, `vmap` and `grad` at once: one compiled program a case, for all who ask about it."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from compiling import QUICKLY
+
+from contract.cases import CASES
+
+# Three good points, then what is bad and beyond, one argument at a time; as many rows for every case.
+ROWS = 16
+
+
+def batch(case, beyond=True):
+    """(columns of the traceable arguments, how many rows are good): the others hold a bad number each."""
+    fixed = set(case.concrete)
+    spoiled = [case.bad, case.beyond] if beyond else [case.bad]
+    rows = [{name: values[k] for name, values in case.good.items()} for k in range(3)]
+    for numbers in spoiled:
+        for argument, value in numbers.items():
+            if argument not in fixed:
+                rows.append({name: values[1] for name, values in case.good.items()} | {argument: value})
+    assert len(rows) <= ROWS
+    rows += [rows[0]] * (ROWS - len(rows))
+    good = np.array([k < 3 or row is rows[0] for k, row in enumerate(rows)])
+    return [np.array([row[name] for row in rows]) for name in case.free], good
+
+
+def has_gradient(case):
+    return case.derivatives is not None and not case.gradient_in
+
+
+def fixed_of(case):
+    return {name: case.arguments[name][0] for name in case.concrete}
+
+
+@cache
+def compiled(case_name):
+    """The case inside jit, vmap and grad at once, where it has a gradient, in float64: what comes out for its batch."""
+    case = next(case for case in CASES if case.name == case_name)
+
+    def total(point):
+        leaves = case.leaves(case.call(**dict(zip(case.free, point, strict=True)), **fixed_of(case)))
+        # Infinite margins have no derivative to speak of.
+        parts = [jnp.sum(jnp.abs(v)) for v in leaves.values() if v.dtype.kind in "fc"]
+        return sum(parts, start=jnp.zeros(())), leaves
+
+    function = jax.value_and_grad(total, has_aux=True) if has_gradient(case) else total
+    return jax.jit(jax.vmap(function), compiler_options=QUICKLY)
+
+
+@cache
+def in_float64(case_name):
+    """(leaves, gradients) of `batch`."""
+    case = next(case for case in CASES if case.name == case_name)
+    with jax.enable_x64(True):
+        result = compiled(case_name)([jnp.asarray(column) for column in batch(case)[0]])
+    (_, leaves), gradient = result if has_gradient(case) else (result, None)
+    return {name: np.asarray(value) for name, value in leaves.items()}, gradient
+
+
+def ask(name: str, **columns: Any) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The leaves of a case in float64 at up to `ROWS` points, and the derivatives of their sum in every argument."""
+    case = next(case for case in CASES if case.name == name)
+    spread = np.broadcast_arrays(*(np.asarray(columns[argument], np.float64) for argument in case.free))
+    count = spread[0].size
+    assert count <= ROWS
+    with jax.enable_x64(True):
+        (_, leaves), slopes = compiled(name)([jnp.asarray(np.resize(column, ROWS)) for column in spread])
+    return (
+        {leaf: np.asarray(value)[:count] for leaf, value in leaves.items()},
+        {argument: np.asarray(slope)[:count] for argument, slope in zip(case.free, slopes, strict=True)},
+    )
