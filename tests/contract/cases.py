@@ -176,11 +176,13 @@ CASES = [
 OTHERS = {
     "assess": "one scene: tests/unit/studies/test_published.py, tests/properties/test_consistency.py",
     "assess_many": "scenes by name: tests/unit/scenes/test_assessment.py",
+    "excite": "one signal: tests/unit/fitting/test_respond.py",
     "fit_buzz": "one device: tests/unit/fitting/test_buzz.py",
     "fit_log": "one device: tests/unit/fitting/test_log.py",
     "limits_of": "one scene: tests/unit/scenes/test_limits.py",
     "load_config": "a file: tests/unit/config/test_reader.py",
     "open_dataset": "a folder: tests/unit/sweep/test_sweep_engine.py",
+    "respond": "one record: tests/unit/fitting/test_respond.py",
     "robust_max_stiffness": "boxes of devices: tests/unit/scenes/test_robust.py",
     "robust_wall": "boxes of devices: tests/unit/scenes/test_robust.py",
     "run": "a configuration: tests/unit/runs/test_run.py",

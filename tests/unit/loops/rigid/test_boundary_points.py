@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from functools import cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -221,11 +222,9 @@ def test_optimistix_agrees():
     top = zwidth.alpha_max(delta, d)
     alpha = top.alpha * random.uniform(1e-3, 0.98, count)
     beta = -delta + (top.beta + delta) * random.uniform(0.05, 1.2, count)
-    for line, options in (
-        ({"beta": beta}, {}),
-        ({"alpha": alpha}, {"side": "lower"}),
-        ({"alpha": alpha}, {"side": "upper"}),
-    ):
+    row, column = {"beta": beta}, {"alpha": alpha}
+    asked: list[tuple[Any, Any]] = [(row, {}), (column, {"side": "lower"}), (column, {"side": "upper"})]
+    for line, options in asked:
         mine = zwidth.boundary_point(delta, d, **line, **options)
         solve = partial(zwidth.boundary_point, method="optimistix", **options)
         if options:
