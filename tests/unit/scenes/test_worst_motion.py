@@ -229,7 +229,7 @@ def test_what_is_refused():
     with pytest.raises(InputError, match="longest: got 4; a whole number from 8"):
         zwidth.worst_motion(scene, 1.0, longest=4)
     coupling = zwidth.Coupling(0.05, 20e3, 1.0, "tip")
-    with pytest.raises(InputError, match="'tip' has no passivity condition"):
+    with pytest.raises(InputError, match="with the sensor at the tip: there is no passivity condition"):
         zwidth.worst_motion(zwidth.Scene(zwidth.Device(0.1, 10.0, coupling), zwidth.Timing(1e-3)), 1e3)
     assert zwidth.worst_motion(scene, 1e200).status == Status.OUT_OF_RANGE
 
