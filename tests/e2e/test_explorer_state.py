@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-import signal
-import subprocess
-import sys
 import xml.etree.ElementTree as ET
-from typing import Any
 
 import numpy as np
 import pytest
 from browser import open_page
-from waiting import LONGEST, wait_for
+from explorer_server import serve
+from waiting import wait_for
 
 import zwidth
 
@@ -27,14 +24,8 @@ SETTLED = (
 
 @pytest.fixture(scope="module")
 def address(tmp_path_factory):
-    command = [sys.executable, "-m", "zwidth", "explore", "--no-browser"]
-    with subprocess.Popen(
-        command, cwd=tmp_path_factory.mktemp("explore"), stdout=subprocess.PIPE, text=True
-    ) as running:
-        out: Any = running.stdout
-        yield out.readline().split()[0]
-        running.send_signal(signal.SIGINT)
-        running.wait(LONGEST)
+    with serve(tmp_path_factory.mktemp("explore")) as running:
+        yield running.address
 
 
 @pytest.fixture

@@ -39,5 +39,10 @@ def test_the_page_opens_from_the_disk(browser, tmp_path, width, scheme):
             page.keyboard.press("ArrowDown")
         expected = zwidth.spectral_radius(0.01, -0.2, 0.5, 1.0)
         assert float(readout.inner_text().split(":")[1]) == pytest.approx(float(expected), rel=1e-4)
+        # The map's corner lies within its axes: the highest row of the first column.
+        page.locator("canvas").hover(position={"x": 64, "y": 14})
+        assert readout.inner_text().startswith("normalized stiffness = 0.01, normalized virtual damping = 1: ")
+        page.locator("canvas").hover(position={"x": 4, "y": 4})
+        assert page.evaluate("document.querySelector('canvas').width") > 250
         assert page.asked == []
         assert page.complaints == []

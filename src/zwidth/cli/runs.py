@@ -169,6 +169,8 @@ def _report_end(result: RunResult, command: str) -> None:
     for study in result.studies:
         for number, line in enumerate(study.answer):
             click.echo(f"{'' if number else study.name:<20}  {line}")
+    if any(study.sweep and study.state in ("done", "kept") for study in result.studies):
+        click.echo(f"figures of the sweeps: {shlex.join(['zwidth', 'figures', str(result.folder)])}")
     if result.hopeless:
         click.echo(f"zwidth: out: {result.folder}: {result.hopeless}", err=True)
         click.echo(f"zwidth: the disk is full or read-only; make room and go on with: {command}", err=True)
@@ -324,6 +326,8 @@ def reporter() -> Iterator[Callable[[StudyEvent], None]]:
             if event.progress is not None:
                 done, total = event.progress.points, event.progress.total_points
                 bar.update(shown, description=description, completed=done, total=total, state=_state(event.progress))
+            elif event.parts is not None:
+                bar.update(shown, description=description, completed=event.parts[0], total=event.parts[1], state="")
             elif event.result is None:
                 bar.update(shown, description=description, completed=event.index - 1, total=event.total, state="")
             else:
@@ -341,12 +345,14 @@ class _Lines:
         self.last = time.monotonic()
 
     def __call__(self, event: StudyEvent) -> None:
-        progress = event.progress
+        progress, now = event.progress, time.monotonic()
+        if event.parts is not None and now - self.last >= _SECONDS_BETWEEN_LINES:
+            self.last = now
+            click.echo(f"{event.name:<20} {event.parts[0]}/{event.parts[1]} done", err=True)
         if progress is None:
             for line in _lines(event) if event.result else ():
                 click.echo(line, err=True)
             return
-        now = time.monotonic()
         last = progress.chunks == progress.total_chunks
         if last or progress.error or now - self.last >= _SECONDS_BETWEEN_LINES:
             self.last = now

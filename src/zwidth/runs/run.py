@@ -16,7 +16,7 @@ from zwidth.config.study import Study
 from zwidth.figures.style import figure_width
 from zwidth.runs.record import RUN_FILE, Record, gather_inputs, rename_inputs
 from zwidth.studies.document import Config, FigureLook, load_config
-from zwidth.studies.outcome import ComputedStudy, Outcome
+from zwidth.studies.outcome import LISTENER, ComputedStudy, Outcome
 from zwidth.sweep.engine import Progress, SweepResult, check_stores, compute_sweeps, remove, store_path
 from zwidth.sweep.files import holding, hopeless
 from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
@@ -77,7 +77,7 @@ class RunResult:
 
 @dataclass(frozen=True)
 class StudyEvent:
-    """The start or the end of a study, or a chunk of a sweep."""
+    """The start or the end of a study, a part of one, or a chunk of a sweep."""
 
     index: int  # number of the study, from 1
     total: int  # how many there are
@@ -85,6 +85,7 @@ class StudyEvent:
     kind: str
     result: StudyResult | None = None  # how it went, when it ends
     progress: Progress | None = None  # how far the sweeps are, after a chunk
+    parts: tuple[int, int] | None = None  # how many parts of a study that takes long are done, and of how many
 
 
 ProgressCallback: TypeAlias = Callable[[StudyEvent], None]
@@ -124,7 +125,8 @@ def run(
         shard: (i, n), 1 <= i <= n: compute every n-th chunk of the sweeps only, one of n such runs in the same folder;
             the other studies are the first one's. A shard goes on with what is there.
         memory: bytes that a chunk of a sweep may take while it is computed.
-        progress: called with a `StudyEvent` when a study starts and when it ends, and after every chunk.
+        progress: called with a `StudyEvent` when a study starts and when it ends, after every chunk of a sweep, and
+            between the parts of a study that takes long.
 
     Returns:
         RunResult: ``folder``; ``studies``, how each of them went; ``seconds``. A study that fails is recorded with its
@@ -232,6 +234,7 @@ class _Run:
             self.repaired += [f"{study.name}: {fault}" for fault in faults if entry and entry["state"] == "done"]
             try:
                 self.tell(event)
+                LISTENER.set(lambda *parts, event=event: self.tell(replace(event, parts=parts)))
                 self.results.append(self._compute(study))
                 self.tell(replace(event, result=self.results[-1]))
             except KeyboardInterrupt:

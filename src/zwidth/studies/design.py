@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from functools import partial
+from itertools import product
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -23,7 +24,7 @@ from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.scenes.stiffest import RequiredValue
 from zwidth.scenes.tolerances import Tolerance, simulate_tolerances
-from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest
+from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summarize_stiffest, track
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, short, suggestion
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
@@ -305,14 +306,13 @@ class FiltersStudy(ComputedStudy):
     def compute(self, scene: AnyScene | None, alone: bool) -> Outcome:
         rows = []
         bare = self.device.to_scene()
-        for damping in self.dampings.tolist():
-            for named, velocity in self.estimates():
-                top = bare.replace(damping=damping, velocity=velocity).max_stiffness()
-                row = {"damping_N_s_per_m": damping, **named, **summarize_stiffest(top)}
-                if self.resolution is not None:
-                    noise = find_velocity_noise(velocity, self.device.period, self.resolution)
-                    row |= {"velocity_noise_m_per_s": noise, "force_noise_N": noise * abs(float(top.virtual_damping))}
-                rows.append(row)
+        for damping, (named, velocity) in track(list(product(self.dampings.tolist(), self.estimates()))):
+            top = bare.replace(damping=damping, velocity=velocity).max_stiffness()
+            row = {"damping_N_s_per_m": damping, **named, **summarize_stiffest(top)}
+            if self.resolution is not None:
+                noise = find_velocity_noise(velocity, self.device.period, self.resolution)
+                row |= {"velocity_noise_m_per_s": noise, "force_noise_N": noise * abs(float(top.virtual_damping))}
+            rows.append(row)
         table = stack(rows)
         drawn: dict[str, Any] = {"": partial(figures.draw_filters, table)}
         if self.resolution is not None:

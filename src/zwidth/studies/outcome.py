@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeAlias
+from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import WrapValidator
@@ -24,6 +25,17 @@ from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.formatting import to_cell
 
 Table: TypeAlias = dict[str, np.ndarray]
+Item = TypeVar("Item")
+
+# Whom a study that takes long tells how many of its parts are done, and of how many.
+LISTENER: ContextVar[Callable[[int, int], None]] = ContextVar("LISTENER", default=lambda done, total: None)
+
+
+def track(parts: Sequence[Item]) -> Iterator[Item]:
+    """The parts of a study one by one; whoever listens to it is told how many are done."""
+    for done, part in enumerate(parts):
+        LISTENER.get()(done, len(parts))
+        yield part
 
 
 @dataclass(frozen=True)

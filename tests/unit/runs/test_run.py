@@ -224,3 +224,11 @@ def test_a_record_that_names_files_elsewhere_removes_none(finished, both, tmp_pa
     with pytest.raises(StoreError, match="no file of its folder"):
         run(both, out=finished, overwrite=True)
     assert precious.read_text(encoding="utf-8") == "mine"
+
+
+def test_a_study_that_takes_long_tells_how_far_it_is(tmp_path):
+    events = []
+    device = {"mass": 0.1, "damping": 1, "period": 1e-3, "delay": 1e-3}
+    study = {"kind": "filters", "name": "f", "device": device, "damping": [1, 10], "samples": [2, 3]}
+    assert run({"version": 1, "name": "n", "studies": [study]}, out=tmp_path / "out", progress=events.append).ok
+    assert [event.parts for event in events] == [None, *((done, 6) for done in range(6)), None]

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from zwidth.config.study import KINDS
+from zwidth.runs.draw import Edges, make_edges
 from zwidth.runs.record import CONFIG_FILE, INPUTS, RUN_FILE, Record, file_hash
 from zwidth.sweep.dataset import open_dataset
 from zwidth.sweep.files import write_whole
-from zwidth.sweep.store import SUFFIX
+from zwidth.sweep.store import SUFFIX, Store
 from zwidth.words.errors import StoreError
 from zwidth.words.quantities import OUTPUTS, VARIABLES
 
@@ -151,7 +152,7 @@ def _contents(where: Path, entry: dict[str, Any]) -> Iterator[str]:
             with open_dataset(path) as data:
                 if not data.attrs["complete"]:
                     raise StoreError(f"{path}: chunks are missing; 'zwidth run CONFIG --resume' computes them")
-                yield from find_slices(data)
+                yield from find_slices(data, make_edges(Store(path)))
 
 
 def _published(content: dict[str, Any]) -> str:
@@ -171,8 +172,8 @@ def _scrolling(name: str, rows: str) -> str:
     return f'<div class="wide" tabindex="0" role="region" aria-label="{name}"><table>{rows}</table></div>'
 
 
-def find_slices(data: xarray.Dataset) -> Iterator[str]:
-    """The maps of a store, as HTML."""
+def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[str]:
+    """The maps of a store, as HTML, with the exact edges of the stable and the passive walls."""
     # Loads matplotlib.
     from zwidth.figures.grid import choose_axes
 
@@ -180,10 +181,10 @@ def find_slices(data: xarray.Dataset) -> Iterator[str]:
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
         if len(axes) == 2 and "device" not in axes:
-            yield _draw(data[name], name, *axes)
+            yield _draw(data[name], name, *axes, edges or (lambda part: {}))
 
 
-def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
+def _draw(values: xarray.DataArray, name: str, x: str, y: str, edges: Edges) -> str:
     from zwidth.figures.style import pick_evenly
 
     output = OUTPUTS[name]
@@ -192,7 +193,7 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
     most = {dim: along if dim in (x, y) else _OTHERS for dim in map(str, values.dims)}
     thin = values.isel({dim: pick_evenly(values.sizes[dim], count) for dim, count in most.items()})
     thin = thin.transpose(*others, y, x).load()
-    numbers = thin.values.astype(np.float32)
+    numbers, sizes = thin.values.astype(np.float32), [thin.sizes[dim] for dim in others]
     finite = numbers[np.isfinite(numbers)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
     steep = output.look in ("logarithmic", "steep") and low > 0
@@ -206,6 +207,7 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
         "x": _axis(thin, x),
         "y": _axis(thin, y),
         "others": [_axis(thin, dim) for dim in others],
+        "edges": [_trace(thin.isel(dict(zip(others, place, strict=True))), x, edges) for place in np.ndindex(*sizes)],
         "values": base64.b64encode(np.where(np.isfinite(numbers), numbers, np.nan).astype("<f4").tobytes()).decode(),
     }
     words = f"{output.long_name}, over {_words(x)} (across) and {_words(y)} (up)"
@@ -222,11 +224,24 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str) -> str:
     thinned = "" if thin.size == values.size else f" Shown are {thin.size:,} of {values.size:,} values."
     return (
         f'<div class="slices"><h3>{escape(name)}</h3><p class="soft">{escape(words)}. '
-        f"Dark to bright: {ends}; gray: {_GRAY}.{thinned} "
+        f"Dark to bright: {ends}; gray: {_GRAY}. Lines, if any: exact edges of the stable walls, dashed of the passive "
+        f"ones.{thinned} "
         "Point, or focus the map and use the arrow keys, to read a value.</p>"
         f'{sliders}<canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas><output aria-live="polite">'
         f'</output><script type="application/json">{_embed(content)}</script></div>'
     )
+
+
+def _trace(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, list[Any]]:
+    """The outlines of the stable and the passive walls of one slice, across first, in the units of its axes."""
+    for dim in map(str, part.coords):
+        part[dim].attrs.setdefault("factor", 1.0)
+    over = slice(None, None, 1 if x in ("alpha", "stiffness") else -1)
+    found = edges(part.to_dataset(name="values")).items()
+    return {
+        name: [[[float(f"{v:.6g}") for v in point[over]] for point in ring] for ring, _ in rings]
+        for name, rings in found
+    }
 
 
 def _axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:

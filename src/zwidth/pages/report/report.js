@@ -17,9 +17,11 @@
     const [rows, columns] = [data.y.values.length, data.x.values.length];
     const canvas = block.querySelector("canvas"), readout = block.querySelector("output");
     const sliders = [...block.querySelectorAll("input")];
-    canvas.width = columns; canvas.height = rows;
-    const painter = canvas.getContext("2d");
+    const small = document.createElement("canvas");
+    small.width = columns; small.height = rows;
+    const painter = small.getContext("2d"), pen = canvas.getContext("2d");
     const at = { column: columns >> 1, row: rows >> 1 };
+    const box = { left: 62, top: 12, right: 78, bottom: 44 };
     const logarithmic = data.scale === "log";
     const share = (value) => logarithmic ? Math.log(value / data.low) / Math.log(data.high / data.low)
       : (value - data.low) / (data.high - data.low || 1);
@@ -42,17 +44,83 @@
       });
       tell();
     }
+    // The place of a value among the cells of an axis, from 0 to their number.
+    function place(steps, value) {
+      const up = steps[steps.length - 1] >= steps[0];
+      let k = steps.findIndex((step) => up ? step > value : step < value);
+      k = Math.min(Math.max(k < 0 ? steps.length - 1 : k, 1), steps.length - 1);
+      return k - 0.5 + (value - steps[k - 1]) / (steps[k] - steps[k - 1]);
+    }
+    // Round values where the steps are even, else some of the steps themselves.
+    function ticks(steps, most) {
+      const last = steps.length - 1, span = Math.abs(steps[last] - steps[0]), step = span / last;
+      if (typeof steps[0] !== "number" || steps.some((value, k) => k && Math.abs(Math.abs(value - steps[k - 1]) - step) > 0.01 * step))
+        return [...new Set(Array.from({ length: most }, (_, k) => Math.round(k * last / (most - 1))))].map((k) => [k + 0.5, shorten(steps[k])]);
+      const low = Math.min(steps[0], steps[last]), size = 10 ** Math.floor(Math.log10(span / most)), unit = [1, 2, 5, 10].find((n) => n * size >= span / most) * size;
+      const first = Math.ceil(low / unit - 1e-9), count = Math.floor((low + span) / unit + 1e-9) - first;
+      return Array.from({ length: count + 1 }, (_, k) => unit * (first + k)).map((value) => [place(steps, value), shorten(value)]);
+    }
+    const shorten = (value) => typeof value === "string" ? value.slice(0, 12) : Number(value.toPrecision(3)).toString();
+    function draw() {
+      const scale = window.devicePixelRatio || 1, style = getComputedStyle(canvas);
+      const wide = canvas.clientWidth, high = Math.round(0.66 * wide);
+      canvas.width = wide * scale; canvas.height = high * scale;
+      const { left, top } = box, across = wide - left - box.right, up = high - top - box.bottom;
+      pen.setTransform(scale, 0, 0, scale, 0, 0);
+      pen.imageSmoothingEnabled = false;
+      pen.drawImage(small, left, top, across, up);
+      const line = (x0, y0, x1, y1) => { pen.beginPath(); pen.moveTo(x0, y0); pen.lineTo(x1, y1); pen.stroke(); };
+      const write = (text, x, y, align, most) => { pen.textAlign = align; pen.fillText(text, x, y, most); };
+      pen.strokeStyle = pen.fillStyle = style.color;
+      pen.font = "12px system-ui, sans-serif"; pen.textBaseline = "middle"; pen.lineWidth = 1;
+      pen.strokeRect(left, top, across, up);
+      for (const [share, text] of ticks(data.x.values, Math.max(3, Math.floor(across / 70)))) {
+        const x = left + share / columns * across;
+        line(x, top + up, x, top + up + 5); write(text, x, top + up + 14, "center", across / 5);
+      }
+      for (const [share, text] of ticks(data.y.values, Math.max(3, Math.floor(up / 50)))) {
+        const y = top + up - share / rows * up;
+        line(left - 5, y, left, y); write(text, left - 8, y, "right", left - 22);
+      }
+      const named = (axis) => axis.unit ? `${axis.name} in ${axis.unit}` : axis.name;
+      write(named(data.x), left + across / 2, high - 8, "center", across);
+      pen.save(); pen.translate(9, top + up / 2); pen.rotate(-Math.PI / 2); write(named(data.y), 0, 0, "center", up); pen.restore();
+      // The colors, and what they stand for at both ends and in the middle.
+      const bar = left + across + 12;
+      for (let k = 0; k < up; k++) { pen.fillStyle = `rgb(${color(data.truth ? +(k < up / 2) : 1 - k / up)})`; pen.fillRect(bar, top + k, 12, 1.5); }
+      pen.fillStyle = style.color;
+      const valueAt = (share) => logarithmic ? data.low * (data.high / data.low) ** share : data.low + share * (data.high - data.low);
+      for (const share of data.truth ? [0.25, 0.75] : [0, 0.5, 1])
+        write(data.truth ? (share > 0.5 ? "yes" : "no") : shorten(valueAt(share)), bar + 16, top + Math.min(Math.max(up * (1 - share), 6), up - 6), "left", box.right - 30);
+      pen.save(); pen.beginPath(); pen.rect(left, top, across, up); pen.clip();
+      for (const [name, rings] of Object.entries(data.edges[offset() / rows / columns])) for (const ring of rings) {
+        pen.setLineDash(name === "passive" ? [7, 4] : []);
+        pen.beginPath();
+        for (const [x, y] of ring) pen.lineTo(left + place(data.x.values, x) / columns * across, top + up - place(data.y.values, y) / rows * up);
+        pen.closePath();
+        // Seen on every color.
+        for (const [width, ink] of [[4, "#ffffff"], [2, "#000000"]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }
+      }
+      pen.restore();
+      pen.setLineDash([]);
+      for (const [width, ink] of [[4, "#ffffff"], [2, "#000000"]]) {
+        pen.lineWidth = width; pen.strokeStyle = ink;
+        pen.strokeRect(left + (at.column + 0.5) / columns * across - 4, top + up - (at.row + 0.5) / rows * up - 4, 8, 8);
+      }
+    }
     function tell() {
+      draw();
       const value = values[offset() + at.row * columns + at.column];
       const words = data.truth ? (value ? data.name : `not ${data.name}`) : Number.isNaN(value) ? "not known" : spell(value);
-      readout.textContent = `${data.x.name} = ${spell(data.x.values[at.column])} ${data.x.unit}, `
-        + `${data.y.name} = ${spell(data.y.values[at.row])} ${data.y.unit}: ${words} ${data.truth ? "" : data.unit}`;
+      const known = (axis, k) => `${axis.name} = ${spell(axis.values[k])} ${axis.unit}`.trim();
+      readout.textContent = `${known(data.x, at.column)}, ${known(data.y, at.row)}: ${words} ${data.truth ? "" : data.unit}`;
     }
     sliders.forEach((slider) => slider.addEventListener("input", paint));
     canvas.addEventListener("pointermove", (event) => {
-      const box = canvas.getBoundingClientRect();
-      at.column = Math.min(columns - 1, Math.max(0, Math.floor((event.clientX - box.left) / box.width * columns)));
-      at.row = Math.min(rows - 1, Math.max(0, rows - 1 - Math.floor((event.clientY - box.top) / box.height * rows)));
+      const x = event.offsetX - box.left, y = event.offsetY - box.top;
+      const across = canvas.clientWidth - box.left - box.right, up = canvas.clientHeight - box.top - box.bottom;
+      at.column = Math.min(columns - 1, Math.max(0, Math.floor(x / across * columns)));
+      at.row = Math.min(rows - 1, Math.max(0, rows - 1 - Math.floor(y / up * rows)));
       tell();
     });
     canvas.addEventListener("keydown", (event) => {
@@ -63,6 +131,8 @@
       at.row = Math.min(rows - 1, Math.max(0, at.row + step[1]));
       tell();
     });
+    new ResizeObserver(draw).observe(block);
+    window.matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
     paint();
   }
   document.querySelectorAll(".slices").forEach(show);

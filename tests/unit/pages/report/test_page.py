@@ -82,6 +82,12 @@ def test_slices_hold_what_the_store_holds(run, page):
     np.testing.assert_allclose(values, expected, rtol=1e-6)
     assert found["others"][0]["values"] == [0.1, 0.5]
     assert named["stable"]["truth"] is True
+    for edges, delta in zip(found["edges"], (0.1, 0.5), strict=True):
+        region = zwidth.stable_region(delta, 1.0)
+        ((ring,), (passive, *_)) = edges["stable"], edges["passive"]
+        np.testing.assert_allclose(ring, np.stack([region.alpha, region.beta], -1), rtol=1e-5, atol=1e-6)
+        alpha, beta = np.asarray(passive).mean(0)
+        assert zwidth.is_passive(alpha, beta, delta, 1.0)
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path):
