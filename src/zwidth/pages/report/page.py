@@ -181,12 +181,13 @@ def find_slices(data: xarray.Dataset, edges: Edges | None = None) -> Iterator[st
     for name in (name for name in OUTPUTS if name in data and name != "kind"):
         axes = choose_axes(data, name)
         if len(axes) == 2 and "device" not in axes:
-            yield _draw(data[name], name, *axes, edges or (lambda part: {}))
+            yield _draw(data[name], name, (axes[0], axes[1]), edges or (lambda part: {}))
 
 
-def _draw(values: xarray.DataArray, name: str, x: str, y: str, edges: Edges) -> str:
+def _draw(values: xarray.DataArray, name: str, axes: tuple[str, str], edges: Edges) -> str:
     from zwidth.figures.style import pick_evenly
 
+    x, y = axes
     output = OUTPUTS[name]
     others = [str(dim) for dim in values.dims if dim not in (x, y)]
     along = min(_ALONG, int(np.sqrt(_MOST / max(1, np.prod([min(values.sizes[dim], _OTHERS) for dim in others])))))
@@ -208,7 +209,7 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str, edges: Edges) -> 
         "y": _axis(thin, y),
         "others": [_axis(thin, dim) for dim in others],
         "edges": [_trace(thin.isel(dict(zip(others, place, strict=True))), x, edges) for place in np.ndindex(*sizes)],
-        "values": base64.b64encode(np.where(np.isfinite(numbers), numbers, np.nan).astype("<f4").tobytes()).decode(),
+        "values": _encode(np.where(np.isfinite(numbers), numbers, np.nan)),
     }
     words = f"{output.long_name}, over {_words(x)} (across) and {_words(y)} (up)"
     sliders = "".join(
@@ -232,16 +233,17 @@ def _draw(values: xarray.DataArray, name: str, x: str, y: str, edges: Edges) -> 
     )
 
 
-def _trace(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, list[Any]]:
+def _trace(part: xarray.DataArray, x: str, edges: Edges) -> dict[str, list[str]]:
     """The outlines of the stable and the passive walls of one slice, across first, in the units of its axes."""
     for dim in map(str, part.coords):
         part[dim].attrs.setdefault("factor", 1.0)
     over = slice(None, None, 1 if x in ("alpha", "stiffness") else -1)
     found = edges(part.to_dataset(name="values")).items()
-    return {
-        name: [[[float(f"{v:.6g}") for v in point[over]] for point in ring] for ring, _ in rings]
-        for name, rings in found
-    }
+    return {name: [_encode(points[:, over]) for points, _ in outlines] for name, outlines in found}
+
+
+def _encode(numbers: np.ndarray) -> str:
+    return base64.b64encode(numbers.astype("<f4").tobytes()).decode()
 
 
 def _axis(values: xarray.DataArray, dim: str) -> dict[str, Any]:

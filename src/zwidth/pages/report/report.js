@@ -12,8 +12,8 @@
 
   function show(block) {
     const data = JSON.parse(block.querySelector("script").textContent);
-    const bytes = Uint8Array.from(atob(data.values), (letter) => letter.charCodeAt(0));
-    const values = new Float32Array(bytes.buffer);
+    const decode = (text) => new Float32Array(Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0)).buffer);
+    const values = decode(data.values);
     const [rows, columns] = [data.y.values.length, data.x.values.length];
     const canvas = block.querySelector("canvas"), readout = block.querySelector("output");
     const sliders = [...block.querySelectorAll("input")];
@@ -96,7 +96,9 @@
       for (const [name, rings] of Object.entries(data.edges[offset() / rows / columns])) for (const ring of rings) {
         pen.setLineDash(name === "passive" ? [7, 4] : []);
         pen.beginPath();
-        for (const [x, y] of ring) pen.lineTo(left + place(data.x.values, x) / columns * across, top + up - place(data.y.values, y) / rows * up);
+        const points = decode(ring);
+        for (let k = 0; k < points.length; k += 2)
+          pen.lineTo(left + place(data.x.values, points[k]) / columns * across, top + up - place(data.y.values, points[k + 1]) / rows * up);
         pen.closePath();
         // Seen on every color.
         for (const [width, ink] of [[4, "#ffffff"], [2, "#000000"]]) { pen.lineWidth = width; pen.strokeStyle = ink; pen.stroke(); }

@@ -84,9 +84,12 @@ def test_slices_hold_what_the_store_holds(run, page):
     assert named["stable"]["truth"] is True
     for edges, delta in zip(found["edges"], (0.1, 0.5), strict=True):
         region = zwidth.stable_region(delta, 1.0)
-        ((ring,), (passive, *_)) = edges["stable"], edges["passive"]
-        np.testing.assert_allclose(ring, np.stack([region.alpha, region.beta], -1), rtol=1e-5, atol=1e-6)
-        alpha, beta = np.asarray(passive).mean(0)
+        ((ring,), (passive, *_)) = (
+            [np.frombuffer(base64.b64decode(text), "<f4").reshape(-1, 2) for text in edges[name]]
+            for name in ("stable", "passive")
+        )
+        np.testing.assert_allclose(ring, np.stack([region.alpha, region.beta], -1), rtol=1e-6, atol=1e-7)
+        alpha, beta = passive.astype(float).mean(0)
         assert zwidth.is_passive(alpha, beta, delta, 1.0)
 
 
