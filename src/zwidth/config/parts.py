@@ -41,9 +41,14 @@ SIMULATED = "use the kind 'simulate' or 'limit_cycle', or a linear estimate such
 def locate_refusal(error: InputError) -> LocatedProblem:
     """What a part or a scene refuses, at the field that its message names."""
     field, _, text = str(error).partition(": ")
+    return tuple(field.split(".")), split_refusal(text)
+
+
+def split_refusal(text: str) -> Any:
+    """A refusal as what was given, what is allowed and the remedy; of two parts the second is the remedy."""
     what, _, rest = text.partition("; ")
-    allowed, _, remedy = rest.partition("; ")
-    return tuple(field.split(".")), problem(what, allowed, remedy)
+    allowed, _, remedy = rest.rpartition("; ")
+    return problem(what, allowed, remedy)
 
 
 class PartSection(Strict):

@@ -51,7 +51,8 @@ class Actuator:
 
     def __post_init__(self) -> None:
         if (self.cutoff is None) == (self.time_constant is None):
-            raise InputError("actuator.cutoff: give either cutoff (Hz) or time_constant (s), and only one of them")
+            given = "neither cutoff nor time_constant" if self.cutoff is None else "cutoff and time_constant"
+            raise InputError(f"actuator: got {given}; one of them says the lag; give cutoff (Hz) or time_constant (s)")
         check_fields(self, "actuator")
         if self.order == 1 and self.damping_ratio is not None:
             raise InputError(

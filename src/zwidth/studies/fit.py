@@ -16,7 +16,7 @@ from zwidth import figures
 from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict, members
-from zwidth.config.parts import VelocityField, locate_refusal
+from zwidth.config.parts import VelocityField, locate_refusal, split_refusal
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.config.values import Fraction, Quantity, describe_entry, quantity_of
@@ -205,7 +205,7 @@ class FitStudy(ComputedStudy):
                 known = len(path) == 1 and path[0] in LogSection.model_fields
                 # A single log is written without a list around it.
                 place = ("log", *((k,) if len(self.log or ()) > 1 else ()))
-                yield (*place, *(path if known else ("csv",))), (what if known else problem(text))
+                yield (*place, *(path if known else ("csv",))), (what if known else split_refusal(text))
         self._motions = tuple(motions)
         if any(motion.rotary for motion in motions) and self.buzz:
             what = "got walls in N/m beside a log of an angle"

@@ -27,8 +27,8 @@ def scene():
 @pytest.mark.parametrize(
     "make, words",
     [
-        (lambda: zwidth.Actuator(), "actuator.cutoff: give either cutoff"),
-        (lambda: zwidth.Actuator(100, 1e-3), "actuator.cutoff: give either cutoff"),
+        (lambda: zwidth.Actuator(), "actuator: got neither cutoff nor"),
+        (lambda: zwidth.Actuator(100, 1e-3), "actuator: got cutoff and time_constant; one"),
         (lambda: zwidth.Actuator(-1), "actuator.cutoff: got -1"),
         (lambda: zwidth.Actuator(100, order=3), "actuator.order: got 3"),
         (lambda: zwidth.Actuator(100, damping_ratio=0.7), "of first order; leave it out, or say order=2"),
