@@ -33,7 +33,7 @@ class Actuator:
         >>> import zwidth
         >>> device, timing = zwidth.Device(0.1, 10, actuator=zwidth.Actuator(cutoff=300)), zwidth.Timing(period=1e-3)
         >>> print(f"{zwidth.Scene(device, timing).max_stiffness().stiffness:.0f} N/m")
-        19466 N/m
+        36925 N/m
     """
 
     # Forms that the explorer offers.

@@ -87,7 +87,7 @@ class KnownDevice:
         Example:
             >>> import zwidth
             >>> zwidth.devices.find_device("haptic_wheel").to_device()
-            Device(mass=0.00045, damping=0.0013, coupling=None)
+            Device(mass=0.00045, damping=0.0013, coupling=None, actuator=None, modes=())
         """
         return Device(mass=self._chosen("mass", mass), damping=self._chosen("damping", damping))
 

@@ -49,7 +49,7 @@ class LinearDevice:
         >>> device = zwidth.LinearDevice(([1.0], [0.1, 10.0, 0.0]))
         >>> scene = zwidth.Scene(device, zwidth.Timing(period=1e-3, delay=1e-3))
         >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
-        14909 N/m
+        19865 N/m
     """
 
     # What a `Device` has, and no body of this one.

@@ -28,7 +28,7 @@ class Mode:
         >>> import zwidth
         >>> device = zwidth.Device(0.1, 10, modes=[zwidth.Mode(frequency=120, damping_ratio=0.02, mass=-0.5)])
         >>> print(f"{zwidth.Scene(device, zwidth.Timing(period=1e-3)).max_stiffness().stiffness:.0f} N/m")
-        0 N/m
+        25419 N/m
     """
 
     frequency: Any

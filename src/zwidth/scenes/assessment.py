@@ -258,7 +258,7 @@ def limits_of(scene: Scene) -> list[Limit]:
         >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
         >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=30))
         >>> [limit.words for limit in zwidth.limits_of(scene)][:2]
-        ['a velocity filter twice as fast', 'half the delay']
+        ['half the delay', 'a velocity filter twice as fast']
     """
     now = _stiffness(scene)
     found = []

@@ -313,5 +313,8 @@ def _search(scene: Any, surplus: Surplus, most: float) -> tuple[float, float]:
     for place in (edge - _CLOSE, low):
         if spare(place) >= 0:
             stiffness = math.exp(float(place))
-            return stiffness, dampings[stiffness]
+            exact = stiffness, dampings[stiffness]
+            # A wall to type in: no more digits than a device can tell apart, where what is wanted allows it.
+            short = float(f"{exact[0]:.6g}"), float(f"{exact[1]:.6g}")
+            return short if min(map(float, surplus(*short).values())) >= 0 else exact
     return math.nan, math.nan

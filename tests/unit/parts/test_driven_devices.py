@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, cast
 
 import any_loop
+import jax
 import numpy as np
 import pytest
 
@@ -65,11 +66,8 @@ def test_sensitivities_are_slopes_of_the_stiffest_wall(scene, path):
     assert scene.sensitivities().per[path] == pytest.approx(around, rel=1e-6)
 
 
-def test_traced_slopes_are_the_same(scene):
-    import jax
-
-    with jax.enable_x64():
-        slope = jax.grad(lambda value: scene.replace(**{"modes.1.mass": value}).max_stiffness().stiffness)(-3.0)
+def test_traced_slopes_are_the_same(scene, x64):
+    slope = jax.grad(lambda value: scene.replace(**{"modes.1.mass": value}).max_stiffness().stiffness)(-3.0)
     assert float(slope) == pytest.approx(scene.sensitivities().per["modes.1.mass"], rel=1e-7)
 
 
