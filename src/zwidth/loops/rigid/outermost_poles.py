@@ -21,6 +21,7 @@ from zwidth.loops.rigid.pole_map import Area, fill_up, follow_poles
 from zwidth.loops.rigid.pole_search import (
     Found,
     certification_width,
+    certify_again,
     certify_starts,
     has_bound,
     quick_kernel,
@@ -116,7 +117,9 @@ def _finish_poles(columns: list[np.ndarray], found: Found, accuracy: float, kind
 def _patiently(
     columns: list[np.ndarray], found: Found, error: np.ndarray, left: np.ndarray, accuracy: float, kind: bool
 ) -> None:
-    attempts: list[Any] = [certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
+    begun = fill_up(left)
+    again = partial(certify_again, found.re[begun], found.im[begun])
+    attempts: list[Any] = [again, certify_starts, 1.0, search, *_LADDER[accuracy * _LADDER <= _LARGEST_ERROR]]
     for attempt in attempts:
         if not left.size:
             return

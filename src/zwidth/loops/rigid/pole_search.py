@@ -40,6 +40,8 @@ _SMALLEST, _HALVINGS, _POLISHING = -690.0, 62, 6
 _TOGETHER = 3
 # Off the real axis, of the angle of the first pair.
 _OFF = 0.1
+# And between there and the pair's angle, where a short delay has a third pole.
+_BETWEEN = 0.5
 
 
 class Found(NamedTuple):
@@ -141,7 +143,7 @@ def certify_pole(re: Array, im: Array, tolerance: Array, loop: Loop, fractional:
 
 def quick_kernel(alpha: Array, beta: Array, delta: Array, d: Array, tolerance: Array, fractional: bool) -> Found:
     """The outermost pole of most points."""
-    loop = factor_loop(alpha, beta, delta, d, fractional)
+    loop = store_once(factor_loop(alpha, beta, delta, d, fractional), delta)
     return certify_pole(*candidate(loop, fractional), tolerance, loop, fractional, fractional)
 
 
@@ -152,10 +154,18 @@ def has_bound(log_r: Array, tolerance: Any, loop: Loop, fractional: bool) -> Arr
     return above.full & above.sure & ~below.full & below.sure
 
 
+def certify_again(re: Array, im: Array, tolerance: Array, loop: Loop, fractional: bool) -> Found:
+    """Where the quick kernel ended after one step more, with a count that may meet several crossovers."""
+    return certify_pole(*halley_step(re, im, loop, fractional), tolerance, loop, fractional, False)
+
+
 def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> Found:
-    """What both starts lead to, or the slow one put on the real axis or off it, which steps do not leave or meet."""
+    """What both starts lead to, or the slow one on the real axis or off it, which steps do not leave or meet, or others."""
     (slow, turn), pair = both_starts(loop, fractional)
-    start = np.stack([slow, pair[0], slow]), np.stack([turn, pair[1], np.where(turn > 0, 0.0, _OFF * pair[1])])
+    start = (
+        np.stack([slow, pair[0], slow, 0.0 * slow]),
+        np.stack([turn, pair[1], np.where(turn > 0, 0.0, _OFF * pair[1]), _BETWEEN * pair[1]]),
+    )
     at = repeat(_PATIENT, lambda at: halley_step(*at, loop, fractional), start, np)
     found = certify_pole(*at, tolerance, loop, fractional, False)
     best = np.where(found.proved, np.inf, np.nan_to_num(found.re, nan=-np.inf)).argmax(0)
