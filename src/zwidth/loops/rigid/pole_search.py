@@ -160,7 +160,7 @@ def certify_again(re: Array, im: Array, tolerance: Array, loop: Loop, fractional
 
 
 def certify_starts(tolerance: Array, loop: Loop, fractional: bool) -> Found:
-    """What both starts lead to, or the slow one on the real axis or off it, which steps do not leave or meet, or others."""
+    """What the starts lead to, the slow one also put on the real axis or off it, which steps do not leave or meet."""
     (slow, turn), pair = both_starts(loop, fractional)
     start = (
         np.stack([slow, pair[0], slow, 0.0 * slow]),
