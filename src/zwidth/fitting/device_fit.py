@@ -91,7 +91,8 @@ class DeviceFit:
         residuals: measured less fitted, of buzzing walls an array (n, 2) in units of the noise of K and f, of a log in
             m, NaN where samples are left out.
         doubts: what is odd about the records or about the estimate, a sentence each; then there is no safe wall.
-        status: of `zwidth.Status`: UNDECIDED where another device fits as well.
+        status: of `zwidth.Status`: UNDECIDED where another device fits as well, or where a log shows more than the
+            model has.
         rivals: those devices, a `zwidth.RivalDevice` each.
         next: the further experiment that narrows K_max most; None of a log.
         offset: constant force in N beside the commanded one, of a log; its error in ``errors``.
@@ -99,6 +100,8 @@ class DeviceFit:
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
         period, velocity: of the loop; the velocity with the cut-off found where that was unknown.
+        seen_to: frequency in Hz up to which a log would show a resonance, by a doubt, that may make three quarters of
+            K_max unstable; what is above is not excluded. 0 where none would show, NaN of buzzing walls.
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
@@ -122,6 +125,7 @@ class DeviceFit:
     velocity: Velocity
     freedom: int | None = None
     rivals: tuple[RivalDevice, ...] = ()
+    seen_to: float = np.nan
 
     @property
     def is_doubted(self) -> bool:
@@ -250,6 +254,7 @@ class DeviceFit:
             "friction": self.friction,
             "resolution": self.resolution,
             "period": self.period,
+            "seen_to": self.seen_to,
             "doubts": list(self.doubts),
             "status": int(self.status),
             "rivals": [rival._asdict() for rival in self.rivals],
@@ -287,6 +292,7 @@ class StiffnessEstimate:
         resolution: float = 0.0,
         motions: tuple[FittedMotion, ...] = (),
         rivals: tuple[RivalDevice, ...] = (),
+        seen_to: float = np.nan,
     ) -> DeviceFit:
         """The result; ``parts`` are a log's offset and friction with their errors, ``freedom`` as for `reach_of`."""
         scene = self.scene
@@ -316,6 +322,7 @@ class StiffnessEstimate:
             velocity=scene.velocity,
             freedom=freedom,
             rivals=rivals,
+            seen_to=seen_to,
         )
 
 

@@ -16,14 +16,16 @@ from zwidth.fitting.device_fit import (
     in_si,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
+from zwidth.fitting.hidden import find_hidden
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
 from zwidth.fitting.scenes import scene_of
 from zwidth.parts.checks import check_number
 from zwidth.parts.velocity import BackwardDifference, Velocity
+from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.quantities import NOT_NEGATIVE
+from zwidth.words.quantities import NOT_NEGATIVE, RECOMMENDED_SHARE
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -41,6 +43,11 @@ _SEEN = 5.0
 _ALIKE = 1.5
 # So much of the motion's squares may stay unexplained by anything, where it is so far from noise.
 _UNEXPLAINED, _SMOOTH = 0.01, 5.0
+# What to do about a device that is more than the model.
+_RECORD_NEXT = (
+    "it has something that the model lacks, so that no K_max follows; play a record of zwidth.excite, for "
+    "zwidth.respond needs no model"
+)
 # Smaller residuals, as a share of the way moved, are rounding.
 _EXACT = 1e-9
 
@@ -81,7 +88,8 @@ def fit_log(
         whose errors are NaN where the log leaves open how much is of which, as of a mass that slides one way only;
         ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %; ``noise`` of the position in m; ``residuals``
         and ``motions``; ``doubts``, as of a unit or of residuals that are no noise: then there is no safe wall;
-        ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED.
+        ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the residuals
+        are no noise: then K_max is NaN; ``seen_to``, up to which Hz a harmful resonance would show so.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the device runs away from its force, most
@@ -134,8 +142,11 @@ def fit_log(
     covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T + np.outer(by_period, by_period)
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
     errors = np.sqrt(np.diag(covariance))
-    doubts = odd + doubts + _doubt(values, errors, best, logs, rotary)
+    unexplained, seen_to = _find_unexplained(best, stiffest.scene)
+    doubts = odd + doubts + _doubt(values, errors, best, logs, rotary) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
+    # The device that bears K_max is another one then.
+    status = Status.UNDECIDED if status == Status.OK and unexplained else status
     if theta[2] > longest - 1e-3:
         status = Status.UNREACHABLE
         doubts.append(
@@ -152,7 +163,28 @@ def fit_log(
         parts={"offset": _in_newton(best, -2), "friction": _in_newton(best, -1)},
         resolution=step,
         motions=motions,
+        seen_to=seen_to,
     )
+
+
+def _find_unexplained(best: FittedModel, scene: Scene) -> tuple[list[str], float]:
+    """What the residuals show beyond noise, with the record to make next, and up to which Hz a resonance would show."""
+    way, period = max(float(np.ptp(log.position)) for log in best.model.logs), scene.timing.period
+    if float(best.residuals @ best.residuals) <= _EXACT**2 * best.residuals.size * way**2:
+        # Nothing but rounding is left.
+        return [], 0.5 / period
+    stiffest = scene.max_stiffness()
+    hidden = find_hidden(best, scene, RECOMMENDED_SHARE * float(stiffest.stiffness), float(stiffest.virtual_damping))
+    seen_to, at = hidden.seen_to / period, with_unit(hidden.frequency / period, "Hz", 3)
+    if hidden.rings:
+        what = f"it follows the force, most like a resonance near {at}"
+    elif np.isfinite(hidden.frequency):
+        what = f"it follows the force with a lag, most like one of {at}"
+    elif best.excess > _ALIKE:
+        what = f"its sums spread {plain(np.sqrt(best.excess), 2)} times as far, as of a hand or a compliance"
+    else:
+        return [], seen_to
+    return [f"what the fit leaves is no noise, {what}: {_RECORD_NEXT}"], seen_to
 
 
 def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:
@@ -239,11 +271,6 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
         doubts.append(
             f"the delay is 0 at best: the position would have to precede the force to fit better, by {plain(-away, 2)} "
             "standard errors; is a column shifted?"
-        )
-    if best.excess > _ALIKE:
-        doubts.append(
-            f"what the fit leaves is no noise, its sums spread {plain(np.sqrt(best.excess), 2)} times as far: the "
-            "errors are widened by as much, yet the estimates may be biased; look for a compliance or a hand"
         )
     return doubts
 

@@ -29,6 +29,9 @@ _TROUBLES = {
     Status.UNREACHABLE: "the delay ends the range looked in",
 }
 _ROTARY_NOTE = "# A rotary axis: kg stands for kg m^2 (inertia), N s/m for N m s/rad, N/m for N m/rad, N for N m."
+# As a share of the sampling rate; what shows up to there shows everywhere.
+_EVERYWHERE = 0.4
+_SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
 NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
 
 
@@ -109,13 +112,18 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     safe, wall = fit.safe_wall(), choose_wall(fit)
     if safe.status == Status.OK:
         bound = f"K = {units.spell('stiffness', safe.stiffness)}, B = {units.spell('damping', safe.virtual_damping)}"
-        rows.append(("safe wall", f"{bound}: stable on 99 % of the devices that these records allow"))
+        rows.append(("safe wall", f"{bound}: stable on 99 % of the rigid devices that these records allow"))
     if fit.is_doubted:
         rows.append(("no wall", NO_WALL))
     if wall is not None:
         K, B = units.spell("stiffness", wall.stiffness), units.spell("damping", wall.virtual_damping)
         rows.append(("set", f"K = {K}, B = {B}: {wall.why}"))
     rows += [("doubt", doubt) for doubt in list_doubts(fit, units)]
+    if not fit.is_doubted and fit.seen_to * fit.period < _EVERYWHERE:
+        at = with_unit(fit.seen_to, "Hz", 3)
+        rows.append(
+            ("not seen", f"a resonance above {at} may make such walls unstable and not show in this log: {_SEE_MORE}")
+        )
     if fit.next is not None:
         step = fit.next
         B, K = units.spell("damping", step.virtual_damping, 3), units.spell("stiffness", step.stiffness, 3)
@@ -131,6 +139,8 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
 def name_trouble(fit: DeviceFit) -> str:
     """What the status of a fit says, "" where it is OK."""
     status = Status(fit.status)
+    if status == Status.UNDECIDED and not fit.rivals:
+        return "what the fit leaves is no noise"
     return "" if status == Status.OK else _TROUBLES.get(status, status.message)
 
 
