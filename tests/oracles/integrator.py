@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -123,8 +123,9 @@ def integrate(
     virtual_damping: float,
     periods: int,
     *,
-    position: float = 0.0,
-    velocity: float = 0.0,
+    law: Callable[[float, float, float], float] | None = None,
+    position: float | Sequence[float] = 0.0,
+    velocity: float | Sequence[float] = 0.0,
     push: float = 0.0,
     contact: str = "bilateral",
     resolution: float = 0.0,
@@ -139,6 +140,7 @@ def integrate(
 ) -> History:
     """The motion at samples 0 to ``periods``, the last included; ``jitter_samples`` has one share for each.
 
+    ``law`` stands for spring and damper where it is given; ``position`` and ``velocity`` are of all bodies, or of each.
     ``rtol`` and ``step``, the longest one in radians of the fastest motion, bound the error of the integration.
     """
     friction = Friction(coulomb, coulomb if static is None else static) if coulomb or static else None
@@ -146,14 +148,14 @@ def integrate(
     sensor = int(np.argmax(continuous(scene)[2]))
     period, late = scene.timing.period, float(scene.d)
     n = bodies.count
-    state = np.repeat([float(position), float(velocity)], n)
-    estimate = velocity_program(scene, position, velocity, resolution)
+    state = np.concatenate([np.broadcast_to(np.asarray(start, float), n) for start in (position, velocity)])
+    estimate = velocity_program(scene, float(state[sensor]), float(state[n + sensor]), resolution)
     instants = np.arange(periods + 1) + (0.0 if jitter_samples is None else np.asarray(jitter_samples))
     distances: dict[str, float] = {}
     events: list[tuple[float, str]] = []
     pieces: list[Piece] = []
     rows = []
-    slip = None if friction is None else float(np.sign(velocity))
+    slip = None if friction is None else float(np.sign(state[n]))
     wall = command = reach = 0.0
     coming: deque[tuple[float, float]] = deque()
 
@@ -216,7 +218,8 @@ def integrate(
             note("contact", sensed / reach)
         speed = estimate(measured)
         touching = contact == "bilateral" or measured > 0
-        wanted = -(stiffness * measured + virtual_damping * speed) if touching else 0.0
+        asked = -(stiffness * measured + virtual_damping * speed) if law is None else law(measured, speed, k * period)
+        wanted = asked if touching else 0.0
         if contact == "push_only":
             wanted = min(wanted, 0.0)
         wanted = min(max(wanted, -max_force), max_force)

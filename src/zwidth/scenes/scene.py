@@ -24,7 +24,6 @@ from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.optima import SceneOptima
-from zwidth.simulation.result import Motion
 from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
 from zwidth.words.showing import shown
@@ -223,22 +222,8 @@ class Scene(SceneAnswers, SceneOptima):
             for piece in pieces
         ]
 
-    def simulate(
-        self, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None, **options: Any
-    ) -> Motion:
-        """Simulate this device on a wall in time, with contact, friction, an encoder and a motor as wanted.
-
-        Args:
-            stiffness, virtual_damping: K in N/m and B in N s/m; neither means the scene's own wall.
-            **options: those of `zwidth.simulate`, which this calls.
-
-        Example:
-            >>> import zwidth
-            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
-            >>> zwidth.MotionKind(scene.simulate(25e3, 40, start_position=1e-4, coulomb=1.0).outcome).name
-            'REST'
-        """
-        return simulate(self, stiffness, virtual_damping, **options)
+    # As a method, with all its named arguments.
+    simulate = simulate
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.

@@ -71,6 +71,7 @@ class Batch:
             jitter=jitter,
             foaw=scenes[0].velocity.samples if adapts else 0,
             record=course.record,
+            law=course.law,
         )
         windows = [each.samples if isinstance(each, FOAW) else each.window for each in self.estimates]
         self.rings = round_up(max(windows) + 1), round_up(int(self.late.max()) + 3)
@@ -91,6 +92,8 @@ class Batch:
         lanes = Lanes(
             alpha=numbers["stiffness"] * force,
             beta=numbers["virtual_damping"] * period / mass,
+            period=period,
+            force=1.0 / force,
             resolution=numbers["resolution"],
             push=numbers["push"] * force,
             bilateral=np.array([course.contact == "bilateral"]),
@@ -118,8 +121,8 @@ class Batch:
                 course.substeps,
             )
         return lanes, Given(
-            position=numbers["start_position"],
-            velocity=numbers["start_velocity"] * period,
+            positions=np.stack([numbers[f"start_position.{name}"] for name in self.names]),
+            velocities=np.stack([numbers[f"start_velocity.{name}"] for name in self.names]) * period,
             noise=draw_noise(numbers["seed"], numbers["noise"], course.periods),
             history=(numbers["push_history"] * force[:, None]).T if "push_history" in numbers else None,
             durations=durations,

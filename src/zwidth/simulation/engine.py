@@ -6,7 +6,7 @@ A block has a fixed number of periods, so that a longer simulation compiles noth
 from __future__ import annotations
 
 from collections import deque
-from functools import cache, partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -72,12 +72,14 @@ class Inputs(NamedTuple):
     durations: Array  # (substeps, pieces, lanes) with jitter
 
 
-def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) -> State:
-    """The state before the first sample: coming on a line, and no command on its way (T2)."""
+def begin(lanes: Lanes, positions: np.ndarray, velocities: np.ndarray, rings: tuple[int, int]) -> State:
+    """The state before the first sample: coming on a line, and no command on its way (T2); modes are at rest."""
     count, size = lanes.place.shape[:2]
-    body = np.zeros((size, x.size))
-    # All bodies together: nothing is stretched.
-    body[0], body[np.argmax(lanes.motion[0, :, 0])] = x, v
+    body = np.zeros((size, positions.shape[1]))
+    # Of the bodies only: those that start together stretch nothing.
+    own, first = np.linalg.inv(lanes.place[:, :count, 0]), np.argmax(lanes.motion[0, :, 0])
+    body[:count], body[first : first + count] = own @ positions, own @ velocities
+    x, v = body[0], body[first]
     back = np.mod(-np.arange(rings[0]), rings[0])
     # What the program would have read.
     positions = round_to(lanes.resolution, x - back[:, None] * v)
@@ -86,7 +88,7 @@ def begin(lanes: Lanes, x: np.ndarray, v: np.ndarray, rings: tuple[int, int]) ->
     turns = np.zeros((3, x.size))
     never = zero + np.nan
     summary = Summary(zero, zero, zero, never, zero, Extent(far, -far), turns, never, never)
-    return State(BodyState(body, np.sign(v)), program, Work(zero, zero, zero, zero), summary)
+    return State(BodyState(body, np.sign(velocities[0])), program, Work(zero, zero, zero, zero), summary)
 
 
 def _settle(lanes: Lanes, x: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -164,7 +166,8 @@ def _summarize(
     )
 
 
-@cache
+# Each law of the user's is a program of its own.
+@lru_cache(256)
 def compile_block(options: Options) -> Any:
     """A block of periods, compiled."""
 
@@ -180,7 +183,7 @@ def run_lanes(
     """The last state, the last positions, and what is recorded along a first axis of periods (and of substeps)."""
     edges = course.periods - course.tail * np.arange(2, -1, -1) // 2
     # All arrays in one go: one by one they cost as much as the motion.
-    state: Any = begin(lanes, given.position, given.velocity, rings)
+    state: Any = begin(lanes, given.positions, given.velocities, rings)
     state, lanes, ends = jax.device_put((state, lanes, edges))
     recorded: Any = deque(maxlen=None if options.record else CYCLE // BLOCK + 1)
     for first in range(0, course.periods, BLOCK):

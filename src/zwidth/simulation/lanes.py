@@ -5,9 +5,9 @@ Everything is in units of the period and of the mass that the wall's force acts 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -22,6 +22,11 @@ from zwidth.words.types import Array
 _STEP, _MOST_STEPS = 0.25, 256
 
 
+Law: TypeAlias = Callable[[Any, Any, Any], Any]
+"""The force on the device in N, of the position in m and the velocity in m/s that the program knows and the time in s:
+arrays of JAX, one value a simulation."""
+
+
 class Options(NamedTuple):
     """What decides the shape of the program that is compiled."""
 
@@ -31,6 +36,7 @@ class Options(NamedTuple):
     jitter: bool
     foaw: int  # longest window, 0 where the estimate is linear
     record: bool
+    law: Law | None
 
 
 class Course(NamedTuple):
@@ -41,13 +47,14 @@ class Course(NamedTuple):
     tail: int
     contact: str
     record: bool
+    law: Law | None = None
 
 
 class Given(NamedTuple):
     """What comes from outside, normalized, and the units of that."""
 
-    position: np.ndarray
-    velocity: np.ndarray
+    positions: np.ndarray  # of all bodies, (bodies, lanes)
+    velocities: np.ndarray
     noise: np.ndarray | None  # (periods, lanes), in m
     history: np.ndarray | None  # (periods, lanes)
     durations: np.ndarray | None  # (periods, substeps, pieces, lanes)
@@ -81,6 +88,8 @@ class Lanes(NamedTuple):
 
     alpha: Array
     beta: Array
+    period: Array  # in s
+    force: Array  # what a unit of force is in N
     resolution: Array
     push: Array
     bilateral: Array  # whether the wall acts on both sides of its surface

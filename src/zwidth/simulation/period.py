@@ -77,7 +77,11 @@ def control(lanes: Lanes, options: Options, program: Program, k: Array, sensed: 
             velocity = velocity + dot(estimator.C, filtered)
             filtered = times(estimator.A, filtered) + estimator.B * entering
     touching = lanes.bilateral | (measured > 0)
-    wanted = jnp.where(touching, -(lanes.alpha * measured + lanes.beta * velocity), 0.0)
+    if options.law is None:
+        wanted = -(lanes.alpha * measured + lanes.beta * velocity)
+    else:
+        wanted = options.law(measured, velocity / lanes.period, k * lanes.period) / lanes.force
+    wanted = jnp.where(touching, wanted, 0.0)
     wanted = jnp.where(lanes.pulling, wanted, jnp.minimum(wanted, 0.0))
     motor, last = lanes.motor, program.commands[(k - 1) % program.commands.shape[0]]
     wanted = jnp.clip(wanted, -motor.max_force, motor.max_force)

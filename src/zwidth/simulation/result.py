@@ -110,7 +110,7 @@ class Motion:
             it is; RESTLESS, it never comes to rest, for there is no place where it could, and ``trend`` says how its
             width changes; DIVERGED, beyond 1e100. UNCLEAR, none of these is shown. INVALID, ``status`` is not 0.
         status: code of `zwidth.Status`; not 0 with NaN: INVALID_INPUT, or NOT_CONVERGED where friction had more events
-            within a period than are followed.
+            within a period than are followed, or a force law gave no finite force.
     """
 
     time: Any

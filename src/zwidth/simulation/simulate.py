@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, join_shapes, processors
+from zwidth.arrays.evaluate import as_float64, compute_concretely, join_shapes, processors
 from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole, read_texts
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
-from zwidth.simulation.batch import TOGETHER, run_batch, structure
-from zwidth.simulation.lanes import Course
+from zwidth.simulation.batch import TOGETHER, name_bodies, run_batch, structure
+from zwidth.simulation.lanes import Course, Law
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
-from zwidth.words.errors import InputError, ResourceError, check_choice
+from zwidth.words.errors import InputError, ResourceError, check_choice, describe_choice
 from zwidth.words.quantities import ANY, NOT_NEGATIVE
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
@@ -29,6 +29,7 @@ CONTACTS: tuple[Contact, ...] = ("bilateral", "unilateral", "push_only")
 _RECORDED, _JITTERED, _DRAWN, _MOST_BYTES = 2 * 14 * 8, 20 * 8, 4 * 8, 4 << 30
 
 
+_STARTS = ("start_position", "start_velocity")
 _ARGUMENTS = {
     "stiffness": ("N/m", ANY),
     "virtual_damping": ("N s/m", ANY),
@@ -52,12 +53,14 @@ def simulate(
     stiffness: ArrayLike | None = None,
     virtual_damping: ArrayLike | None = None,
     *,
+    force: Law | None = None,
     periods: int = 1000,
     substeps: int = 1,
-    start_position: ArrayLike = 0.0,
-    start_velocity: ArrayLike = 0.0,
+    start_position: ArrayLike | Mapping[str, ArrayLike] = 0.0,
+    start_velocity: ArrayLike | Mapping[str, ArrayLike] = 0.0,
     push: ArrayLike = 0.0,
     push_history: ArrayLike | None = None,
+    hand_history: ArrayLike | None = None,
     contact: Contact = "bilateral",
     resolution: ArrayLike = 0.0,
     noise: ArrayLike = 0.0,
@@ -82,12 +85,19 @@ def simulate(
             shape of the batch. Numbers may be texts with a unit, "2 N".
         stiffness: K in N/m.
         virtual_damping: B in N s/m. Neither means each scene's own wall, as for `zwidth.Scene.is_stable`.
+        force: a law in place of the wall's spring and damper: a function of the measured position (m), the estimated
+            velocity (m/s) and the time of the sample (s; without jitter), arrays of one value a simulation, written
+            with `jax.numpy`, that returns the force on the device in N. It is sampled, held and delayed as the wall's
+            is. Nothing can be proved of a law, so the outcome is UNCLEAR or DIVERGED.
         periods: how many sampling periods, >= 1.
         substeps: instants recorded in each period, >= 1.
-        start_position: of all bodies, in m.
-        start_velocity: of all bodies, in m/s; the measured past lies on that line.
+        start_position: in m; of all bodies, or by their names in `Motion`, as ``{"position": 0, "hand_position":
+            1e-3}``; a body that is not named starts with the device.
+        start_velocity: in m/s, likewise, by the same names; the measured past lies on the line of the sensed body.
         push: constant force of the hand on the device, in N.
         push_history: force of the hand in N, held over each period, (..., periods); added to ``push``.
+        hand_history: recorded position in m of the place that the spring and damper of a rigid `zwidth.Operator` end
+            at, (..., periods + 1), linear between samples; its force is held at its mean over each period.
         contact: "bilateral", the wall acts on both sides of its surface; "unilateral", where the measured position is
             > 0; "push_only", there and never pulling.
         resolution: of the encoder, in m; positions are rounded to it. 0 for none.
@@ -105,7 +115,8 @@ def simulate(
         Motion: arrays over time and figures of the whole, see `zwidth.Motion`.
 
     Raises:
-        InputError: a number is not usable; friction on a link that rings hundreds of times a period.
+        InputError: a number is not usable; friction on a link that rings hundreds of times a period; JAX cannot trace
+            the law.
         ResourceError: what is recorded or drawn takes more than 4 GiB.
 
     Numerics:
@@ -129,9 +140,14 @@ def simulate(
     periods = check_whole("periods", periods, 1, 10**9)
     substeps = check_whole("substeps", substeps, 1, 10_000)
     tail = max(periods // 4, 1) if tail is None else check_whole("tail", tail, 1, periods)
-    course = Course(periods, substeps, tail, contact, record)
+    course = Course(periods, substeps, tail, contact, record, force)
     known, which = _list_scenes(scenes)
-    numbers, which, good = _read(known, which, given, seed, push_history, periods)
+    if force is not None:
+        _check_law(force, stiffness, virtual_damping)
+        given |= {"stiffness": 0.0, "virtual_damping": 0.0}
+    if hand_history is not None:
+        push_history = _push_by_hand(known, which, hand_history, push_history, periods)
+    numbers, which, good = _read(known, which, _spread_starts(known, given), seed, push_history, periods)
     _check_memory(numbers, course)
     shape, which = which.shape, which.ravel()
     found: dict[str, np.ndarray] = {}
@@ -159,6 +175,66 @@ def simulate(
         for name, column in found.items()
     }
     return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
+
+
+def _check_law(force: Any, stiffness: Any, virtual_damping: Any) -> None:
+    """Refuse a law beside a wall, and one that is no function of three arrays of JAX."""
+    if stiffness is not None or virtual_damping is not None:
+        raise InputError("force: got a law and a stiffness or damping; write both into the law, or leave it out")
+    # What JAX is needed for begins here.
+    import jax
+
+    with compute_concretely(), jax.numpy_rank_promotion("allow"):
+        try:
+            hash(force)
+            found = jax.eval_shape(force, *[jax.ShapeDtypeStruct((2,), float)] * 3)
+        except Exception as error:
+            name, words = getattr(force, "__name__", repr(force)), str(error).partition("\n")[0][:200]
+            raise InputError(
+                f"force: JAX cannot trace {name}: {words}; a function of position, velocity and time is needed, "
+                "written with jax.numpy, jnp.where in place of if"
+            ) from error
+    kind = getattr(found, "dtype", np.dtype(object)).kind
+    if getattr(found, "shape", None) not in ((), (2,)) or kind not in "if":
+        raise InputError(f"force: the law returns {found} for two simulations; one force in N for each is needed")
+
+
+def _spread_starts(known: list[Any], given: dict[str, Any]) -> dict[str, Any]:
+    """The arguments with a start of each body, by name, in place of one of all."""
+    bodies = dict.fromkeys(["position", *(name for scene in known for name in name_bodies(scene))])
+    for name in _STARTS:
+        start = given.pop(name)
+        start = dict(start) if isinstance(start, Mapping) else {"position": start}
+        for body in start.keys() - bodies.keys():
+            raise InputError(f"{name}: {describe_choice(body, tuple(bodies))}")
+        own = start.get("position", 0.0)
+        given |= {f"{name}.{body}": start.get(body, own) for body in bodies}
+    return given
+
+
+def _push_by_hand(known: list[Any], which: np.ndarray, hand: Any, push: Any, periods: int) -> Any:
+    """The pushes of operators whose springs and dampers end at a moving place, each held at its mean over a period."""
+    places = as_float64("hand_history", read_texts("hand_history", hand, "m"))
+    if places.ndim == 1 and not np.isfinite(places).all():
+        raise InputError("hand_history: got a position that is not finite; fill the gaps")
+    if not places.ndim or places.shape[-1] != periods + 1:
+        raise InputError(
+            f"hand_history: got an array of shape {places.shape}; its last axis holds a position at the beginning of "
+            f"each of {periods} periods and one at the end, {periods + 1}"
+        )
+    for scene in known:
+        if scene.operator is None or not scene.operator.rigid or scene.device.coupling is not None:
+            raise InputError(
+                "hand_history: it moves the end of the spring and damper of an operator who holds the device rigidly; "
+                "give operator=zwidth.Operator(stiffness=..., damping=...), on a device without coupling"
+            )
+    units = [
+        (float(each.operator.stiffness), float(each.operator.damping) / float(each.timing.period)) for each in known
+    ]
+    spring, damper = np.moveaxis(np.array(units)[which], -1, 0)[..., None]
+    with np.errstate(all="ignore"):
+        pushes = spring * 0.5 * (places[..., 1:] + places[..., :-1]) + damper * np.diff(places)
+    return pushes if push is None else pushes + as_float64("push_history", push)
 
 
 def _check_memory(numbers: dict[str, np.ndarray], course: Course) -> None:
@@ -230,10 +306,15 @@ def _read(
         given = {**given, "stiffness": own[..., 0], "virtual_damping": own[..., 1]}
     elif given["virtual_damping"] is None:
         given = {**given, "virtual_damping": 0.0}
-    texts = {name: read_texts(name, value, _ARGUMENTS[name][0]) for name, value in given.items()}
-    arrays = {name: as_float64(name, value) for name, value in texts.items()}
+    arrays = {
+        name: as_float64(_spell(name), read_texts(_spell(name), value, _unit(name))) for name, value in given.items()
+    }
     seeds, pushes = _read_seeds(seed), None
-    shapes = {"scenes": which.shape, **{name: array.shape for name, array in arrays.items()}, "seed": seeds.shape}
+    shapes = {
+        "scenes": which.shape,
+        **{_spell(name): array.shape for name, array in arrays.items()},
+        "seed": seeds.shape,
+    }
     if history is not None:
         pushes = as_float64("push_history", history)
         if not pushes.ndim or pushes.shape[-1] != periods:
@@ -251,7 +332,7 @@ def _read(
     for name, array in arrays.items():
         usable, allowed = _check(name, array, arrays, clock[which] if array.ndim else clock.min())
         if array.ndim == 0 and not np.all(usable):
-            raise InputError(f"{name}: got {float(array):g} {_ARGUMENTS[name][0]}; {allowed}")
+            raise InputError(f"{_spell(name)}: got {float(array):g} {_unit(name)}; {allowed}")
         good &= usable
     numbers: dict[str, Any] = {
         name: np.where(good, np.broadcast_to(array, shape), 0.0).reshape(-1) for name, array in arrays.items()
@@ -267,9 +348,19 @@ def _read(
     return numbers, which, good.reshape(-1)
 
 
+def _unit(name: str) -> str:
+    """Of an argument, or of a body's share of it."""
+    return _ARGUMENTS[name.partition(".")[0]][0]
+
+
+def _spell(name: str) -> str:
+    """An argument as its user wrote it: a start of the device alone stands for all bodies."""
+    return name.removesuffix(".position")
+
+
 def _check(name: str, array: np.ndarray, arrays: dict[str, np.ndarray], period: Any) -> tuple[Any, str]:
     """Which values of an argument are usable, and what is allowed."""
-    _, rule = _ARGUMENTS[name]
+    _, rule = _ARGUMENTS[name.partition(".")[0]]
     usable = rule.holds(array) & (np.isfinite(array) | ((name in _LIMITS) & (array > 0)))
     allowed = "it must be finite" if rule == ANY else f"it must be {rule}" + ("" if name in _LIMITS else " and finite")
     if name == "static":

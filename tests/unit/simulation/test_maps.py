@@ -12,7 +12,7 @@ from tolerances import SIMULATED_LINEAR
 
 import zwidth
 from zwidth.arrays.evaluate import compute_concretely
-from zwidth.simulation.batch import Batch
+from zwidth.simulation.batch import Batch, name_bodies
 from zwidth.simulation.engine import run_lanes
 from zwidth.simulation.lanes import Course
 from zwidth.simulation.maps import LaneGroup, find_kept, gather, lay_loop
@@ -79,6 +79,8 @@ def simulate(scenes: list[zwidth.Scene], way: Way, periods: int) -> Iterator[tup
     numbers = {name: np.full(which.size, given.get(name, 0.0)) for name in NUMBERS}
     # Each second one moves half as fast: no lane is taken for another.
     numbers["start_velocity"][1::2] *= 0.5
+    for start in ("start_position", "start_velocity"):
+        numbers |= {f"{start}.{body}": numbers[start] for body in name_bodies(scenes[0])}
     course = Course(periods, 2, 1, way.contact, record=False)
     batch = Batch(scenes, which, numbers, course)
     lanes, outside = batch.lay(np.arange(which.size))

@@ -1,0 +1,138 @@
+"""Force laws of the user's, a start of each body, and a hand whose position was recorded."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.integrate
+import tolerances
+from integrator import integrate
+
+import zwidth
+
+PERIODS = 300
+RIGID = zwidth.Scene(zwidth.Device(0.1, 2.0), zwidth.Timing(1e-3, 1.4e-3), velocity=zwidth.LowPass(cutoff=80))
+TIP = zwidth.Device(0.1, 2.0, zwidth.Coupling(0.05, 2e4, 1.0, "tip"))
+GRASPED = zwidth.Scene(TIP, zwidth.Timing(1e-3, 1e-3), operator=zwidth.Operator(0.5, 5.0, 100.0, 800.0, 3.0))
+
+
+def nonlinear_spring(x: Any, v: Any, t: Any, xp: Any = jnp) -> Any:
+    return -2e3 * x - 4e8 * x**3 - 3.0 * v
+
+
+def hunt_crossley(x: Any, v: Any, t: Any, xp: Any = jnp) -> Any:
+    depth = xp.maximum(x, 0.0)
+    return -xp.maximum(6e4 * depth**1.5 * (1.0 + 1.5 * v), 0.0)
+
+
+def moving_wall(x: Any, v: Any, t: Any, xp: Any = jnp) -> Any:
+    place, speed = 5e-4 * xp.sin(60.0 * t), 0.03 * xp.cos(60.0 * t)
+    return xp.where(x > place, -(2e3 * (x - place) + 5.0 * (v - speed)), 0.0)
+
+
+LAWS = [nonlinear_spring, hunt_crossley, moving_wall]
+
+
+@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("scene", [RIGID, GRASPED], ids=["rigid", "grasped"])
+def test_laws_act_as_in_an_independent_integrator(law, scene):
+    start: dict[str, Any] = {"start_position": -1e-4, "start_velocity": 0.08}
+    found = scene.simulate(force=law, periods=PERIODS, **start)
+    judge = integrate(scene, 0.0, 0.0, PERIODS, law=lambda *at: float(law(*at, np)), position=-1e-4, velocity=0.08)
+    for name, column in (("position", judge.position[:PERIODS, 0]), ("measured", judge.measured[:PERIODS])):
+        np.testing.assert_allclose(getattr(found, name), column, rtol=0, atol=1e-9 * np.abs(column).max())
+    np.testing.assert_allclose(found.command, judge.command[:PERIODS], rtol=0, atol=1e-9 * np.abs(judge.command).max())
+    assert np.abs(judge.command).max() > 0.1
+
+
+def test_the_law_of_a_wall_is_the_wall():
+    same: dict[str, Any] = {
+        "periods": 400, "start_position": np.array([1e-3, -2e-3]), "start_velocity": 0.1, "contact": "push_only",
+        "resolution": 1e-6, "coulomb": 0.2, "max_force": 8.0, "jitter": 1e-4, "seed": 3,
+    }  # fmt: skip
+    wall, law = RIGID.simulate(3e3, 5.0, **same), RIGID.simulate(force=lambda x, v, t: -(3e3 * x + 5.0 * v), **same)
+    for name in ("position", "command", "wall_work", "energy"):
+        one, other = getattr(wall, name), getattr(law, name)
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-10 * np.abs(one).max())
+
+
+def test_nothing_is_said_of_what_becomes_of_it():
+    def wall(x: Any, v: Any, t: Any) -> Any:
+        return -(3e3 * x + 5.0 * v)
+
+    assert RIGID.simulate(3e3, 5.0, start_position=1e-3).outcome == zwidth.MotionKind.GROWING
+    assert RIGID.simulate(force=wall, start_position=1e-3).outcome == zwidth.MotionKind.UNCLEAR
+    runaway = RIGID.simulate(force=lambda x, v, t: 1e6 * x, start_position=1e-3)
+    assert runaway.outcome == zwidth.MotionKind.DIVERGED
+
+
+def test_a_law_without_a_value_spoils_its_own_motion_only():
+    found = RIGID.simulate(force=lambda x, v, t: jnp.where(x > 1e-3, jnp.nan, -1e3 * x), start_position=[1e-4, 2e-3])
+    assert found.status.tolist() == [zwidth.Status.OK, zwidth.Status.NOT_CONVERGED]
+    assert found.outcome.tolist() == [zwidth.MotionKind.UNCLEAR, zwidth.MotionKind.INVALID]
+    assert np.isfinite(found.position[0]).all()
+
+
+@pytest.mark.parametrize(
+    "given, words",
+    [
+        ({"force": lambda x, v, t: x if x > 0 else 0.0}, "jnp.where in place of if"),
+        ({"force": lambda x: x}, "position, velocity and time"),
+        ({"force": 3.0}, "JAX cannot trace 3.0"),
+        ({"force": lambda x, v, t: jnp.zeros(5)}, "one force in N for each"),
+        ({"force": lambda x, v, t: "soft"}, "JAX cannot trace <lambda>"),
+        ({"force": lambda x, v, t: -x, "stiffness": 1e3}, "write both into the law"),
+        ({"stiffness": 1.0, "start_position": {"nose": 1e-3}}, "start_position: got 'nose', allowed are 'position'"),
+        ({"stiffness": 1.0, "start_position": {"position": math.inf}}, "start_position: got inf m"),
+        ({"stiffness": 1.0, "hand_history": np.zeros(11), "periods": 10}, "give operator=zwidth.Operator"),
+        ({"stiffness": 1.0, "hand_history": np.zeros(10), "periods": 10}, "at the end, 11"),
+        ({"stiffness": 1.0, "hand_history": [0.0, math.nan], "periods": 1}, "fill the gaps"),
+    ],
+)
+def test_what_is_refused(given, words):
+    with pytest.raises(zwidth.InputError, match=words):
+        RIGID.simulate(**given)
+
+
+def test_every_body_has_a_start_of_its_own():
+    start: dict[str, Any] = {"position": 1e-3, "tip_position": "1.02 mm", "hand_position": -2e-3}
+    speed = {"hand_position": 0.1}
+    found = GRASPED.simulate(1e3, 5.0, start_position=start, start_velocity=speed, periods=PERIODS)
+    at_first = (found.position[0], found.tip_position[0], found.hand_position[0], found.velocity[0])
+    assert at_first == pytest.approx((1e-3, 1.02e-3, -2e-3, 0.0), rel=1e-14, abs=1e-18)
+    judge = integrate(GRASPED, 1e3, 5.0, PERIODS, position=[1e-3, 1.02e-3, -2e-3], velocity=[0.0, 0.0, 0.1])
+    for name, column in zip(("position", "tip_position", "hand_position"), judge.position[:PERIODS].T, strict=True):
+        size = tolerances.JUDGE.float64 * np.abs(judge.position).max()
+        np.testing.assert_allclose(getattr(found, name), column, rtol=0, atol=size)
+
+
+def test_a_recorded_hand_moves_the_end_of_its_spring():
+    stiffness, damping, mass, own, span = 400.0, 2.0, 0.1, 3.0, 0.2
+
+    def place(t: Any) -> Any:
+        return 2e-3 * np.sin(30.0 * t) ** 2
+
+    def newton(t: float, y: np.ndarray) -> list[float]:
+        speed = 2e-3 * 30.0 * math.sin(60.0 * t)
+        return [y[1], (stiffness * (place(t) - y[0]) + damping * (speed - y[1]) - own * y[1]) / mass]
+
+    errors = []
+    for period in (1e-3, 5e-4):
+        hand = zwidth.Operator(stiffness=stiffness, damping=damping)
+        scene = zwidth.Scene(zwidth.Device(mass, own), zwidth.Timing(period), operator=hand)
+        periods = round(span / period)
+        times = period * np.arange(periods + 1)
+        given: dict[str, Any] = {"hand_history": place(times), "periods": periods}
+        found = scene.simulate(0.0, **given)
+        exact = scipy.integrate.solve_ivp(newton, (0, span), [0.0, 0.0], t_eval=times[:-1], rtol=1e-10, atol=1e-13)
+        errors.append(np.abs(found.position - exact.y[0]).max() / np.abs(exact.y[0]).max())
+        both = scene.simulate(0.0, push_history=np.full(periods, 0.7), **given)
+        apart = scene.simulate(0.0, push=0.7, periods=periods)
+        np.testing.assert_allclose(both.position, found.position + apart.position, atol=1e-15)
+    # A force held at its mean is wrong by the square of the period.
+    assert errors[1] < 1e-4
+    assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.1)
