@@ -17,7 +17,7 @@ from zwidth.cli.options import json_option, quantity_type, scene_options
 from zwidth.pages import words
 from zwidth.pages.words import row
 from zwidth.words.errors import InputError, ZwidthError, check_choice
-from zwidth.words.formatting import plain, with_unit
+from zwidth.words.formatting import plain, spell_stiffness, with_unit
 from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 
 _COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
@@ -34,7 +34,8 @@ _TABLE = re.compile(r"csv: *([\w.-]+\.csv)")
 def cli() -> None:
     """Stability of haptic virtual walls: what stiffness and damping a sampled, delayed device can render.
 
-    A quantity is a number in SI base units (10e3) or a number with a unit ("10 kN/m").
+    A quantity is a number in SI base units (10e3) or a number with a unit ("10 kN/m"). A rotary device has its own:
+    "12 g cm^2", "0.02 mN m s/rad", "20 mN m/deg"; where one option is in these, or --device is rotary, all are.
     """
 
 
@@ -115,10 +116,11 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
             "islands": [island._asdict() for island in scene.islands()],
             "notes": notes,
         }
-        labels = zip(("K_max", "B", "frequency"), named.values(), ("N/m", "N s/m", "Hz"), strict=True)
+        labels = zip(("B", "frequency"), list(named.values())[1:], ("N s/m", "Hz"), strict=True)
         lines = [
             *words.scene_lines(scene),
             *lines,
+            row("K_max", spell_stiffness(named["stiffness_max"])),
             *(row(label, with_unit(value, unit)) for label, value, unit in labels),
             row("what to set", "at wanted margins: zwidth recommend, with the same options"),
         ]

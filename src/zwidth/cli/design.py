@@ -11,6 +11,7 @@ from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.pages.words import row, tell
 from zwidth.words.formatting import plain, with_unit
+from zwidth.words.rotation import own_unit
 
 _FINDS = {
     "damping": ("damping", "N s/m"),
@@ -93,7 +94,7 @@ def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
         within = present / 30.0, min(30.0 * present, 0.499 / (scene.velocity.coded_period or scene.timing.period))
     wanted = float(scene.wall.stiffness)
     needed = scene.required(path, wanted, within=within)
-    result = {"parameter": path, "value": needed.value, "unit": unit, "enough": needed.enough}
+    result = {"parameter": path, "value": needed.value, "unit": own_unit(unit), "enough": needed.enough}
     result |= {"crossings": [[c.value, c.enough] for c in needed.crossings], "range": list(needed.range)}
     text = with_unit(needed.value, unit)
     if path == "period":

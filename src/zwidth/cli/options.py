@@ -10,9 +10,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import click
 
-from zwidth.parts.checks import Span
+from zwidth.parts.checks import Span, find_kind
 from zwidth.words.formatting import short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, OF_PARTS, PARAMETERS, Range
+from zwidth.words.rotation import is_rotary, own_unit, use_kind
+from zwidth.words.units import tell_kind
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -43,6 +45,8 @@ _SLIPS = {
     "time_constant": (("{flag} '{value} ms'", "time_constant", 1e-3),),
     "cutoff": (("{flag} '{value} kHz'", "cutoff", 1e3),),
 }
+# Where the texts of options are kept whose units tell linear and rotary devices apart.
+_TOLD = "zwidth.told"
 _BOTH = "--period and --rate are both given: they are one thing, give one of them"
 Command: TypeAlias = Callable[..., Any]
 
@@ -64,10 +68,10 @@ def doubts_of(given: dict[str, Any]) -> list[str]:
             meant = [
                 text.format(flag=flag, value=short(number))
                 for text, other, scale in _SLIPS.get(kind, ())
-                if _is_plausible(other, number * scale)
+                if _is_plausible(other, number * scale) and not (is_rotary() and own_unit(unit) != unit)
             ]
             remedy = f"did you mean {meant[0]}?" if meant else "check its unit"
-            lines.append(f"{flag} is {short(number)} {unit}, far from any device; {remedy}")
+            lines.append(f"{flag} is {short(number)} {own_unit(unit)}, far from any device; {remedy}")
     return lines
 
 
@@ -86,6 +90,8 @@ class Parsed(click.ParamType):
         """Parse one option; one that is parsed, or a default that is no text, stays as it is."""
         if not isinstance(value, str):
             return value
+        if ctx is not None and param is not None and tell_kind(value) is not None:
+            ctx.meta.setdefault(_TOLD, {})[param.opts[0]] = value
         try:
             return self.read(value)
         except ValueError as error:
@@ -100,7 +106,9 @@ def quantity_type(unit: str, allowed: Range = ANY, *, periods: bool = False) -> 
         from zwidth.words.units import find_dimension, read_quantity
 
         number = number_or_text(text)
-        return read_span(number, allowed) if periods else read_quantity(number, find_dimension(unit), allowed)[0]
+        # Whether all are of one kind of device is asked when all are known.
+        with use_kind(bool(tell_kind(number))):
+            return read_span(number, allowed) if periods else read_quantity(number, find_dimension(unit), allowed)[0]
 
     return Parsed("quantity", read)
 
@@ -135,6 +143,9 @@ def flag_of(path: str) -> str:
 
 
 def _add_option(command: Command, path: str, required: bool = False) -> Command:
+    if path == "device":
+        words = "A device with published mass and damping, linear or rotary, as `zwidth devices` lists them."
+        return click.option("--device", metavar="NAME", help=words)(command)
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
     else:
@@ -152,9 +163,8 @@ def scene_options(*, wall: bool, required: bool) -> Callable[[Command], Command]
 
     Where none is required it is None without any of them.
     """
-    bare = (*(("stiffness", "virtual_damping") if wall else ()), "mass", "damping", "period", "rate", "delay")
-    needed = ("stiffness", "mass") if required else ("stiffness",)
-    return _take_options("scene", (*bare, *_PARTS), needed, lambda given: build_scene(given, required))
+    bare = (*(("stiffness", "virtual_damping") if wall else ()), "device", "mass", "damping", "period", "rate", "delay")
+    return _take_options("scene", (*bare, *_PARTS), ("stiffness",), lambda given: build_scene(given, required))
 
 
 def _take_options(
@@ -166,7 +176,14 @@ def _take_options(
         @wraps(function)
         def with_made(**given: Any) -> Any:
             named = {path: given.pop(path.replace(".", "__")) for path in paths}
-            return function(**{name: make({path: each for path, each in named.items() if each is not None})}, **given)
+            known = {path: each for path, each in named.items() if each is not None}
+            if "device" in known:
+                from zwidth.parts.devices import find_device
+
+                known["device"] = find_device(known["device"])
+            told = click.get_current_context().meta.get(_TOLD, {})
+            with use_kind(bool(find_kind(told | ({"--device": known["device"]} if "device" in known else {})))):
+                return function(**{name: make(known)}, **given)
 
         command = with_made
         for path in reversed(paths):
@@ -197,8 +214,9 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
         return None
     if {"period", "rate"} <= given.keys():
         raise click.UsageError(_BOTH)
-    if "mass" not in given or not {"period", "rate"} & given.keys():
-        raise click.UsageError("give --mass, and one of --period and --rate")
+    device = given.pop("device", None)
+    if not (device or "mass" in given) or not {"period", "rate"} & given.keys():
+        raise click.UsageError("give --mass or --device, and one of --period and --rate")
     for line in doubts_of(given):
         click.echo(f"zwidth: {line}", err=True)
 
@@ -212,7 +230,9 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
         modes = [_make_part(name, Mode, own) for name in _MODES if (own := _own(given, name))]
         parts |= {"modes": modes} if modes else {}
         scene = Scene(
-            Device(**some("mass", "damping")),
+            Device(**some("mass", "damping"), rotary=is_rotary())
+            if device is None
+            else device.to_device(**some("mass", "damping")),
             Timing(**some("period", "rate", "delay")),
             VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
             velocity=_make_velocity(given),

@@ -12,6 +12,7 @@ from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, select
 from zwidth.words.formatting import header
 from zwidth.words.quantities import PARAMETERS
+from zwidth.words.rotation import is_rotary, own_unit
 
 _STIFFNESS, _NOISE = SI_COLUMNS[0], "velocity_noise_m_per_s"
 _OVER = {
@@ -53,7 +54,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
         if kind == "low_pass" or grid.logarithmic(np.unique(values)):
             style.use_logarithmic(ax, "x", values, style.DECADES)
     panels[0].set_ylabel(words)
-    handles = [style.line(rf"$b = {damping:g}$ N s/m", color=color) for damping, color in colors.items()]
+    handles = [style.line(rf"$b = {damping:g}$ {own_unit('N s/m')}", color=color) for damping, color in colors.items()]
     handles.append(style.line("one-sample difference", style.DASHED, 0.9))
     style.legend(panels, handles, outside=axes is None, ncols=len(handles))
     return panels
@@ -79,12 +80,12 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
             look = {"linestyle": dash, "color": color, "label": f"{kind}, b = {damping:g}", **mark}
             ax.plot(rows[_NOISE] * 1e3, rows[_STIFFNESS] * factor, **look)
         best = _mark_best(ax, select(table, damping_N_s_per_m=damping, best=True), color, factor, words)
-        handles.append(style.line(rf"$b = {damping:g}$ N s/m{best}", color=color))
+        handles.append(style.line(rf"$b = {damping:g}$ {own_unit('N s/m')}{best}", color=color))
     if np.isfinite(limit):
         ax.axvline(limit * 1e3, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
     style.use_logarithmic(ax, "x", table[_NOISE], style.DECADES)
     style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
-    ax.set(xlabel=r"noise of the velocity  $\sigma_v$  in mm/s", ylabel=words)
+    ax.set(xlabel=rf"noise of the velocity  $\sigma_v$  in {'mrad/s' if is_rotary() else 'mm/s'}", ylabel=words)
     handles += [style.line(words, dash, marker=marker, markersize=4.5) for dash, marker, words in kinds.values()]
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels

@@ -11,6 +11,7 @@ from matplotlib.lines import Line2D
 
 from zwidth.figures import style
 from zwidth.figures.table import Table, curves
+from zwidth.words.rotation import is_rotary, own_unit
 
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 4.5}
@@ -43,7 +44,9 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     responses = _read_responses(table)
     for ax in panels[1:]:
         _draw_forces(ax, responses, clock)
-        ax.set_ylabel("wall force in N" if unit else "wall force  in $F$")
+        ax.set_ylabel(
+            f"wall {'torque' if is_rotary() else 'force'} in {own_unit('N')}" if unit else "wall force  in $F$"
+        )
     for ax in panels:
         # The last sample ends before the time that was asked for.
         ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
@@ -76,7 +79,9 @@ def draw_positions(ax: Axes, table: Table) -> tuple[float, str]:
             at = np.interp(each.settling_time, each.time, each.position)
             ax.plot(each.settling_time * clock, at * factor, color=each.look["color"], zorder=4, **_DOT)
     ax.set_ylim(bottom=min(0.0, ax.get_ylim()[0]))
-    ax.set_ylabel(f"position  $x$  in {length} for 1 N" if physical else r"position  $x$  in $F\,T^2\!/m$")
+    ax.set_ylabel(
+        f"position  $x$  in {length} for 1 {own_unit('N')}" if physical else r"position  $x$  in $F\,T^2\!/m$"
+    )
     return clock, unit
 
 

@@ -46,6 +46,7 @@ from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import Motion
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import PARAMETERS
+from zwidth.words.rotation import in_own_units, own_unit
 from zwidth.words.types import ArrayLike
 
 _ANGLES = 181
@@ -87,6 +88,7 @@ def _complex_plane(ax: Axes | None, real: tuple[float, float], imaginary: tuple[
     return ax
 
 
+@in_own_units
 @style.house_style()
 def region(
     scene: Scene | Mapping[str, Scene], ax: Axes | None = None, *, normalized: bool = False, passive: bool = False
@@ -121,6 +123,7 @@ def _trace(scene: Scene, label: str, *, passive: bool) -> list[dict[str, Any]]:
     return outlines
 
 
+@in_own_units
 @style.house_style()
 def recommendation(
     found: Recommendation, axes: style.AnyAxes | None = None, *, response: Table | None = None
@@ -149,6 +152,7 @@ def recommendation(
     return draw_recommendation(told, outlines, response, axes)
 
 
+@in_own_units
 @style.house_style()
 def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = None) -> Axes:
     """Draw the stiffest stable wall over one parameter of a scene, all others as they are.
@@ -164,7 +168,10 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     if grid.ndim != 1 or not grid.size:
         raise InputError(f"values: got shape {grid.shape}; a list of values of {parameter} is needed")
     walls = [scene.replace(**{parameter: value}).max_stiffness() for value in grid.tolist()]
-    top = np.array([float(wall.stiffness) for wall in walls])
+    top, spelled = np.array([float(wall.stiffness) for wall in walls]), known.unit if known else "1"
+    if own_unit(spelled) != spelled:
+        scale, spelled = style.si_unit(grid, spelled)
+        grid = scale * grid
     ax = _axes(ax)
     factor, unit = style.si_unit(top, "N/m")
     whole = known is not None and known.whole
@@ -172,7 +179,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     if not whole:
         ax.fill_between(grid, 0.0, top * factor, color=style.BLUE, alpha=0.08, linewidth=0.0)
     words = f"{known.words}  ${known.symbol}$" if known else style.literal(parameter)
-    words += f"  in {known.unit}" if known and known.unit not in ("", "1") else ""
+    words += f"  in {spelled}" if spelled not in ("", "1") else ""
     ax.set(xlabel=words, ylabel=rf"stiffest stable wall  $K_{{\max}}$  in {unit}", ylim=(0.0, None))
     scale_axis(ax, "x", grid)
     if whole and ax.get_xscale() == "linear":
@@ -180,6 +187,7 @@ def ridge(scene: Scene, parameter: str, values: ArrayLike, ax: Axes | None = Non
     return ax
 
 
+@in_own_units
 @style.house_style()
 def step(
     scene: Scene,
@@ -221,6 +229,7 @@ def _frequencies(scene: Scene) -> np.ndarray:
     return np.concatenate([slow, fast[1:]])
 
 
+@in_own_units
 @style.house_style()
 def bode(
     scene: Scene,
@@ -270,6 +279,7 @@ def bode(
     return np.array([upper, lower])
 
 
+@in_own_units
 @style.house_style()
 def nyquist(
     scene: Scene,
@@ -301,6 +311,7 @@ def nyquist(
     return ax
 
 
+@in_own_units
 @style.house_style()
 def poles(
     scene: Scene,
@@ -330,6 +341,7 @@ def poles(
     return ax
 
 
+@in_own_units
 @style.house_style()
 def motion(found: Motion, ax: Axes | None = None, *, labels: Sequence[str] = ()) -> Axes:
     """Draw the position of one simulated motion, or of several, over time.

@@ -16,6 +16,7 @@ from zwidth.figures import style
 from zwidth.figures.motion import draw_positions
 from zwidth.figures.table import SI_COLUMNS, Table, curves, select
 from zwidth.words.formatting import with_unit
+from zwidth.words.rotation import own_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -80,7 +81,7 @@ def draw_zeros(ax: Axes) -> None:
 def name_axes(ax: Axes, spring: str, damper: str = "N s/m") -> None:
     """Label the axes of stiffness and damping, normalized where they have no unit, with lines where these are zero."""
     draw_zeros(ax)
-    in_si = f"stiffness  $K$  in {spring}", f"virtual damping  $B$  in {damper}"
+    in_si = f"stiffness  $K$  in {spring}", f"virtual damping  $B$  in {own_unit(damper)}"
     style.label_axes(np.array([ax]), *(in_si if spring else (style.ALPHA_LABEL, style.BETA_LABEL)), once=False)
 
 
@@ -162,7 +163,7 @@ def draw_stable_set(
     pieces = set()
     for label, color in colors.items() if "label" in outlines else ():
         pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factor, 0.5 / (1 + len(labels)))
-    symbols = ((r"\alpha", ""), (r"\beta", "")) if normalized else (("K", f" {unit}"), ("B", " N s/m"))
+    symbols = ((r"\alpha", ""), (r"\beta", "")) if normalized else (("K", f" {unit}"), ("B", f" {own_unit('N s/m')}"))
     rows = select(walls)
     for kind, label, *wall in zip(*(rows[name] for name in ("wall", "label", *names)), strict=True):
         wall[0] *= factor

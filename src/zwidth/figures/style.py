@@ -22,6 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.words.errors import InputError
+from zwidth.words.rotation import is_rotary, own_unit
 
 # Okabe and Ito's palette, told apart with any color vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -296,14 +297,19 @@ def spread(positions: Sequence[float], gap: float) -> np.ndarray:
 
 
 def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
-    """Read the normalized axes of an (alpha, beta) plane in kN/m and N s/m as well, at the top and the right."""
+    """Read the normalized axes of an (alpha, beta) plane in kN/m and N s/m as well, at the top and the right.
+
+    Those of a rotary device in N m/rad and N m s/rad.
+    """
     ax.spines[["top", "right"]].set_visible(True)
     stiffness, damping = (
         ((lambda value, factor=factor: value * factor), (lambda value, factor=factor: value / factor))
-        for factor in (scale[0] / 1e3, scale[1])
+        for factor in (scale[0] / (1.0 if is_rotary() else 1e3), scale[1])
     )
-    ax.secondary_xaxis("top", functions=stiffness).set_xlabel(r"stiffness  $K$  in kN/m")
-    ax.secondary_yaxis("right", functions=damping).set_ylabel(r"virtual damping  $B$  in N s/m")
+    ax.secondary_xaxis("top", functions=stiffness).set_xlabel(
+        f"stiffness  $K$  in {own_unit('N/m') if is_rotary() else 'kN/m'}"
+    )
+    ax.secondary_yaxis("right", functions=damping).set_ylabel(f"virtual damping  $B$  in {own_unit('N s/m')}")
 
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
@@ -311,11 +317,13 @@ _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"
 
 def si_unit(values: Any, unit: str) -> tuple[float, str]:
     """The factor and the unit in which the largest of some values has one to three digits before the point."""
-    largest = float(np.nanmax(np.abs(values), initial=0.0))
+    unit, largest = own_unit(unit), float(np.nanmax(np.abs(values), initial=0.0))
     if not np.isfinite(largest) or largest <= 0 or unit == "sampling periods" or unit.startswith("1"):
         # Of an inverse the prefix would be read as its unit's.
         return 1.0, unit
     if unit == "kg":
         return (1.0, unit) if largest >= 1 else (1e3, "g")
+    if unit == "kg m^2":
+        return 1e7, "g cm$^2$"
     power = int(np.clip(3 * np.floor(np.log10(largest) / 3), -12, 9))
     return 10.0**-power, _PREFIXES[power] + unit

@@ -11,8 +11,9 @@ import click
 
 from zwidth.loops.linear.passivity import find_obstacle
 from zwidth.parts.paths import find_parts
-from zwidth.words.formatting import plain, short, tell_apart, to_json, with_unit
+from zwidth.words.formatting import plain, short, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
+from zwidth.words.rotation import in_own_units, is_rotary, own_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.assessment import Assessment, FrictionRule, Intervals, Limit
@@ -39,10 +40,12 @@ def tell(result: Any, lines: list[str], as_json: bool) -> None:
         click.echo(line)
 
 
+@in_own_units
 def scene_lines(scene: Scene) -> list[str]:
     device, timing = scene.device, scene.timing
+    mass = f"{'J' if device.rotary else 'm'} = {with_unit(device.mass, 'kg')}"
     lines = [
-        row("device", f"m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}"),
+        row("device", f"{mass}, b = {with_unit(device.damping, 'N s/m')}"),
         row(
             "timing",
             f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(scene.d)})",
@@ -82,20 +85,21 @@ def stability_word(stable: bool, marginal: bool = False) -> str:
     return click.style("stable", fg="green", bold=True) if stable else click.style("UNSTABLE", fg="red", bold=True)
 
 
+@in_own_units
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     wall = scene.wall
     word = stability_word(verdict.stable, verdict.marginal)
     best = "none: no stiffness is stable at any damping"
     if isfinite(verdict.stiffness_max):
         best = (
-            f"K_max = {with_unit(verdict.stiffness_max, 'N/m')} at B = "
+            f"K_max = {spell_stiffness(verdict.stiffness_max)} at B = "
             f"{with_unit(verdict.virtual_damping_at_max, 'N s/m')} ({verdict.ridge_kind.replace('_', ' ')} optimum, "
             f"{with_unit(verdict.ridge_frequency, 'Hz')}; alpha_max = {plain(verdict.alpha_max)}, "
             f"beta = {plain(verdict.beta_at_max)})"
         )
     return [
         *scene_lines(scene),
-        row("wall", f"K = {with_unit(wall.stiffness, 'N/m')}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
+        row("wall", f"K = {spell_stiffness(wall.stiffness)}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
         row(
             "normalized",
             f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}",
@@ -230,7 +234,7 @@ class Slope(NamedTuple):
         return row(f"dK_max/d({self.name})", f"{with_unit(self.value, self.unit)}: {self.words}")
 
     def as_dict(self) -> dict[str, Any]:
-        return {"value": self.value, "unit": self.unit}
+        return {"value": self.value, "unit": own_unit(self.unit)}
 
 
 def list_slopes(scene: Scene) -> list[Slope]:
@@ -241,7 +245,8 @@ def list_slopes(scene: Scene) -> list[Slope]:
         unit, value = unit_of(path), float(slope)
         # A delay is counted in periods, a damping one by one.
         size = scene.timing.period if path == "delay" else values[path]
-        step = 1.0 if unit == "N s/m" or not size else one_percent(float(size))
+        by_one = not size or (unit == "N s/m" and not is_rotary())
+        step = one_percent(float(size)) if not by_one else 1e-3 if is_rotary() else 1.0
         words = f"{with_unit(step, unit, 1)} more {describe_effect(value * step)}"
         words += " (same delay in seconds)" if path == "period" else ""
         found.append(Slope(path, value, f"N/m per {unit}", words))

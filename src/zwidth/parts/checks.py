@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import Field, fields
 from functools import wraps
 from numbers import Real
@@ -15,8 +15,9 @@ from zwidth.arrays.xp import frozen, is_jax, namespace
 from zwidth.words.errors import InputError, UnusableValueError, check_choice
 from zwidth.words.formatting import describe, short
 from zwidth.words.quantities import ANY, CHOICES, FIELDS, NOT_NEGATIVE, PARAMETERS, Range
+from zwidth.words.rotation import is_rotary, use_kind
 from zwidth.words.types import Array
-from zwidth.words.units import TIME, find_dimension, read_quantity, to_float
+from zwidth.words.units import TIME, find_dimension, read_quantity, tell_kind, to_float
 
 
 def in_periods(delay: Array, period: Array) -> Array:
@@ -60,20 +61,27 @@ def read_span(value: Any, allowed: Range) -> Span:
     return Span(amount, "periods" if unit == "periods" else "s")
 
 
+# Of linear devices and of rotary ones, for messages.
+_KINDS, _UNITS = ("linear", "rotary"), ("kg, N s/m and N/m", "kg m^2, N m s/rad and N m/rad")
+
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
 
 
 def accept_units(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Let the SI quantities that a function takes be texts with a unit: "70 g", and a delay "1.5 periods" as well."""
+    """Let the SI quantities that a function takes be texts with a unit: "70 g", and a delay "1.5 periods" as well.
+
+    Where one is in a unit of rotary devices, the answer is in theirs.
+    """
     names = tuple(inspect.signature(function).parameters)
 
     @wraps(function)
     def accepting(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
         given = dict(zip(names, args, strict=False)) | kwargs
         if len(args) <= len(names) and any(map(_has_text, given.values())):
-            period = _in_si("period", given.get("period"), None)
-            return function(**{name: _in_si(name, value, period) for name, value in given.items()})  # pyright: ignore[reportCallIssue]
+            with use_kind(bool(find_kind(given))):
+                period = _in_si("period", given.get("period"), None)
+                return function(**{name: _in_si(name, value, period) for name, value in given.items()})  # pyright: ignore[reportCallIssue]
         return function(*args, **kwargs)
 
     return accepting
@@ -122,8 +130,62 @@ def _in_si(name: str, value: Any, period: Any) -> Any:
 def check_fields(part: Any, owner: str = "") -> None:
     """Put every number of a part in its SI unit, where `words.quantities` allows it; else raise `InputError`.
 
-    ``owner`` begins the names of its quantities. A number that is None by default may be left out.
+    ``owner`` begins the names of its quantities. A number that is None by default may be left out. A part that was told
+    in units of one kind of device, linear or rotary, has that as ``rotary``.
     """
+    told = find_kind(
+        {f"{owner}.{item.name}" if owner else item.name: getattr(part, item.name) for item in fields(part)}
+    )
+    if told is not None:
+        object.__setattr__(part, "rotary", told)
+    with use_kind(is_rotary() if told is None else told):
+        _read_fields(part, owner)
+
+
+def _list_told(given: dict[str, Any]) -> Iterator[tuple[str, Any]]:
+    """What may tell a kind of device: every value by its name, each text of a list."""
+    for name, value in given.items():
+        if isinstance(value, list | tuple) and _has_text(value):
+            for each in value:
+                yield from _list_told({name: each})
+        else:
+            yield name, value
+
+
+def find_kind(given: dict[str, Any]) -> bool | None:
+    """Whether quantities and parts, by name, are those of a rotary device; None where none says.
+
+    Raises:
+        InputError: some are of a rotary device, others of a linear one.
+    """
+    told: dict[bool, str] = {}
+    for name, value in _list_told(given):
+        kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+        if kind is None:
+            continue
+        words = f"{value!r}" if isinstance(value, str) else "a part"
+        if told and kind not in told:
+            raise InputError(
+                f"{name}: got {words}, in units of a {_KINDS[kind]} device, beside {told[not kind]}, of a "
+                f"{_KINDS[not kind]} one; write all of them in {_UNITS[False]}, or in {_UNITS[True]}"
+            )
+        told.setdefault(bool(kind), f"{name} = {words}" if isinstance(value, str) else name)
+    return next(iter(told), None)
+
+
+def check_kind(rotary: bool, given: dict[str, Any]) -> None:
+    """Refuse quantities and parts of a device, by name, that are told in units of the other kind of device."""
+    for name, value in given.items():
+        kind = tell_kind(value) if isinstance(value, str) else getattr(value, "rotary", None)
+        if kind is not None and bool(kind) != rotary:
+            raise InputError(
+                f"{name}: got {value!r}, in units of a {_KINDS[kind]} device, for a {_KINDS[rotary]} one; write it in "
+                f"{_UNITS[rotary]}, or make the device {_KINDS[kind]}: zwidth.Device(..., rotary={bool(kind)})"
+            )
+
+
+def _read_fields(part: Any, owner: str) -> None:
+    """Put every number of a part in its SI unit."""
     for item in fields(part):
         path, value = f"{owner}.{item.name}" if owner else item.name, getattr(part, item.name)
         if path in CHOICES:

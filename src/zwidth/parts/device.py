@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal
 
 from zwidth.parts.actuator import Actuator
-from zwidth.parts.checks import check_fields
+from zwidth.parts.checks import check_fields, check_kind, find_kind
 from zwidth.parts.mode import Mode
 from zwidth.words.errors import InputError
+from zwidth.words.rotation import use_kind
 
 
 @dataclass(frozen=True)
@@ -47,14 +48,24 @@ class Coupling:
 
 @dataclass(frozen=True)
 class Device:
-    """The haptic device: a mass with viscous damping.
+    """The haptic device: a mass with viscous damping, or an inertia where it is rotary.
+
+    A rotary device is the same mathematics in other units: kg m^2 in place of kg, N m s/rad of N s/m, N m/rad of N/m,
+    rad of m and N m of N. Every part and every wall of its scene is in these, and so is every answer.
 
     Args:
-        mass: m in kg, > 0; with a coupling, of the motor's side.
-        damping: b in N s/m, >= 0.
+        mass: m in kg, > 0; with a coupling, of the motor's side. Of a rotary device the inertia J in kg m^2.
+        damping: b in N s/m, >= 0; N m s/rad of a rotary device.
         coupling: the mass beyond a spring and damper, None for a rigid device.
         actuator: the lag of amplifier and motor, None where a command acts at once.
         modes: resonances that a command excites and the sensor sees, in any number.
+        rotary: whether it turns; left out, the units of the other arguments say so, and plain numbers are of a linear
+            device.
+
+    Example:
+        >>> import zwidth
+        >>> zwidth.Device("12 g cm^2", "0.02 mN m s/rad")
+        Device(mass=1.2e-06, damping=2e-05, coupling=None, actuator=None, modes=(), rotary=True)
     """
 
     mass: Any
@@ -63,14 +74,28 @@ class Device:
     actuator: Actuator | None = None
     # A list is as good.
     modes: Any = ()
+    rotary: bool | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self)
+        modes = (self.modes,) if isinstance(self.modes, Mode) else self.modes
+        if not isinstance(modes, list | tuple) or not all(isinstance(mode, Mode) for mode in modes):
+            raise InputError(f"modes: got {self.modes!r}; a list of zwidth.Mode is needed")
+        if self.rotary is not None and not isinstance(self.rotary, bool):
+            raise InputError(f"rotary: got {self.rotary!r}; True or False is needed")
+        own = {name: getattr(self, name) for name in ("mass", "damping", "coupling")}
+        told = find_kind(own | {f"modes.{k}": mode for k, mode in enumerate(modes)})
+        rotary = told or False if self.rotary is None else self.rotary
+        object.__setattr__(self, "modes", tuple(modes))
         for name, kind in {"coupling": Coupling, "actuator": Actuator}.items():
             part = getattr(self, name)
             if part is not None and not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a zwidth.{kind.__name__} is needed, or None")
-        modes = (self.modes,) if isinstance(self.modes, Mode) else self.modes
-        if not isinstance(modes, list | tuple) or not all(isinstance(mode, Mode) for mode in modes):
-            raise InputError(f"modes: got {self.modes!r}; a list of zwidth.Mode is needed")
-        object.__setattr__(self, "modes", tuple(modes))
+        check_kind(rotary, own | {f"modes.{k}": mode for k, mode in enumerate(modes)})
+        with use_kind(rotary):
+            check_fields(self)
+        object.__setattr__(self, "rotary", rotary)
+
+    def __repr__(self) -> str:
+        """As a call; of linear devices without their kind."""
+        names = [item.name for item in fields(self) if item.name != "rotary" or self.rotary]
+        return f"Device({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"

@@ -65,6 +65,11 @@ class KnownDevice:
     damping_limit: Published | None = None
 
     @property
+    def rotary(self) -> bool:
+        """Whether it turns."""
+        return self.motion == "rotary"
+
+    @property
     def numbers(self) -> dict[str, Published]:
         """Every number that is published, by its name."""
         return {
@@ -74,8 +79,8 @@ class KnownDevice:
     def to_device(self, *, mass: Any = None, damping: Any = None) -> Device:
         """A `zwidth.Device` with the published mass and damping.
 
-        For a rotary device ``Device.mass`` holds the inertia in kg m^2 and ``Device.damping`` N m s/rad. Every
-        stiffness and virtual damping of such a scene is in N m/rad and N m s/rad, wherever N/m and N s/m are printed.
+        For a rotary device ``Device.mass`` holds the inertia in kg m^2 and ``Device.damping`` N m s/rad, and every
+        stiffness and virtual damping of such a scene is in N m/rad and N m s/rad.
 
         Args:
             mass: yours, in place of the published one or where none is published.
@@ -87,9 +92,10 @@ class KnownDevice:
         Example:
             >>> import zwidth
             >>> zwidth.devices.find_device("haptic_wheel").to_device()
-            Device(mass=0.00045, damping=0.0013, coupling=None, actuator=None, modes=())
+            Device(mass=0.00045, damping=0.0013, coupling=None, actuator=None, modes=(), rotary=True)
         """
-        return Device(mass=self._chosen("mass", mass), damping=self._chosen("damping", damping))
+        numbers = {"mass": self._chosen("mass", mass), "damping": self._chosen("damping", damping)}
+        return Device(**numbers, rotary=self.rotary)
 
     def _chosen(self, name: str, given: Any) -> Any:
         if given is not None:

@@ -56,6 +56,7 @@ class LinearDevice:
     coupling: ClassVar[None] = None
     actuator: ClassVar[None] = None
     modes: ClassVar[tuple[()]] = ()
+    rotary: ClassVar[bool] = False
     damping: ClassVar[float] = 0.0
 
     system: Any

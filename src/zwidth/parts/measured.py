@@ -49,6 +49,7 @@ class MeasuredDevice:
     coupling: ClassVar[None] = None
     actuator: ClassVar[None] = None
     modes: ClassVar[tuple[()]] = ()
+    rotary: ClassVar[bool] = False
 
     frequency: Any
     response: Any

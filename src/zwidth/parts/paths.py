@@ -78,7 +78,7 @@ def list_parameters(scene: Parts) -> dict[str, Any]:
 
 
 def _is_number(value: Any) -> bool:
-    return is_jax(value) or isinstance(value, int | float | np.number)
+    return is_jax(value) or (isinstance(value, int | float | np.number) and not isinstance(value, bool))
 
 
 def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
@@ -139,5 +139,6 @@ def spell_part(part: Any, *, every: bool = False) -> dict[str, Any]:
     return {
         name: value
         for name, (value, default) in values.items()
-        if (value is not None if every else default is MISSING or value != default)
+        # A device is linear where nothing is said.
+        if (value is not None if every else default is MISSING or value != default) and value is not False
     }

@@ -7,6 +7,7 @@ from typing import Any
 
 from zwidth.parts.checks import check_fields, read_texts
 from zwidth.words.errors import InputError
+from zwidth.words.rotation import is_rotary, own_unit, use_kind
 
 
 @dataclass(frozen=True)
@@ -33,16 +34,20 @@ class NoWall(VirtualWall):
     virtual_damping: Any = field(default=0.0, init=False, repr=False)
 
 
-def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any) -> tuple[Any, Any]:
+def resolve_wall(
+    wall: VirtualWall, stiffness: Any, virtual_damping: Any, rotary: bool | None = None
+) -> tuple[Any, Any]:
     """Which K and B a question means of a scene with this wall, the one rule for all of them.
 
     Neither given means the scene's own wall. Both given are what they say. K alone is a spring, B = 0, of a scene
-    without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit.
+    without a wall; where there is one it could as well mean that wall's B, and is refused. Texts have a unit, of a
+    rotary device or not, or of the kind of device in question.
     """
     # Most questions are of numbers, in which there is no text to look for.
     if not (isinstance(stiffness, int | float) and isinstance(virtual_damping, int | float | None)):
-        stiffness = read_texts("stiffness", stiffness, "N/m")
-        virtual_damping = read_texts("virtual_damping", virtual_damping, "N s/m")
+        with use_kind(is_rotary() if rotary is None else rotary):
+            stiffness = read_texts("stiffness", stiffness, "N/m")
+            virtual_damping = read_texts("virtual_damping", virtual_damping, "N s/m")
     chosen = not isinstance(wall, NoWall)
     if stiffness is None and virtual_damping is None:
         if not chosen:
@@ -60,7 +65,8 @@ def resolve_wall(wall: VirtualWall, stiffness: Any, virtual_damping: Any) -> tup
         if chosen:
             raise InputError(
                 f"virtual_damping: none is given beside stiffness, and the scene's own wall has {wall.virtual_damping} "
-                "N s/m; say which, 0 for a spring alone, or replace the wall: scene.replace(stiffness=...)"
+                f"{own_unit('N s/m')}; say which, 0 for a spring alone, or replace the wall: "
+                "scene.replace(stiffness=...)"
             )
         return stiffness, 0.0
     return stiffness, virtual_damping

@@ -66,7 +66,7 @@ class SceneAnswers:
         self: Any, stiffness: ArrayLike | None = None, virtual_damping: ArrayLike | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Walls in SI units as arrays of alpha and beta that broadcast; the scene's own wall where neither is given."""
-        units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping)
+        units, both = self.units, resolve_wall(self.wall, stiffness, virtual_damping, self.device.rotary)
         if are_numbers(*both):
             both = np.float64(both[0]), np.float64(both[1])
         else:

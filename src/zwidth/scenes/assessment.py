@@ -22,6 +22,7 @@ from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.stiffest import StiffestWall, stiffest_wall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
+from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 
@@ -90,6 +91,7 @@ class Assessment:
         return to_json(asdict(self))
 
 
+@in_own_units
 def assess(scene: Scene) -> Assessment:
     """Judge the wall of a scene.
 
@@ -234,6 +236,7 @@ class Limit(NamedTuple):
         return f"{self.words}: K_max {with_unit(self.stiffness, 'N/m')}, {plain(self.gain, 3)} times{less}"
 
 
+@in_own_units
 def limits_of(scene: Scene) -> list[Limit]:
     """Say what limits the stiffest wall of a scene, that of `Scene.max_stiffness`: islands do not count.
 
@@ -269,6 +272,7 @@ def limits_of(scene: Scene) -> list[Limit]:
     return sorted(found, key=lambda limit: (not limit.gain >= 0, -limit.gain))
 
 
+@in_own_units
 def describe_islands(scene: Scene) -> list[str]:
     """A line for each island: stable walls that K_max does not count."""
     lines = []

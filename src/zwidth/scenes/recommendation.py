@@ -19,8 +19,9 @@ from zwidth.scenes.assessment import Assessment, Limit, assess, check_held, desc
 from zwidth.scenes.stiffest import StiffestWall, choose_damping, find_lowest, soft_dampings, stiffest_wall
 from zwidth.scenes.wall_code import write_wall
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
+from zwidth.words.formatting import plain, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import FRACTION, RECOMMENDED_SHARE, Range
+from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
@@ -149,9 +150,9 @@ class Recommendation:
         verdict = self.verdict
         if verdict is None:
             return (f"no wall: {self.reason}",)
-        K, B, largest = with_unit(self.stiffness, "N/m"), with_unit(self.virtual_damping, "N s/m"), self.stiffest[0]
+        K, B, largest = spell_stiffness(self.stiffness), with_unit(self.virtual_damping, "N s/m"), self.stiffest[0]
         share = 100.0 * self.stiffness / float(largest)
-        first = f"K = {K}, B = {B}: {share:.4g} % of the stiffest stable wall, {with_unit(float(largest), 'N/m')}"
+        first = f"K = {K}, B = {B}: {share:.4g} % of the stiffest stable wall, {spell_stiffness(float(largest))}"
         if self.limited_by != "stiffness_fraction":
             first += f"; {self.wanted.spell(self.limited_by)} allows no more"
         lower, upper = tell_apart(verdict.virtual_damping_lower, verdict.virtual_damping_upper)
@@ -162,7 +163,7 @@ class Recommendation:
             f"delay {'not known' if math.isnan(delay) else with_unit(delay, 's')}",
         )
         rest = f"margins: {', '.join(apart)}; passive: {self.spell_passive()}"
-        return first, f"stable for B from {lower} to {upper} N s/m; {rest}"
+        return first, f"stable for B from {lower} to {upper} {own_unit('N s/m')}; {rest}"
 
     def spell_passive(self) -> str:
         """Whether the wall is passive, or why that is not known."""
@@ -178,7 +179,7 @@ class Recommendation:
         constant = math.nan if verdict is None or not verdict.stable else verdict.time_constant
         alpha, beta = scene.normalize_walls(top.stiffness, top.virtual_damping)
         found = {
-            "units": _UNITS,
+            "units": {name: own_unit(unit) for name, unit in _UNITS.items()},
             "device": {**device, "velocity": type(scene.velocity).__name__, "delta": float(scene.delta), "d": scene.d},
             "maximum": {
                 "stiffness": float(top.stiffness),

@@ -14,6 +14,7 @@ from zwidth.loops.linear.curve import curve_at
 from zwidth.loops.loop import LinearLoop, RigidLoop, make_plain
 from zwidth.loops.measured.loop import MeasuredLoop
 from zwidth.loops.normalization import Normalized, Physical, denormalize, normalize
+from zwidth.parts.checks import check_kind
 from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
@@ -26,6 +27,7 @@ from zwidth.scenes.answers import SceneAnswers
 from zwidth.scenes.optima import SceneOptima
 from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
+from zwidth.words.rotation import in_own_units, wrap_methods
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, ArrayLike
 
@@ -85,6 +87,8 @@ class Scene(SceneAnswers, SceneOptima):
             part = getattr(self, name)
             if not isinstance(part, kind):
                 raise InputError(f"{name}: got {part!r}; a part of zwidth is needed, as {_EXAMPLES[name]}")
+        named = {name: getattr(self, name) for name in ("wall", "operator", "velocity")}
+        check_kind(bool(self.device.rotary), named)
         if self.operator is not None and not isinstance(self.device, Device):
             raise InputError(
                 "operator: a hand holds a body, and of this device no body is known; make the hand a part of it"
@@ -183,6 +187,7 @@ class Scene(SceneAnswers, SceneOptima):
         )
 
     @cached_property
+    @in_own_units
     def units(self) -> WallSI:
         """The stiffness of alpha = 1 in N/m and the damping of beta = 1 in N s/m."""
         rate = self.mass / self.timing.period
@@ -257,4 +262,15 @@ class Scene(SceneAnswers, SceneOptima):
                 f"{min(at_rate)}: a measured response holds the rate and the delay that it was measured with; measure "
                 "again at others"
             )
-        return replace_parameters(self, changes)
+        made = replace_parameters(self, changes)
+        if made.device.rotary != self.device.rotary and not {"device", "rotary"} & changes.keys():
+            kind = "rotary" if made.device.rotary else "linear"
+            raise InputError(
+                f"{', '.join(changes)}: the device would become a {kind} one, and other numbers of the scene mean "
+                "another unit; make a new scene, of a new zwidth.Device"
+            )
+        return made
+
+
+# Labels have no units, and walls that are texts are read in those of the device.
+wrap_methods(Scene, but=("is_stable", "normalize_walls"))

@@ -15,6 +15,7 @@ from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
 from zwidth.words.errors import InputError, check_choice, describe_choice
 from zwidth.words.quantities import FIELDS
+from zwidth.words.rotation import own_unit
 from zwidth.words.showing import shown
 from zwidth.words.status import RidgeKind, Status
 from zwidth.words.types import Array
@@ -109,7 +110,7 @@ def require(
     """See `zwidth.Scene.required`."""
     stiffness = read_texts("stiffness", stiffness, "N/m")
     if not (isinstance(stiffness, int | float | np.number) and math.isfinite(stiffness) and stiffness > 0):
-        raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in N/m)")
+        raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {own_unit('N/m')})")
     now = _present_value(scene, parameter)
     low, high = _range(parameter, now, within)
 
@@ -211,7 +212,7 @@ def find_best_damping(
     given = resolve_wall(scene.wall, None, None)[0] if stiffness is None else stiffness
     stiffness = float(read_texts("stiffness", given, "N/m"))
     if not (math.isfinite(stiffness) and stiffness > 0):
-        raise InputError(f"stiffness: got {stiffness:g}; it must be finite and greater than 0 (in N/m)")
+        raise InputError(f"stiffness: got {stiffness:g}; it must be finite and greater than 0 (in {own_unit('N/m')})")
 
     units = scene.units
 

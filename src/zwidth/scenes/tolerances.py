@@ -14,6 +14,7 @@ import numpy as np
 from zwidth.parts.checks import check_whole
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError, check_choice, describe_choice
+from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 
 # Of the interval in which the share of all devices lies.
@@ -49,6 +50,7 @@ class ToleranceEstimate:
     labels: np.ndarray  # whether each device bears the wall
 
 
+@in_own_units
 def simulate_tolerances(
     scene: Scene,
     tolerances: dict[str, Any],

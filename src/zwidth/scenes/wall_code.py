@@ -17,14 +17,19 @@ import numpy as np
 from zwidth.parts.velocity import Estimate
 from zwidth.words.errors import check_choice
 from zwidth.words.formatting import with_unit
+from zwidth.words.rotation import is_rotary, own_unit
 
 # A root is real whose imaginary part is no more of it than rounding.
 _ROUNDED = 1e-13
 
-_CALLED = (
-    "x is the position in m, 0 at the surface of the wall and positive inside of it; the force on the device is",
-    "in N, and 0 outside of the wall.",
-)
+
+def _describe_call() -> tuple[str, str]:
+    """What goes in and what comes out, in two lines."""
+    position, force = ("angle in rad", "torque") if is_rotary() else ("position in m", "force")
+    return (
+        f"x is the {position}, 0 at the surface of the wall and positive inside of it; the {force} on the device is",
+        f"in {own_unit('N')}, and 0 outside of the wall.",
+    )
 
 
 class Section(NamedTuple):
@@ -125,7 +130,9 @@ def _write_c(program: WallProgram) -> str:
     force = [f"double {', '.join(names)}", *program.force, f"return x > 0.0 ? {program.law} : 0.0"]
     blocks = ["\n".join(f"    {line.replace('@', 'wall->')};" for line in lines) for lines in (start, force)]
     kept = "\n".join(f"    {line};" for line in (*members, *(f"double {name}" for name in program.states)))
-    words = "\n   ".join([f"/* {program.head}", *_CALLED, "Call wall_start once, then wall_force once a period. */"])
+    words = "\n   ".join(
+        [f"/* {program.head}", *_describe_call(), "Call wall_start once, then wall_force once a period. */"]
+    )
     opened = "void wall_start(Wall *wall, double x)\n{\n", "double wall_force(Wall *wall, double x)\n{\n"
     functions = [f"{head}{block}\n}}\n" for head, block in zip(opened, blocks, strict=True)]
     return "\n".join([words, f"typedef struct {{\n{kept}\n}} Wall;\n", *functions])
@@ -136,7 +143,9 @@ def _write_python(program: WallProgram) -> str:
     count = program.window
     begin = [f"@past = [x] * {count}", "@next = 0"] if count > 1 else ["@x = x"]
     force = [*program.force, f"return {program.law} if x > 0.0 else 0.0"]
-    words = "\n    ".join([f'    """{program.head}\n', *_CALLED, "Make one, then call force once a period.", '"""'])
+    words = "\n    ".join(
+        [f'    """{program.head}\n', *_describe_call(), "Make one, then call force once a period.", '"""']
+    )
     heads = "    def __init__(self, x=0.0):", "    def force(self, x):"
     blocks = ["\n".join(f"        {line}" for line in lines) for lines in ([*begin, *program.start], force)]
     functions = [f"{head}\n{block}\n".replace("@", "self.") for head, block in zip(heads, blocks, strict=True)]

@@ -17,6 +17,7 @@ from zwidth.parts.checks import check_whole
 from zwidth.parts.velocity import Estimate
 from zwidth.parts.wall import resolve_wall
 from zwidth.scenes.answers import one_wall
+from zwidth.words.rotation import in_own_units
 from zwidth.words.showing import shown
 from zwidth.words.status import Status
 
@@ -51,6 +52,7 @@ class WorstMotion(NamedTuple):
     status: Status
 
 
+@in_own_units
 def worst_motion(
     scene: Any, stiffness: float | None = None, virtual_damping: float | None = None, *, longest: int = 1 << 20
 ) -> WorstMotion:

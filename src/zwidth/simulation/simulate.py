@@ -18,6 +18,7 @@ from zwidth.simulation.lanes import Course, Law
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.words.errors import InputError, ResourceError, check_choice, describe_choice
 from zwidth.words.quantities import ANY, NOT_NEGATIVE
+from zwidth.words.rotation import in_own_units
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -48,6 +49,7 @@ _ARGUMENTS = {
 _LIMITS = ("max_force", "max_rate")
 
 
+@in_own_units
 def simulate(
     scenes: Any,
     stiffness: ArrayLike | None = None,

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from zwidth.words.errors import InputError
+from zwidth.words.rotation import is_rotary, own_unit
 
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
@@ -38,7 +39,14 @@ def plain(value: float, digits: int = 4) -> str:
 
 
 def with_unit(value: float, unit: str, digits: int = 4) -> str:
-    """A quantity with an SI prefix on its unit: ``19.87 kN/m``, ``100.0 g`` of kilograms."""
+    """A quantity with an SI prefix on its unit: ``19.87 kN/m``, ``100.0 g`` of kilograms.
+
+    The unit is that of a linear device; of a rotary one in question its own is written.
+    """
+    unit = own_unit(unit)
+    if unit == "kg m^2":
+        # What data sheets of rotors have.
+        return f"{plain(1e7 * value, digits)} g cm^2" if math.isfinite(value) else plain(value)
     if unit == "kg":
         value, unit = 1e3 * value, "g"
     if not math.isfinite(value) or value == 0:
@@ -48,6 +56,12 @@ def with_unit(value: float, unit: str, digits: int = 4) -> str:
     if abs(float(f"{value / 10**power:.{digits - 1}e}")) >= 1000 and power < 9:
         power += 3
     return f"{plain(value / 10**power, digits)} {_PREFIXES[power]}{unit}"
+
+
+def spell_stiffness(value: float) -> str:
+    """A stiffness with its unit; of a rotary device per degree as well, as people picture it."""
+    text = with_unit(value, "N/m")
+    return f"{text} ({plain(value * 1e3 * math.pi / 180)} mN m/deg)" if is_rotary() and math.isfinite(value) else text
 
 
 def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:

@@ -12,6 +12,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from zwidth.words.formatting import with_unit
+from zwidth.words.rotation import in_own_units, is_rotary, wrap_methods
 from zwidth.words.status import Status
 
 Kind = TypeVar("Kind", bound=type)
@@ -65,10 +66,27 @@ def shown(
             return write_table(kind.__name__, [[name, text] for name, text in spell(self).items()]) + below
 
         for name, method in (("__repr__", as_text), ("_repr_html_", as_html)):
-            setattr(kind, name, method)
+            setattr(kind, name, in_own_units(method))
+        _add_rotary(kind)
         return kind
 
     return decorate
+
+
+def _add_rotary(kind: Any) -> None:
+    """Let results made for a rotary device keep its units: they are of a class below, ``kind.InRotaryUnits``."""
+    name, plain_new = "InRotaryUnits", kind.__new__
+    below = type(name, (kind,), {"__slots__": (), "__module__": kind.__module__, "in_rotary_units": True})
+    # As pickle finds it.
+    below.__qualname__ = f"{kind.__qualname__}.{name}"
+    wrap_methods(below, of=kind)
+
+    def make(cls: type, *args: Any, **kwargs: Any) -> Any:
+        chosen = below if cls is kind and is_rotary() else cls
+        return object.__new__(chosen) if plain_new is object.__new__ else plain_new(chosen, *args, **kwargs)
+
+    kind.__new__, kind.in_rotary_units = make, False
+    setattr(kind, name, below)
 
 
 def spell_value(value: Any, unit: Unit = "") -> str:

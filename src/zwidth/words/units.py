@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, SI_RANGE, Range
+from zwidth.words.rotation import ROTARY, is_rotary, own_unit
 
 # Mantissa, exponent, unit. The exponent is short so that no text makes an integer of thousands of digits.
 _QUANTITY = re.compile(r"([-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+))(?:[eE]([-+]?[0-9]{1,6}))?\s*(\S.{0,20})", re.DOTALL)
@@ -68,18 +69,43 @@ TORQUE = Dimension({"N m": 0, "mN m": -3, "kN m": 3, "N mm": -3, "mN mm": -6, "N
 ANGULAR_STIFFNESS = Dimension(
     {"N m/rad": 0, "mN m/rad": -3}, "0.5 N m/rad", {"N m/deg": 180 / math.pi, "mN m/deg": 0.18 / math.pi}
 )
-ANGULAR_DAMPING = Dimension({"N m s/rad": 0, "mN m s/rad": -3}, "2 mN m s/rad")
+ANGULAR_DAMPING = Dimension(
+    {"N m s/rad": 0, "mN m s/rad": -3, "uN m s/rad": -6, "µN m s/rad": -6},
+    "2 mN m s/rad",
+    {"N m s/deg": 180 / math.pi, "mN m s/deg": 0.18 / math.pi},
+)
+INERTIA = Dimension(
+    {"kg m^2": 0, "g m^2": -3, "kg cm^2": -4, "kg mm^2": -6, "g cm^2": -7, "g mm^2": -9, "mg mm^2": -12}, "12 g cm^2"
+)
+ANGULAR_SPEED = Dimension({"rad/s": 0, "mrad/s": -3}, "0.1 rad/s", {"deg/s": math.pi / 180})
+TORQUE_RATE = Dimension({"N m/s": 0, "mN m/s": -3}, "0.5 N m/s")
 SPEED = Dimension({"m/s": 0, "cm/s": -2, "mm/s": -3, "um/s": -6}, "1 mm/s")
 FORCE_RATE = Dimension({"N/s": 0, "kN/s": 3, "N/ms": 3}, "500 N/s")
 RATIO = Dimension({"": 0}, "0.02")
-_SCALES = (MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED)
+_SCALES = (
+    *(MASS, TIME, RATE, DAMPING, STIFFNESS, FORCE, FORCE_RATE, LENGTH, SPEED),
+    *(INERTIA, ANGULAR_DAMPING, ANGULAR_STIFFNESS, TORQUE, TORQUE_RATE, ANGLE, ANGULAR_SPEED),
+)
 _OF_UNIT = {"1": RATIO, **{dimension.base: dimension for dimension in _SCALES}}
+_OTHER_KIND = {one: other for pair in ROTARY.items() for one, other in (pair, pair[::-1])}
 
 PERIOD_WORDS = ("periods", "period")
 
 
 def find_dimension(unit: str) -> Dimension:
-    return _OF_UNIT[unit]
+    """The units of a quantity by its SI unit, that of a linear device: of the kind of device in question."""
+    return _OF_UNIT[own_unit(unit)]
+
+
+def find_other(dimension: Dimension) -> Dimension | None:
+    """The same quantity of the other kind of device, linear or rotary; None where both have one unit."""
+    return _OF_UNIT.get(_OTHER_KIND.get(dimension.base, ""))
+
+
+def tell_kind(value: Any) -> bool | None:
+    """Whether a text is a number with a unit of a rotary device; None where it tells no kind."""
+    match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
+    return None if match is None else _KIND_OF_UNIT.get(_canonical(match[3]))
 
 
 def spell_exactly(value: float, unit: str) -> str:
@@ -125,8 +151,18 @@ def _canonical(unit: str) -> str:
     # Two characters look like the micro sign; this makes them one.
     unit = unicodedata.normalize("NFKC", unit)
     unit = re.sub(r"\s*/\s*", "/", unit)
+    unit = re.sub(r"([kmµu]?g)[\s*·⋅.]*([cm]?m)\^?2$", r"\1 \2^2", unit)
     unit = re.sub(r"N[\s*·⋅.]*m[\s*·⋅.]*(?=s/)", "N m ", unit)
     return re.sub(r"N[\s*·⋅.]*(?=[scm])", "N ", unit)
+
+
+_KIND_OF_UNIT = {
+    _canonical(unit): kind == 1
+    for pair in ROTARY.items()
+    for kind, base in enumerate(pair)
+    if base in _OF_UNIT
+    for unit in _OF_UNIT[base].units
+}
 
 
 def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, str]:
@@ -157,8 +193,17 @@ def _parse(value: Any, dimension: Dimension, *, periods: bool) -> tuple[float, s
         return float(f"{mantissa}e{exponent or 0}"), "periods"
     amount = dimension.in_base(mantissa, int(exponent or 0), unit)
     if amount is None and dimension is not RATIO:
+        other = find_other(dimension)
+        if other is not None and other.in_base(mantissa, 0, unit) is not None:
+            this, that = ("rotary", "linear") if is_rotary() else ("linear", "rotary")
+            raise UnusableValueError(
+                f"got {describe(value)}, a unit of a {that} device where the device is {this}",
+                f"the units allowed are {names}",
+                f"write one of these, or every quantity of the device in {that} units, as {other.example!r} here",
+            )
+        known = (*units, *(other.units if other else ()))
         raise UnusableValueError(
-            f"got {describe(value)}", f"the units allowed are {names}", suggestion(unit, units, remedy)
+            f"got {describe(value)}", f"the units allowed are {names}", suggestion(unit, known, remedy)
         )
     if amount is None:
         raise UnusableValueError(f"got {describe(value)}", allowed, remedy)

@@ -1,0 +1,86 @@
+"""Commands for rotary devices: units that tell them, published ones, and nothing mixed."""
+
+import json
+import re
+
+import pytest
+from click.testing import CliRunner
+
+import zwidth
+from zwidth.cli.commands import cli
+
+DEVICE = ["--mass", "12 g cm^2", "--damping", "0.02mNms/rad", "--rate", "1 kHz", "--delay", "1 ms"]
+LINEAR_UNITS = re.compile(r"(N/m|N s/m|\bm?N\b(?! m)|\bk?g\b(?! ?[cm]+\^2))")
+COMMANDS = {
+    "check": ["--stiffness", "2 mN m/deg", "--virtual-damping", "0.4 mN m s/rad", "--friction", "1 mN m"],
+    "ridge": [],
+    "recommend": ["--phase-margin", "20"],
+    "design": ["--stiffness", "4 mN m/deg", "--find", "delay", "--tolerance", "mass=10%"],
+}
+
+
+def run(*arguments):
+    result = CliRunner().invoke(cli, list(arguments))
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_speaks_in_rotary_units(command):
+    text = run(command, *DEVICE, *COMMANDS[command])
+    assert "N m/rad" in text
+    assert not LINEAR_UNITS.search(text), text
+    if command != "design":
+        assert "J = 12.00 g cm^2" in text
+        assert "mN m/deg" in text
+    as_json = run(command, *DEVICE, *COMMANDS[command], "--json")
+    assert not LINEAR_UNITS.search(as_json), as_json
+
+
+def test_the_answer_is_the_one_of_python():
+    found = json.loads(run("ridge", *DEVICE, "--json"))
+    scene = zwidth.Scene(zwidth.Device(12e-7, 2e-5, rotary=True), zwidth.Timing(1e-3, 1e-3))
+    assert found["stiffness_max"] == float(scene.max_stiffness().stiffness)
+    assert found["sensitivities"]["mass"]["unit"] == "N m/rad per kg m^2"
+
+
+def test_a_published_device_brings_its_numbers_and_its_units():
+    wall = ["--rate", "1 kHz", "--stiffness", "20 mN m/deg"]
+    text = run("check", "--device", "haptic_wheel", *wall)
+    assert "J = 4500 g cm^2, b = 1.300 mN m s/rad" in text
+    assert "(20.00 mN m/deg)" in text
+    own = run("check", "--device", "haptic_wheel", "--damping", "2 mN m s/rad", "--rate", "1 kHz", "--stiffness", "1")
+    assert "b = 2.000 mN m s/rad" in own
+    assert "K = 1.000 N m/rad" in own
+    known = next(device.name for device in zwidth.devices.DEVICES if not device.rotary and device.mass)
+    assert "kN/m" in run("ridge", "--device", known, "--damping", "1", "--rate", "1 kHz")
+    result = CliRunner().invoke(cli, ["check", "--device", "haptic_weel", *wall])
+    assert result.exit_code
+    assert "haptic_wheel" in str(result.exception)
+
+
+def test_code_of_a_rotary_wall_says_what_goes_in_and_out():
+    text = run("recommend", *DEVICE, "--code", "c")
+    assert "angle in rad" in text
+    assert "in N m," in text
+    assert "N m/rad" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["ridge", "--mass", "12 g", "--damping", "0.02 mN m s/rad", "--rate", "1 kHz"], "--damping: got '0.02 mN m s"),
+        (["ridge", "--device", "haptic_wheel", "--damping", "2 N s/m", "--rate", "1 kHz"], "beside --damping"),
+        (["check", *DEVICE, "--stiffness", "2 N/m"], "in units of a linear device"),
+        (["check", *DEVICE, "--stiffness", "2", "--friction", "1 N"], "--friction"),
+        (["ridge", *DEVICE, "--coupling-mass", "1 g", "--coupling-stiffness", "1"], "--coupling-mass"),
+        (["ridge", *DEVICE, "--operator-mass", "1 kg"], "--operator-mass"),
+        (["ridge", *DEVICE, "--modes-0-mass", "1 g"], "--modes-0-mass"),
+    ],
+)
+def test_mixing_is_refused(arguments, words):
+    result = CliRunner().invoke(cli, arguments)
+    assert result.exit_code
+    text = result.output + str(result.exception)
+    assert words in text
+    assert "write all of them in" in text
