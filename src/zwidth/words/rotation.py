@@ -6,11 +6,13 @@ What reads and writes units asks `own_unit`, within `use_kind` for the kind of t
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar
+
+from zwidth.words.errors import InputError
 
 ROTARY = {
     "kg": "kg m^2",
@@ -73,10 +75,12 @@ def in_own_units(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
 def find_kind_of(owner: Any) -> bool:
     """Whether a scene, several scenes or a result are of a rotary device; what knows no kind has that in question."""
-    if isinstance(owner, dict):
-        owner = list(owner.values())
-    if isinstance(owner, list) and owner:
-        owner = owner[0]
+    several = owner.values() if isinstance(owner, Mapping) else getattr(owner, "flat", owner)
+    if isinstance(owner, list | Mapping) or several is not owner:
+        kinds = {find_kind_of(each) for each in several}
+        if len(kinds) == 2:
+            raise InputError("scenes: got rotary devices beside linear ones; ask of those of one kind at a time")
+        return kinds.pop() if kinds else is_rotary()
     known = getattr(owner, "in_rotary_units", None)
     if known is None:
         known = getattr(getattr(owner, "device", None), "rotary", None)

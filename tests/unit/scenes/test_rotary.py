@@ -144,6 +144,7 @@ TIMING = zwidth.Timing(1e-3)
         ("start_position", lambda: zwidth.simulate(zwidth.Scene(ROTARY_DEVICE, TIMING), 1, 0, start_position="1 mm")),
         ("mass", lambda: zwidth.Scene(LINEAR_DEVICE, TIMING).replace(mass="12 g cm^2")),
         ("mass", lambda: zwidth.Scene(ROTARY_DEVICE, TIMING).replace(mass="12 g")),
+        ("scenes", lambda: zwidth.simulate([zwidth.Scene(each, TIMING) for each in (LINEAR_DEVICE, ROTARY_DEVICE)], 1)),
         ("rotary", lambda: zwidth.Device(0.1, rotary="yes")),  # pyright: ignore[reportArgumentType]
     ],
 )
