@@ -165,7 +165,7 @@ def _name_targets(required: Table, factor: float, unit: str) -> Iterator[tuple[f
     shares = required["stable_share"] if borne else np.full(len(required["reserve"]), np.nan)
     for wanted, reserve, share in zip(required[SI_COLUMNS[0]], required["reserve"], shares, strict=True):
         words = f"{wanted * factor:.3g} {unit}" + (rf" $\times\,{reserve:g}$" if reserve != 1 else "")
-        yield wanted * reserve, words + (f", borne by {100 * share:.3g} %" if np.isfinite(share) else "")
+        yield wanted * reserve, words + (f": {100 * share:.3g} % of devices bear it" if np.isfinite(share) else "")
 
 
 def _mark_present(ax: Axes, values: np.ndarray, stiffness: np.ndarray, present: float) -> None:

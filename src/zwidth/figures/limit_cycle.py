@@ -7,6 +7,7 @@ from typing import Any
 
 import matplotlib
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
@@ -97,7 +98,8 @@ def draw_limit_cycle_curves(
 ) -> np.ndarray:
     """Draw amplitude (above) and frequency (below) of the buzz over one parameter, a column per condition.
 
-    A gap: silent, or wider than any buzz; a vertical line: boundary of the linear theory.
+    A gap: silent, or wider than any buzz, and a curve that is silent throughout is named in its panel; a vertical line:
+    boundary of the linear theory.
 
     Args:
         arrays: what the npz file of a limit_cycle study holds.
@@ -130,6 +132,7 @@ def draw_limit_cycle_curves(
             for one in curves(edges, "number", condition=labels[column]) if edges and not family else ():
                 ax.axvline(getattr(one, over)[0] * scale, color=style.VERMILION, linewidth=1.0, label="linear")
             if row == 0:
+                _name_silent(ax, looks, cycles[name][column] < bounds[0])
                 style.use_logarithmic(ax, "y", amplitudes)
                 ax.set_title(style.literal(labels[column]) if len(labels) > 1 else "")
             else:
@@ -138,8 +141,18 @@ def draw_limit_cycle_curves(
                 ax.set_ylabel(words)
     handles = [style.line(look["label"], look["linestyle"], color=look["color"]) for look in looks]
     boundary = [style.line("boundary of the linear theory", width=1.0, color=style.VERMILION)] if edges else []
-    style.legend(panels, handles if family else boundary, outside=axes is None, ncols=4)
+    gap = style.line(f"gap: silent, or beyond {with_unit(bounds[1], 'm', 1)}", "")
+    style.legend(panels, [*(handles if family else boundary), gap], outside=axes is None, ncols=4)
     return panels
+
+
+def _name_silent(ax: Axes, looks: list[dict[str, Any]], silent: np.ndarray) -> None:
+    """Write into a panel which curves are nowhere to be seen, and why."""
+    names = [look["label"] for look, nowhere in zip(looks, np.all(silent, axis=-1).tolist(), strict=True) if nowhere]
+    if names:
+        lines = [", ".join(names[k : k + 2]) for k in range(0, len(names), 2)]
+        text = "silent everywhere:\n" + ",\n".join(lines)
+        ax.text(0.04, 0.5, text, transform=ax.transAxes, fontsize=7.5, color=style.GRAY, va="center")
 
 
 def _list_looks(arrays: Mapping[str, np.ndarray], family: str, stable: np.ndarray) -> list[dict[str, Any]]:

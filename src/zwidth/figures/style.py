@@ -50,6 +50,8 @@ AnyAxes: TypeAlias = Axes | Sequence[Axes] | np.ndarray
 WIDTH = 7.0  # inches: both columns of a journal page
 DECADES = 3000.0  # from so many times its least value on, an axis of stiffnesses has powers of ten only
 PNG_DPI = 180
+# Values closer together than this have but one or two of 1, 2 and 5 among them.
+_FEW = 5.0
 
 # Dates and versions out of the files, for the same figure is to give the same bytes.
 _METADATA: Any = {".png": {"Software": None}, ".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
@@ -168,12 +170,15 @@ def legend(axes: np.ndarray, handles: Sequence[Any], *, outside: bool, place: An
 
 
 def use_logarithmic(ax: Axes, which: str, values: Any, wide: float = 100.0) -> None:
-    """A logarithmic axis with plain numbers, which has 2 and 5 as well unless positive values are as far apart."""
+    """A logarithmic axis with plain numbers: 2 and 5 too unless positive values are as far apart, more of a few."""
     getattr(ax, f"set_{which}scale")("log")
     axis, known = getattr(ax, f"{which}axis"), np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known) & (known > 0)]
     near = not known.size or known.max() < wide * known.min()
-    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if near else (1.0,)))
+    few = known.size and known.max() < _FEW * known.min()
+    axis.set_major_locator(
+        LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if few else (1.0, 2.0, 5.0) if near else (1.0,))
+    )
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 

@@ -47,7 +47,9 @@ def test_the_look_is_a_style_of_matplotlib():
         assert dict(matplotlib.rcParams) == ours
 
 
-@pytest.mark.parametrize("low, high", [(2.1, 4.9), (1.1, 1.9), (2.0, 8.0), (2.1, 10.4), (0.3, 40.0), (1e-3, 1e4)])
+@pytest.mark.parametrize(
+    "low, high", [(2.1, 4.9), (7.0, 19.0), (1.1, 1.9), (2.0, 8.0), (2.1, 10.4), (0.3, 40.0), (1e-3, 1e4)]
+)
 def test_a_logarithmic_axis_has_plain_numbers(low, high):
     (ax,) = style.panels(None, 1, 5.0, 3.0)
     style.use_logarithmic(ax, "x", (low, high))

@@ -5,6 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 import zwidth
+from zwidth import figures
 from zwidth.config.faults import problems_of
 from zwidth.studies.limit_cycle import LimitCycleStudy
 
@@ -93,6 +94,20 @@ def test_curves_are_drawn_over_the_other_axis(curves):
         np.testing.assert_allclose(line.get_ydata(), arrays["amplitude_m"][0, k] * 1e6)
         (line,) = [line for line in below.lines if line.get_label() == label]
         np.testing.assert_allclose(line.get_ydata(), arrays["frequency_Hz"][0, k])
+
+
+def test_a_curve_without_a_point_is_named_and_explained():
+    arrays = {
+        "condition": ["rubbing"], "stiffness_N_per_m": [5e3, 1e4], "resolution_m": [1e-6, 1e-5, 1e-4],
+        "amplitude_m": np.array([[[1e-9, 1e-9, 1e-8], [1e-6, 1e-5, 1e-8]]]), "frequency_Hz": np.full((1, 2, 3), 80.0),
+        "outcome": np.full((1, 2, 3), 2), "linearly_stable": np.ones((1, 2, 3), bool),
+    }  # fmt: skip
+    known = {name: np.asarray(values) for name, values in arrays.items()}
+    upper, lower = figures.draw_limit_cycle_curves(known, {}, (1e-7, 1e-3), "stiffness_N_per_m")
+    assert [text.get_text() for text in upper.texts] == ["silent everywhere:\n$K = 5$ kN/m"]
+    assert not lower.texts
+    (legend,) = upper.figure.legends
+    assert [text.get_text() for text in legend.get_texts()][-1] == "gap: silent, or beyond 1 mm"
 
 
 def test_a_limited_motor_swings_as_the_describing_function_says(curves):
