@@ -227,8 +227,8 @@ class Scene(SceneAnswers, SceneOptima):
             for piece in pieces
         ]
 
-    # As a method, with all its named arguments.
     simulate = simulate
+    """`zwidth.simulate` of this scene, with all its arguments."""
 
     def parameters(self) -> dict[str, Any]:
         """Every number of every part by its dotted path.
