@@ -32,10 +32,15 @@ from zwidth.config.faults import (
     problem,
     problems_of,
 )
+from zwidth.parts.devices import DEVICES
 from zwidth.words.formatting import describe
+from zwidth.words.rotation import use_kind
+from zwidth.words.units import tell_kind
 
 _Model = TypeVar("_Model", bound=BaseModel)
 
+# Free text.
+_TEXTS = ("name", "description", "label")
 MAX_FILE_BYTES = 2**20
 MAX_NODES = 50_000
 MAX_DEPTH = 20
@@ -48,7 +53,7 @@ def read_model(path: str | bytes | os.PathLike[str], model: type[_Model]) -> _Mo
     problems = []
     found = None
     try:
-        with files_relative_to(Path(file).parent):
+        with files_relative_to(Path(file).parent), use_kind(tells_rotary(tree.data)):
             found = model.model_validate(tree.data)
     except ValidationError as error:
         problems = problems_of(error)
@@ -63,12 +68,28 @@ def read_mapping(data: Mapping[str, Any], model: type[_Model]) -> _Model:
     problems: list[LocatedProblem] = []
     found = None
     try:
-        found = model.model_validate(_simplify(data, (), problems))
+        simple = _simplify(data, (), problems)
+        with use_kind(tells_rotary(simple)):
+            found = model.model_validate(simple)
     except ValidationError as error:
         problems += problems_of(error)
     if found is None or problems:
         raise ConfigFileError.of(locate("", problems, {}, {}))
     return found
+
+
+def tells_rotary(data: Any, key: str = "") -> bool:
+    """Whether values of a configuration are of rotary devices: a unit of theirs, ``rotary: true``, or one by its name.
+
+    All devices of a file are of one kind, so that what is told of one holds for all. A fit finds the kind in its logs.
+    """
+    if isinstance(data, Mapping):
+        return data.get("kind") != "fit" and any(tells_rotary(each, str(name)) for name, each in data.items())
+    if isinstance(data, list):
+        return any(tells_rotary(each, key) for each in data)
+    if key == "device" and isinstance(data, str):
+        return any(known.rotary for known in DEVICES if known.name == data)
+    return data is True if key == "rotary" else key not in _TEXTS and tell_kind(data) is True
 
 
 def _simplify(value: Any, path: FieldPath, problems: list[LocatedProblem]) -> Any:

@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationInfo, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.arrays.xp import within
-from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Strict
 from zwidth.config.parts import (
     PART_NAMES,
@@ -23,16 +23,20 @@ from zwidth.config.parts import (
 from zwidth.config.values import Delay, NonNegative, Number, describe_entry, quantity_of
 from zwidth.parts.checks import Span
 from zwidth.parts.device import Device
+from zwidth.parts.devices import DEVICES
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import FOAW
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, short
+from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
+from zwidth.words.rotation import is_rotary
 from zwidth.words.types import DelayModel
 
-_PHYSICAL = frozenset({"mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES})
+_PHYSICAL = frozenset(
+    {"device", "rotary", "mass", "damping", "period", "rate", "delay", "stiffness", "virtual_damping", *PART_NAMES}
+)
 _NORMALIZED = frozenset({"delta", "d", "alpha", "beta"})
 
 
@@ -75,10 +79,52 @@ def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
         yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
 
 
+def tell_rotary(value: Any = None) -> bool | None:
+    """What a section keeps: true of a file of rotary devices; nothing of linear ones."""
+    if value is not None and not isinstance(value, bool):
+        raise problem(f"got {describe(value)}", "it must be true or false", "remove it: units tell the kind")
+    if value is False and is_rotary():
+        raise problem("got false", "other devices of the file are rotary, or have units of rotation", "write two files")
+    return value or is_rotary() or None
+
+
+Rotary = Annotated[bool | None, PlainValidator(tell_rotary, json_schema_input_type=bool)]
+_LISTED = "zwidth devices lists them"
+
+
+def _add_device(schema: dict[str, Any]) -> None:
+    """What editors are told of the name of a published device, which stands in the place of mass and damping."""
+    words = "Name of a published device, whose mass and damping are taken where none are written."
+    names = [device.name for device in DEVICES]
+    schema["properties"] = {"device": {"description": words, "enum": names}, **schema["properties"]}
+    schema["required"] = [name for name in schema.get("required", []) if name != "mass"]
+
+
 class _Mass(_OneKind):
     """A mass with damping, sampled, in SI units."""
 
+    # The name of a published device is replaced by its numbers.
+    model_config = ConfigDict(json_schema_extra=_add_device)
+
     foreign: ClassVar[frozenset[str]] = _NORMALIZED
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        """Put the numbers of a published device in the place of its name; those that are written count."""
+        name = raw.get("device")
+        if name is None:
+            return super().prepare(raw)
+        known = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
+        names = tuple(device.name for device in DEVICES)
+        if known is None:
+            what = problem(f"got {describe(name)}", f"published are {listing(names)}", suggestion(name, names, _LISTED))
+            raise validation_error(cls.__name__, [(("device",), what)])
+        if known.rotary != is_rotary():
+            allowed = "this device is linear, and others of the file are rotary"
+            what = problem(f"got {describe(name)}", allowed, "write two files")
+            raise validation_error(cls.__name__, [(("device",), what)])
+        found = {key: number.value for key in ("mass", "damping") if (number := getattr(known, key)) is not None}
+        return super().prepare({**found, **{key: value for key, value in raw.items() if key != "device"}})
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:
@@ -87,10 +133,13 @@ class _Mass(_OneKind):
         return f"{cls.what} has mass and period or rate, or, normalized, delta", "add 'mass: 0.1 kg'"
 
     mass: Annotated[float, quantity_of("mass")]
-    """Moving mass m of the device in kg, > 0."""
+    """Moving mass m of the device in kg, > 0; of a rotary one its inertia in kg m^2."""
 
     damping: Annotated[float, quantity_of("damping")] = 0.0
-    """Physical damping b of the device in N s/m, >= 0."""
+    """Physical damping b of the device in N s/m, >= 0; of a rotary one in N m s/rad."""
+
+    rotary: Rotary = Field(default_factory=tell_rotary)
+    """Whether the device turns, as all of a file do where one quantity has a unit of rotation."""
 
     rate: Annotated[float, quantity_of("rate")] | None = Field(default=None, exclude=True)
     """Sampling rate 1/T in Hz; give it or the period."""
@@ -161,7 +210,8 @@ class _PhysicalPlant(_Parts, _Mass):
     def to_scene(self) -> Scene:
         """The device and its timing in SI units."""
         timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
-        return Scene(Device(mass=self.mass, damping=self.damping), timing).replace(**build_parts(self))
+        device = Device(mass=self.mass, damping=self.damping, rotary=bool(self.rotary))
+        return Scene(device, timing).replace(**build_parts(self))
 
 
 class _NormalizedPlant(_OneKind):
@@ -250,6 +300,7 @@ class PhysicalScene(_PhysicalPlant):
     @property
     def _device_keys(self) -> dict[str, Any]:
         own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay")}
+        own |= {"rotary": True} if self.rotary else {}
         return {**own, **list_parts(self)}
 
     def limits(self) -> Iterable[LocatedProblem]:

@@ -21,7 +21,16 @@ from zwidth.config.fields import Strict, repeated
 from zwidth.parts.checks import Span, read_span
 from zwidth.words.formatting import describe, short, suggestion
 from zwidth.words.quantities import ANY, FRACTION, NOT_NEGATIVE, PARAMETERS, POSITIVE, Range
-from zwidth.words.units import PERIOD_WORDS, check_range, find_dimension, looks_like_number, read_quantity, to_float
+from zwidth.words.rotation import is_rotary, use_kind
+from zwidth.words.units import (
+    PERIOD_WORDS,
+    check_range,
+    find_dimension,
+    find_other,
+    looks_like_number,
+    read_quantity,
+    to_float,
+)
 
 _NOT_FINITE_TEXT = {"nan", "inf", "+inf", "-inf", "infinity"}
 LONGEST_AXIS = 10_000_000
@@ -80,6 +89,7 @@ class Quantity:
         whole: whether they are whole numbers.
         periods: whether it is a length of time, in s or in sampling periods: a `Span`.
         remedy: what helps where another number is given.
+        turns: whether it is an angle, a torque, ... where the device is rotary.
     """
 
     unit: str = "1"
@@ -87,6 +97,7 @@ class Quantity:
     whole: bool = False
     periods: bool = False
     remedy: str = ""
+    turns: bool = True
 
     @cached_property
     def read(self) -> Callable[[Any], Any]:
@@ -94,13 +105,17 @@ class Quantity:
             return raise_problems(lambda value: read_span(value, self.allowed))
         if self.unit == "1":
             return _whole_number(self.allowed) if self.whole else _number(self.allowed, self.remedy)
-        dimension = find_dimension(self.unit)
-        return raise_problems(lambda value: read_quantity(value, dimension, self.allowed)[0])
+        return raise_problems(self._read_quantity)
+
+    def _read_quantity(self, value: Any) -> float:
+        with use_kind(self.turns and is_rotary()):
+            return read_quantity(value, find_dimension(self.unit), self.allowed)[0]
 
     @property
     def schema(self) -> dict[str, Any]:
         if self.unit != "1":
-            return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()))
+            other = find_other(find_dimension(self.unit)) if self.turns else None
+            return describe_entry(self.unit, *(PERIOD_WORDS if self.periods else ()), *(other.units if other else ()))
         low, high, low_open, high_open = self.allowed
         ends = {"exclusiveMinimum" if low_open else "minimum": low}
         ends |= {"exclusiveMaximum" if high_open else "maximum": high}

@@ -23,6 +23,7 @@ from zwidth.sweep.plan import MEMORY, Plan, check_resources, make_plan
 from zwidth.sweep.store import Store, check_installed
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError
+from zwidth.words.rotation import use_kind
 
 AnyConfig = Config | Mapping[str, Any] | str | os.PathLike[str]
 
@@ -249,9 +250,9 @@ class _Run:
         error: Exception | None = None
         with self.record.staging(study.name) as stage:
             try:
-                outcome = study.compute(self.config.scene, alone)
                 look = self.config.figure or FigureLook()
-                with figure_width(look.inches):
+                with use_kind(self.config.rotary), figure_width(look.inches):
+                    outcome = study.compute(self.config.scene, alone)
                     outcome.write(stage, study.name, look.formats)
             except Exception as caught:
                 error = caught
@@ -289,7 +290,8 @@ class _Run:
             # Named before it is made: what a killed run leaves is its own.
             self.record.note(self._spell_sweep(study, "open"))
         try:
-            sweeps = compute_sweeps(planned, self.record.folder, about, progress=follow, **options)
+            with use_kind(self.config.rotary):
+                sweeps = compute_sweeps(planned, self.record.folder, about, progress=follow, **options)
         except KeyboardInterrupt:
             # Before the first chunk began.
             self.interrupted = True

@@ -28,6 +28,7 @@ from zwidth.studies.outcome import ComputedStudy, Outcome, Table, csv_text, summ
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, header, short, suggestion
 from zwidth.words.quantities import PARAMETERS, PHYSICAL, POSITIVE, Range
+from zwidth.words.rotation import own_unit
 from zwidth.words.status import Status
 
 FINDS = tuple(name for name in PHYSICAL if not PARAMETERS[name].whole and name not in ("stiffness", "virtual_damping"))
@@ -117,7 +118,9 @@ class DesignStudy(ComputedStudy):
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
         if not self.stiffness.values().min() > 0:
-            what = problem(f"got {short(float(self.stiffness.values().min()))} N/m", "it must be greater than 0")
+            what = problem(
+                f"got {short(float(self.stiffness.values().min()))} {own_unit('N/m')}", "it must be greater than 0"
+            )
             yield ("stiffness",), what
         known = self._list_parameters()
         if self.find not in known:
@@ -212,7 +215,7 @@ class DesignStudy(ComputedStudy):
         return dict(zip(names, (drawn.stable, drawn.stable_low, drawn.stable_high, drawn.stiffness), strict=True))
 
     def _note(self, stiffness: float, needed: RequiredValue) -> Iterable[str]:
-        wanted = f"{self.reserve * stiffness:g} N/m"
+        wanted = f"{self.reserve * stiffness:g} {own_unit('N/m')}"
         low, high = needed.range
         if needed.status != Status.OK:
             yield f"{wanted}: {self.find} from {low:g} to {high:g}: {Status(needed.status).message}"

@@ -34,6 +34,7 @@ from zwidth.config.study import KINDS, Study, register
 from zwidth.config.values import Quantity
 from zwidth.words.formatting import describe
 from zwidth.words.quantities import Range
+from zwidth.words.rotation import is_rotary
 from zwidth.words.units import looks_like_number
 
 FORMAT_VERSION = 1
@@ -104,7 +105,7 @@ class FigureLook(Strict):
 
     what: ClassVar[str] = "the look of figures"
 
-    width: Annotated[float, Quantity("m", Range(0.05, 0.5))] | None = None
+    width: Annotated[float, Quantity("m", Range(0.05, 0.5), turns=False)] | None = None
     """Width of every figure, as 85 mm of a journal's column; type is no smaller for it."""
 
     format: Literal["png", "svg", "pdf"] | None = None
@@ -144,7 +145,14 @@ class Config(Strict):
     studies: Annotated[tuple[Annotated[Study, _OfAnyKind], ...], WrapValidator(members("studies"))]
     """What to compute, in this order."""
 
+    _rotary: bool = PrivateAttr(default_factory=is_rotary)
+
     _place: _Place = PrivateAttr(default_factory=lambda: _Place(find_file("").absolute()))
+
+    @property
+    def rotary(self) -> bool:
+        """Whether its devices turn."""
+        return self._rotary
 
     @property
     def folder(self) -> Path:

@@ -22,7 +22,7 @@ from zwidth.config.values import Axis, DelayAxis, DeltaAxis
 from zwidth.figures.table import SI_COLUMNS
 from zwidth.scenes.assessment import name_kind
 from zwidth.scenes.stiffest import StiffestWall
-from zwidth.words.formatting import to_cell
+from zwidth.words.formatting import own_header, to_cell
 
 Table: TypeAlias = dict[str, np.ndarray]
 Item = TypeVar("Item")
@@ -65,7 +65,8 @@ class Outcome:
         if self.table:
             (folder / f"{name}.csv").write_text(csv_text(self.table), encoding="utf-8")
         if self.arrays:
-            np.savez_compressed(folder / f"{name}.npz", **self.arrays)  # pyright: ignore[reportArgumentType]
+            arrays = {own_header(key): array for key, array in self.arrays.items()}
+            np.savez_compressed(folder / f"{name}.npz", **arrays)  # pyright: ignore[reportArgumentType]
         for addition, draw in self.figures.items():
             figures.save(draw(), folder / f"{name}{addition}", formats)
 
@@ -171,6 +172,6 @@ def csv_text(table: Table) -> str:
     """A table as CSV; numbers are written with all digits that tell them apart, texts so that no program runs them."""
     buffer = io.StringIO()
     writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow(table)
+    writer.writerow(map(own_header, table))
     writer.writerows(zip(*(map(to_cell, column.tolist()) for column in table.values()), strict=True))
     return buffer.getvalue()

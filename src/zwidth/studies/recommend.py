@@ -100,11 +100,12 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
         spelled = [f"{mark}{spell(row[name], unit)}{mark}" for name, unit in units.items()]
         return " | ".join([*spelled, spell(row["alpha"]), spell(row["beta"])])
 
+    symbol = "J" if device.rotary else "m"
     parts = [f"{name} = {value}" for name, value in found["device"].items() if name not in _BARE]
     lines = [
         "# Recommended virtual wall",
         "",
-        f"Device: m = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, sampled every "
+        f"Device: {symbol} = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, sampled every "
         f"{with_unit(scene.timing.period, 's')}, force delayed by",
         f"{with_unit(scene.timing.delay, 's')} (normalized: delta = {plain(scene.delta)}, d = {plain(scene.d)}).",
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),

@@ -12,6 +12,7 @@ from zwidth.config.device_table import LABEL
 from zwidth.loops.normalization import normalize
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.quantities import PARAMETERS, WALL, Family
+from zwidth.words.rotation import own_unit
 
 
 class Plane(NamedTuple):
@@ -77,7 +78,11 @@ class Grid:
             labels = table.labels or tuple(str(row) for row in range(1, table.size + 1))
             found["device"] = (("device",), np.array(labels), {"long_name": f"{LABEL} of the device"})
         for name, values in self._values.items():
-            units = "sampling periods" if name == "delay" and self.axes.delay_in_periods else PARAMETERS[name].unit
+            units = (
+                "sampling periods"
+                if name == "delay" and self.axes.delay_in_periods
+                else own_unit(PARAMETERS[name].unit)
+            )
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
             variable = PARAMETERS[name].variable
             if table is not None and name in table.columns:

@@ -28,6 +28,7 @@ from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.study import SweepStudy
 from zwidth.words.errors import InputError, StoreError, StoreExistsError
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
+from zwidth.words.rotation import own_unit
 
 if TYPE_CHECKING:
     import zarr
@@ -276,7 +277,7 @@ def _build(path: Path, plan: Plan, grid: Grid) -> None:
             output = OUTPUTS[name]
             attributes = {"long_name": output.long_name, **output.flags}
             if output.dtype == "float64":
-                attributes["units"] = output.units_in(grid.physical)
+                attributes["units"] = own_unit(output.units_in(grid.physical))
             attributes["ancillary_variables"] = STATUS_OF[family.family]
             group.create_array(name, dtype=output.dtype, attributes=attributes, **common, **keeping[output.dtype])
         group.create_array(STATUS_OF[family.family], dtype="uint8", attributes=status_flags(), **common, **code)

@@ -13,7 +13,7 @@ from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
-from zwidth.config.scenes import AnyScene, PhysicalScene, find_second_period, is_with_parts
+from zwidth.config.scenes import AnyScene, PhysicalScene, Rotary, find_second_period, is_with_parts, tell_rotary
 from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
@@ -172,6 +172,9 @@ class SweepStudy(_Parts, _Swept):
     from_scene = ("delay_model",)
     takes_parts = True
 
+    rotary: Rotary = Field(default_factory=tell_rotary)
+    """Whether its devices turn, as all of a file do where one quantity has a unit of rotation."""
+
     outputs: Annotated[tuple[OutputName, ...], WrapValidator(members("outputs"))] = ("stable",)
     """What is computed."""
 
@@ -316,7 +319,7 @@ class SweepStudy(_Parts, _Swept):
                 parts[part] = PARTS[part](
                     **{path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{part}.")}
                 )
-        device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0))
+        device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0), rotary=bool(self.rotary))
         return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
     def _delay_limits(self, given: tuple[str, ...]) -> Iterable[LocatedProblem]:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from zwidth.words.errors import InputError
-from zwidth.words.rotation import is_rotary, own_unit
+from zwidth.words.rotation import ROTARY, is_rotary, own_unit
 
 _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
@@ -77,6 +77,15 @@ def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
 def header(name: str, unit: str) -> str:
     """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
     return name if unit in ("", "1", "sampling periods") else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
+
+
+def own_header(name: str) -> str:
+    """The name of a column with the unit of the kind of device in question, as ``stiffness_N_m_per_rad``."""
+    for unit in sorted(ROTARY, key=len, reverse=True) if is_rotary() else ():
+        ending = header("", unit)
+        if name.endswith(ending):
+            return name.removesuffix(ending) + header("", ROTARY[unit].replace("^", ""))
+    return name
 
 
 def to_json(value: Any) -> Any:

@@ -1,0 +1,128 @@
+"""Rotary devices in configurations: read, computed, written and never mixed with linear ones."""
+
+import csv
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.config.reader import read_mapping
+from zwidth.studies.document import Config, load_config
+
+SCENE: dict[str, Any] = {"mass": "12 g cm^2", "damping": "0.02 mN m s/rad", "rate": "1 kHz", "delay": "1 ms"}
+WALL = {"stiffness": "2 mN m/deg", "virtual_damping": "0.4 mN m s/rad"}
+RECOMMEND = {"kind": "recommend", "name": "set"}
+
+
+def read(scene: Any = None, *studies: dict[str, Any], **top: Any) -> Config:
+    given = {"version": 1, "name": "turn", "studies": list(studies) or [RECOMMEND], **top}
+    return read_mapping(given if scene is None else {**given, "scene": scene}, Config)
+
+
+def refuse(scene: Any, *studies: dict[str, Any]) -> str:
+    with pytest.raises(zwidth.ConfigError) as refused:
+        read(scene, *studies)
+    return str(refused.value)
+
+
+def test_units_of_rotation_make_the_devices_of_a_file_rotary():
+    config = read(SCENE | WALL)
+    scene = config.scene.to_scene()  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    assert config.rotary
+    assert scene.device == zwidth.Device(12e-7, 2e-5, rotary=True)
+    assert scene.wall.stiffness == pytest.approx(0.36 / np.pi, rel=1e-14)
+    # As it is written and read again, in numbers.
+    spelled = config.model_dump(mode="json", exclude_none=True)
+    again = read_mapping(spelled, Config)
+    assert again.rotary
+    assert again.model_dump(mode="json", exclude_none=True) == spelled
+    assert not read({"mass": 0.1, "rate": 1000, "rotary": False}).rotary
+    assert "rotary" not in str(read({"mass": 0.1, "rate": 1000}).model_dump(mode="json", exclude_none=True))
+    assert read({"mass": 1e-6, "rate": 1000, "rotary": True}).rotary
+
+
+def test_a_published_device_stands_by_its_name():
+    config = read({"device": "haptic_wheel", "rate": "1 kHz", "stiffness": 1.0})
+    assert config.rotary
+    wheel = zwidth.devices.find_device("haptic_wheel").to_device()
+    assert config.scene.to_scene().device == wheel  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    own = read({"device": "haptic_wheel", "damping": "2 mN m s/rad", "rate": "1 kHz"})
+    assert own.scene.damping == 2e-3  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    assert "did you mean 'haptic_wheel'?" in refuse({"device": "haptic_weel", "rate": "1 kHz"})
+    name = next(device.name for device in zwidth.devices.DEVICES if device.mass and not device.rotary)
+    assert not read({"device": name, "rate": "1 kHz"}).rotary
+    assert "others of the file are rotary" in refuse({"device": name, "rate": "1 kHz", "stiffness": "1 N m/rad"})
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"mass": "12 g"}, "scene.mass"),
+        ({"damping": "2 N s/m"}, "scene.damping"),
+        ({"stiffness": "2 N/m"}, "scene.stiffness"),
+        ({"operator": {"mass": "0.5 kg"}}, "scene.operator.mass"),
+        ({"coupling": {"mass": "3 g cm^2", "stiffness": "20 kN/m"}}, "scene.coupling.stiffness"),
+        ({"modes": [{"frequency": 100, "damping_ratio": 0.1, "mass": "3 g"}]}, "scene.modes[0].mass"),
+        ({"rotary": False}, "scene.rotary"),
+    ],
+)
+def test_mixing_is_refused_where_it_stands(change, field):
+    text = refuse(SCENE | change)
+    assert text.startswith(f"{field}: got ")
+    assert "linear" in text or "rotation" in text
+
+
+def test_a_study_of_the_file_is_not_of_the_other_kind():
+    motion = {"kind": "simulate", "name": "m", "duration": "0.1 s", "start_position": "1 mm"}
+    assert "studies[0].start_position: got '1 mm', a unit of a linear device" in refuse(SCENE | WALL, motion)
+
+
+def test_a_typing_error_is_not_taken_for_a_linear_unit(tmp_path):
+    file = tmp_path / "a.yaml"
+    scene = "{mass: 0.1, rate: 1 kHz, damping: 0.02 mN m s/rd}"
+    file.write_text(f"version: 1\nname: a\nscene: {scene}\nstudies: [{{kind: recommend, name: r}}]\n")
+    with pytest.raises(zwidth.ConfigError, match=r"a\.yaml:3:.*did you mean 'mN m s/rad'\?"):
+        load_config(file)
+    file.write_text(file.read_text().replace("s/rd", "s/rad"))
+    # A number alone is of the kind of the file, and 0.1 kg m^2 is an inertia.
+    assert load_config(file).rotary
+    file.write_text(file.read_text().replace("mass: 0.1", "mass: 100 g"))
+    with pytest.raises(zwidth.ConfigError) as refused:
+        load_config(file)
+    assert "mN s/m" not in str(refused.value)
+    assert re.search(r"a\.yaml:3:15: scene\.mass: got '100 g', a unit of a linear device", str(refused.value))
+
+
+def test_the_width_of_a_figure_stays_a_length():
+    assert read(SCENE, figure={"width": "85 mm"}).figure.width == 0.085  # pyright: ignore[reportOptionalMemberAccess]
+
+
+def test_a_run_writes_rotary_units(tmp_path):
+    axes = {"stiffness": {"linear": {"start": 0, "stop": "0.3 N m/rad", "num": 4}}, "virtual_damping": [1e-4, 5e-4]}
+    sweep = {"kind": "sweep", "name": "s", "axes": axes, "outputs": ["stable", "stiffness_max"]}
+    motion = {"kind": "simulate", "name": "m", "duration": "0.05 s", "start_position": "1 deg", "coulomb": "1 uN m"}
+    needs = {"kind": "design", "name": "d", "stiffness": ["10 mN m/deg"], "find": "delay"}
+    scene = SCENE | WALL
+    config = {"version": 1, "name": "a", "scene": scene, "studies": [RECOMMEND, sweep, motion | {"coulomb": 0}, needs]}
+    assert zwidth.run(config, out=tmp_path / "a").ok
+    with open(tmp_path / "a" / "m.csv", encoding="utf-8") as stream:
+        names = next(csv.reader(stream))
+    assert {"stiffness_N_m_per_rad", "position_rad", "velocity_rad_per_s", "command_N_m"} <= set(names)
+    assert not [name for name in names if re.search(r"(_m|N_per_m|_N)$", name) and not name.endswith("N_m")]
+    told = (tmp_path / "a" / "recommendation.md").read_text(encoding="utf-8")
+    assert "J = 12.00 g cm^2" in told
+    assert not re.search(r"N/m|N s/m|kg\b", told)
+    data = zwidth.open_dataset(tmp_path / "a" / "s.zarr")
+    units = {name: data[name].attrs.get("units") for name in ("stiffness", "virtual_damping", "mass", "stiffness_max")}
+    assert units == {
+        "stiffness": "N m/rad",
+        "virtual_damping": "N m s/rad",
+        "mass": "kg m^2",
+        "stiffness_max": "N m/rad",
+    }
+    top = zwidth.Scene(zwidth.Device(12e-7, 2e-5, rotary=True), zwidth.Timing(1e-3, 1e-3)).max_stiffness().stiffness
+    np.testing.assert_allclose(data["stiffness_max"].values, top, rtol=1e-12)
+    # The same once more from what the run kept.
+    assert zwidth.run(tmp_path / "a" / "config.yaml", out=tmp_path / "a", resume=True).ok
