@@ -17,6 +17,7 @@ from zwidth.cli.options import (
     quantity_type,
     read_period,
     read_share,
+    tell_long_logs,
     velocity_options,
 )
 from zwidth.pages.words import row, tell
@@ -85,6 +86,7 @@ _SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 @click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts, :deg.")
 @click.option("--force", help="Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.")
 @click.option("--resolution", metavar="QUANTITY", help="One count of the encoder, as 0.03mm or 0.09deg.")
+@click.option("--motor-constant", metavar="QUANTITY", help="What an ampere of a force in A makes, as 5N/A.")
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
@@ -124,7 +126,7 @@ def fit(
     if walls:
         for name, value in {**columns, "max-delay": max_delay, "resample": resample or None}.items():
             if value is not None:
-                raise click.UsageError(f"--{name} belongs to a LOG.csv")
+                raise click.UsageError(f"--{name.replace('_', '-')} belongs to a LOG.csv")
         if period is None:
             raise click.UsageError("give --period or --rate")
         from zwidth.fitting.buzz import BuzzPoint, fit_buzz
@@ -145,8 +147,9 @@ def fit(
             raise click.UsageError("give one of --time, --period and --rate")
         from zwidth.fitting.columns import fit_motions, read_log
 
-        step = columns.pop("resolution")
-        motions = [read_log(log, columns, resolution=step, period=period) for log in logs]
+        options = {name: columns.pop(name) for name in ("resolution", "motor_constant")}
+        tell_long_logs(logs)
+        motions = [read_log(log, columns, period=period, **options) for log in logs]
         units = ROTARY if motions[0].rotary else LINEAR
         found = fit_motions(motions, period=period, velocity=velocity, max_delay=max_delay, resample=resample)
         source = " and ".join(log.name for log in logs)

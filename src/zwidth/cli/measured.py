@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import figure_option, json_option, quantity_type, velocity_options
+from zwidth.cli.options import figure_option, json_option, quantity_type, tell_long_logs, velocity_options
 from zwidth.pages.words import row, tell
 from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import POSITIVE
@@ -56,6 +56,7 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
 @click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts.")
 @click.option("--force", help="Column of the commanded force: its header, or HEADER:mN.")
 @click.option("--resolution", metavar="QUANTITY", help="One count of the encoder, as 0.03mm.")
+@click.option("--motor-constant", metavar="QUANTITY", help="What an ampere of a force in A makes, as 5N/A.")
 @click.option("--save", type=_FILE, metavar="FILE.csv", help="Keep the response.")
 @velocity_options
 @figure_option
@@ -66,6 +67,7 @@ def respond(
     table: bool,
     cycle: float | None,
     resolution: str | None,
+    motor_constant: str | None,
     save: Path | None,
     velocity: Any,
     figure: Path | None,
@@ -91,7 +93,9 @@ def respond(
     else:
         if columns["time"] is not None and period is not None:
             raise click.UsageError("give one of --time and --period")
-        motions = [read_log(log, columns, resolution=resolution, period=period) for log in logs]
+        options = {"resolution": resolution, "motor_constant": motor_constant, "period": period}
+        tell_long_logs(logs)
+        motions = [read_log(log, columns, **options) for log in logs]
         found = respond_to_logs(motions, period=period, cycle=cycle)
         device, period, doubts = found.device, found.period, found.doubts
         kind = "stretches of a force that repeats" if found.cycle else "pieces"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import MISSING, fields
 from functools import wraps
 from pathlib import Path
@@ -32,6 +32,8 @@ _PLAUSIBLE = {
     "cutoff": (0.05, 1e6),
     "time_constant": (1e-7, 5.0),
 }
+# In bytes.
+_LONG = 2**23
 # Kinds of quantities with another name.
 _OF_UNIT = {"N s/m": "damping", "N/m": "spring", "s": "period", "kg": "mass"}
 # The slips: the same number with another unit, or as another quantity.
@@ -287,3 +289,11 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON f
 velocity_options = _take_options(
     "velocity", [path for path in _PARTS if path.startswith("velocity.")], (), _make_velocity
 )
+
+
+def tell_long_logs(logs: Iterable[Path]) -> None:
+    """Say on the error stream which logs are read where that takes a while."""
+    for log in logs:
+        size = log.stat().st_size if log.is_file() else 0
+        if size > _LONG:
+            click.echo(f"zwidth: reading {log.name}, {size / 2**20:.0f} MiB; then the numbers are computed", err=True)

@@ -1,10 +1,11 @@
-"""Logs in CSV files: columns in any order, under any names, in any units, read into SI units.
+"""Logs in files: columns in any order, under any names, in any units, read into SI units (`formats` finds them).
 
-A file has a line of column names and a line a sample, as `sweep.files.cells` reads it.
+A velocity is summed up to a position, and a current is a force by the constant of its motor.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -13,16 +14,14 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit
+from zwidth.fitting.formats import COUNTS, LogTable, read_table, split_head
 from zwidth.fitting.log import fit_log
 from zwidth.words.errors import InputError, UnusableValueError
-from zwidth.words.formatting import describe, read_rows, split_title, suggestion, with_unit
+from zwidth.words.formatting import describe, suggestion, with_unit
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
 
 QUANTITIES = ("time", "position", "force")
-COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
-"""Units of a position that its encoder's resolution translates."""
-
 # What each may be in, a linear axis first, and the names that say so by themselves.
 _DIMENSIONS: dict[str, tuple[Dimension, ...]] = {"time": (TIME,), "position": (LENGTH, ANGLE), "force": (FORCE, TORQUE)}
 _NAMES = {
@@ -30,7 +29,13 @@ _NAMES = {
     "position": ("position", "pos", "x", "encoder", "angle", "phi", "theta", "q"),
     "force": ("force", "f", "torque", "tau"),
 }
-_MOST_BYTES = 2**28
+# What is read in place of a position or a force that no name says, and the unit without one.
+_INSTEAD = {
+    "position": (("velocity", "vel", "speed", "v", "omega", "w", "dx"), "m/s"),
+    "force": (("current", "i", "iq", "i_q", "amps"), "A"),
+}
+_AMPERES = {"A": 1.0, "mA": 1e-3}
+_PER_AMPERE = re.compile(r"(.*?)\s*/\s*A\s*")
 # Periods that differ by more are two.
 _OTHER = 0.1
 
@@ -61,57 +66,100 @@ class LoggedMotion:
 
 
 def read_log(
-    file: str | Path, columns: Mapping[str, str | None], *, resolution: Any = None, period: float | None = None
+    file: str | Path,
+    columns: Mapping[str, str | None],
+    *,
+    resolution: Any = None,
+    period: float | None = None,
+    motor_constant: str | None = None,
 ) -> LoggedMotion:
     """Read the time, the position and the force of a log.
 
     Args:
-        file: of UTF-8 text.
-        columns: the column of ``time``, ``position`` and ``force`` by its header, or its header without the unit in
-            brackets; ``COLUMN:unit`` where the header has none, or a wrong one. Of what is left out the column is
-            found by its name.
+        file: columns between commas, semicolons, tabs or blanks, in UTF-8, UTF-16 or Latin-1, packed by gzip or not,
+            with a preamble and a line of units or not; of NumPy, .npz or .npy; of MATLAB, .mat up to version 7.
+        columns: the column of ``time``, ``position`` and ``force`` by its header, or its header without the unit, or
+            its number where a file has no names; ``COLUMN:unit`` where the header has none, or a wrong one. Of what is
+            left out the column is found by its name. Times may be those of a calendar, ISO 8601. A position in m/s,
+            rad/s or counts/s is summed up: of a velocity that is the difference of two positions, and not filtered.
         resolution: of the encoder, a length or an angle with its unit, for one count; a number is in m, or in rad with
             a torque.
         period: of the samples, in s, where the time is not to be read.
+        motor_constant: what a force in A or mA is multiplied with, as "5 N/A" or "0.03 N m/A".
 
     Raises:
         InputError: a column is missing, or may be several; a unit is unknown; a cell holds no number; a length is
             paired with a torque; a column of times with their unit contradicts the period.
     """
-    lines = _read_lines(Path(file))
-    heads = lines[0][1]
+    table = read_table(Path(file))
+    heads = table.heads
     wanted = [name for name in QUANTITIES if name != "time" or period is None]
+    if table.nameless and not all((columns.get(name) or "").partition(":")[0] in heads for name in wanted):
+        raise InputError(table.nameless)
     places = {name: _find_column(file, heads, name, columns.get(name)) for name in wanted}
-    units = {name: _read_unit(name, unit) for name, (_, unit) in places.items()}
     taken = [at for at, _ in places.values()]
     if len(set(taken)) < len(taken):
         words = ", ".join(f"{name} {heads[at]!r}" for name, (at, _) in places.items())
         raise InputError(f"{file}: one column is taken twice: {words}; name another")
-    numbers = _read_numbers(file, lines, {name: at for name, (at, _) in places.items()})
+    given = {name: unit for name, (_, unit) in places.items()}
+    moves = _without_rate(given["position"])
+    units = {**given, "position": moves or given["position"]}
+    constant = 1.0
+    if given["force"] in _AMPERES:
+        constant, units["force"] = _read_constant(motor_constant, given["force"])
+    units = {name: _read_unit(name, unit) for name, unit in units.items()}
     rotary, step = _pair_units(units, resolution)
+    factors = {name: 1.0 if unit in COUNTS else _factor(name, unit) for name, unit in units.items()}
     if units["position"] in COUNTS:
         if step is None:
             raise InputError(
                 "position: it is in counts; give the resolution, as 0.03 mm or 0.09 deg for a count of the encoder"
             )
-        numbers["position"] = numbers["position"] * step
-    for name in wanted:
-        if units[name] not in COUNTS:
-            numbers[name] = numbers[name] * _factor(name, units[name])
+        factors["position"] = step
+    factors["force"] *= constant
+    columns_read = dict(zip(wanted, table.numbers(taken), strict=True))
+    numbers = {name: column * factors[name] for name, column in columns_read.items()}
     if period is not None:
-        _compare_period(file, lines, period)
+        _compare_period(file, table, period)
+    if moves is not None:
+        time = numbers.get("time", np.zeros(1))
+        apart = float(time[-1] - time[0]) / max(1, time.size - 1) if period is None else period
+        numbers["position"] = np.cumsum(numbers["position"]) * apart * (1 / 60 if given["position"] == "rpm" else 1.0)
     return LoggedMotion(numbers.get("time"), numbers["position"], numbers["force"], step, rotary)
 
 
-def _compare_period(file: str | Path, lines: list[tuple[int, list[str]]], period: float) -> None:
+def _without_rate(unit: str) -> str | None:
+    """The length, angle or counts that a velocity sums up to; None of no velocity."""
+    if unit == "rpm":
+        return "turns"
+    base, per, second = unit.rpartition("/")
+    return base if per and second == "s" else None
+
+
+def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
+    """N or N m that one of a unit of current makes, and which of them."""
+    match = _PER_AMPERE.fullmatch(constant or "")
+    for dimension in (FORCE, TORQUE):
+        try:
+            if match:
+                return read_quantity(match[1], dimension, POSITIVE)[0] * _AMPERES[unit], dimension.base
+        except UnusableValueError:
+            continue
+    got = "nothing" if constant is None else describe(constant)
+    raise InputError(
+        f"motor_constant: got {got} for a force in {unit}; write what an ampere makes, as 5 N/A or 0.03 N m/A"
+    )
+
+
+def _compare_period(file: str | Path, table: LogTable, period: float) -> None:
     """Raise `InputError` where a column of times, in a unit that it says, is of another period than the one given."""
-    heads = [split_title(head) for head in lines[0][1]]
+    heads = [split_head(head) for head in table.heads]
     found = [(at, unit) for at, (name, unit) in enumerate(heads) if name.lower() in _NAMES["time"] and unit]
     if len(found) != 1:
         return
     try:
         factor = _factor("time", _read_unit("time", found[0][1]))
-        time = factor * _read_numbers(file, lines, {"time": found[0][0]})["time"]
+        time = factor * table.numbers([found[0][0]])[0]
     except InputError:
         # The period may be given for the times' sake.
         return
@@ -123,34 +171,17 @@ def _compare_period(file: str | Path, lines: list[tuple[int, list[str]]], period
         )
 
 
-def _read_lines(file: Path) -> list[tuple[int, list[str]]]:
-    """The row of names and those of samples."""
-    rows, separator = read_rows(file, _MOST_BYTES)
-    if not rows:
-        raise InputError(f"{file}: it is empty; a line of column names and a line a sample are needed")
-    line, heads = rows[0]
-    if len(heads) == 1:
-        raise InputError(f"{file}:{line}: got {heads[0][:60]!r}; separate the columns by commas, semicolons or tabs")
-    if all(looks_like_number(name.replace(",", ".")) for name in heads if name):
-        raise InputError(
-            f"{file}:{line}: got numbers where the names of the columns are expected; add a line such as "
-            f"{separator.join(('time [s]', 'position [m]', 'force [N]'))!r}, without # before it"
-        )
-    if len(rows) < 2:
-        raise InputError(f"{file}: it has names of columns and no samples; record some")
-    for number, cells in rows[1:]:
-        if any(cells[len(heads) :]):
-            hint = "; a comma as decimal sign needs semicolons between the columns" if separator == "," else ""
-            raise InputError(f"{file}:{number}: got {len(cells)} cells for {len(heads)} columns{hint}")
-    return rows
-
-
 def _find_column(file: str | Path, heads: Sequence[str], name: str, wanted: str | None) -> tuple[int, str]:
     """The column's index and its unit, "" where nothing says it."""
     if wanted is None:
-        found = [k for k, head in enumerate(heads) if split_title(head)[0].lower() in _NAMES[name]]
+        titles = [split_head(head) for head in heads]
+        others, usual = _INSTEAD.get(name, ((), ""))
+        found = [k for k, (title, _) in enumerate(titles) if title.lower() in _NAMES[name]]
+        instead = [k for k, (title, _) in enumerate(titles) if title.lower() in others]
         if len(found) == 1:
-            return found[0], split_title(heads[found[0]])[1]
+            return found[0], titles[found[0]][1]
+        if not found and len(instead) == 1:
+            return instead[0], titles[instead[0]][1] or usual
         what = f"may be any of {_listing(heads[k] for k in found)}" if found else f"is none of {_listing(heads)}"
         raise InputError(f"{name}: by its name it {what} in {file}; say which column it is")
     title, unit = wanted.strip(), None
@@ -162,16 +193,16 @@ def _find_column(file: str | Path, heads: Sequence[str], name: str, wanted: str 
         title = title or wanted.strip()
         if found:
             raise InputError(f"{name}: {file} has {len(found)} columns {title!r}; give each a name of its own")
-        known = [*heads, *(split_title(head)[0] for head in heads)]
+        known = [*heads, *(split_head(head)[0] for head in heads)]
         hint = suggestion(title, known, f"it has {_listing(heads)}")
         raise InputError(f"{name}: {file} has no column {title!r}; {hint}")
-    return found[0], split_title(heads[found[0]])[1] if unit is None else unit
+    return found[0], split_head(heads[found[0]])[1] if unit is None else unit
 
 
 def _matches(heads: Sequence[str], title: str) -> list[int]:
     """Columns of this header; else those of this name before the brackets."""
     whole = [k for k, head in enumerate(heads) if head == title]
-    return whole or [k for k, head in enumerate(heads) if title and split_title(head)[0] == title]
+    return whole or [k for k, head in enumerate(heads) if title and split_head(head)[0] == title]
 
 
 def _listing(heads: Any) -> str:
@@ -241,31 +272,6 @@ def read_step(resolution: Any) -> tuple[float, bool | None]:
             raise InputError(
                 f"resolution: {what}; {allowed}, or with one of {', '.join(ANGLE.units)}: as 0.03 mm or 0.09 deg"
             ) from None
-
-
-def _read_numbers(
-    file: str | Path, lines: list[tuple[int, list[str]]], places: Mapping[str, int]
-) -> dict[str, np.ndarray]:
-    """The columns as they stand."""
-    heads, samples = lines[0][1], lines[1:]
-    read = {}
-    for name, at in places.items():
-        try:
-            # Python would read 1_000 as well.
-            cells = [row[at] for _, row in samples]
-            values = np.array([float(cell) if "_" not in cell else np.nan for cell in cells])
-        except (ValueError, IndexError):
-            values = np.full(len(samples), np.nan)
-        if not np.all(np.isfinite(values)):
-            for number, row in samples:
-                got = row[at] if at < len(row) else ""
-                if not (looks_like_number(got) and np.isfinite(float(got))):
-                    raise InputError(
-                        f"{file}:{number}: got {repr(got) if got else 'nothing'} under {heads[at]!r}; "
-                        "a number is needed"
-                    )
-        read[name] = values
-    return read
 
 
 def fit_motions(motions: Sequence[LoggedMotion], *, period: float | None = None, **options: Any) -> DeviceFit:

@@ -56,7 +56,7 @@ class FurtherExperiment(NamedTuple):
 class FittedMotion(NamedTuple):
     """One log beside its fit, a number a sample: times in s, forces in N, positions in m.
 
-    ``modelled`` is NaN at the first samples, whose past forces are unknown.
+    ``modelled`` is NaN at the first samples, whose past forces are unknown, and behind the first 200,000.
     """
 
     time: np.ndarray

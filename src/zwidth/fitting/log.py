@@ -37,6 +37,8 @@ _LIGHTEST, _HEAVIEST = 2e-3, 10.0
 _FARTHEST, _STRONGEST = 3.0, 1e3
 # Fewer positions than this are explained by other devices as well, far outside of the errors.
 _FEW = 60
+# So many positions of all logs are fitted, minutes of a record: more would cost gigabytes and narrow errors alone.
+_MOST = 200_000
 # A slope of less than so many of its standard errors is none.
 _SEEN = 5.0
 # Sums of what the fit leaves may spread so many times more than noise's, before it is doubted.
@@ -76,7 +78,7 @@ def fit_log(
         force: commanded at the samples, in N, positive towards growing positions.
         velocity: how the loop whose K_max is asked for estimates its velocity; the backward difference by default.
         max_delay: the longest delay looked for, in s; 20 periods by default. So much of the beginning serves only as
-            past force.
+            past force. Of all logs the first 200,000 samples are fitted.
         resolution: step of the encoder, in m; found from the positions where left out; 0 for none.
         resample: whether times off by up to a quarter of a period are those of a clock that wavers: the samples are
             taken as they are, even, with the period of all times; 5 % otherwise.
@@ -123,7 +125,7 @@ def fit_log(
     logs, period, wavers = read_logs(time, position, force, resample)
     longest = _LONGEST if max_delay is None else check_number("max_delay", max_delay, "s", NOT_NEGATIVE) / period
     skip = int(np.ceil(longest)) + 2
-    recordings = tuple(log.recording(skip, k) for k, log in enumerate(logs))
+    recordings = tuple(log.recording(skip, k).begin(_MOST // len(logs)) for k, log in enumerate(logs))
     doubts = [doubt for log in logs for doubt in find_stretches(log)]
     step, odd = _find_step(resolution, logs)
     best = fit_model(recordings, longest, step)
@@ -276,9 +278,12 @@ def _doubt(values: np.ndarray, errors: np.ndarray, best: FittedModel, logs: tupl
 
 
 def _place(best: FittedModel, logs: tuple[Log, ...], skip: int, period: float) -> tuple[FittedMotion, ...]:
-    """Every log beside its fit, NaN at its first samples."""
-    ends = np.cumsum([log.force.size - skip for log in logs])
-    places = [np.append(np.full(skip, np.nan), part) for part in np.split(best.moved[0], ends[:-1])]
+    """Every log beside its fit, NaN at its first samples and where it is too long."""
+    places = []
+    for log, part in zip(logs, best.model.split(best.moved[0]), strict=True):
+        place = np.full(log.force.size, np.nan)
+        place[skip : skip + part.size] = part
+        places.append(place)
     return tuple(
         FittedMotion(period * np.arange(place.size), log.force, log.position, place)
         for log, place in zip(logs, places, strict=True)

@@ -221,6 +221,10 @@ class Recordings:
         """All positions that count."""
         return np.concatenate([log.position for log in self.logs])
 
+    def split(self, column: np.ndarray) -> list[np.ndarray]:
+        """What of a column over samples belongs to each log."""
+        return np.split(column, np.cumsum([log.position.size for log in self.logs])[:-1])
+
     @property
     def size(self) -> int:
         """How many numbers theta has."""

@@ -7,6 +7,8 @@ import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
+import numpy as np
+
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
 from zwidth.parts.paths import spell_estimate
 from zwidth.words.formatting import plain, with_unit
@@ -93,6 +95,9 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
     if fit.status != Status.OK:
         rows.append((Status(fit.status).name, f"do not rely on these numbers: {name_trouble(fit)}"))
     rows.append(("fitted to", source))
+    if any(np.isnan(motion.modelled[-1]) for motion in fit.motions):
+        count, total = int(np.isfinite(fit.residuals).sum()), fit.residuals.size
+        rows.append(("of it", f"{count:,} of {total:,} samples, the first ones; more would only narrow the errors"))
     names = ("mass", "damping", "delay", *(["cutoff"] if "cutoff" in fit.errors else []), "stiffness_max")
     for name in names:
         symbol = "J" if name == "mass" and units is ROTARY else SYMBOLS[name]

@@ -51,12 +51,12 @@ Step = Annotated[float | str, BeforeValidator(_read_resolution), WithJsonSchema(
 
 
 class LogSection(Strict):
-    """One log: a CSV file and which of its columns is what."""
+    """One log: a file of columns and which of them is what."""
 
     what: ClassVar[str] = "a log"
 
     csv: str
-    """Name of the file, relative to the configuration."""
+    """Name of the file, relative to the configuration: a text of columns, .npz, .npy or .mat."""
 
     time: str | None = None
     """Header of the column of times, or header:unit; found by its name where left out, not read where there is a
@@ -70,6 +70,9 @@ class LogSection(Strict):
 
     resolution: Step | None = None
     """One count of the encoder, a length or an angle; needed for positions in counts."""
+
+    motor_constant: str | None = None
+    """What an ampere makes, as 5 N/A or 0.03 N m/A; needed for forces in A or mA."""
 
     sha256: str | None = None
     """Digest of the file; another file is refused. Where left out it is the file's own, for the record."""
@@ -91,7 +94,8 @@ class LogSection(Strict):
 
     def read(self, period: float | None) -> LoggedMotion:
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
-        return read_log(find_file(self.csv), columns, resolution=self.resolution, period=period)
+        options = {"resolution": self.resolution, "motor_constant": self.motor_constant}
+        return read_log(find_file(self.csv), columns, period=period, **options)
 
 
 def _digest(name: Any) -> str:

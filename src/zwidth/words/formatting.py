@@ -8,11 +8,15 @@ decimal signs.
 
 from __future__ import annotations
 
+import codecs
 import csv
 import difflib
+import gzip
 import math
 import re
-from collections.abc import Iterable, Mapping
+import zlib
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +27,7 @@ _PREFIXES = {-9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}
 LONGEST_VALUE = 60
 _REMARK = re.compile(r"\s*#|\s*\"?sep=.\"?\s*$", re.IGNORECASE)
 _TITLE = re.compile(r"(.*?)\s*(?:\[([^\[\]]*)\]|\(([^()]*)\))?")
+_CODINGS, _GZIP, _NO_TEXT = ("utf-8-sig", "cp1252", "latin-1"), b"\x1f\x8b", re.compile("[\0-\x08\x0e-\x1f]")
 _DECIMAL_COMMA = re.compile(r"^([-+]?[0-9]*),(?=[0-9][^.]*$)")
 
 
@@ -154,29 +159,60 @@ def short(value: float) -> str:
     return text if float(text) == value else repr(value)
 
 
-def read_rows(file: Path, most_bytes: int) -> tuple[list[tuple[int, list[str]]], str]:
-    """The row of names and those below that hold something, each with its line; and what separates cells."""
+def read_lines(file: Path, most_bytes: int) -> list[str]:
+    """The lines of a text: UTF-8, UTF-16 with its mark, else Latin-1 as Windows has it; packed by gzip or not."""
     # A pipe would be waited for.
     if not file.is_file():
         raise InputError(f"{file}: {'it is no file' if file.exists() else 'no such file'}; check the path")
     try:
-        if file.stat().st_size > most_bytes:
-            raise InputError(f"{file}: it has more than {most_bytes >> 20} MiB; take a part of it")
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise InputError(f"{file}: it is no text in UTF-8; save it as CSV in UTF-8") from None
+        with file.open("rb") as opened:
+            raw = opened.read(most_bytes + 1)
+        if raw.startswith(_GZIP):
+            with gzip.open(file) as opened:
+                raw = opened.read(most_bytes + 1)
+    except (EOFError, zlib.error, gzip.BadGzipFile):
+        raise InputError(f"{file}: its gzip is cut off or broken; pack it again") from None
     except OSError as error:
         raise InputError(f"{file}: {error.strerror or error}; check the path") from None
+    if len(raw) > most_bytes:
+        raise InputError(f"{file}: it has more than {most_bytes >> 20} MiB; take a part of it")
+    for coding in ("utf-16",) if raw.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else _CODINGS:
+        try:
+            text = raw.decode(coding)
+        except UnicodeDecodeError:
+            continue
+        # Of numbers and names none are control characters.
+        if not _NO_TEXT.search(text):
+            return text.splitlines()
+    raise InputError(f"{file}: it is no text in UTF-8, UTF-16 or Latin-1; save it as CSV in UTF-8")
+
+
+def read_rows(file: Path, most_bytes: int) -> tuple[list[tuple[int, list[str]]], str]:
+    """The row of names and those below that hold something, each with its line; and what separates cells."""
+    lines = read_lines(file, most_bytes)
     first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), len(lines))
     separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
-    reader = csv.reader(lines[first:], delimiter=separator, skipinitialspace=True, strict=True)
+    rows = list(split_lines(file, lines, first, separator))
+    if separator != ",":
+        rows[1:] = [(line, [with_point(cell) for cell in cells]) for line, cells in rows[1:]]
+    return rows, separator
+
+
+def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Iterator[tuple[int, list[str]]]:
+    """The cells of each line from the first on that holds something, with its number."""
+    reader = csv.reader(islice(lines, first, None), delimiter=separator, skipinitialspace=True, strict=True)
     try:
-        rows = [(first + reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        for row in reader:
+            cells = [cell.strip() for cell in row]
+            if any(cells):
+                yield first + reader.line_num, cells
     except csv.Error as error:
         raise InputError(f"{file}:{first + reader.line_num}: {error}; check the quotes") from None
-    if separator != ",":
-        rows[1:] = [(line, [_DECIMAL_COMMA.sub(r"\1.", cell) for cell in cells]) for line, cells in rows[1:]]
-    return [row for row in rows if any(row[1])], separator
+
+
+def with_point(cell: str) -> str:
+    """A number with a decimal comma, with a point."""
+    return _DECIMAL_COMMA.sub(r"\1.", cell)
 
 
 def split_title(title: str) -> tuple[str, str]:

@@ -265,3 +265,17 @@ def test_under_a_doubt_there_is_no_wall(period, scale, word):
     assert "safe wall" not in said
     assert "record again" in said["no wall"]
     assert not any("recommend" in line for line in write_scene(fit, "a log"))
+
+
+def test_of_a_long_log_the_beginning_is_fitted_and_that_is_said(monkeypatch):
+    monkeypatch.setattr("zwidth.fitting.log._MOST", 400)
+    rng = np.random.default_rng(16)
+    force = steps_to_and_fro(rng, 900)
+    position = move(0.1, 2.0, 1.4e-3, force) + 1e-6 * rng.standard_normal(900)
+    fit = zwidth.fit_log(PERIOD, position, force)
+    known = np.flatnonzero(np.isfinite(fit.residuals))
+    assert (known[0], known.size) == (22, known[-1] - 21)
+    assert 400 <= known.size < 500
+    assert abs(fit.mass - 0.1) < 4 * fit.errors["mass"]
+    assert dict(describe_fit(fit, "a log"))["of it"].startswith(f"{known.size} of 900 samples")
+    assert "of it" not in dict(describe_fit(zwidth.fit_log(PERIOD, position[:400], force[:400]), "a log"))

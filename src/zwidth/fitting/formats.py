@@ -1,0 +1,321 @@
+"""Files of logs as programs write them: named columns, numbers when asked for.
+
+Texts have their columns between commas, semicolons, tabs or blanks. The first lines of numbers tell by which, and the
+line of names is the nearest one above them with as many cells, behind # or % too; what stands above it is a preamble,
+and a line of units alone between the two belongs to the names. Files of NumPy and MATLAB have arrays for columns.
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+import zipfile
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import read_lines, split_lines, split_title, with_point
+from zwidth.words.units import ANGLE, FORCE, LENGTH, SPEED, TIME, TORQUE, looks_like_number
+
+COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
+"""Units of a position that its encoder's resolution translates."""
+
+_KNOWN, _FURTHER = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED), ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s")
+_MOST_BYTES = 2**28
+_BY_NUMBER = "say which column is which by its number, as 1:ms, 2:mm and 3:N for time, position and force"
+# Lines that may stand above the numbers.
+_PREAMBLE = 500
+# Where a unit may begin behind a name without brackets: time_s, time/s, time s.
+_JOINT = re.compile(r"\s*[/,]\s*|_|\s+")
+_REMARK = re.compile(r"\s*[#%]+\s*")
+_SEPARATOR = re.compile(r"\s*\"?sep=.\"?\s*$", re.IGNORECASE)
+_BLANKS = re.compile(r"\s+(?![\[(])")
+# 2024-05-01T12:00:00.001, also with a blank or a time zone; or the time of a day alone.
+_CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)(Z|[+-]\d\d:?\d\d)?")
+_DAY, _AT_ONCE = "1970-01-01T", 20_000
+
+
+@dataclass(frozen=True)
+class LogTable:
+    """Names of columns, and how to get the numbers of some; ``nameless`` says so where the names are 1, 2, ..."""
+
+    heads: list[str]
+    numbers: Callable[[Sequence[int]], list[np.ndarray]]
+    nameless: str = ""
+
+
+def read_table(file: Path) -> LogTable:
+    """The columns of a file of any known kind; raise `InputError` for others, with how to save them."""
+    if not file.is_file():
+        read_lines(file, _MOST_BYTES)
+    with file.open("rb") as opened:
+        begin = opened.read(8)
+    if begin.startswith((b"PK\x03\x04", b"\xd0\xcf\x11\xe0")) and not _is_npz(file):
+        raise InputError(
+            f"{file}: it is a workbook or an archive, not a table; save the sheet as CSV UTF-8 (File, Save as), and "
+            "give that file"
+        )
+    if begin.startswith((b"\x93NUMPY", b"PK\x03\x04")) or file.suffix.lower() == ".mat":
+        return _table_arrays(file, _load(file))
+    return _table_text(file, read_lines(file, _MOST_BYTES))
+
+
+def split_head(head: str) -> tuple[str, str]:
+    """The name of a column and its unit: in brackets, or behind a slash, an underscore or a blank where it is known."""
+    name, unit = split_title(head)
+    if unit or name != head.strip():
+        return name, unit
+    for joint in _JOINT.finditer(head):
+        if joint.start() and is_unit(head[joint.end() :]):
+            return head[: joint.start()], head[joint.end() :]
+    return name, unit
+
+
+def is_unit(text: str) -> bool:
+    """Whether a text is the unit of some column of logs."""
+    return text in _FURTHER or text.lower() in COUNTS or any(each.in_base("1", 0, text) is not None for each in _KNOWN)
+
+
+def _is_npz(file: Path) -> bool:
+    try:
+        with zipfile.ZipFile(file) as archive:
+            return all(name.endswith(".npy") for name in archive.namelist())
+    except (zipfile.BadZipFile, OSError):
+        return False
+
+
+def _load(file: Path) -> dict[str, Any]:
+    """The arrays of a file of NumPy or MATLAB, by name; of a single one without names its columns, by number."""
+    try:
+        if file.suffix.lower() == ".mat":
+            from scipy.io import loadmat
+
+            return {name: array for name, array in loadmat(file).items() if not name.startswith("__")}
+        loaded: Any = np.load(file, allow_pickle=False)
+        if not isinstance(loaded, np.ndarray):
+            with loaded:
+                return dict(loaded)
+        if loaded.dtype.names:
+            return {name: loaded[name] for name in loaded.dtype.names}
+        return {"": loaded}
+    except NotImplementedError:
+        raise InputError(f"{file}: it is of MATLAB's version 7.3; save it again with save('log.mat', '-v7')") from None
+    except Exception as error:
+        # Whatever a broken file makes of its reader.
+        what = "objects, which may run programs" if "pickle" in str(error).lower() else "no arrays that can be read"
+        raise InputError(f"{file}: it holds {what}; save columns of numbers, or a CSV file") from error
+
+
+def _table_arrays(file: Path, arrays: dict[str, Any]) -> LogTable:
+    """Columns of equal length; a matrix alone is taken by its columns."""
+    columns = {name: array for name, array in arrays.items() if getattr(array, "size", 0) > 1}
+    flat = {name: array.ravel() for name, array in columns.items() if max(array.shape) == array.size}
+    wide = {name: array for name, array in columns.items() if name not in flat and array.ndim == 2}
+    named = bool(flat)
+    if not flat and len(wide) == 1:
+        (matrix,) = wide.values()
+        flat = {str(k + 1): column for k, column in enumerate(matrix.T)}
+    flat = {name: array for name, array in flat.items() if array.dtype.kind in "fiubM"}
+    if not flat:
+        shapes = ", ".join(f"{name or 'an array'} {np.shape(array)}" for name, array in arrays.items()) or "nothing"
+        raise InputError(f"{file}: got {shapes[:200]}; give a column of numbers each for time, position and force")
+    heads, values = list(flat), list(flat.values())
+
+    def numbers(places: Sequence[int]) -> list[np.ndarray]:
+        sizes = {heads[at]: values[at].size for at in places}
+        if len(set(sizes.values())) > 1:
+            text = ", ".join(f"{name!r} {size}" for name, size in sizes.items())
+            raise InputError(f"{file}: the columns have different lengths, {text}; save them sample by sample")
+        found = []
+        for at in places:
+            clock = values[at].dtype.kind == "M"
+            column = _seconds(values[at]) if clock else values[at].astype(float)
+            bad = np.flatnonzero(~np.isfinite(column))
+            if bad.size:
+                raise InputError(
+                    f"{file}: got {column[bad[0]]} in {heads[at]!r} at sample {bad[0]}; a number is needed"
+                )
+            found.append(column)
+        return found
+
+    return LogTable(heads, numbers, "" if named else f"{file}: its columns have no names; {_BY_NUMBER}")
+
+
+class _Layout(NamedTuple):
+    """Where in a text the names, their units and the samples stand, and what separates cells; None for what is not."""
+
+    names: int | None
+    units: int | None
+    begin: int
+    separator: str
+
+
+def _table_text(file: Path, lines: list[str]) -> LogTable:
+    if not any(map(_says, lines)):
+        raise InputError(f"{file}: it is empty; a line of column names and a line a sample are needed")
+    layout = _lay_out(lines)
+    separator = layout.separator
+    names, top = layout.names, layout.begin if layout.names is None else layout.names
+    heads = _split(lines[top], separator)
+    if len(heads) == 1:
+        got = lines[top].strip()[:60]
+        raise InputError(f"{file}:{top + 1}: got {got!r}; separate the columns by commas, semicolons, tabs or blanks")
+    if names is None:
+        heads = [str(k + 1) for k in range(len(heads))]
+    elif layout.units is not None:
+        units = [cell.strip("[]()") for cell in _split(lines[layout.units], separator)]
+        heads = [f"{head} [{unit}]" if is_unit(unit) else head for head, unit in zip(heads, units, strict=True)]
+    if not any(line.strip() for line in lines[layout.begin :]):
+        raise InputError(f"{file}: it has names of columns and no samples; record some")
+
+    def numbers(places: Sequence[int]) -> list[np.ndarray]:
+        found = _read_quickly(lines, layout, len(heads), places)
+        return _read_each(file, lines, layout, heads, places) if found is None else found
+
+    nameless = (
+        f"{file}:{top + 1}: got numbers where the names of the columns are expected; add a line such as "
+        f"{separator.join(('time [s]', 'position [m]', 'force [N]'))!r}, or {_BY_NUMBER}"
+    )
+    return LogTable(heads, numbers, nameless if names is None else "")
+
+
+def _split(line: str, separator: str) -> list[str]:
+    """The cells of a line of names or numbers, a remark's sign left out."""
+    line = _REMARK.sub("", line, count=1) if _REMARK.match(line) else line.strip()
+    if separator == " ":
+        return _BLANKS.split(line.strip())
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])]
+
+
+def _says(line: str) -> bool:
+    """Whether a line holds more than a remark or a spreadsheet's mark."""
+    return bool(line.strip()) and not _REMARK.match(line) and not _SEPARATOR.match(line)
+
+
+def _count_numbers(cells: list[str]) -> int:
+    return sum(looks_like_number(with_point(cell)) or cell.lower() == "nan" for cell in cells)
+
+
+def _lay_out(lines: list[str]) -> _Layout:
+    """Find the first lines of numbers, by the separator that leaves the least text in them, and what is above."""
+    held = [k for k, line in enumerate(lines[:_PREAMBLE]) if line.strip()]
+    best: tuple[float, int, str] | None = None
+    for separator in "\t;, ":
+        rows = [_split(lines[k], separator) for k in held]
+        full = [_count_numbers(row) >= 2 and not _REMARK.match(lines[k]) for k, row in zip(held, rows, strict=True)]
+        for at, (k, row) in enumerate(zip(held, rows, strict=True)):
+            above = at > 0 and not full[at - 1] and len(rows[at - 1]) == len(row)
+            if full[at] and (above or at + 1 == len(held) or full[at + 1]):
+                share = _count_numbers(row) / len(row)
+                best = (share, k, separator) if best is None or share > best[0] else best
+                break
+    if best is None:
+        first = next(k for k, line in enumerate(lines) if _says(line))
+        separator = next((mark for mark in "\t;," if mark in lines[first]), " ")
+        return _Layout(first, None, first + 1, separator)
+    _, begin, separator = best
+    width = len(_trim(_split(lines[begin], separator)))
+    above = [k for k in reversed(held) if k < begin]
+    named = [k for k in above if len(_trim(_split(lines[k], separator))) == width]
+    if not named:
+        plain = [k for k in above if _says(lines[k])]
+        return _Layout(plain[0] if plain else None, None, begin, separator)
+    cells = [cell.strip("[]()") for cell in _split(lines[named[0]], separator)]
+    if len(named) > 1 and sum(map(is_unit, cells)) >= 2 and all(is_unit(cell) or len(cell) <= 5 for cell in cells):
+        return _Layout(named[1], named[0], begin, separator)
+    return _Layout(named[0], None, begin, separator)
+
+
+def _trim(cells: list[str]) -> list[str]:
+    """Cells without empty ones at the end."""
+    return cells[: max((k + 1 for k, cell in enumerate(cells) if cell), default=0)]
+
+
+def _read_quickly(lines: list[str], layout: _Layout, count: int, places: Sequence[int]) -> list[np.ndarray] | None:
+    """Columns by NumPy's reader; None where there is anything that it does not read, to be told line by line."""
+    begin, separator = layout.begin, layout.separator
+    clocks = _find_clocks(lines, layout, places)
+    if separator == " ":
+        wide = max(len(line.split()) for line in lines[begin:])
+    else:
+        wide = 1 + max(line.count(separator) for line in lines[begin:])
+    if wide > count:
+        return None
+    options: dict[str, Any] = {"comments": None, "quotechar": '"', "ndmin": 1}
+    options["delimiter"] = None if separator == " " else separator
+    found = {}
+    try:
+        for at in places:
+            rows: Iterable[str] = islice(lines, begin, None)
+            if at in clocks:
+                found[at] = _read_clock(np.loadtxt(rows, usecols=at, dtype="U40", **options))
+                continue
+            rows = rows if separator == "," else (line.replace(",", ".") for line in rows)
+            found[at] = np.loadtxt(rows, usecols=at, dtype=float, **options)
+    except (ValueError, IndexError, TypeError):
+        return None
+    return [found[at] for at in places] if all(np.all(np.isfinite(each)) for each in found.values()) else None
+
+
+def _read_each(
+    file: Path, lines: list[str], layout: _Layout, heads: list[str], places: Sequence[int]
+) -> list[np.ndarray]:
+    """Columns cell by cell; raise `InputError` for the first cell that holds no number."""
+    separator, found = layout.separator, [[] for _ in places]
+    if separator == " ":
+        rows = ((k + 1, lines[k].split()) for k in range(layout.begin, len(lines)) if lines[k].strip())
+    else:
+        rows = split_lines(file, lines, layout.begin, separator)
+    clocks = _find_clocks(lines, layout, places)
+    for number, cells in rows:
+        if any(cells[len(heads) :]):
+            hint = "; a comma as decimal sign needs semicolons between the columns" if separator == "," else ""
+            raise InputError(f"{file}:{number}: got {len(cells)} cells for {len(heads)} columns{hint}")
+        for column, at in zip(found, places, strict=True):
+            got = cells[at] if at < len(cells) else ""
+            value = got if separator == "," else with_point(got)
+            known = _is_time(got) if at in clocks else looks_like_number(value) and np.isfinite(float(value))
+            if not known:
+                kind = "a time such as 2024-05-01T12:00:00.001" if at in clocks else "a number"
+                raise InputError(
+                    f"{file}:{number}: got {repr(got) if got else 'nothing'} under {heads[at]!r}; {kind} is needed"
+                )
+            column.append(got if at in clocks else float(value))
+    columns = zip(places, map(np.array, found), strict=True)
+    return [_read_clock(column) if at in clocks else column for at, column in columns]
+
+
+def _find_clocks(lines: list[str], layout: _Layout, places: Sequence[int]) -> list[int]:
+    """Columns whose first cell is a time of the calendar."""
+    first = _split(lines[layout.begin], layout.separator)
+    return [at for at in places if at < len(first) and _CLOCK.fullmatch(first[at])]
+
+
+def _is_time(text: str) -> bool:
+    try:
+        return _read_clock(np.array([text])).size == 1
+    except ValueError:
+        return False
+
+
+def _read_clock(texts: np.ndarray) -> np.ndarray:
+    """Seconds since the first of times that a calendar or a clock gives; raise `ValueError` where one does not."""
+    days, zones = [], set()
+    # Not all at one time, for texts take much memory.
+    for part in np.array_split(texts, 1 + texts.size // _AT_ONCE):
+        found = [match for text in part.tolist() if (match := _CLOCK.fullmatch(text.strip()))]
+        zones |= {match[3] for match in found}
+        if len(found) < part.size or len(zones) > 1:
+            raise ValueError("no time, or another zone")
+        days.append(np.array([(match[1] or _DAY) + match[2].replace(",", ".") for match in found], "datetime64[ns]"))
+    return _seconds(np.concatenate(days))
+
+
+def _seconds(times: np.ndarray) -> np.ndarray:
+    """Of `numpy.datetime64`, since the first; NaN of no time."""
+    return (times - times[0]) / np.timedelta64(1, "s") if times.size else times.astype(float)
