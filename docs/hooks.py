@@ -1,7 +1,8 @@
-"""What the site does beyond mkdocs: names of the library become links, and examples in docstrings become code."""
+"""What the site does beyond mkdocs: names become links, formulas MathML, and examples in docstrings code."""
 
 from __future__ import annotations
 
+import html
 import re
 from typing import Any
 
@@ -11,8 +12,142 @@ import griffe
 _NAME = re.compile(r'(?<!">)<code>(zwidth\.[\w.]+)</code>')
 
 
-def on_page_content(html: str, **_: Any) -> str:
-    """Link `zwidth.name` to its place in the reference; autorefs leaves alone what has none."""
+# Formulas in the theory's pages stand as indented lines, as they are typed; columns are aligned by runs of spaces.
+_BLOCK = re.compile(r'<div class="highlight"><pre><span></span><code>(.*?)</code></pre></div>', re.DOTALL)
+_COLUMN = re.compile(r"\S+(?: {1,2}\S+)*")
+_TOKEN = re.compile(
+    r"(?P<word>[a-z]+'s\b)|(?P<name>[A-Za-z]+\d*(?:_(?:\w+|\((?=[^()]*\))[^()]*\)))?'{0,2})|(?P<number>\d+(?:\.\d+)?)|(?P<space>\s+)"
+    r"|(?P<sign><=|>=|!=|->|\.\.\.|\S)"
+)
+# Brackets of one size: taller ones would part the lines.
+_FLAT = ' stretchy="false"'
+_GREEK = {
+    **{"alpha": "α", "beta": "β", "gamma": "γ", "delta": "δ", "zeta": "ζ", "eta": "η", "theta": "θ", "kappa": "κ"},
+    **{"xi": "ξ", "pi": "π", "rho": "ρ", "tau": "τ", "phi": "φ", "psi": "ψ", "omega": "ω", "lambda": "λ", "mu": "μ"},
+    **{"sigma": "σ", "Gamma": "Γ", "Delta": "Δ", "Psi": "Ψ", "Sigma": "Σ", "Phi": "Φ"},
+}
+_SIGNS = {
+    "<=": "≤",
+    ">=": "≥",
+    "!=": "≠",
+    "->": "→",
+    "...": "…",
+    "-": "−",
+    "*": "·",
+    "<": "&lt;",
+    ">": "&gt;",
+    "&": "&amp;",
+}
+_UPRIGHT = frozenset(
+    {
+        "sin",
+        "cos",
+        "tan",
+        "cot",
+        "arg",
+        "exp",
+        "log",
+        "ln",
+        "max",
+        "min",
+        "Re",
+        "Im",
+        "sqrt",
+        "sum",
+        "mean",
+        "integral",
+        "conj",
+        "num",
+        "den",
+    }
+)
+
+
+def typeset(line: str) -> str:
+    """A typed formula as MathML: powers, indices, roots and Greek letters; words stay words."""
+    tokens = [(match.lastgroup or "", match.group()) for match in _TOKEN.finditer(line)]
+    shown, rest = _row(tokens, 0, "")
+    return f"<math>{shown}</math>" if rest == len(tokens) else f"<code>{html.escape(line)}</code>"
+
+
+def _row(tokens: list[tuple[str, str]], at: int, until: str) -> tuple[str, int]:
+    """What stands up to a closing sign, and the place behind it."""
+    parts: list[str] = []
+    while at < len(tokens) and tokens[at][1] != until:
+        shown, at = _atom(tokens, at)
+        while at < len(tokens) and tokens[at][1] == "^":
+            if at + 1 == len(tokens) or tokens[at + 1][0] == "space" or tokens[at + 1][1] == ")":
+                shown, at = f"<mover>{shown}<mo>^</mo></mover>", at + 1
+                continue
+            power, at = _atom(tokens, at + 1, bare=True)
+            shown = f"<msup>{shown}{power}</msup>"
+        parts.append(shown)
+    return f"<mrow>{''.join(parts)}</mrow>", at + bool(until)
+
+
+def _atom(tokens: list[tuple[str, str]], at: int, bare: bool = False) -> tuple[str, int]:
+    """One name, number, sign or group from here, and the place behind it; a ``bare`` group is without parentheses."""
+    kind, text = tokens[at]
+    if kind == "space":
+        # Wide gaps part formulas on one line.
+        return ('<mspace width="2em"/>' if len(text) > 1 else '<mspace width="0.2em"/>'), at + 1
+    if kind == "number":
+        return f"<mn>{text}</mn>", at + 1
+    if text == "sqrt" and tokens[at + 1 : at + 2] == [("sign", "(")]:
+        inside, behind = _row(tokens, at + 2, ")")
+        return f"<msqrt>{inside}</msqrt>", behind
+    if kind == "word":
+        return f"<mtext>{text}</mtext>", at + 1
+    if kind == "name":
+        return _name(text), at + 1
+    if text == "-" and bare:
+        inside, behind = _atom(tokens, at + 1, bare=True)
+        return f"<mrow><mo>−</mo>{inside}</mrow>", behind
+    if text in "({[":
+        close = {"(": ")", "{": "}", "[": "]"}[text]
+        inside, behind = _row(tokens, at + 1, close)
+        return (inside if bare else f"<mrow><mo{_FLAT}>{text}</mo>{inside}<mo{_FLAT}>{close}</mo></mrow>"), behind
+    return f"<mo{_FLAT if text == '|' else ''}>{_SIGNS.get(text, text)}</mo>", at + 1
+
+
+def _name(text: str) -> str:
+    """A quantity with its index and primes, an operator, or a word."""
+    base, _, index = text.rstrip("'").partition("_")
+    primes = text[len(text.rstrip("'")) :]
+    stem = base.rstrip("0123456789")
+    index = index.strip("()") or base[len(stem) :]
+    if stem in _UPRIGHT:
+        shown = f'<mi mathvariant="normal">{stem}</mi>' if stem != "integral" else "<mo>∫</mo>"
+    elif stem in _GREEK or len(stem) == 1:
+        shown = f"<mi>{_GREEK.get(stem, stem)}</mi>"
+    elif len(stem) == 2 and (stem[0] in "cdgj" or index or primes):
+        shown = f"<mrow>{''.join(f'<mi>{letter}</mi>' for letter in stem)}</mrow>"
+    else:
+        return f"<mtext>{text}</mtext>"
+    if index:
+        low = "".join(_GREEK.get(part, part) for part in re.split(r"([A-Za-z]+)", index))
+        shown = f"<msub>{shown}<mn>{low}</mn></msub>"
+    return f"<msup>{shown}<mo>{'′' * len(primes)}</mo></msup>" if primes else shown
+
+
+def _lay(block: re.Match[str]) -> str:
+    """Typed lines as a grid of formulas, their columns where they were."""
+    lines = [html.unescape(line) for line in block[1].rstrip("\n").split("\n")]
+    pieces = [[(piece.start(), piece.group()) for piece in _COLUMN.finditer(line)] for line in lines]
+    starts = sorted({start for line in pieces for start, _ in line})
+    cells = ""
+    for row, line in enumerate(pieces, 1):
+        ends = [starts.index(start) + 1 for start, _ in line[1:]] + [len(starts) + 1]
+        for (start, text), end in zip(line, ends, strict=False):
+            place = f"grid-area: {row} / {starts.index(start) + 1} / {row + 1} / {end}"
+            cells += f'<div style="{place}">{typeset(text)}</div>'
+    return f'<div class="formulas{" single" if len(lines) == 1 else ""}">{cells}</div>'
+
+
+def on_page_content(html: str, page: Any, **_: Any) -> str:
+    """Link `zwidth.name` to its place in the reference, if it has one, and typeset the formulas of the theory."""
+    if page.file.src_uri.startswith("theory/"):
+        html = _BLOCK.sub(_lay, html)
     return _NAME.sub(r'<autoref identifier="\1" optional>\g<0></autoref>', html)
 
 

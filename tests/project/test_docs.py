@@ -71,6 +71,41 @@ def test_what_cannot_be_run_is_an_error(refresh_docs, text, error):
         refresh_docs.refreshed(text)
 
 
+@pytest.fixture
+def hooks(monkeypatch):
+    """What the site does beyond mkdocs, as a module."""
+    pytest.importorskip("griffe")
+    monkeypatch.syspath_prepend(DOCS)
+    return importlib.import_module("hooks")
+
+
+def test_formulas_are_typeset(hooks):
+    shown = hooks.typeset("T^ <= sqrt(a2) e^(-delta t) phi1, of x''")
+    for part in (
+        "<mover><mi>T</mi><mo>^</mo></mover>",
+        "<mo>≤</mo>",
+        "<msqrt><mrow><msub><mi>a</mi><mn>2</mn></msub></mrow></msqrt>",
+        "<msup><mi>e</mi><mrow><mo>−</mo><mi>δ</mi>",
+        "<msub><mi>φ</mi><mn>1</mn></msub>",
+        "<mtext>of</mtext>",
+        "<msup><mi>x</mi><mo>′′</mo></msup>",
+    ):
+        assert part in shown
+    assert hooks.typeset("a (b < c") == "<code>a (b &lt; c</code>"
+
+
+def test_every_formula_of_the_theory_can_be_typeset(hooks):
+    """None is shown as it is typed, for want of a bracket."""
+    lines = [
+        line
+        for page in sorted((DOCS / "theory").glob("*.md"))
+        for block in re.findall(r"(?:(?<=\n\n)(?: {4}\S.*\n)+)", page.read_text(encoding="utf-8"))
+        for line in block.splitlines()
+    ]
+    assert len(lines) > 60
+    assert not [line for line in lines if "<code>" in hooks.typeset(line.strip())]
+
+
 def test_a_section_ends_where_the_next_one_begins(refresh_docs):
     found = refresh_docs.include("benchmarks/results/bench.md#What each question costs")
     assert "| question |" in found
