@@ -31,8 +31,8 @@ _NAMES = {
 }
 # What is read in place of a position or a force that no name says, and the unit without one.
 _INSTEAD = {
-    "position": (("velocity", "vel", "speed", "v", "omega", "w", "dx"), "m/s"),
-    "force": (("current", "i", "iq", "i_q", "amps"), "A"),
+    "position": (("velocity", "vel", "speed"), "m/s"),
+    "force": (("current", "iq", "i_q"), "A"),
 }
 _AMPERES = {"A": 1.0, "mA": 1e-3}
 _PER_AMPERE = re.compile(r"(.*?)\s*/\s*A\s*")

@@ -12,7 +12,7 @@ import re
 import zipfile
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import islice
+from itertools import islice, zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -169,7 +169,12 @@ def _table_text(file: Path, lines: list[str]) -> LogTable:
         heads = [str(k + 1) for k in range(len(heads))]
     elif layout.units is not None:
         units = [cell.strip("[]()") for cell in _split(lines[layout.units], separator)]
-        heads = [f"{head} [{unit}]" if is_unit(unit) else head for head, unit in zip(heads, units, strict=True)]
+        # What a name says itself counts.
+        told = [
+            f" [{unit}]" if is_unit(unit) and not split_head(head)[1] else ""
+            for head, unit in zip(heads, units, strict=False)
+        ]
+        heads = [head + unit for head, unit in zip_longest(heads, told, fillvalue="")]
     if not any(line.strip() for line in lines[layout.begin :]):
         raise InputError(f"{file}: it has names of columns and no samples; record some")
 

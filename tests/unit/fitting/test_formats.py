@@ -36,6 +36,7 @@ TEXTS = {
         "time,x,temp,F\nms,mm,degC,mN\n0,1.5,20,500\n1,-2,20,-1250\n2,0,20,3000\n",
         {},
     ),
+    "units in a line and in a name": ("time;x [mm];F;\nms;mm;mN\n0;1,5;500\n1;-2;-1250;\n2;0;3000\n", {}),
     "a preamble": ("Recorder 7\nDate,2024-05-01\nSample rate,1000\n\nt [ms],x [mm],F [mN]\n" + ROWS, {}),
     "a preamble of other separators": ("Recorder: 7\nAxis; 1; of 2\n#\nt [ms],x [mm],F [mN]\n" + ROWS, {}),
     "a preamble and units in a line": ("Channels,3\ntime,x,F\nms,mm,mN\n" + ROWS, {}),
@@ -115,9 +116,9 @@ def test_arrays_of_numpy_and_matlab_are_read(kind, tmp_path):
     "head, rows, columns, resolution, rotary",
     [
         ("t_ms,velocity_mm/s,F", "0,1500,.5\n1,-3500,-1.25\n2,2e3,3\n", {}, None, False),
-        ("t_ms,v,F", "0,1.5,.5\n1,-3.5,-1.25\n2,2,3\n", {}, None, False),
+        ("t_ms,vel,F", "0,1.5,.5\n1,-3.5,-1.25\n2,2,3\n", {}, None, False),
         ("t_ms,n,F", "0,3e4,.5\n1,-7e4,-1.25\n2,4e4,3\n", {"position": "n:counts/s"}, "50 um", False),
-        ("t_ms,omega [rad/s],tau [N m]", "0,1.5,.5\n1,-3.5,-1.25\n2,2,3\n", {}, None, True),
+        ("t_ms,w [rad/s],tau [N m]", "0,1.5,.5\n1,-3.5,-1.25\n2,2,3\n", {"position": "w"}, None, True),
         ("t_ms,n,tau_Nm", "0,1.5,.5\n1,-3.5,-1.25\n2,2,3\n", {"position": "n:rpm"}, None, True),
     ],
 )  # fmt: skip
@@ -134,7 +135,7 @@ def test_velocities_are_summed_up(head, rows, columns, resolution, rotary, tmp_p
     "head, constant, rotary, position",
     [
         ("t_ms,x_mm,current_A", "2.5 N/A", False, 1.0),
-        ("t_ms,x_mm,i [mA]", "2.5 kN/A", False, 1.0),
+        ("t_ms,x_mm,current [mA]", "2.5 kN/A", False, 1.0),
         ("t_ms,x_rad,iq", "2500 mN m / A", True, 1e3),
     ],
 )
@@ -156,7 +157,7 @@ REFUSED = {
     "an old workbook": (b"\xd0\xcf\x11\xe0" + bytes(20), "save the sheet as CSV"),
     "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", "it is no text"),
     "half of a gzip": (gzip.compress(ROWS.encode())[:-9], "pack it again"),
-    "a current alone": (b"t,x,i_A\n0,1,2\n", "motor_constant: got nothing for a force in A"),
+    "a current alone": (b"t,x,current_A\n0,1,2\n", "motor_constant: got nothing for a force in A"),
     "no time": (b"t;x;F\n10:00:00;1;2\n10:00:6x;1;2\n", ":3: got '10:00:6x' under 't'; a time"),
     "no such time": (b"t;x;F\n10:00:00;1;2\n10:00:61;1;2\n", ":3: got '10:00:61' under 't'; a time"),
     "a cell between blanks": (b"t x F\n0 1 2\n1 no 3\n", ":3: got 'no' under 'x'; a number is needed"),
