@@ -9,17 +9,12 @@ import xml.etree.ElementTree as ET
 import numpy as np
 import pytest
 from browser import open_page
-from explorer_server import serve
+from explorer_server import enter, serve, settle, value_of
 from waiting import wait_for
 
 import zwidth
 
 pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
-
-SETTLED = (
-    "inputs !== null && !scheduled && !rests && Object.keys(waiting).length === 0 && answered === serial"
-    " && !document.body.classList.contains('busy') && location.hash !== ''"
-)
 
 
 @pytest.fixture(scope="module")
@@ -36,20 +31,6 @@ def page(browser, address):
         yield opened
         assert opened.asked == []
         assert opened.complaints == []
-
-
-def settle(page, condition="true"):
-    wait_for(lambda: page.evaluate(f"{SETTLED} && ({condition})"), lambda: f"{condition}; {page.inner_text('header')}")
-
-
-def enter(page, name, text):
-    page.fill(f"[id='{name}']", text)
-    page.press(f"[id='{name}']", "Enter")
-    settle(page)
-
-
-def value_of(page, name):
-    return float(page.input_value(f"[id='{name}']"))
 
 
 def data_of(page, name):

@@ -11,7 +11,7 @@ import urllib.request
 from typing import Any
 
 import pytest
-from waiting import LONGEST
+from waiting import LONGEST, wait_for
 
 
 class Server:
@@ -55,3 +55,23 @@ def serve(folder):
     out, err, code = running.end()
     assert (out, err, code) == ("stopped\n", "", 0)
     assert list(folder.iterdir()) == []
+
+
+SETTLED = (
+    "inputs !== null && !scheduled && !rests && Object.keys(waiting).length === 0 && answered === serial"
+    " && !document.body.classList.contains('busy') && location.hash !== ''"
+)
+
+
+def settle(page, condition="true"):
+    wait_for(lambda: page.evaluate(f"{SETTLED} && ({condition})"), lambda: f"{condition}; {page.inner_text('header')}")
+
+
+def enter(page, name, text):
+    page.fill(f"[id='{name}']", text)
+    page.press(f"[id='{name}']", "Enter")
+    settle(page)
+
+
+def value_of(page, name):
+    return float(page.input_value(f"[id='{name}']"))

@@ -23,6 +23,7 @@ from zwidth.cli.options import (
 from zwidth.pages.words import row, tell
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.rotation import use_kind
 
 if TYPE_CHECKING:
     from zwidth.fitting.device_fit import DeviceFit
@@ -58,18 +59,12 @@ def _read_wall(text: str) -> HeardWall:
 
 def _read_letter(letter: str, text: str) -> tuple[float, bool | None]:
     """A number in its SI unit, and whether the unit is of a rotary axis."""
-    from zwidth.words.units import ANGULAR_DAMPING, ANGULAR_STIFFNESS, DAMPING, RATE, STIFFNESS, read_quantity
+    from zwidth.words.units import find_dimension, read_quantity, tell_kind
 
-    angular = {"K": ANGULAR_STIFFNESS, "B": ANGULAR_DAMPING}.get(letter)
-    linear = {"K": STIFFNESS, "B": DAMPING, "f": RATE}[letter]
     number = number_or_text(text)
-    try:
-        told = isinstance(number, str) and angular is not None
-        return read_quantity(number, linear)[0], False if told else None
-    except UnusableValueError:
-        if angular is None or not any(unit in text for unit in ("rad", "deg")):
-            raise
-        return read_quantity(number, angular)[0], True
+    rotary = tell_kind(number)
+    with use_kind(bool(rotary)):
+        return read_quantity(number, find_dimension({"K": "N/m", "B": "N s/m", "f": "Hz"}[letter]))[0], rotary
 
 
 _WALL = Parsed("WALL", _read_wall)

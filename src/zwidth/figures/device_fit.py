@@ -11,16 +11,17 @@ from zwidth.figures import style
 from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
 from zwidth.figures.table import Table, curves, select
 from zwidth.words.formatting import header
+from zwidth.words.rotation import ROTARY
 
 # Samples that one panel shows; of longer logs every n-th.
 _MOST = 4000
 _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}
 _UNITS = {
-    **dict.fromkeys(("position", "modelled", "residual"), ("m", "rad")),
+    **dict.fromkeys(("position", "modelled", "residual"), ("m", ROTARY["m"])),
     **dict.fromkeys(("time", "lag"), ("s",)),
-    "stiffness": ("N/m", "N m/rad"),
-    "virtual_damping": ("N s/m", "N m s/rad"),
+    "stiffness": ("N/m", ROTARY["N/m"]),
+    "virtual_damping": ("N s/m", ROTARY["N s/m"]),
     "frequency": ("Hz",),
 }
 _FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))

@@ -11,6 +11,7 @@ import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
 from zwidth.parts.paths import spell_estimate
+from zwidth.words import rotation
 from zwidth.words.formatting import plain, with_unit
 from zwidth.words.quantities import RECOMMENDED_SHARE
 from zwidth.words.status import Status
@@ -30,7 +31,6 @@ _TROUBLES = {
     Status.UNDECIDED: "another device fits as well",
     Status.UNREACHABLE: "the delay ends the range looked in",
 }
-_ROTARY_NOTE = "# A rotary axis: kg stands for kg m^2 (inertia), N s/m for N m s/rad, N/m for N m/rad, N for N m."
 # As a share of the sampling rate; what shows up to there shows everywhere.
 _EVERYWHERE = 0.4
 _SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
@@ -48,10 +48,6 @@ class AxisUnits(NamedTuple):
 
     def spell(self, name: str, value: float, digits: int = 4) -> str:
         """A value of a fit for people."""
-        if name == "mass":
-            # What data sheets of rotors have.
-            turns = self is ROTARY
-            return f"{plain(1e7 * value, digits)} g cm^2" if turns else with_unit(value, "kg", digits)
         units = {
             **self._asdict(),
             "delay": "s",
@@ -64,7 +60,7 @@ class AxisUnits(NamedTuple):
 
 
 LINEAR = AxisUnits("kg", "N s/m", "N/m", "N", "m")
-ROTARY = AxisUnits("kg m^2", "N m s/rad", "N m/rad", "N m", "rad")
+ROTARY = AxisUnits(*(rotation.ROTARY[unit] for unit in LINEAR))
 
 
 class WallChoice(NamedTuple):
@@ -206,10 +202,8 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     if fit.status != Status.OK:
         lines.append(f"# {Status(fit.status).name}: do not rely on these numbers: {name_trouble(fit)}.")
     lines += [f"# Doubt: {doubt}" for doubt in list_doubts(fit, units)]
-    lines += [_ROTARY_NOTE] if units is ROTARY else []
     lines += ["version: 1", "name: fitted_device", "scene:"]
-    # The configuration knows linear units alone.
-    for key, unit in (("mass", "kg"), ("damping", "N s/m"), ("delay", "s")):
+    for key, unit in (("mass", units.mass), ("damping", units.damping), ("delay", "s")):
         lines.append(f"  {key}: {_write(fit, key)} {unit} # fitted, {_between(fit, key, units)}")
     lines.append(f"  period: {fit.period!r} s # as given")
     for key, section in spell_estimate(fit.velocity, every=True).items():
@@ -220,9 +214,8 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     else:
         lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):
-        lines.append(
-            f"# For studies of kind simulate: coulomb: {_write(fit, 'friction')} N, {_between(fit, 'friction', units)}."
-        )
+        friction = f"{_write(fit, 'friction')} {units.force}, {_between(fit, 'friction', units)}"
+        lines.append(f"# For studies of kind simulate: coulomb: {friction}.")
     if fit.resolution:
-        lines.append(f"# For studies of kind simulate: resolution: {fit.resolution!r} m.")
+        lines.append(f"# For studies of kind simulate: resolution: {fit.resolution!r} {units.position}.")
     return lines

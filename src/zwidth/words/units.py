@@ -65,9 +65,13 @@ ANGLE = Dimension(
     "0.1 deg",
     {"deg": math.pi / 180, "°": math.pi / 180, **dict.fromkeys(("rev", "turn", "turns"), 2 * math.pi)},
 )
-TORQUE = Dimension({"N m": 0, "mN m": -3, "kN m": 3, "N mm": -3, "mN mm": -6, "N cm": -2}, "50 mN m")
+TORQUE = Dimension(
+    {"N m": 0, "mN m": -3, "uN m": -6, "µN m": -6, "kN m": 3, "N mm": -3, "mN mm": -6, "N cm": -2}, "50 mN m"
+)
 ANGULAR_STIFFNESS = Dimension(
-    {"N m/rad": 0, "mN m/rad": -3}, "0.5 N m/rad", {"N m/deg": 180 / math.pi, "mN m/deg": 0.18 / math.pi}
+    {"N m/rad": 0, "mN m/rad": -3, "uN m/rad": -6, "µN m/rad": -6, "kN m/rad": 3},
+    "0.5 N m/rad",
+    {"N m/deg": 180 / math.pi, "mN m/deg": 0.18 / math.pi},
 )
 ANGULAR_DAMPING = Dimension(
     {"N m s/rad": 0, "mN m s/rad": -3, "uN m s/rad": -6, "µN m s/rad": -6},
@@ -105,7 +109,9 @@ def find_other(dimension: Dimension) -> Dimension | None:
 def tell_kind(value: Any) -> bool | None:
     """Whether a text is a number with a unit of a rotary device; None where it tells no kind."""
     match = _QUANTITY.fullmatch(value.strip()) if isinstance(value, str) else None
-    return None if match is None else _KIND_OF_UNIT.get(_canonical(match[3]))
+    unit = "" if match is None else _canonical(match[3])
+    # Whoever writes an unknown unit per angle means no linear one.
+    return _KIND_OF_UNIT.get(unit, True if unit.endswith(("/rad", "/deg")) else None)
 
 
 def spell_exactly(value: float, unit: str) -> str:

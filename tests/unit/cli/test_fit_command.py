@@ -150,7 +150,13 @@ def test_a_rotary_axis_is_the_linear_one_in_other_units(tmp_path):
     assert "mN m s/rad" in words
     assert "kN m/rad" in words
     scene = run(str(file), "--resolution", "0.03mrad", "--yaml")
-    assert "kg stands for kg m^2" in scene
+    assert re.search(r"^  mass: \S+ kg m\^2 # fitted", scene, re.MULTILINE)
+    assert re.search(r"^  damping: \S+ N m s/rad # fitted", scene, re.MULTILINE)
+    made = tmp_path / "fitted.yaml"
+    made.write_text(scene, encoding="utf-8")
+    device = load_config(made).scene.to_scene().device  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+    assert device.rotary
+    assert device.mass == pytest.approx(turned["mass"], rel=1e-6)
     result = CliRunner().invoke(cli, ["fit", str(file), "--resolution", "0.03mm"])
     assert "a length belongs to a force" in str(result.exception)
 

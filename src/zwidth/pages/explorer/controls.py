@@ -23,6 +23,7 @@ from zwidth.scenes.stiffest import choose_damping
 from zwidth.studies.document import Config, load_config
 from zwidth.words.errors import InputError
 from zwidth.words.quantities import OF_PARTS, PARAMETERS, Parameter
+from zwidth.words.rotation import ROTARY, own_unit, use_kind
 from zwidth.words.units import spell_exactly
 
 # Beyond so many, the poles cannot follow a drag.
@@ -58,23 +59,33 @@ class Slider(NamedTuple):
     whole: bool = False
 
 
-def _make_slider(parameter: Parameter) -> Slider:
+def _make_slider(parameter: Parameter, rotary: bool = False) -> Slider:
     unit, per_si = _SHOWN.get(parameter.unit, (parameter.unit.removeprefix("1"), 1.0))
     low, high = parameter.slider or (0.0, 0.0)
-    label = f"{parameter.words} {parameter.symbol.lstrip(chr(92))}"
-    return Slider(label, unit, per_si, low * per_si, high * per_si, parameter.whole)
+    words, symbol = parameter.words, parameter.symbol.lstrip(chr(92))
+    if rotary and parameter.unit in _TURNED:
+        # Walls are set on a chart that is in SI units.
+        unit, per_si = (ROTARY[parameter.unit], 1.0) if parameter.name in _WALL else _TURNED[parameter.unit]
+        low, high = low * _SMALLER[parameter.unit], high * _SMALLER[parameter.unit]
+        words, symbol = words.replace("mass", "inertia"), "J" if parameter.name == "mass" else symbol
+    return Slider(f"{words} {symbol}", unit, per_si, low * per_si, high * per_si, parameter.whole)
 
 
-# The units of the page, and how many of them are one SI unit.
+# The units of the page, and how many of them are one SI unit; of rotary devices those that differ.
 _SHOWN = {"kg": ("g", 1e3), "s": ("ms", 1e3)}
+_TURNED = {"kg": ("g cm^2", 1e7), "N s/m": ("mN m s/rad", 1e3), "N/m": ("N m/rad", 1.0)}
+# What rotary devices have in SI units for one of a linear device, roughly: masses at some centimeters.
+_SMALLER = {"kg": 1e-3, "N s/m": 1e-3, "N/m": 1e-3}
 _BARE = ("device", "timing", "wall")
 _DEVICE, _WALL = ("mass", "damping", "period", "delay", "delta", "d"), ("stiffness", "virtual_damping", "alpha", "beta")
 # By the path in a scene. A range that begins at 0 is cubic on the page, one above logarithmic.
 SLIDERS = {name: _make_slider(PARAMETERS[name]) for name in (*_DEVICE, *_WALL, *OF_PARTS) if PARAMETERS[name].slider}
+ROTARY_SLIDERS = {name: _make_slider(PARAMETERS[name], True) for name in SLIDERS}
 # With m = 1 and T = 1 these are the scene's own numbers.
 _NORMALIZED = {"delta": "damping", "d": "delay", "alpha": "stiffness", "beta": "virtual_damping"}
 CHOICES = {
     "mode": {"physical": "physical", "normalized": "normalized"},
+    "motion": {"linear": "linear", "rotary": "rotary"},
     "velocity": {
         "BackwardDifference": "backward difference",
         "WindowedDifference": "window of n",
@@ -88,6 +99,7 @@ CHOICES["coupling"] |= {"motor": "tip, sensor at the motor", "tip": "tip, sensor
 
 
 _SMALL_DEVICE = Scene(Device(0.1, 10.0), Timing(1e-3, 1e-3), VirtualWall(10e3, 40.0))
+_SMALL_ROTARY = Scene(Device(1e-4, 0.01, rotary=True), Timing(1e-3, 1e-3), VirtualWall(10.0, 0.04))
 
 
 @dataclass(frozen=True)
@@ -96,11 +108,22 @@ class Controls:
 
     scene: Scene = _SMALL_DEVICE
     normalized: bool = False
-    scale: tuple[float, float] = (0.1, 1e-3)  # mass and period that a normalized scene takes when it gets units again
+    # Mass, period and whether it is rotary, that a normalized scene takes when it gets units again.
+    scale: tuple[float, float, bool] = (0.1, 1e-3, False)
 
     @property
     def wall(self) -> tuple[float, float]:
         return float(self.scene.wall.stiffness), float(self.scene.wall.virtual_damping)
+
+    @property
+    def rotary(self) -> bool:
+        """Whether the device turns."""
+        return bool(self.scene.device.rotary)
+
+    @property
+    def sliders(self) -> dict[str, Slider]:
+        """The numbers of the page for this kind of device."""
+        return ROTARY_SLIDERS if self.rotary else SLIDERS
 
     def shown(self) -> dict[str, Any]:
         """Every number and choice that the scene has, as the page shows it."""
@@ -108,12 +131,16 @@ class Controls:
         if self.normalized:
             return {"mode": "normalized"} | {name: values[path] for name, path in _NORMALIZED.items()}
         forms = {name: _find_form(part) for name, part in find_parts(scene).items() if name in PARTS}
-        found = {name: value * SLIDERS[name].per_si for name, value in values.items() if name in SLIDERS}
+        found = {name: value * self.sliders[name].per_si for name, value in values.items() if name in SLIDERS}
         for part, form in forms.items():
             # A form has the numbers that it names: without a spring, the damper beside it does nothing.
             idle = {f"{part}.{item.name}" for item in fields(PARTS[part]) if item.name not in PARTS[part].usual[form]}
             found = {name: value for name, value in found.items() if name not in idle}
-        choices = {"mode": "physical", "velocity": type(scene.velocity).__name__}
+        choices = {
+            "mode": "physical",
+            "motion": "rotary" if self.rotary else "linear",
+            "velocity": type(scene.velocity).__name__,
+        }
         return found | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
@@ -124,14 +151,21 @@ class Controls:
                 if not isinstance(value, str) or value not in CHOICES[name]:
                     raise InputError(f"{name}: got {str(value)[:40]!r}; choose one of {', '.join(CHOICES[name])}")
                 if value != new.shown().get(name):
-                    new = new._convert() if name == "mode" else replace(new, scene=new._replace_part(name, value))
+                    new = (
+                        new._turn()
+                        if name == "motion"
+                        else new._convert()
+                        if name == "mode"
+                        else new._take(name, value)
+                    )
                 continue
             if name not in new.shown():
                 # A slider that has just gone, or none that ever was.
                 raise InputError(f"{str(name)[:40]!r}: the page has no such number now")
             if isinstance(value, bool) or not isinstance(value, int | float) or not -_LARGEST <= value <= _LARGEST:
-                raise InputError(f"{SLIDERS[name].label}: got {str(value)[:40]!r}; a finite number is needed")
-            number = round(value) if SLIDERS[name].whole else _round(float(value) / SLIDERS[name].per_si, 15)
+                raise InputError(f"{new.sliders[name].label}: got {str(value)[:40]!r}; a finite number is needed")
+            slider = new.sliders[name]
+            number = round(value) if slider.whole else _round(float(value) / slider.per_si, 15)
             new = replace(new, scene=new.scene.replace(**{_NORMALIZED.get(name, name): number}))
         return new.check()
 
@@ -146,8 +180,16 @@ class Controls:
             )
         return self
 
-    def _replace_part(self, name: str, kind: str) -> Scene:
+    def _turn(self) -> Controls:
+        """A device of the other kind, as this one has no numbers in its units, at the same rate and delay."""
+        other = _SMALL_DEVICE if self.rotary else _SMALL_ROTARY
+        return Controls(replace(other, timing=self.scene.timing))
+
+    def _take(self, name: str, kind: str) -> Controls:
         """The scene with another part of a usual kind."""
+        return replace(self, scene=self._replace_part(name, kind))
+
+    def _replace_part(self, name: str, kind: str) -> Scene:
         scene = self.scene
         cutoff = min(100.0, 0.1 / scene.timing.period)
         estimates = {
@@ -157,21 +199,29 @@ class Controls:
             "Butterworth": lambda: Butterworth(cutoff),
         }
         if name in PARTS:
-            return scene.replace(**{name: None if kind == "none" else PARTS[name](**PARTS[name].usual[kind])})
+            return scene.replace(**{name: None if kind == "none" else self._make_usual(name, kind)})
         if kind not in estimates:
             raise InputError(f"{name}: coefficients come with a configuration alone; choose another")
         return scene.replace(velocity=estimates[kind]())
 
+    def _make_usual(self, name: str, kind: str) -> Any:
+        """A part in one of its usual forms; of a rotary device as much smaller as that is."""
+        given = dict(PARTS[name].usual[kind])
+        for key, value in given.items():
+            unit = unit_of(f"{name}.{key}")
+            given[key] = _round(value * _SMALLER[unit], 12) if self.rotary and unit in _SMALLER else value
+        return PARTS[name](**given)
+
     def _convert(self) -> Controls:
         """The device and wall in the other units; normalized it is rigid, its parts are left out."""
-        scene, (mass, period) = self.scene, self.scale
+        scene, (mass, period, rotary) = self.scene, self.scale
         if not self.normalized:
             numbers = (_round(float(number), 12) for number in scene.normalized)
-            return replace(normalized_controls(*numbers), scale=(float(scene.mass), scene.timing.period))
+            return replace(normalized_controls(*numbers), scale=(float(scene.mass), scene.timing.period, self.rotary))
         rate, (stiffness, damping) = mass / period, self.wall
         numbers = stiffness * rate / period, damping * rate, scene.damping * rate, float(scene.d) * period
         *wall, own, delay = (_round(float(number), 12) for number in numbers)
-        return Controls(Scene(Device(mass, own), Timing(period, delay), VirtualWall(*wall)))
+        return Controls(Scene(Device(mass, own, rotary=rotary), Timing(period, delay), VirtualWall(*wall)))
 
 
 def _round(value: float, digits: int) -> float:
@@ -256,7 +306,8 @@ def _spell_section(controls: Controls) -> dict[str, Any]:
     """The section ``scene`` of a configuration; quantities have their units."""
     if controls.normalized:
         return {name: value for name, value in controls.shown().items() if name != "mode"}
-    return _add_units(spell_scene(controls.scene))
+    with use_kind(controls.rotary):
+        return _add_units(spell_scene(controls.scene))
 
 
 def _add_units(value: Any, path: str = "") -> Any:
@@ -285,13 +336,19 @@ def to_yaml(controls: Controls) -> str:
 
 def to_python(controls: Controls) -> str:
     """A script that builds the scene, judges its wall and draws the stable set."""
+    with use_kind(controls.rotary):
+        return _write_script(controls)
+
+
+def _write_script(controls: Controls) -> str:
     parts = spell_part(controls.scene)
     units = not controls.normalized
     paths = {name: "" if name in _BARE else name for name in parts}
     text = "".join(f"    {name}={_spell(part, paths[name], units)},\n" for name, part in parts.items())
     normalized = {"notes": "# Normalized: with m = 1 and T = 1, K is alpha and B is beta.\n", "unit": "(alpha)"}
     normalized |= {"x": "normalized stiffness alpha", "y": "normalized damping beta"}
-    physical = {"notes": "", "unit": "N/m", "x": "stiffness K in N/m", "y": "virtual damping B in N s/m"}
+    spring, damper = own_unit("N/m"), own_unit("N s/m")
+    physical = {"notes": "", "unit": spring, "x": f"stiffness K in {spring}", "y": f"virtual damping B in {damper}"}
     return _SCRIPT.format(scene=f"zwidth.Scene(\n{text})", **(physical if units else normalized))
 
 

@@ -21,6 +21,7 @@ from zwidth.pages.explorer.controls import Controls, read_link, to_link, to_pyth
 from zwidth.pages.explorer.details import IMPORTING, Update, Wish, compute_details, show_outlines
 from zwidth.parts.wall import VirtualWall
 from zwidth.words.errors import ZwidthError
+from zwidth.words.rotation import is_rotary, own_unit, use_kind
 
 # A message holds some dozen numbers, or an address.
 _LONGEST_MESSAGE = 16_000
@@ -196,13 +197,19 @@ class Page:
     def _name_axes(self) -> None:
         normalized = self.controls.normalized
         hertz = "cycles per period" if normalized else "frequency in Hz"
+        spring, damper, torque, turns = own_unit("N/m"), own_unit("N s/m"), own_unit("N"), is_rotary()
+        place = "position in mrad" if turns else "position in mm"
         names = {
-            "plane": ("alpha", "beta") if normalized else ("stiffness K in N/m", "damping B in N s/m"),
+            "plane": ("alpha", "beta") if normalized else (f"stiffness K in {spring}", f"damping B in {damper}"),
             "gain": (hertz, "|L| in dB"),
             "phase": (hertz, "phase in degrees"),
-            "step": ("time in periods", "position") if normalized else ("time in s", "position in mm/N"),
-            "contact": ("time in periods", "position") if normalized else ("time in s", "position in mm"),
-            "force": ("time in periods", "wall force") if normalized else ("time in s", "wall force in N"),
+            "step": ("time in periods", "position")
+            if normalized
+            else ("time in s", f"{place}/({torque})" if turns else f"{place}/N"),
+            "contact": ("time in periods", "position") if normalized else ("time in s", place),
+            "force": ("time in periods", "wall force")
+            if normalized
+            else ("time in s", f"wall {'torque' if turns else 'force'} in {torque}"),
         }
         for name, (x, y) in names.items():
             self.plots[name].xaxis.axis_label, self.plots[name].yaxis.axis_label = x, y
@@ -244,7 +251,8 @@ class Page:
             with IMPORTING:
                 before = self.controls if link is None else read_link(link) if link else self.start
                 controls = before.change(changes)
-                self._show_at_once(controls, rest)
+                with use_kind(controls.rotary):
+                    self._show_at_once(controls, rest)
         except Exception as error:
             self.tell({"error": _explain(error), "state": self.controls.shown(), "busy": False})
             return
@@ -319,10 +327,11 @@ class Page:
     def _compute(self, generation: int, wish: Wish) -> None:
         """In the worker's thread: compute part by part, unless something newer is wanted."""
         try:
-            for update in compute_details(wish):
-                if generation != self.generation:
-                    return
-                self._hand_over(generation, update)
+            with use_kind(bool(wish.scene.device.rotary)):
+                for update in compute_details(wish):
+                    if generation != self.generation:
+                        return
+                    self._hand_over(generation, update)
             self._hand_over(generation, {"busy": False})
         except Exception as error:
             # What belongs to the wall before goes.

@@ -27,7 +27,7 @@ from tornado.httputil import HTTPServerRequest
 from tornado.ioloop import IOLoop
 from tornado.web import ErrorHandler, RedirectHandler, RequestHandler, StaticFileHandler
 
-from zwidth.pages.explorer.controls import CHOICES, SLIDERS, Controls
+from zwidth.pages.explorer.controls import CHOICES, ROTARY_SLIDERS, SLIDERS, Controls
 from zwidth.pages.explorer.page import Page
 from zwidth.words.errors import InputError
 
@@ -110,7 +110,8 @@ class PageHandler(_Closed, SessionHandler):
         session: Any = await self.get_session()  # pyright: ignore[reportGeneralTypeIssues]
         roots = {root.id: root.name for root in session.document.roots}
         item = {"token": session.token, "roots": roots, "root_ids": list(roots), "use_for_title": False}
-        sliders = {name: slider._asdict() for name, slider in SLIDERS.items()}
+        kinds = {"linear": SLIDERS, "rotary": ROTARY_SLIDERS}
+        sliders = {kind: {name: each._asdict() for name, each in known.items()} for kind, known in kinds.items()}
         start = {"items": [item], "sliders": sliders, "choices": CHOICES}
         resources: Resources = self.application.resources()
         page = (_ASSETS / "page.html").read_text(encoding="utf-8")

@@ -8,7 +8,17 @@ from typing import Any
 import pytest
 
 import zwidth
-from zwidth.pages.explorer.controls import CHOICES, SLIDERS, Controls, normalized_controls, read_controls
+from zwidth.pages.explorer.controls import (
+    CHOICES,
+    ROTARY_SLIDERS,
+    SLIDERS,
+    Controls,
+    normalized_controls,
+    read_controls,
+    read_link,
+    to_link,
+    to_python,
+)
 
 CONFIGS = Path(__file__).parents[4] / "configs"
 DEVICE = "mass: 0.1, period: 1 ms, delay: 1.5 periods"
@@ -133,3 +143,21 @@ def test_a_run_has_recorded_its_scene(tmp_path):
     file = written(tmp_path, f"{DEVICE}, stiffness: 1000")
     assert zwidth.run(file, out=tmp_path / "run").ok
     assert read_controls(tmp_path / "run") == read_controls(file)
+
+
+@pytest.mark.parametrize("operator", CHOICES["operator"])
+@pytest.mark.parametrize("coupling", CHOICES["coupling"])
+def test_a_rotary_device_keeps_its_numbers_in_every_form_of_the_view(operator, coupling):
+    controls = Controls().change({"motion": "rotary"}).change({"operator": operator, "coupling": coupling})
+    shown = controls.shown()
+    assert controls.scene.device.rotary
+    assert controls.change(shown) == controls
+    assert read_link(to_link(controls)) == controls
+    assert "rotary=True" in to_python(controls)
+    for name in set(shown) & set(ROTARY_SLIDERS):
+        moved = controls.change({name: shown[name] * 1.5 + 1})
+        assert moved.shown()[name] == pytest.approx(shown[name] * 1.5 + 1, rel=1e-15)
+        assert ROTARY_SLIDERS[name].low <= shown[name] <= ROTARY_SLIDERS[name].high
+    if not controls.scene.parts_beyond and operator == "none":
+        assert controls.change({"mode": "normalized"}).change({"mode": "physical"}) == controls
+    assert not controls.change({"motion": "linear"}).scene.device.rotary

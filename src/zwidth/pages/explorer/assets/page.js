@@ -32,12 +32,10 @@ function addRow(form, name, label, ...controls) {
   return row;
 }
 function addSlider(form, name) {
-  const field = { ...start.sliders[name] };
-  const label = field.unit ? `${field.label} in ${field.unit}` : field.label;
+  const field = { slides: true };
   field.range = element("input", { type: "range", min: 0, max: STEPS, step: 1, id: `${name}-slider` });
-  field.range.setAttribute("aria-label", `${label}, slider`);
   field.number = element("input", { type: "number", step: "any", id: name });
-  field.row = addRow(form, name, label, field.range, field.number);
+  field.row = addRow(form, name, "", field.range, field.number);
   const slide = rest => {
     field.number.value = valueAt(field, Number(field.range.value));
     field.range.setAttribute("aria-valuetext", `${field.number.value} ${field.unit}`);
@@ -51,9 +49,19 @@ function addSlider(form, name) {
   field.number.addEventListener("change", () => {
     moved = "";
     if (Number.isFinite(field.number.valueAsNumber)) send({ [name]: field.number.valueAsNumber }, true);
-    else refuse([name], `${label}: no number; write one, or press Escape`);
+    else refuse([name], `${field.text}: no number; write one, or press Escape`);
   });
   fields[name] = field;
+}
+// Labels, units and ranges of linear devices or of rotary ones.
+function setMotion(motion) {
+  for (const [name, field] of Object.entries(fields)) {
+    if (!field.slides || field.motion === motion) continue;
+    Object.assign(field, start.sliders[motion][name], { motion });
+    field.text = field.unit ? `${field.label} in ${field.unit}` : field.label;
+    field.row.firstElementChild.textContent = field.text;
+    field.range.setAttribute("aria-label", `${field.text}, slider`);
+  }
 }
 function addChoice(form, name) {
   const select = element("select", { id: name });
@@ -62,9 +70,10 @@ function addChoice(form, name) {
   fields[name] = { select, row: addRow(form, name, LABELS[name] ?? name, select) };
 }
 function build() {
-  const form = by("controls"), names = Object.keys(start.sliders);
+  const form = by("controls"), names = Object.keys(start.sliders.linear);
   form.addEventListener("submit", event => event.preventDefault());
   addChoice(form, "mode");
+  addChoice(form, "motion");
   for (const name of names.filter(name => !name.includes("."))) {
     addSlider(form, name);
     if (name === "period") {
@@ -74,10 +83,11 @@ function build() {
       fields.rate = { rate, row };
     }
   }
-  for (const part of Object.keys(start.choices).filter(name => name !== "mode")) {
+  for (const part of Object.keys(start.choices).filter(name => name !== "mode" && name !== "motion")) {
     addChoice(form, part);
     for (const name of names.filter(name => name.startsWith(`${part}.`))) addSlider(form, name);
   }
+  setMotion("linear");
 }
 
 // The newest values go out when the last answer is in: what lies between is skipped, and nothing queues up.
@@ -132,6 +142,7 @@ function show(answer) {
   if (answer.error && answer.state) refuse(Object.keys(sent), answer.error);
   else if (answer.error) by("error").textContent = answer.error;
   else if ("error" in answer) accept();
+  if (answer.state?.motion) setMotion(answer.state.motion);
   if (answer.frame) for (const [k, names] of [[0, ["stiffness", "alpha"]], [1, ["virtual_damping", "beta"]]])
     for (const name of names) Object.assign(fields[name], { low: answer.frame[k][0], high: answer.frame[k][1], linear: true });
   if (answer.state) showState(answer.state);
