@@ -190,3 +190,19 @@ def test_an_axes_of_ones_own_is_drawn_into_and_no_setting_changes():
     assert dict(matplotlib.rcParams) == before
     with pytest.raises(zwidth.InputError, match="values: got shape"):
         plot.ridge(RIGID, "damping", 3.0)
+
+
+def test_a_rotary_device_is_drawn_in_its_units():
+    device, timing = zwidth.Device("12 g cm^2", "0.02 mN m s/rad"), zwidth.Timing("1 ms")
+    scene = zwidth.Scene(device, timing, zwidth.VirtualWall("4 mN m/deg", "0.3 mN m s/rad"))
+    _, (first, second, third, fourth) = plt.subplots(1, 4)
+    zwidth.plot.region(scene, first)
+    zwidth.plot.ridge(scene, "mass", ["10 g cm^2", "20 g cm^2"], second)
+    zwidth.plot.step(scene, ax=third)
+    zwidth.plot.motion(scene.simulate(start_position="2 deg", periods=50), fourth)
+    assert first.get_xlabel().endswith("in mN m/rad")
+    assert first.get_ylabel().endswith("in N m s/rad")
+    assert second.get_xlabel().endswith("in g cm$^2$")
+    np.testing.assert_allclose(second.lines[0].get_xdata(), [10, 20])
+    assert third.get_ylabel().endswith("rad for 1 N m")
+    assert fourth.get_ylabel().endswith("in mrad")
