@@ -81,7 +81,9 @@ def tell_apart(low: float, high: float, unit: str = "") -> tuple[str, str]:
 
 def header(name: str, unit: str) -> str:
     """The name of a column with its unit, as ``stiffness_N_per_m``; a number without unit has its name alone."""
-    return name if unit in ("", "1", "sampling periods") else f"{name}_{unit.replace('/', '_per_').replace(' ', '_')}"
+    if unit in ("", "1", "sampling periods"):
+        return name
+    return f"{name}_{unit.replace('/', '_per_').replace(' ', '_').replace('^', '')}"
 
 
 def own_header(name: str) -> str:
@@ -89,7 +91,7 @@ def own_header(name: str) -> str:
     for unit in sorted(ROTARY, key=len, reverse=True) if is_rotary() else ():
         ending = header("", unit)
         if name.endswith(ending):
-            return name.removesuffix(ending) + header("", ROTARY[unit].replace("^", ""))
+            return name.removesuffix(ending) + header("", ROTARY[unit])
     return name
 
 
