@@ -27,6 +27,16 @@ Law: TypeAlias = Callable[[Any, Any, Any], Any]
 arrays of JAX, one value a simulation."""
 
 
+class TracedLaw(NamedTuple):
+    """A law and the text of its program, which differs as soon as a number that the law reads elsewhere does."""
+
+    force: Law
+    program: str
+
+    def __call__(self, position: Any, velocity: Any, time: Any) -> Any:
+        return self.force(position, velocity, time)
+
+
 class Options(NamedTuple):
     """What decides the shape of the program that is compiled."""
 
@@ -36,7 +46,7 @@ class Options(NamedTuple):
     jitter: bool
     foaw: int  # longest window, 0 where the estimate is linear
     record: bool
-    law: Law | None
+    law: TracedLaw | None
 
 
 class Course(NamedTuple):
@@ -47,7 +57,7 @@ class Course(NamedTuple):
     tail: int
     contact: str
     record: bool
-    law: Law | None = None
+    law: TracedLaw | None = None
 
 
 class Given(NamedTuple):

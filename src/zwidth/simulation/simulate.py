@@ -14,7 +14,7 @@ from zwidth.parts.checks import check_whole, read_texts
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
 from zwidth.simulation.batch import TOGETHER, name_bodies, run_batch, structure
-from zwidth.simulation.lanes import Course, Law
+from zwidth.simulation.lanes import Course, Law, TracedLaw
 from zwidth.simulation.result import OF_MOTION, Motion, MotionKind
 from zwidth.words.errors import InputError, ResourceError, check_choice, describe_choice
 from zwidth.words.quantities import ANY, NOT_NEGATIVE
@@ -124,7 +124,8 @@ def simulate(
     Numerics:
         Float64. Matrix exponentials over the constant parts of a period; with friction the instants of stopping and
         starting to the last bit (docs/theory/simulation.md). JAX compiles for one to three seconds for each combination
-        of bodies and nonlinear parts; what each then costs stands in docs/simulation.md.
+        of bodies and nonlinear parts; `zwidth.use_compilation_cache` keeps that for later processes. What each then
+        costs stands in docs/simulation.md.
 
     References:
         Hulin, Preusche, Hirzinger 2006, section II (the loop).
@@ -142,10 +143,10 @@ def simulate(
     periods = check_whole("periods", periods, 1, 10**9)
     substeps = check_whole("substeps", substeps, 1, 10_000)
     tail = max(periods // 4, 1) if tail is None else check_whole("tail", tail, 1, periods)
-    course = Course(periods, substeps, tail, contact, record, force)
+    course = Course(periods, substeps, tail, contact, record)
     known, which = _list_scenes(scenes)
     if force is not None:
-        _check_law(force, stiffness, virtual_damping)
+        course = course._replace(law=_trace_law(force, stiffness, virtual_damping))
         given |= {"stiffness": 0.0, "virtual_damping": 0.0}
     if hand_history is not None:
         push_history = _push_by_hand(known, which, hand_history, push_history, periods)
@@ -179,8 +180,8 @@ def simulate(
     return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
 
 
-def _check_law(force: Any, stiffness: Any, virtual_damping: Any) -> None:
-    """Refuse a law beside a wall, and one that is no function of three arrays of JAX."""
+def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
+    """The law as it is now; refuse one beside a wall, and one that is no function of three arrays of JAX."""
     if stiffness is not None or virtual_damping is not None:
         raise InputError("force: got a law and a stiffness or damping; write both into the law, or leave it out")
     # What JAX is needed for begins here.
@@ -189,7 +190,10 @@ def _check_law(force: Any, stiffness: Any, virtual_damping: Any) -> None:
     with compute_concretely(), jax.numpy_rank_promotion("allow"):
         try:
             hash(force)
-            found = jax.eval_shape(force, *[jax.ShapeDtypeStruct((2,), float)] * 3)
+            # Through a new function each time: of one it knows, JAX would keep the numbers that it read at first.
+            own = jax.jit(lambda position, velocity, time: force(position, velocity, time))
+            lowered = own.lower(*[jax.ShapeDtypeStruct((2,), float)] * 3)
+            found, program = lowered.out_info, lowered.as_text()
         except Exception as error:
             name, words = getattr(force, "__name__", repr(force)), str(error).partition("\n")[0][:200]
             raise InputError(
@@ -199,6 +203,7 @@ def _check_law(force: Any, stiffness: Any, virtual_damping: Any) -> None:
     kind = getattr(found, "dtype", np.dtype(object)).kind
     if getattr(found, "shape", None) not in ((), (2,)) or kind not in "if":
         raise InputError(f"force: the law returns {found} for two simulations; one force in N for each is needed")
+    return TracedLaw(force, program)
 
 
 def _spread_starts(known: list[Any], given: dict[str, Any]) -> dict[str, Any]:

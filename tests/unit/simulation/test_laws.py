@@ -60,6 +60,20 @@ def test_the_law_of_a_wall_is_the_wall():
         np.testing.assert_allclose(other, one, rtol=0, atol=1e-10 * np.abs(one).max())
 
 
+@pytest.mark.parametrize("table", [np.float64(1.0), np.linspace(0.0, 2.0, 3001)], ids=["number", "table"])
+def test_a_law_acts_with_the_numbers_that_it_reads_now(table):
+    def spring(x: Any, v: Any, t: Any) -> Any:
+        return -1e3 * x * (table if table.ndim == 0 else jnp.asarray(table)[1500])
+
+    def command() -> float:
+        return float(RIGID.simulate(force=spring, start_position=1e-3, periods=3).command[0])
+
+    before = command()
+    assert before == pytest.approx(-1.0, rel=1e-12)
+    table = table * (1.0 + 1e-9)
+    assert command() / before == pytest.approx(1.0 + 1e-9, rel=1e-13)
+
+
 def test_nothing_is_said_of_what_becomes_of_it():
     def wall(x: Any, v: Any, t: Any) -> Any:
         return -(3e3 * x + 5.0 * v)
