@@ -158,7 +158,8 @@ class LimitCycleStudy(SimulatedStudy, Circumstances):
         edges, notes = [], []
         for label, given in zip(labels, self.list_circumstances(), strict=True):
             placed = given.place(self.device.to_scene())
-            motion = placed.simulate(**given.options(self.device.period) | axes, record=False)
+            options: dict[str, Any] = given.options(self.device.period) | axes
+            motion = placed.simulate(**options, record=False)
             for name in _OUTPUTS:
                 found[name].append(getattr(motion, name))
             stable = np.full(motion.outcome.shape, -1, np.int8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -177,7 +179,7 @@ def test_who_is_said_to_come_to_rest_while_it_slips_never_turns():
 @pytest.mark.parametrize("name", ["resolution", "coulomb"])
 def test_who_is_too_wide_for_steps_and_friction_to_stop_grows(name):
     """Friction stops the narrow ones of these unstable motions, and no one says that they grow."""
-    given = {name: np.geomspace(*{"resolution": (1e-7, 3e-4), "coulomb": (1e-4, 30.0)}[name], 60)}
+    given: dict[str, Any] = {name: np.geomspace(*{"resolution": (1e-7, 3e-4), "coulomb": (1e-4, 30.0)}[name], 60)}
     wall = 1.04 * float(TOP.stiffness), float(TOP.virtual_damping)
     now, later = (SCENE.simulate(*wall, **given, start_position=1e-3, periods=periods) for periods in (80, 800))
     grew = later.amplitude > 2.0 * now.amplitude

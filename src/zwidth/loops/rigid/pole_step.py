@@ -90,6 +90,11 @@ def _half_turn(x: Array, xp: Any) -> tuple[Array, Array]:
     return x * horner(square, _SINE), horner(square, _COSINE)
 
 
+def _store(value: Any, witness: Array) -> Any:
+    """A pair that five loops use, each of which would repeat its series: a step takes 0.7 of the time."""
+    return Pair(*store_once((value.real, value.imag), witness))
+
+
 def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     """Evaluate at ``e^(re + j im)``, |im| <= pi."""
     xp = namespace(re, loop.alpha)
@@ -114,9 +119,7 @@ def value_at(re: Array, im: Array, loop: Loop, fractional: bool) -> Value:
     turned, level = _half_turn(0.5 * phase, xp)
     lag = number(up * (1.0 - 2.0 * turned * turned), 2.0 * up * turned * level)
     if number is Pair:
-        # Five loops use them, each of which would repeat the series: a step takes 0.7 of the time.
-        parts = store_once((gap.real, gap.imag, lag.real, lag.imag), re)
-        gap, lag = Pair(*parts[:2]), Pair(*parts[2:])
+        gap, lag = _store(gap, re), _store(lag, re)
     z = gap + 1.0
     a, slope = gap * (gap + loop.em), z * (gap * 2.0 + loop.em)
     lead = (z * loop.a2 + loop.h) * down
