@@ -75,7 +75,16 @@ class RivalDevice(NamedTuple):
     cutoff: float | None = None
 
 
-@shown(("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "doubts"))
+@shown(
+    ("mass", "damping", "delay", "stiffness_max", "stiffness_error", "friction", "status", "doubts"),
+    missing=dict.fromkeys(("stiffness_max", "stiffness_error"), "see status and doubts"),
+    mass="kg",
+    damping="N s/m",
+    delay="s",
+    stiffness_max="N/m",
+    stiffness_error="N/m",
+    friction="N",
+)
 @dataclass(frozen=True)
 class DeviceFit:
     """A device found from records of it.

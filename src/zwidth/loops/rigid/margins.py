@@ -31,7 +31,7 @@ _LEAST_MARGIN = float(np.finfo(np.float32).tiny)
 _NO_CROSSOVER = -1e-3
 
 
-@shown(phase_margin="degrees")
+@shown(phase_margin="degrees", delay_margin="periods")
 class Margins(NamedTuple):
     """Margins of a wall and where they are taken, in radians a period; python-control's names in brackets."""
 
