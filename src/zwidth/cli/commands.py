@@ -23,7 +23,7 @@ from zwidth.words.quantities import NOT_NEGATIVE, POSITIVE
 _COLUMNS = ("mass", "damping", "friction", "resolution", "period", "force", "stiffness_limit")
 _PACKAGE = Path(__file__).resolve().parents[1]
 # A table that a configuration reads from its own folder.
-_TABLE = re.compile(r"csv: *([\w.-]+\.csv)")
+_TABLE = re.compile(r"(?:csv|device): *([\w.-]+\.csv)")
 
 
 @click.group(
@@ -94,6 +94,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     if int(wall.status) != Status.OK:
         raise click.UsageError(f"no wall with K > 0 is stable on this device: {Status(int(wall.status)).message}")
     top, kind = scene.normalize_walls(wall.stiffness, wall.virtual_damping), name_kind(wall)
+    by_mass = isinstance(scene.device, Device)
     result: dict[str, Any] = {
         "delta": float(scene.delta),
         "d": float(scene.d),
@@ -107,6 +108,9 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         row("alpha_max", f"{result['alpha_max']:.12g} ({kind.replace('_', ' ')} optimum)"),
         row("beta", f"{result['beta']:.12g}"),
     ]
+    if not by_mass:
+        # No mass is known, in whose units normalized numbers are.
+        result, lines = {"kind": kind}, []
     if not normalized:
         slopes, notes = words.list_slopes(scene), words.scene_notes(scene)
         found = wall.stiffness, wall.virtual_damping, wall.frequency

@@ -55,6 +55,8 @@ Command: TypeAlias = Callable[..., Any]
 # By path in a scene, as in configuration files, one part after the other.
 _PART_NAMES = tuple(dict.fromkeys(path.rpartition(".")[0] for path in OF_PARTS))
 _PARTS = sorted((*CHOICES, *OF_PARTS), key=lambda path: _PART_NAMES.index(path.rpartition(".")[0]))
+# What a device that is given as a whole holds already.
+_HELD = ("operator", "coupling", "actuator", "modes")
 _MODES = tuple(name for name in _PART_NAMES if name.startswith("modes."))
 
 
@@ -146,7 +148,11 @@ def flag_of(path: str) -> str:
 
 def _add_option(command: Command, path: str, required: bool = False) -> Command:
     if path == "device":
-        words = "A device with published mass and damping, linear or rotary, as `zwidth devices` lists them."
+        words = (
+            "A device with published mass and damping, linear or rotary, as `zwidth devices` lists them; or in place "
+            "of mass, damping and all parts a transfer function 'NUM / DEN', coefficients in s as '1 / 0.1 10 0', or "
+            "FILE.csv, a measured response."
+        )
         return click.option("--device", metavar="NAME", help=words)(command)
     if path in CHOICES:
         kind, text = click.Choice(CHOICES[path].names), CHOICES[path].sentence
@@ -180,9 +186,9 @@ def _take_options(
             named = {path: given.pop(path.replace(".", "__")) for path in paths}
             known = {path: each for path, each in named.items() if each is not None}
             if "device" in known:
-                from zwidth.parts.devices import find_device
+                from zwidth.parts.devices import read_device
 
-                known["device"] = find_device(known["device"])
+                known["device"] = read_device(known["device"])
             told = click.get_current_context().meta.get(_TOLD, {})
             with use_kind(bool(find_kind(told | ({"--device": known["device"]} if "device" in known else {})))):
                 return function(**{name: make(known)}, **given)
@@ -205,6 +211,7 @@ def read_period(period: float | None, rate: float | None) -> float | None:
 def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
     """The scene of some options by path; None where nothing describes one and none is required."""
     from zwidth.parts.device import Device
+    from zwidth.parts.devices import KnownDevice
     from zwidth.parts.mode import Mode
     from zwidth.parts.paths import PARTS
     from zwidth.parts.timing import Timing
@@ -231,10 +238,15 @@ def build_scene(given: dict[str, Any], required: bool = True) -> Scene | None:
         }
         modes = [_make_part(name, Mode, own) for name in _MODES if (own := _own(given, name))]
         parts |= {"modes": modes} if modes else {}
+        if device is None:
+            device = Device(**some("mass", "damping"), rotary=is_rotary())
+        elif isinstance(device, KnownDevice):
+            device = device.to_device(**some("mass", "damping"))
+        else:
+            for path in (path for path in given if path in ("mass", "damping") or path.partition(".")[0] in _HELD):
+                raise click.UsageError(f"--device is given as a whole and holds {flag_of(path)}: give one of the two")
         scene = Scene(
-            Device(**some("mass", "damping"), rotary=is_rotary())
-            if device is None
-            else device.to_device(**some("mass", "damping")),
+            device,
             Timing(**some("period", "rate", "delay")),
             VirtualWall(given.get("stiffness", 0.0), given.get("virtual_damping", 0.0)),
             velocity=_make_velocity(given),

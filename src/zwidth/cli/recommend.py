@@ -49,7 +49,7 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
     notes = [*words.coded_period_notes(scene), *found.notes]
     lines = [*words.scene_lines(scene), *(row("" if k else "set", text) for k, text in enumerate(found.lines()))]
     if found.verdict is not None:
-        lines.append(row("slowest pole", words.pole_words(found.verdict.time_constant, found.verdict.frequency)))
+        lines += words.pole_lines(found.verdict)
     lines += [row("" if k else "what buys stiffness", step.spell()) for k, step in enumerate(found.steps)]
     lines += [row("wrote", str(figure))] if figure is not None else []
     words.tell(found.as_dict() | {"notes": notes}, lines + words.note_lines(notes), as_json)

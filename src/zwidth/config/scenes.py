@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import BeforeValidator, ConfigDict, Field, PlainValidator, ValidationInfo, WithJsonSchema, WrapValidator
 
 from zwidth.arrays.xp import within
+from zwidth.config.devices import DeviceForm
 from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Strict
 from zwidth.config.parts import (
@@ -24,12 +25,13 @@ from zwidth.config.values import Delay, NonNegative, Number, describe_entry, qua
 from zwidth.parts.checks import Span
 from zwidth.parts.device import Device
 from zwidth.parts.devices import DEVICES
+from zwidth.parts.paths import PARTS, replace_parameters
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import FOAW
 from zwidth.parts.wall import VirtualWall
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import describe, short, suggestion
+from zwidth.words.formatting import describe, short
 from zwidth.words.quantities import LARGEST_DAMPING, MAX_DELAY_PERIODS, WALL_RANGE
 from zwidth.words.rotation import is_rotary
 from zwidth.words.types import DelayModel
@@ -72,11 +74,29 @@ def _period(value: Any, info: ValidationInfo) -> float:
     return 1.0 / rate
 
 
+def _mass(value: Any, info: ValidationInfo) -> float | None:
+    """The mass itself; none of a device that is given as a whole."""
+    if value is not None:
+        return quantity_of("mass").read(value)
+    if info.data.get("device", ...) is None:
+        allowed = "a device has mass and period or rate, or, normalized, delta"
+        raise problem("missing", allowed, "add 'mass: 0.1 kg'")
+    return None
+
+
 def find_second_period(keys: Iterable[str]) -> Iterable[LocatedProblem]:
     """A problem where the sampling period is given twice."""
     for second in [key for key in keys if key in ("period", "rate")][1:]:
         allowed = "the sampling period and its rate say the same"
         yield (second,), problem("period and rate are both given", allowed, "remove one", on_key=True)
+
+
+def find_second_device(keys: dict[str, Any]) -> Iterable[LocatedProblem]:
+    """Problems of what a device that is given as a whole holds already."""
+    for key in keys:
+        if key.partition(".")[0] in ("mass", "damping", *PARTS, "modes") and keys[key]:
+            allowed = "the linear system or response of the device holds it"
+            yield (key,), problem(f"got {key!r} beside a device given as a whole", allowed, "remove one", on_key=True)
 
 
 def tell_rotary(value: Any = None) -> bool | None:
@@ -93,11 +113,9 @@ _LISTED = "zwidth devices lists them"
 
 
 def _add_device(schema: dict[str, Any]) -> None:
-    """What editors are told of the name of a published device, which stands in the place of mass and damping."""
-    words = "Name of a published device, whose mass and damping are taken where none are written."
-    names = [device.name for device in DEVICES]
-    schema["properties"] = {"device": {"description": words, "enum": names}, **schema["properties"]}
-    schema["required"] = [name for name in schema.get("required", []) if name != "mass"]
+    """What editors are told of the texts that name a device, in the place of mass and damping."""
+    forms = schema["properties"]["device"]["anyOf"]
+    forms[:0] = [{"enum": [device.name for device in DEVICES]}, {"type": "string"}]
 
 
 class _Mass(_OneKind):
@@ -112,13 +130,9 @@ class _Mass(_OneKind):
     def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
         """Put the numbers of a published device in the place of its name; those that are written count."""
         name = raw.get("device")
-        if name is None:
-            return super().prepare(raw)
         known = {device.name: device for device in DEVICES}.get(name) if isinstance(name, str) else None
-        names = tuple(device.name for device in DEVICES)
         if known is None:
-            what = problem(f"got {describe(name)}", f"published are {listing(names)}", suggestion(name, names, _LISTED))
-            raise validation_error(cls.__name__, [(("device",), what)])
+            return super().prepare(raw)
         if known.rotary != is_rotary():
             allowed = "this device is linear, and others of the file are rotary"
             what = problem(f"got {describe(name)}", allowed, "write two files")
@@ -126,13 +140,13 @@ class _Mass(_OneKind):
         found = {key: number.value for key in ("mass", "damping") if (number := getattr(known, key)) is not None}
         return super().prepare({**found, **{key: value for key, value in raw.items() if key != "device"}})
 
-    @classmethod
-    def missing(cls, name: str) -> tuple[str, str]:
-        if name != "mass":
-            return super().missing(name)
-        return f"{cls.what} has mass and period or rate, or, normalized, delta", "add 'mass: 0.1 kg'"
+    device: DeviceForm | None = None
+    """Name of a published device, whose mass and damping are taken where none are written; or a device that is no mass
+    with damping: a linear system ('1 / 0.1 10 0' in s, or a mapping), or a measured response (FILE.csv)."""
 
-    mass: Annotated[float, quantity_of("mass")]
+    mass: Annotated[float | None, BeforeValidator(_mass), WithJsonSchema(quantity_of("mass").schema)] = Field(
+        default=None, validate_default=True
+    )
     """Moving mass m of the device in kg, > 0; of a rotary one its inertia in kg m^2."""
 
     damping: Annotated[float, quantity_of("damping")] = 0.0
@@ -154,7 +168,9 @@ class _Mass(_OneKind):
 
     @classmethod
     def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
-        return find_second_period(raw)
+        yield from find_second_period(raw)
+        if raw.get("device") is not None:
+            yield from find_second_device(raw)
 
 
 _Parts: Any = make_parts_base("the difference of two samples", "none")
@@ -175,6 +191,8 @@ class _PhysicalPlant(_Parts, _Mass):
                 scene.check_parts()
         except InputError as error:
             yield locate_refusal(error)
+            return
+        if self.device is not None:
             return
         with np.errstate(all="ignore"):
             numbers = scene.normalized
@@ -210,8 +228,9 @@ class _PhysicalPlant(_Parts, _Mass):
     def to_scene(self) -> Scene:
         """The device and its timing in SI units."""
         timing = Timing(period=self.period, delay=self.delay.seconds(self.period))
-        device = Device(mass=self.mass, damping=self.damping, rotary=bool(self.rotary))
-        return Scene(device, timing).replace(**build_parts(self))
+        # A device that is given as a whole is one of the parts, and takes the place of this one.
+        device = Device(mass=self.mass or 1.0, damping=self.damping, rotary=bool(self.rotary))
+        return replace_parameters(Scene(device, timing), build_parts(self))
 
 
 class _NormalizedPlant(_OneKind):
@@ -288,7 +307,7 @@ class PhysicalScene(_PhysicalPlant):
         return replace(bare, timing=timing, wall=wall)
 
     @property
-    def device(self) -> PhysicalDevice:
+    def bare(self) -> PhysicalDevice:
         """The scene without its wall, for studies that need a linear velocity estimate."""
         return PhysicalDevice(**self._device_keys)
 
@@ -299,9 +318,8 @@ class PhysicalScene(_PhysicalPlant):
 
     @property
     def _device_keys(self) -> dict[str, Any]:
-        own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay")}
-        own |= {"rotary": True} if self.rotary else {}
-        return {**own, **list_parts(self)}
+        own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay", "rotary")}
+        return {name: value for name, value in own.items() if value is not None} | list_parts(self)
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -332,7 +350,7 @@ class NormalizedScene(_NormalizedPlant):
     """How a delay that is not whole is modeled."""
 
     @property
-    def device(self) -> NormalizedDevice:
+    def bare(self) -> NormalizedDevice:
         """The scene without its wall."""
         return NormalizedDevice(delta=self.delta, d=self.d)
 

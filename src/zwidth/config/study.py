@@ -112,9 +112,9 @@ class Study(Strict):
             "delay_models": [scene.delay_model],
         }
         if "device" in cls.from_scene and isinstance(scene, PhysicalScene):
-            supplied["device"] = scene.simulated_device if cls.simulates else scene.device
+            supplied["device"] = scene.simulated_device if cls.simulates else scene.bare
         if "devices" in cls.from_scene:
-            supplied["devices"] = [scene.device]
+            supplied["devices"] = [scene.bare]
         return {**{name: supplied[name] for name in cls.from_scene if name in supplied}, **raw}
 
     @classmethod

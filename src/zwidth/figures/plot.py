@@ -136,12 +136,17 @@ def recommendation(
         response: columns of a step study of this wall, in SI units; computed at the samples where left out.
     """
     scene, told, top = found.scene, found.as_dict(), found.stiffest
-    axes = _two(axes, 1, 2, (style.WIDTH, 3.5)) if axes is None and found.verdict is not None else axes
+    # Without a model there is no response.
+    moves = not isinstance(scene.device, MeasuredDevice)
+    if axes is None:
+        axes = _two(None, 1, 2, (style.WIDTH, 3.5)) if found.verdict is not None and moves else _axes(None)
     outlines = stack(_trace(scene, "", passive=not find_obstacle(**vars(scene.device)) and scene.device.damping > 0))
     if found.verdict is None:
         wall = {"label": "", "wall": "stiffest", **tabulate_walls(scene, *top[:2])}
-        return draw_stable_set(outlines, stack([wall]), _axes(None) if axes is None else axes)
+        return draw_stable_set(outlines, stack([wall]), axes)
     K, B = found.stiffness, found.virtual_damping
+    if not moves:
+        return draw_recommendation(told, outlines, {}, np.atleast_1d(axes)[:1])
     if response is None:
         # As long as the slowest motion takes to decay, or so many periods.
         decay = told["recommended"]["decay_time"] or 0.0

@@ -234,7 +234,7 @@ class LinearLoop:
 
     def soft_column(self, alpha: float, least: float) -> list[tuple[float, float]]:
         """Those above ``least`` whose walls lie in a piece of the stable set with soft walls."""
-        column = np.maximum(stable_dampings(self.boundary, alpha), least).tolist()
+        column = np.maximum(self.column(alpha), least).tolist()
         return [(low, high) for low, high in column if low < high and self.holds_softly(alpha, 0.5 * (low + high))]
 
     def holds_softly(self, alpha: float, beta: float) -> bool:

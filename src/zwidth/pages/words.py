@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from zwidth.loops.linear.passivity import find_obstacle
+from zwidth.parts.device import Device
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.paths import find_parts
 from zwidth.words.formatting import plain, short, spell_stiffness, tell_apart, to_json, with_unit
 from zwidth.words.quantities import PARAMETERS
@@ -43,9 +45,8 @@ def tell(result: Any, lines: list[str], as_json: bool) -> None:
 @in_own_units
 def scene_lines(scene: Scene) -> list[str]:
     device, timing = scene.device, scene.timing
-    mass = f"{'J' if device.rotary else 'm'} = {with_unit(device.mass, 'kg')}"
     lines = [
-        row("device", f"{mass}, b = {with_unit(device.damping, 'N s/m')}"),
+        row("device", device.spell()),
         row(
             "timing",
             f"T = {with_unit(timing.period, 's')}, delay {with_unit(timing.delay, 's')} (d = {plain(scene.d)})",
@@ -77,8 +78,10 @@ def _spell(path: str, value: Any) -> str:
     return with_unit(value, unit) if unit else short(value) if isinstance(value, int) else plain(value)
 
 
-def stability_word(stable: bool, marginal: bool = False) -> str:
+def stability_word(stable: bool | None, marginal: bool = False) -> str:
     """The verdict, in color."""
+    if stable is None:
+        return click.style("undecided", fg="yellow", bold=True)
     if marginal:
         word = click.style("marginal", fg="yellow", bold=True)
         return f"{word} (a pole at z = 1: without stiffness nothing pulls back)"
@@ -89,28 +92,34 @@ def stability_word(stable: bool, marginal: bool = False) -> str:
 def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     wall = scene.wall
     word = stability_word(verdict.stable, verdict.marginal)
-    best = "none: no stiffness is stable at any damping"
+    best, normalized = "none: no stiffness is stable at any damping", []
+    # Of a device that is given as a whole no mass is known, and of a response no pole.
+    by_mass, by_poles = isinstance(scene.device, Device), not isnan(verdict.frequency)
     if isfinite(verdict.stiffness_max):
+        top = f"; alpha_max = {plain(verdict.alpha_max)}, beta = {plain(verdict.beta_at_max)}" if by_mass else ""
         best = (
             f"K_max = {spell_stiffness(verdict.stiffness_max)} at B = "
             f"{with_unit(verdict.virtual_damping_at_max, 'N s/m')} ({verdict.ridge_kind.replace('_', ' ')} optimum, "
-            f"{with_unit(verdict.ridge_frequency, 'Hz')}; alpha_max = {plain(verdict.alpha_max)}, "
-            f"beta = {plain(verdict.beta_at_max)})"
+            f"{with_unit(verdict.ridge_frequency, 'Hz')}{top})"
         )
+    elif not by_poles:
+        best = "none is told by the response"
+    if by_mass:
+        words = f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}"
+        normalized = [row("normalized", words)]
+    if by_poles:
+        word = f"{word}, spectral radius {verdict.spectral_radius:.6f}"
     return [
         *scene_lines(scene),
         row("wall", f"K = {spell_stiffness(wall.stiffness)}, B = {with_unit(wall.virtual_damping, 'N s/m')}"),
-        row(
-            "normalized",
-            f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}",
-        ),
+        *normalized,
         "",
-        row("verdict", f"{word}, spectral radius {verdict.spectral_radius:.6f}"),
+        row("verdict", word),
         row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B")),
         row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K")),
         row("passive", passivity_words(scene, verdict)),
         row("stiffest stable wall", best),
-        row("slowest pole", pole_words(verdict.time_constant, verdict.frequency)),
+        *pole_lines(verdict),
         *margin_lines(wall.stiffness, verdict),
     ]
 
@@ -160,6 +169,13 @@ def passivity_words(scene: Scene, verdict: Assessment) -> str:
         return f"yes, with {with_unit(margin, 'N s/m')} of physical damping to spare"
     verb = "no" if scene.device.coupling is None else "not proved"
     return f"{verb}, for want of {with_unit(-margin, 'N s/m')} of physical damping"
+
+
+def pole_lines(verdict: Assessment) -> list[str]:
+    """How the slowest pole moves; nothing of a measured response, which has no poles."""
+    if isnan(verdict.frequency):
+        return []
+    return [row("slowest pole", pole_words(verdict.time_constant, verdict.frequency))]
 
 
 def pole_words(constant: float, frequency: float) -> str:
@@ -215,7 +231,8 @@ def scene_notes(scene: Scene) -> list[str]:
     """What is remarkable of a scene beside its verdict."""
     from zwidth.scenes.assessment import describe_islands
 
-    return [*coded_period_notes(scene), *describe_islands(scene)]
+    undecided = scene.explain_undecided() if scene.wall.stiffness or scene.wall.virtual_damping else []
+    return [*undecided, *coded_period_notes(scene), *describe_islands(scene)]
 
 
 def note_lines(notes: list[str]) -> list[str]:
@@ -239,6 +256,8 @@ class Slope(NamedTuple):
 
 def list_slopes(scene: Scene) -> list[Slope]:
     """What a little more of every parameter of a scene changes of its stiffest wall."""
+    if isinstance(scene.device, MeasuredDevice):
+        return []
     per, values = scene.sensitivities().per, scene.parameters()
     found = []
     for path, slope in per.items():

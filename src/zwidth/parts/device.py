@@ -9,6 +9,7 @@ from zwidth.parts.actuator import Actuator
 from zwidth.parts.checks import check_fields, check_kind, find_kind
 from zwidth.parts.mode import Mode
 from zwidth.words.errors import InputError
+from zwidth.words.formatting import with_unit
 from zwidth.words.rotation import use_kind
 
 
@@ -94,6 +95,12 @@ class Device:
         with use_kind(rotary):
             check_fields(self)
         object.__setattr__(self, "rotary", rotary)
+
+    def spell(self) -> str:
+        """Mass and damping in words."""
+        with use_kind(bool(self.rotary)):
+            mass, damping = with_unit(self.mass, "kg"), with_unit(self.damping, "N s/m")
+        return f"{'J' if self.rotary else 'm'} = {mass}, b = {damping}"
 
     def __repr__(self) -> str:
         """As a call; of linear devices without their kind."""

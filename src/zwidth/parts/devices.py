@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 from zwidth.parts.device import Device
+from zwidth.parts.linear_device import LinearDevice, split_fraction
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.operator import Operator
 from zwidth.words.errors import InputError, describe_choice
 
@@ -183,3 +185,15 @@ def find_device(name: str) -> KnownDevice:
         if device.name == name:
             return device
     raise InputError(f"device: {describe_choice(name, tuple(device.name for device in DEVICES))}")
+
+
+def read_device(text: str) -> KnownDevice | LinearDevice | MeasuredDevice:
+    """A device as the command line names it: published, by its transfer function, or by a table of its response.
+
+    Args:
+        text: a name that `find_device` knows, ``"NUMERATOR / DENOMINATOR"`` with coefficients in s, highest power
+            first, or the name of a file that ends with ``.csv``.
+    """
+    if text.endswith(".csv"):
+        return MeasuredDevice.read(text)
+    return LinearDevice(split_fraction(text)) if "/" in text else find_device(text)

@@ -70,6 +70,11 @@ class LinearDevice:
         """The period of a sampled system, in s."""
         return self.system.dt
 
+    def spell(self) -> str:
+        """What it is, in words."""
+        kind = "sampled" if self.dt else "continuous"
+        return f"{kind} linear system of order {self.poles.size}, {self.zeros.size} finite zeros"
+
     @cached_property
     def zeros(self) -> np.ndarray:
         """Its finite zeros, in rad/s or in z."""
@@ -102,6 +107,17 @@ class LinearDevice:
         at, unit = (w * (0.3 + 1j), w) if self.dt is None else (0.3 + 1j, 1.0 / self.dt)
         size = abs(self.gain) * np.prod(np.abs(at - self.zeros)) / np.prod(np.abs(at - self.poles))
         return float(1.0 / (size * unit * unit))
+
+
+def split_fraction(text: str) -> tuple[list[float], list[float]]:
+    """The coefficients of ``NUMERATOR / DENOMINATOR``, each separated by blanks or commas, highest power first."""
+    try:
+        top, bottom = ([float(c) for c in side.replace(",", " ").split()] for side in text.split("/"))
+    except ValueError:
+        raise InputError(
+            f"device: got {text!r}; needed are coefficients in s, highest power first; write '1 / 0.1 10 0'"
+        ) from None
+    return top, bottom
 
 
 def _read(given: Any) -> RationalResponse:

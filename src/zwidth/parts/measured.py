@@ -88,8 +88,12 @@ class MeasuredDevice:
         return hash(self._key)
 
     def __repr__(self) -> str:
+        return f"MeasuredDevice({self.spell().partition(', ')[2]})"
+
+    def spell(self) -> str:
+        """What it is, in words."""
         f, band = self.frequency, "" if self.deviation is None else ", with deviation"
-        return f"MeasuredDevice({f.size} lines from {f[0]:g} to {f[-1]:g} Hz{band})"
+        return f"measured response, {f.size} lines from {f[0]:g} to {f[-1]:g} Hz{band}"
 
     @property
     def _key(self) -> tuple[bytes, ...]:

@@ -60,7 +60,7 @@ class Assessment:
     beta: float
     delta: float  # the damping to ground of that mass in the same units
     d: float  # the delay in periods
-    stable: bool  # every pole lies strictly inside the unit circle; everything else agrees with it
+    stable: bool | None  # every pole lies strictly inside the unit circle; None: a measured response leaves it open
     marginal: bool  # not stable for one pole at z = 1 alone: without stiffness nothing pulls back
     spectral_radius: float  # the largest pole magnitude, 1 to rounding where the decay is very slow
     decay_rate: float  # of the slowest motion, in 1/s, with relative accuracy; negative for a growing one
@@ -122,9 +122,10 @@ def assess(scene: Scene) -> Assessment:
     row, column = (tuple(map(tuple, ends.tolist())) for ends in (scene.stable_stiffness(), scene.stable_damping()))
     lower, upper = nearest_interval(column, scene.wall.virtual_damping)
     slowest, period = scene.loop.slowest(float(scene.alpha), float(scene.beta)), scene.timing.period
+    stable = bool(scene.is_stable())
     return Assessment(
         **{name: float(value) for name, value in scene.normalized._asdict().items()},
-        stable=bool(scene.is_stable()),
+        stable=stable or (None if scene.explain_undecided() else False),
         marginal=slowest.marginal,
         spectral_radius=slowest.radius,
         decay_rate=slowest.rate / period,

@@ -70,7 +70,7 @@ class BoundaryStudy(CurvesStudy):
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
         if "device" in raw or (is_with_parts(scene) and not {"delta", "d"} & set(raw)):
-            return {"delay_models": [scene.delay_model], "device": scene.device, **raw}
+            return {"delay_models": [scene.delay_model], "device": scene.bare, **raw}
         return super().fill(raw, scene)
 
     @classmethod
@@ -235,4 +235,9 @@ def _complete(device: Any, scene: PhysicalScene) -> Any:
         return device
     supplied = {"mass": scene.mass, "damping": scene.damping, "delay": scene.delay, **list_parts(scene)}
     supplied |= {} if {"period", "rate"} & set(device) else {"period": scene.period}
-    return {**supplied, **device}
+    # A device that is given as a whole stands for mass, damping and parts, and they for it.
+    if "device" in device:
+        supplied = {name: value for name, value in supplied.items() if name in ("period", "delay", "velocity")}
+    elif "mass" in device:
+        supplied.pop("device", None)
+    return {name: value for name, value in {**supplied, **device}.items() if value is not None}

@@ -107,7 +107,7 @@ class DesignStudy(ComputedStudy):
         if not isinstance(scene, PhysicalScene):
             return raw
         wanted = {} if not scene.stiffness else {"stiffness": scene.stiffness}
-        return {"device": scene.device, **wanted, **raw}
+        return {"device": scene.bare, **wanted, **raw}
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from functools import partial
+from math import isnan
 from typing import Annotated, Any, Literal
 
 from zwidth import figures
@@ -13,6 +14,7 @@ from zwidth.config.values import Fraction, Quantity
 from zwidth.figures.stable_set import trace_outlines
 from zwidth.figures.style import WIDTH, house_style, new_figure
 from zwidth.figures.table import Table, stack
+from zwidth.parts.device import Device
 from zwidth.scenes.recommendation import RANGES, Recommendation
 from zwidth.studies.outcome import Outcome
 from zwidth.studies.step import ResponseStudy
@@ -82,7 +84,8 @@ class RecommendStudy(ResponseStudy):
 @house_style()
 def draw(found: Recommendation, response: Table | None = None) -> Any:
     """Draw a recommendation into a figure that pyplot does not know, and return its Axes."""
-    columns = 1 if found.verdict is None else 2
+    # Of a measured response no motion is known.
+    columns = 1 if found.verdict is None or isnan(found.verdict.frequency) else 2
     _, axes = new_figure(WIDTH if columns == 2 else 5.6, 3.5, 1, columns)
     return figures.plot.recommendation(found, axes, response=response)
 
@@ -90,7 +93,7 @@ def draw(found: Recommendation, response: Table | None = None) -> Any:
 def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
     """A recommendation as Markdown, from its numbers."""
     scene, verdict = recommendation.scene, recommendation.verdict
-    best, most, device = found["recommended"], found["maximum"], scene.device
+    best, most = found["recommended"], found["maximum"]
 
     def spell(value: float | None, unit: str = "") -> str:
         return "not known" if value is None else with_unit(value, unit) if unit else plain(value)
@@ -100,14 +103,14 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
         spelled = [f"{mark}{spell(row[name], unit)}{mark}" for name, unit in units.items()]
         return " | ".join([*spelled, spell(row["alpha"]), spell(row["beta"])])
 
-    symbol = "J" if device.rotary else "m"
     parts = [f"{name} = {value}" for name, value in found["device"].items() if name not in _BARE]
+    by_mass = isinstance(scene.device, Device)
+    normalized = f" (normalized: delta = {plain(scene.delta)}, d = {plain(scene.d)})" if by_mass else ""
     lines = [
         "# Recommended virtual wall",
         "",
-        f"Device: {symbol} = {with_unit(device.mass, 'kg')}, b = {with_unit(device.damping, 'N s/m')}, sampled every "
-        f"{with_unit(scene.timing.period, 's')}, force delayed by",
-        f"{with_unit(scene.timing.delay, 's')} (normalized: delta = {plain(scene.delta)}, d = {plain(scene.d)}).",
+        f"Device: {scene.device.spell()}, sampled every {with_unit(scene.timing.period, 's')}, force delayed by",
+        f"{with_unit(scene.timing.delay, 's')}{normalized}.",
         *([f"Its parts, in SI units: {', '.join(parts)}."] if scene.parts_beyond or scene.operator else []),
         "",
         "| | stiffness K | virtual damping B | alpha | beta |",
@@ -121,6 +124,9 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
         passive, missing = recommendation.spell_passive(), verdict.passivity_margin
         if verdict.passive is False:
             passive += f", that would take {with_unit(-missing, 'N s/m')} more physical damping"
+        radius, how = best["spectral_radius"], ""
+        if isnan(verdict.frequency):
+            how = "by the measured curve" if scene.device.deviation is None else "for every response in the band"
         settles = f"settles to 2 % of a step of force in about {spell(best['settling_time'], 's')}"
         if best["settling_time"] is None:
             settles = f"has a slowest motion that decays to 2 % in {spell(best['decay_time'], 's')}"
@@ -129,9 +135,9 @@ def _describe(recommendation: Recommendation, found: dict[str, Any]) -> str:
             "",
             "The recommended wall",
             "",
-            f"- is stable: spectral radius {best['spectral_radius']:.6f};",
+            f"- is stable: {how if radius is None else f'spectral radius {radius:.6f}'};",
             f"- stays stable at this K for B between {lower} and {upper};",
-            f"- {settles};",
+            *([] if how else [f"- {settles};"]),
             f"- is passive: {passive}.",
             "",
         ]

@@ -10,10 +10,19 @@ from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, Wr
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.device_table import DeviceTable, TableField, read_table
+from zwidth.config.devices import DeviceForm
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
-from zwidth.config.scenes import AnyScene, PhysicalScene, Rotary, find_second_period, is_with_parts, tell_rotary
+from zwidth.config.scenes import (
+    AnyScene,
+    PhysicalScene,
+    Rotary,
+    find_second_device,
+    find_second_period,
+    is_with_parts,
+    tell_rotary,
+)
 from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
@@ -160,6 +169,9 @@ class _Swept(Study):
     axes: Axes
     """The parameters and their values; every combination is computed."""
 
+    device: DeviceForm | None = None
+    """A linear system or a measured response in place of mass and damping; the scene's where left out."""
+
 
 _Parts: Any = make_parts_base("the scene's", "the scene's", " Its keys may be axes, with its name and a dot.")
 
@@ -202,9 +214,10 @@ class SweepStudy(_Parts, _Swept):
         if given & set(PHYSICAL):
             if not isinstance(scene, PhysicalScene):
                 return raw
-            supplied: dict[str, Any] = {"mass": scene.mass, "damping": scene.damping, "delay": str(scene.delay)}
+            supplied: dict[str, Any] = {"delay": str(scene.delay)}
             supplied |= {} if given & {"period", "rate"} else {"period": scene.period}
             raw = {**list_parts(scene), **raw}
+            supplied |= {} if "device" in raw else {"mass": scene.mass, "damping": scene.damping}
         else:
             supplied = {"delta": scene.delta, "d": scene.d}
         return {**raw, "axes": {**axes, **{key: value for key, value in supplied.items() if key not in given}}}
@@ -230,7 +243,7 @@ class SweepStudy(_Parts, _Swept):
         if "rate" not in given and "period" not in given and physical:
             yield ("axes",), problem("period missing", "a physical sweep has period or rate", "add 'period: 1 ms'")
         for name, example in (("mass", "100 g"),) if physical else (("delta", "0.1"), ("d", "1")):
-            if name not in given:
+            if name not in given and self.device is None:
                 kinds = "a sweep has mass and period or rate, or, normalized, delta and d"
                 yield ("axes",), problem(f"{name} missing", kinds, f"add '{name}: {example}', or a scene")
         yield from self._outputs_limits(given, physical)
@@ -270,7 +283,10 @@ class SweepStudy(_Parts, _Swept):
             elif name == "passive" and (obstacle := find_obstacle(**build_parts(self))):
                 allowed = "it is known where a command acts at once, on the body whose position is sensed"
                 yield ("outputs", index), problem(f"got 'passive' {obstacle.partition(':')[0]}", allowed, "remove it")
-        if {"mass"} <= set(given) and {"period", "rate"} & set(given):
+        twice = [] if self.device is None else list(find_second_device(dict.fromkeys(given, True)))
+        if twice:
+            yield from ((("axes", *path), what) for path, what in twice)
+        elif (self.device is not None or "mass" in given) and {"period", "rate"} & set(given):
             yield from self._find_part_faults()
 
     def _find_part_faults(self) -> Iterable[LocatedProblem]:
@@ -319,7 +335,7 @@ class SweepStudy(_Parts, _Swept):
                 parts[part] = PARTS[part](
                     **{path.partition(".")[2]: value for path, value in given.items() if path.startswith(f"{part}.")}
                 )
-        device = Device(mass=given.pop("mass"), damping=given.pop("damping", 0.0), rotary=bool(self.rotary))
+        device = Device(mass=given.pop("mass", 1.0), damping=given.pop("damping", 0.0), rotary=bool(self.rotary))
         return Scene(device, Timing(period=period, delay=delay)).replace(**parts, **given)
 
     def _delay_limits(self, given: tuple[str, ...]) -> Iterable[LocatedProblem]:

@@ -28,11 +28,18 @@ _NODES, _ROUNDS, _MOST = 129, 80, 1 << 18
 _PROVED = 1e-13
 
 
-def find_obstacle(*, coupling: Any = None, actuator: Any = None, modes: Any = (), system: Any = None, **_: Any) -> str:
+def find_obstacle(
+    *, coupling: Any = None, actuator: Any = None, modes: Any = (), system: Any = None, response: Any = None, **_: Any
+) -> str:
     """Why parts of a device have no such condition; nothing where they have.
 
     It is about a force that acts as it is commanded, and the motion of the point where it does.
     """
+    if response is not None:
+        return (
+            "with a measured response: no passivity condition of this kind is known without a model; measure the "
+            "device with the hands it meets"
+        )
     if system is not None:
         return (
             "with a linear device: no passivity condition of this kind is known where damping is not that of one body; "

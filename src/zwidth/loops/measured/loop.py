@@ -10,7 +10,7 @@ import numpy as np
 
 from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.rows import Island
-from zwidth.loops.loop import LinearLoop
+from zwidth.loops.loop import LinearLoop, SlowestMotion
 from zwidth.loops.measured.curve import ResponseCurve
 from zwidth.loops.measured.intervals import DecidedWalls
 from zwidth.loops.rigid.margins import Margins
@@ -29,6 +29,9 @@ _INSIDE = 1e-9
 @dataclass(frozen=True, eq=False)
 class MeasuredLoop(LinearLoop):
     """Verdicts that hold for every response within the deviation; alpha and beta are arrays of one shape."""
+
+    # At no other rate is the response known.
+    most_periods = 0.0
 
     @cached_property
     def chain(self) -> AnyChain:
@@ -86,6 +89,10 @@ class MeasuredLoop(LinearLoop):
             stable[place[inside]] = decided.stable[k[inside]]
         shape, used = alpha.shape, np.full(alpha.shape, Method.CROSSOVER, np.int32)
         return Stability(stable.reshape(shape)[()], status.reshape(shape)[()], used[()])
+
+    def slowest(self, alpha: float, beta: float) -> SlowestMotion:
+        """Not known without a model: NaN."""
+        return SlowestMotion(False, np.nan, np.nan, np.nan)
 
     def row(self, beta: np.ndarray) -> np.ndarray:
         """The intervals of alpha that are surely stable: shape (rows, intervals, 2), NaN where a row has fewer."""

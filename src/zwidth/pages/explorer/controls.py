@@ -265,6 +265,11 @@ def _show_scene(given: Any, origin: Any) -> Controls:
             f"{origin}: scene.delay_model: got {given.delay_model!r}; the page computes the model 'held' alone, "
             "zwidth run draws both"
         )
+    if getattr(given, "device", None) is not None:
+        raise InputError(
+            f"{origin}: scene.device: the page has sliders for mass, damping and parts, and this device is given as a "
+            "whole; judge it by zwidth check, draw it by zwidth run"
+        )
     controls = (
         Controls(given.to_scene()) if hasattr(given, "to_scene") else normalized_controls(0, 0, given.delta, given.d)
     )

@@ -1,0 +1,150 @@
+"""Devices of a configuration that are no mass with damping: a linear system, or a measured frequency response."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import cached_property
+from types import SimpleNamespace
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+from pydantic import BeforeValidator, WithJsonSchema, WrapValidator
+
+from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.fields import Strict
+from zwidth.config.files import FileSection, find_file
+from zwidth.config.parts import locate_refusal
+from zwidth.config.values import Quantity
+from zwidth.parts.devices import DEVICES
+from zwidth.parts.linear_device import LinearDevice, split_fraction
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.words.errors import InputError
+from zwidth.words.formatting import describe, suggestion
+from zwidth.words.quantities import POSITIVE
+
+FORMS = "a published name, 'NUMERATOR / DENOMINATOR' in s, a table FILE.csv of a response, or a mapping"
+_OF_SYSTEM = (("numerator", "denominator"), ("zeros", "poles", "gain"), ("A", "B", "C"))
+
+
+def _to_array(raw: Any) -> np.ndarray:
+    """Real numbers, or complex ones where one is, of a list or of one; `ValueError` where one is none."""
+    given = np.array([] if raw is None else raw)
+    if given.dtype.kind == "U":
+        given = np.array([complex(text.replace(" ", "")) for text in given.ravel()]).reshape(given.shape)
+    if given.dtype.kind not in "iufc":
+        raise ValueError("no numbers")
+    return given
+
+
+def _check_numbers(raw: Any) -> Any:
+    try:
+        if np.all(np.isfinite(_to_array(raw))):
+            return raw
+    except ValueError:
+        pass
+    remedy = "write [1, 0.5], or '-3+40j' for a complex root"
+    raise problem(f"got {describe(raw)}", "it must be a list of finite numbers", remedy)
+
+
+_Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
+
+
+class SystemSection(Strict):
+    """A device as a linear system, from commanded force in N to sensed position in m."""
+
+    what: ClassVar[str] = "a linear system"
+
+    numerator: _Numbers | None = None
+    """Coefficients in s, or in z of a sampled system, highest power first."""
+
+    denominator: _Numbers | None = None
+    """Likewise; of a higher degree."""
+
+    zeros: _Numbers | None = None
+    """Finite zeros in rad/s, or in z; complex ones as text, '-3+40j', with their conjugates. None where left out."""
+
+    poles: _Numbers | None = None
+    """Poles, likewise."""
+
+    gain: _Numbers | None = None
+    """Of the highest powers, with zeros and poles."""
+
+    A: _Numbers | None = None
+    """Matrix of the state, a list of rows."""
+
+    B: _Numbers | None = None
+    """Column of the force."""
+
+    C: _Numbers | None = None
+    """Row of the position."""
+
+    sampled: Annotated[float, Quantity("s", POSITIVE)] | None = None
+    """The period of a system from sample to sample, that of the loop; a continuous one has none."""
+
+    def to_part(self) -> LinearDevice:
+        """The device itself."""
+        return self._known
+
+    @cached_property
+    def _known(self) -> LinearDevice:
+        form = next(form for form in _OF_SYSTEM if getattr(self, form[-1]) is not None)
+        names = {"numerator": "num", "denominator": "den"}
+        known = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
+        return LinearDevice(SimpleNamespace(**known, D=0.0, dt=self.sampled))
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        given = tuple(name for form in _OF_SYSTEM for name in form if getattr(self, name) is not None)
+        if given not in (*_OF_SYSTEM, ("poles", "gain")):
+            forms = " or ".join(listing(form) for form in _OF_SYSTEM)
+            yield (
+                (),
+                problem(f"got {listing(given) or 'nothing'}", f"a linear system has {forms}", "write one of these"),
+            )
+            return
+        try:
+            self.to_part()
+        except InputError as error:
+            yield (), locate_refusal(error)[1]
+
+
+class ResponseSection(FileSection):
+    """A device by its measured frequency response, a table that `zwidth respond --save` writes."""
+
+    what: ClassVar[str] = "a response"
+
+    def to_part(self) -> MeasuredDevice:
+        """The device itself."""
+        return self._known
+
+    @cached_property
+    def _known(self) -> MeasuredDevice:
+        return MeasuredDevice.read(find_file(self.csv))
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        try:
+            # Now, for the folder of the file is known while it is read.
+            self.to_part()
+        except InputError as error:
+            yield ("csv",), locate_refusal(error)[1]
+
+
+def _read_form(raw: Any) -> SystemSection | ResponseSection:
+    """A device in any of its forms but its numbers."""
+    if isinstance(raw, SystemSection | ResponseSection):
+        return raw
+    if isinstance(raw, str) and raw.endswith(".csv"):
+        raw = {"csv": raw}
+    elif isinstance(raw, str) and "/" in raw:
+        try:
+            raw = dict(zip(_OF_SYSTEM[0], split_fraction(raw), strict=True))
+        except InputError as error:
+            raise locate_refusal(error)[1] from None
+    if not isinstance(raw, dict):
+        names = tuple(device.name for device in DEVICES)
+        allowed = f"published are {listing(names)}"
+        raise problem(f"got {describe(raw)}", allowed, suggestion(raw, names, f"zwidth devices lists them; or {FORMS}"))
+    return (ResponseSection if "csv" in raw else SystemSection).model_validate(raw)
+
+
+DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw, _: _read_form(raw))]
