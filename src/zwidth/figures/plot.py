@@ -145,14 +145,12 @@ def recommendation(
         wall = {"label": "", "wall": "stiffest", **tabulate_walls(scene, *top[:2])}
         return draw_stable_set(outlines, stack([wall]), axes)
     K, B = found.stiffness, found.virtual_damping
-    if not moves:
-        return draw_recommendation(told, outlines, {}, np.atleast_1d(axes)[:1])
-    if response is None:
+    if response is None and moves:
         # As long as the slowest motion takes to decay, or so many periods.
         decay = told["recommended"]["decay_time"] or 0.0
         periods = int(min(max(_PERIODS, 1.5 * decay / scene.timing.period), _MOST_PERIODS))
         response = stack([_tabulate_step(scene, K, B, periods)])
-    elif np.isfinite(response["settling_time_s"][0]):
+    elif response is not None and np.isfinite(response["settling_time_s"][0]):
         told["recommended"]["settling_time"] = float(response["settling_time_s"][0])
     return draw_recommendation(told, outlines, response, axes)
 

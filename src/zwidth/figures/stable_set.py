@@ -202,14 +202,14 @@ def _draw_pieces(ax: Axes, table: Table, names: tuple[str, ...], color: Any, fac
 
 @style.house_style()
 def draw_recommendation(
-    found: Mapping[str, Any], region: Table, response: Table, axes: style.AnyAxes | None = None
+    found: Mapping[str, Any], region: Table, response: Table | None, axes: style.AnyAxes | None = None
 ) -> np.ndarray:
     """Draw the stable region over K and B with the recommended wall, and the response of the position to 1 N.
 
     Args:
         found: the recommendation, as its JSON file holds it.
         region: columns of a boundary study of the device, in SI units, or of a device with parts.
-        response: columns of a step study of the device with this wall.
+        response: columns of a step study of the device with this wall; None where no model tells one.
         axes: an Axes of yours for the region alone, or two.
     """
     panels = style.panels(axes, 2, style.WIDTH, 3.5, 2)
@@ -227,7 +227,7 @@ def draw_recommendation(
     interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)
     look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
     panels[0].plot([wall["stiffness"] * factor] * 2, interval, **look)
-    for ax in panels[1:]:
+    for ax in panels[1:] if response is not None else ():
         _draw_response(ax, found, response)
     style.letter(panels)
     return panels
