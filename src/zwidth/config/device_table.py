@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
@@ -10,7 +14,6 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonS
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
-from zwidth.config.files import find_file
 from zwidth.config.values import Entry, in_one_unit, quantity_of, read_entries
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion
@@ -22,6 +25,24 @@ MAX_ROWS = 100_000
 MAX_CSV_BYTES = 2**25
 
 _FORMS = "lists of equal length under the names of parameters, or {csv: FILE}"
+
+# Names of files in a configuration are relative to its folder, which no value of it knows.
+_folder: ContextVar[Path] = ContextVar("folder", default=Path())
+
+
+@contextmanager
+def files_relative_to(folder: Path) -> Iterator[None]:
+    """Let the files that a configuration names be looked for in its own folder."""
+    token = _folder.set(folder)
+    try:
+        yield
+    finally:
+        _folder.reset(token)
+
+
+def find_file(name: str) -> Path:
+    """A file that the configuration being read names."""
+    return _folder.get() / name
 
 
 @dataclass(frozen=True)

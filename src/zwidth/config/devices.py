@@ -10,9 +10,9 @@ from typing import Annotated, Any, ClassVar
 import numpy as np
 from pydantic import BeforeValidator, WithJsonSchema, WrapValidator
 
-from zwidth.config.faults import LocatedProblem, listing, problem
+from zwidth.config.device_table import find_file
+from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
 from zwidth.config.fields import Strict
-from zwidth.config.files import FileSection, find_file
 from zwidth.config.parts import locate_refusal
 from zwidth.config.values import Quantity
 from zwidth.parts.devices import DEVICES
@@ -89,17 +89,20 @@ class SystemSection(Strict):
     def _known(self) -> LinearDevice:
         form = next(form for form in _OF_SYSTEM if getattr(self, form[-1]) is not None)
         names = {"numerator": "num", "denominator": "den"}
-        known = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
+        known: dict[str, Any] = {names.get(name, name): _to_array(getattr(self, name)) for name in form}
+        if form != ("A", "B", "C"):
+            known = {name: values if name == "gain" else np.atleast_1d(values) for name, values in known.items()}
         return LinearDevice(SimpleNamespace(**known, D=0.0, dt=self.sampled))
 
+    @classmethod
+    def conflicts(cls, raw: dict[str, Any]) -> Iterable[LocatedProblem]:
+        # A misspelled key is reported, and its form is as good as there.
+        if raw.keys() <= cls.model_fields.keys() and not _is_whole(raw):
+            given, forms = listing(raw.keys() - {"sampled"}) or "nothing", " or ".join(map(listing, _OF_SYSTEM))
+            yield (), problem(f"got {given}", f"a linear system has {forms}", "write one of these")
+
     def limits(self) -> Iterable[LocatedProblem]:
-        given = tuple(name for form in _OF_SYSTEM for name in form if getattr(self, name) is not None)
-        if given not in (*_OF_SYSTEM, ("poles", "gain")):
-            forms = " or ".join(listing(form) for form in _OF_SYSTEM)
-            yield (
-                (),
-                problem(f"got {listing(given) or 'nothing'}", f"a linear system has {forms}", "write one of these"),
-            )
+        if not _is_whole(self.model_fields_set):
             return
         try:
             self.to_part()
@@ -107,26 +110,57 @@ class SystemSection(Strict):
             yield (), locate_refusal(error)[1]
 
 
-class ResponseSection(FileSection):
-    """A device by its measured frequency response, a table that `zwidth respond --save` writes."""
+def _is_whole(given: Iterable[str]) -> bool:
+    """Whether keys are those of one form; a system may have no zeros."""
+    return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _OF_SYSTEM)
+
+
+class ResponseSection(Strict):
+    """A device by its measured frequency response: a table as `zwidth respond --save` writes it, or its columns."""
 
     what: ClassVar[str] = "a response"
+
+    frequency: _Numbers
+    """Of its lines, in Hz."""
+
+    real: _Numbers
+    """Real part of position over force, in m/N."""
+
+    imag: _Numbers
+    """Imaginary part, in m/N."""
+
+    deviation: _Numbers | None = None
+    """The radius in which the true response lies, in m/N."""
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        """Put the columns of a file in the place of its name."""
+        if "csv" not in raw:
+            return super().prepare(raw)
+        try:
+            if not isinstance(raw["csv"], str):
+                raise InputError(f"csv: got {describe(raw['csv'])}; write the name of a file")
+            known = MeasuredDevice.read(find_file(raw["csv"]))
+        except InputError as error:
+            raise validation_error(cls.__name__, [(("csv",), locate_refusal(error)[1])]) from None
+        columns = {"frequency": known.frequency, "real": known.response.real, "imag": known.response.imag}
+        columns |= {} if known.deviation is None else {"deviation": known.deviation}
+        return {name: column.tolist() for name, column in columns.items()} | {k: raw[k] for k in raw if k != "csv"}
+
+    @cached_property
+    def _known(self) -> MeasuredDevice:
+        real, imag = (_to_array(part) for part in (self.real, self.imag))
+        return MeasuredDevice(self.frequency, real + 1j * imag if real.shape == imag.shape else real, self.deviation)
 
     def to_part(self) -> MeasuredDevice:
         """The device itself."""
         return self._known
 
-    @cached_property
-    def _known(self) -> MeasuredDevice:
-        return MeasuredDevice.read(find_file(self.csv))
-
     def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
         try:
-            # Now, for the folder of the file is known while it is read.
             self.to_part()
         except InputError as error:
-            yield ("csv",), locate_refusal(error)[1]
+            yield locate_refusal(error)
 
 
 def _read_form(raw: Any) -> SystemSection | ResponseSection:
@@ -144,7 +178,7 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
         names = tuple(device.name for device in DEVICES)
         allowed = f"published are {listing(names)}"
         raise problem(f"got {describe(raw)}", allowed, suggestion(raw, names, f"zwidth devices lists them; or {FORMS}"))
-    return (ResponseSection if "csv" in raw else SystemSection).model_validate(raw)
+    return (ResponseSection if {"csv", "frequency"} & set(raw) else SystemSection).model_validate(raw)
 
 
 DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw, _: _read_form(raw))]

@@ -20,6 +20,7 @@ from yaml.reader import Reader
 from yaml.resolver import BaseResolver
 from yaml.scanner import Scanner
 
+from zwidth.config.device_table import files_relative_to
 from zwidth.config.faults import (
     ConfigFileError,
     Fault,
@@ -31,7 +32,6 @@ from zwidth.config.faults import (
     problem,
     problems_of,
 )
-from zwidth.config.files import files_relative_to
 from zwidth.parts.devices import DEVICES
 from zwidth.words.formatting import describe
 from zwidth.words.rotation import use_kind

@@ -185,12 +185,16 @@ class _PhysicalPlant(_Parts, _Mass):
             allowed = f"at most {MAX_DELAY_PERIODS:g} periods"
             yield ("delay",), problem(f"got {self.delay}, which is {short(delay)} periods", allowed, "check the units")
             return
+        if self._is_double:
+            # Its keys have told.
+            return
         try:
             scene = self.to_scene()
             if not is_adaptive(self):
                 scene.check_parts()
         except InputError as error:
-            yield locate_refusal(error)
+            path, what = locate_refusal(error)
+            yield path if path[0] in type(self).model_fields else ("device", *path), what
             return
         if self.device is not None:
             return
@@ -203,6 +207,11 @@ class _PhysicalPlant(_Parts, _Mass):
                 what = f"got {short(getattr(self, field))}, whose normalized value is {name} = {short(value)}"
                 bounds = f"0 or {least:g} to {most:g}" if least else f"at most {most:g}"
                 yield (field,), problem(what, f"{name} must be {bounds}", "check the units and the mass")
+
+    @property
+    def _is_double(self) -> bool:
+        """Whether parts stand beside a device that is given as a whole."""
+        return self.device is not None and any(getattr(self, name) for name in (*PARTS, "modes"))
 
     @property
     def parts_beyond(self) -> tuple[str, ...]:
@@ -323,7 +332,7 @@ class PhysicalScene(_PhysicalPlant):
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
-        if self.delay_model not in self.to_scene().loop.delay_models:
+        if not self._is_double and self.delay_model not in self.to_scene().loop.delay_models:
             allowed = "velocity filters, hands and other parts are computed in the model 'held'"
             yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
 

@@ -227,8 +227,9 @@ def draw_recommendation(
     interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)
     look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
     panels[0].plot([wall["stiffness"] * factor] * 2, interval, **look)
-    for ax in panels[1:] if response is not None else ():
-        _draw_response(ax, found, response)
+    if response is not None:
+        for ax in panels[1:]:
+            _draw_response(ax, found, response)
     style.letter(panels)
     return panels
 

@@ -34,7 +34,7 @@ class LinearDevice:
     """A device as any strictly proper linear system from commanded force (N) to sensed position (m).
 
     Every question about walls is answered of it; its numbers are taken as exact. Nothing is known of bodies: a hand,
-    contact and friction are for `Device`.
+    friction, starts and energies of motions are for `Device`.
 
     Args:
         system: matrices ``(A, B, C)``, coefficients ``(numerator, denominator)`` with the highest power first, or

@@ -9,6 +9,7 @@ import numpy as np
 
 from zwidth.arrays.evaluate import compute_concretely, processors
 from zwidth.loops.linear.chain import chain_of
+from zwidth.parts.device import Device
 from zwidth.parts.paths import Parts, replace_parameters
 from zwidth.parts.velocity import FOAW, BackwardDifference
 from zwidth.simulation.flow import Mechanics, mechanics
@@ -23,7 +24,7 @@ from zwidth.simulation.lanes import (
     lay_machines,
     round_up,
 )
-from zwidth.simulation.result import to_si
+from zwidth.simulation.result import OF_ENERGY, to_si
 
 # Lanes that run together: enough for the vector units, few enough that a state stays next to the processor.
 TOGETHER = 1 << 10
@@ -33,7 +34,10 @@ def structure(scene: Parts) -> tuple[Any, ...]:
     """What the scenes of one program share: bodies, modes and actuator, what is sensed, and FOAW's longest window."""
     sensor = "motor" if scene.device.coupling is None else scene.device.coupling.sensor
     behind = len(scene.device.modes), 0 if scene.device.actuator is None else scene.device.actuator.order
-    return *name_bodies(scene), sensor, *behind, scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
+    # Of a linear system no part is known that others may share.
+    whole = None if isinstance(scene.device, Device) else (scene.device, scene.timing.period)
+    longest = scene.velocity.samples if isinstance(scene.velocity, FOAW) else 0
+    return *name_bodies(scene), sensor, *behind, longest, whole
 
 
 def name_bodies(scene: Parts) -> tuple[str, ...]:
@@ -70,6 +74,7 @@ class Batch:
             friction=friction,
             jitter=jitter,
             foaw=scenes[0].velocity.samples if adapts else 0,
+            bodies=isinstance(scenes[0].device, Device),
             record=course.record,
             law=course.law,
         )
@@ -146,7 +151,10 @@ class Batch:
                 tail = given.history[-self.course.tail :]
                 last, steady = last + tail[-1], steady & np.all(tail == tail[-1], axis=0)
             outlook = foresee(lanes, self.options, state, last, steady, sensed, self.course.periods)
-        return to_si((state, reading, frame), given, lanes.motor.static > 0, outlook, self.names, self.course)
+        found = to_si((state, reading, frame), given, lanes.motor.static > 0, outlook, self.names, self.course)
+        # Where a force acts and what stores its work is known of bodies.
+        unknown = () if self.options.bodies else OF_ENERGY & found.keys()
+        return found | {name: np.full_like(found[name], np.nan) for name in unknown}
 
 
 def run_batch(

@@ -13,7 +13,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import Chain, Resonance, body_position
+from zwidth.loops.linear.chain import AnyChain, Resonance, body_position
+from zwidth.loops.linear.system import System
+from zwidth.words.errors import InputError
 
 # Of series in a matrix of norm up to 1/2: the first term left out is below 1e-19 of the whole.
 _TERMS = 15
@@ -39,9 +41,11 @@ class Mechanics(NamedTuple):
     drain: np.ndarray  # (scenes, n + forces, n + forces): the power that dampers take
 
 
-def mechanics(chains: Sequence[Chain]) -> Mechanics:
-    """The matrices of chains with equally many bodies and modes, the sensor on the same body."""
-    first = chains[0]
+def mechanics(chains: Sequence[AnyChain]) -> Mechanics:
+    """The matrices of chains with equally many bodies and modes, the sensor on the same body; or of one system."""
+    if isinstance(chains[0], System):
+        return _follow(chains)
+    first: Any = chains[0]
     together = {
         name: tuple(_stack(parts) for parts in zip(*(getattr(chain, name) for chain in chains), strict=True))
         for name in ("bodies", "links", "modes")
@@ -77,6 +81,19 @@ def mechanics(chains: Sequence[Chain]) -> Mechanics:
     held = rate - rate[..., -1:] * (motion[0] @ rate)[:, None, :]
     wide = (0, len(forces))
     return Mechanics(rate, held, place, motion, 0.5 * energy, np.pad(drain, ((0, 0), wide, wide)))
+
+
+def _follow(systems: Sequence[Any]) -> Mechanics:
+    """The same of one linear system at any delays: one place is known, that the sensor sees, and no energy."""
+    A, _, push = systems[0].realize()
+    if systems[0].sampled:
+        raise InputError("device: got a system from sample to sample, whose motion between them is not known")
+    if push[0] != 0:
+        raise InputError("device: a force moves its velocity at once; add the mass or the lag that is missing")
+    size = len(A)
+    rate = np.repeat(np.concatenate([A, push[:, None]], 1)[None], len(systems), 0)
+    unknown = np.zeros((len(systems), size, size)), np.zeros((len(systems), size + 1, size + 1))
+    return Mechanics(rate, rate, np.eye(1, size), A[:1], *unknown)
 
 
 def _stack(parts: Sequence[Any]) -> Any:

@@ -45,6 +45,7 @@ class Options(NamedTuple):
     friction: bool
     jitter: bool
     foaw: int  # longest window, 0 where the estimate is linear
+    bodies: bool  # whether masses are known, or a linear system alone
     record: bool
     law: TracedLaw | None
 

@@ -65,9 +65,20 @@ def foresee(
     for shape in np.unique(shapes[known & finite], axis=0):
         at = np.flatnonzero(known & finite & (shapes == shape).all(1))
         group = gather(lanes, options, state, push, periods, at)
-        for name, part in _foresee(group, sensed[:, at], periods).items():
+        proved = _foresee(group, sensed[:, at], periods) if options.bodies else _foresee_linear(group)
+        for name, part in proved.items():
             getattr(outlook, name)[at] = part
     return outlook
+
+
+def _foresee_linear(group: LaneGroup) -> dict[str, np.ndarray]:
+    """What the poles of the linear loop tell, of lanes with nothing else."""
+    lanes, motor = group.lanes, group.lanes.motor
+    linear = (lanes.resolution == 0) & lanes.bilateral & lanes.pulling
+    linear &= np.isinf(motor.max_force) & np.isinf(motor.max_rate)
+    squarings = square(lay_loop(group, True, True, False).A)
+    pace = np.where(squarings == 0, np.inf, np.exp2(np.abs(squarings)))
+    return {"settles": linear & (squarings > 0), "grows": linear & (squarings < 0), "pace": pace}
 
 
 def _foresee(group: LaneGroup, sensed: np.ndarray, periods: int) -> dict[str, np.ndarray]:

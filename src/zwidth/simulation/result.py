@@ -62,6 +62,7 @@ OF_WHOLE = {
     "outcome": ("how the motion ends", "1"),
     "status": ("why a simulation has its values", "1"),
 }
+OF_ENERGY = {"wall_work", "push_work", "damping_loss", "friction_loss", "energy", "energy_given"}
 
 
 def _draw(motion: Motion) -> str:

@@ -11,6 +11,7 @@ import numpy as np
 from zwidth.arrays.evaluate import as_float64, compute_concretely, join_shapes, processors
 from zwidth.arrays.xp import is_traced
 from zwidth.parts.checks import check_whole, read_texts
+from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.wall import resolve_wall
 from zwidth.simulation.batch import TOGETHER, name_bodies, run_batch, structure
@@ -84,7 +85,8 @@ def simulate(
 
     Args:
         scenes: a `zwidth.Scene`, or a list or array of them. Its shape and those of the numbers below broadcast, as the
-            shape of the batch. Numbers may be texts with a unit, "2 N".
+            shape of the batch. Numbers may be texts with a unit, "2 N". A `zwidth.LinearDevice` starts at rest at 0,
+            has no friction, and no energy that is known (NaN).
         stiffness: K in N/m.
         virtual_damping: B in N s/m. Neither means each scene's own wall, as for `zwidth.Scene.is_stable`.
         force: a law in place of the wall's spring and damper: a function of the measured position (m), the estimated
@@ -96,7 +98,7 @@ def simulate(
         start_position: in m; of all bodies, or by their names in `Motion`, as ``{"position": 0, "hand_position":
             1e-3}``; a body that is not named starts with the device.
         start_velocity: in m/s, likewise, by the same names; the measured past lies on the line of the sensed body.
-        push: constant force of the hand on the device, in N.
+        push: constant force of the hand on the device, in N; on a `LinearDevice` it acts where the command does.
         push_history: force of the hand in N, held over each period, (..., periods); added to ``push``.
         hand_history: recorded position in m of the place that the spring and damper of a rigid `zwidth.Operator` end
             at, (..., periods + 1), linear between samples; its force is held at its mean over each period.
@@ -151,6 +153,8 @@ def simulate(
     if hand_history is not None:
         push_history = _push_by_hand(known, which, hand_history, push_history, periods)
     numbers, which, good = _read(known, which, _spread_starts(known, given), seed, push_history, periods)
+    for name in ("static", *(name for name in numbers if name.startswith(_STARTS))):
+        _refuse_bodies(known, which, name, numbers[name])
     _check_memory(numbers, course)
     shape, which = which.shape, which.ravel()
     found: dict[str, np.ndarray] = {}
@@ -178,6 +182,19 @@ def simulate(
         for name, column in found.items()
     }
     return Motion(**(dict.fromkeys(("time", *OF_MOTION)) | shaped))
+
+
+def _refuse_bodies(known: list[Any], which: np.ndarray, name: str, values: np.ndarray) -> None:
+    """Refuse what a linear system has no body for: to slip, or to start from another place than its rest."""
+    whole = np.array([isinstance(scene.device, LinearDevice) for scene in known])
+    if np.any((values != 0) & whole[which.ravel()]):
+        field, what = _spell(name), "a start names the state of all bodies"
+        if name == "static":
+            field, what = "coulomb, static", "friction acts on a body"
+        raise InputError(
+            f"{field}: {what}, and of a linear system none is known; it starts at rest at 0: move it by push or "
+            "push_history, or simulate a zwidth.Device"
+        )
 
 
 def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:
@@ -288,11 +305,6 @@ def _list_scenes(scenes: Any) -> tuple[list[Any], np.ndarray]:
     for place, scene in np.ndenumerate(array):
         if not (hasattr(scene, "device") and hasattr(scene, "timing")):
             raise InputError(f"scenes: got {scene!r}; a zwidth.Scene or a list of them is needed")
-        if hasattr(scene.device, "system"):
-            raise InputError(
-                "device: got one given as a linear system, of which no body is known that touches, slips and starts; "
-                "simulate a zwidth.Device, or step scene.state_space(stiffness, virtual_damping)"
-            )
         if isinstance(scene.device, MeasuredDevice):
             raise InputError("scenes: a measured response is no model to simulate; fit one to a log (zwidth.fit_log)")
         if is_traced(scene.device.mass, scene.timing.period):

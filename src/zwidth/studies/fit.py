@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -12,9 +13,9 @@ from pydantic import BeforeValidator, GetJsonSchemaHandler, PrivateAttr, WithJso
 from pydantic_core import CoreSchema
 
 from zwidth import figures
+from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import Strict, members
-from zwidth.config.files import FileSection, find_file
 from zwidth.config.parts import VelocityField, locate_refusal, split_refusal
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
@@ -49,7 +50,7 @@ def _read_resolution(raw: Any) -> Any:
 Step = Annotated[float | str, BeforeValidator(_read_resolution), WithJsonSchema(describe_entry("m", "rad", "deg"))]
 
 
-class LogSection(FileSection):
+class LogSection(Strict):
     """One log: a file of columns and which of them is what."""
 
     what: ClassVar[str] = "a log"
@@ -73,10 +74,37 @@ class LogSection(FileSection):
     motor_constant: str | None = None
     """What an ampere makes, as 5 N/A or 0.03 N m/A; needed for forces in A or mA."""
 
+    sha256: str | None = None
+    """Digest of the file; another file is refused. Where left out it is the file's own, for the record."""
+
+    @classmethod
+    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
+        digest = _digest(raw.get("csv"))
+        return {**raw, "sha256": digest} if digest and "sha256" not in raw else raw
+
+    @classmethod
+    def missing(cls, name: str) -> tuple[str, str]:
+        return "a log is a CSV file", "add 'csv: log.csv'"
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        digest = _digest(self.csv)
+        if digest and digest != self.sha256:
+            what = f"{self.csv} has another digest, {digest[:12]}..."
+            yield ("sha256",), problem(what, "it is the file that was fitted before", "remove sha256 if it may change")
+
     def read(self, period: float | None) -> LoggedMotion:
         columns = {name: getattr(self, name) for name in ("time", "position", "force")}
         options = {"resolution": self.resolution, "motor_constant": self.motor_constant}
         return read_log(find_file(self.csv), columns, period=period, **options)
+
+
+def _digest(name: Any) -> str:
+    """Of a file's bytes; "" where it cannot be read."""
+    try:
+        file = find_file(name) if isinstance(name, str) else None
+        return hashlib.sha256(file.read_bytes()).hexdigest() if file is not None and file.is_file() else ""
+    except (OSError, ValueError):
+        return ""
 
 
 def _read_logs(raw: Any, handler: Any) -> Any:

@@ -90,3 +90,60 @@ def test_what_is_missing_is_said(arguments, said, tmp_path, monkeypatch, capsys)
         main(arguments)
     assert end.value.code == 2
     assert said in capsys.readouterr().err
+
+
+def said_of(output):
+    return dict(line.split("  ", 1) for line in output.splitlines() if line and line[0] != " ")
+
+
+def test_a_response_is_a_device_of_every_command_that_judges(first):
+    folder, _ = first
+    device = ["--device", folder / "r.csv", "--period", "1 ms"]
+    scene = zwidth.Scene(zwidth.MeasuredDevice.read(folder / "r.csv"), zwidth.Timing(1e-3))
+    top = scene.max_stiffness()
+    known = {"stiffness": float(top.stiffness), "virtual_damping": float(top.virtual_damping)}
+    ridge = json.loads(call("ridge", *device, "--json"))
+    assert (ridge["stiffness_max"], ridge["virtual_damping"]) == tuple(known.values())
+    assert "alpha_max" not in ridge, "no mass is known"
+    lines = said_of(call("check", *device, "--stiffness", "5 kN/m", "--virtual-damping", "12 N s/m"))
+    assert lines["verdict"].strip() == "stable"
+    assert "not known with a measured response" in lines["passive"]
+    assert not {"normalized", "slowest pole"} & lines.keys()
+    # A little stiffer than what is stable for every response in the band.
+    wall = ["--stiffness", 1.03 * known["stiffness"], "--virtual-damping", known["virtual_damping"]]
+    lines = said_of(call("check", *device, *wall))
+    assert lines["verdict"].strip() == "undecided"
+    assert "measure anew from" in lines["note"]
+    assert json.loads(call("check", *device, *wall, "--json"))["stable"] is None
+    found = json.loads(call("recommend", *device, "--gain-margin", "1.3", "--json"))["recommended"]
+    verdict = zwidth.assess(zwidth.Scene(scene.device, scene.timing, zwidth.VirtualWall(*(found[k] for k in known))))
+    assert verdict.stable
+    assert 1.3 <= verdict.gain_margin < 1.301
+
+
+def test_a_transfer_function_is_a_device():
+    system = ["--device", "1 / 0.1 10 0", "--period", "1 ms", "--delay", "1 ms"]
+    mass = ["--mass", "100 g", "--damping", "10 N s/m", "--period", "1 ms", "--delay", "1 ms"]
+    wall = ["--stiffness", "5 kN/m", "--virtual-damping", "20"]
+    found, known = (json.loads(call("check", *device, *wall, "--json")) for device in (system, mass))
+    same = ["stiffness_limit", "virtual_damping_lower", "stiffness_max", "spectral_radius", "time_constant"]
+    assert [found[name] for name in same] == pytest.approx([known[name] for name in same], rel=1e-9)
+    assert said_of(call("check", *system, *wall))["device"].strip() == (
+        "continuous linear system of order 2, 0 finite zeros"
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--device", "1 / x"], "highest power first"),
+        (["--device", "nobody"], "device: got 'nobody'"),
+        (["--device", "nothing.csv"], "no such file"),
+        (["--device", "1 / 0.1 10 0", "--mass", "1 kg"], "holds --mass"),
+        (["--device", "1 / 0.1 10 0", "--operator-mass", "1 kg"], "holds --operator-mass"),
+    ],
+)
+def test_what_is_no_device_is_refused_in_one_line(options, words):
+    done = CliRunner().invoke(cli, ["ridge", "--period", "1 ms", *options])
+    assert done.exit_code != 0
+    assert words in (done.output or str(done.exception)) or words in str(done.exception)

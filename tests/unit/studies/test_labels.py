@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import zwidth
-from zwidth.config.device_table import read_table
-from zwidth.config.files import files_relative_to
+from zwidth.config.device_table import files_relative_to, read_table
 from zwidth.figures import style
 from zwidth.runs.draw import draw_stores
 from zwidth.studies.outcome import csv_text

@@ -223,3 +223,41 @@ def test_a_rigid_scene_takes_the_rigid_path():
     sweep = config.studies[0]
     assert isinstance(sweep, SweepStudy)
     assert not sweep.with_parts
+
+
+def test_devices_given_as_a_whole_are_swept(tmp_path):
+    """A linear system over delays and filters, and a response whose table is gone when the sweep goes on."""
+    timing, lines = {"period": 1e-3}, np.geomspace(1.0, 450.0, 300)
+    rigid = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3), velocity=zwidth.LowPass(cutoff=30.0))
+    # Without its filter the open loop of K = 1 is the device.
+    response = rigid.replace(velocity=zwidth.BackwardDifference()).frequency_response(1.0, 0.0, lines)
+    zwidth.MeasuredDevice(lines, response, 1e-9).save(tmp_path / "response.csv")
+    system, measured = "1 / 0.1 10 0", str(tmp_path / "response.csv")
+    delays = {"delay": ["0 ms", "1 ms"], "velocity.cutoff": [30.0, 100.0]}
+    config = config_of(
+        study("system", {**timing, **delays}, ("stiffness_max",), device=system, **FILTER),
+        study(
+            "measured",
+            {**timing, **WALLS},
+            ("stable",),
+            device=measured,
+            velocity={**FILTER["velocity"], "cutoff": 30.0},
+        ),
+    )
+    (tmp_path / "response.csv").unlink()
+    assert zwidth.run(config, out=tmp_path / "run", workers=2).ok
+    found = open_dataset(tmp_path / "run" / "system.zarr").stiffness_max
+    for delay in (0.0, 1e-3):
+        for cutoff in (30.0, 100.0):
+            alone = rigid.replace(**{"delay": delay, "velocity.cutoff": cutoff}).max_stiffness().stiffness
+            assert float(found.sel(delay=delay, velocity_cutoff=cutoff)) == pytest.approx(float(alone), rel=1e-12)
+    found = open_dataset(tmp_path / "run" / "measured.zarr").stable
+    stable = rigid.is_stable(STIFFNESS[:, None], VIRTUAL)
+    assert not (found.values & ~stable).any(), "stable for every response in the band, of which this is one"
+    assert found.values.sum() > 0.9 * stable.sum()
+
+
+@pytest.mark.parametrize("axis", ["mass", "damping", "actuator.cutoff"])
+def test_a_device_given_as_a_whole_holds_its_mass(axis):
+    with pytest.raises(ValueError, match="beside a device given as a whole"):
+        config_of(study("s", {"period": 1e-3, axis: [1.0, 2.0]}, ("stiffness_max",), device="1 / 0.1 10 0"))

@@ -228,3 +228,27 @@ def test_a_device_on_a_spring_is_one_too():
     # Softer walls than the spring are left open.
     assert sure.mean() > 0.4
     np.testing.assert_array_equal(decided.stable[sure], scene.is_stable(*walls)[sure])
+
+
+def test_an_assessment_says_what_samples_tell_and_leaves_the_rest_open():
+    scene = SCENES["amplifier"]
+    hertz = np.geomspace(0.5, 480, 600)
+    size = np.abs(response(scene, hertz))
+    known = measured(scene, hertz, 0.02 * size)
+    top, words = scene.max_stiffness(), {True: 0, False: 0, None: 0}
+    for share in (0.3, 0.9, 1.0, 1.1, 3.0):
+        wall = zwidth.VirtualWall(share * float(top.stiffness), float(top.virtual_damping))
+        found, true = zwidth.assess(known.replace(wall=wall)), zwidth.assess(scene.replace(wall=wall))
+        decided = known.decide_stability(wall.stiffness, wall.virtual_damping)
+        assert (found.stable is None) == (decided.status == Status.UNDECIDED)
+        assert found.stable in (None, true.stable), "what is said holds for every response, and this one is in the band"
+        words[found.stable] += 1
+        for (low, high), (least, most) in zip(found.stable_stiffness, true.stable_stiffness, strict=False):
+            assert least <= low < high <= most
+        unknown = "spectral_radius", "decay_rate", "time_constant", "frequency", "passivity_margin"
+        assert all(np.isnan(getattr(found, name)) for name in unknown)
+        assert found.passive is None
+    assert all(words.values()), "each verdict is asked for"
+    assert [limit.name for limit in zwidth.limits_of(known)] == [], "at no other rate or delay is it known"
+    (row,) = zwidth.assess_many({"measured": known.replace(wall=zwidth.VirtualWall(1e3, 1.0))})
+    assert (row["status"], row["spectral_radius"]) == ("OK", None)

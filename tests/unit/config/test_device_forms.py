@@ -1,0 +1,128 @@
+"""Devices of a configuration that are given as a whole, by a linear system or a measured response."""
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+
+import zwidth
+from zwidth.config.faults import ConfigFileError
+from zwidth.studies.document import Config
+
+STUDIES = "studies: [{kind: recommend, name: r}]\n"
+RIGID = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3, 1e-3))
+LINES = np.geomspace(1.0, 450.0, 300)
+RESPONSE = RIGID.frequency_response(1.0, 0.0, LINES)
+
+
+def scene_with(device: str, more: str = "period: 1 ms, delay: 1 ms") -> str:
+    return f"scene: {{device: {device}, {more}}}\n{STUDIES}"
+
+
+@pytest.fixture
+def table(tmp_path):
+    """A response beside the configuration."""
+    zwidth.MeasuredDevice(LINES, RESPONSE, 1e-9).save(tmp_path / "response.csv")
+
+
+@pytest.mark.parametrize(
+    "device",
+    [
+        "'1 / 0.1 10 0'",
+        "'1, / 0.1, 10, 0'",
+        "{numerator: [1], denominator: [0.1, 10, 0]}",
+        "{numerator: 1, denominator: [0.1, 10, 0]}",
+        "{poles: [0, -100], gain: 10}",
+        "{zeros: [], poles: ['0', '-100+0j'], gain: 10}",
+        "{A: [[0, 1], [0, -100]], B: [0, 10], C: [1, 0]}",
+    ],
+)
+def test_every_form_of_a_rigid_mass_is_the_rigid_device(load, device):
+    config = load(scene_with(device))
+    found, known = config.scene.to_scene().max_stiffness(), RIGID.max_stiffness()
+    np.testing.assert_allclose(found[:3], known[:3], rtol=1e-12)
+    # What a run keeps of a configuration says the same.
+    assert Config.model_validate(config.model_dump(mode="json", exclude_none=True)) == config
+
+
+def test_complex_roots_come_with_their_conjugates(load):
+    scene = load(scene_with("{poles: [0, '-3 + 40j', '-3 - 40j'], gain: 1e3}")).scene.to_scene()
+    assert sorted(scene.device.poles, key=lambda pole: pole.imag) == pytest.approx([-3 - 40j, 0, -3 + 40j], rel=1e-15)
+
+
+def test_a_sampled_system_has_the_period_of_the_loop(load):
+    loop = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3)).open_loop(1.0, 0.0)
+    matrices = {name: getattr(loop, name).tolist() for name in "AB"} | {"C": loop.C.tolist(), "sampled": "1 ms"}
+    scene = load(scene_with(json.dumps(matrices), "period: 1 ms")).scene.to_scene()
+    known = zwidth.Scene(zwidth.Device(0.1, 10.0), zwidth.Timing(1e-3)).max_stiffness()
+    np.testing.assert_allclose(scene.max_stiffness()[:3], known[:3], rtol=1e-9)
+
+
+def test_a_response_is_read_beside_the_file_and_kept_by_its_numbers(load, table, tmp_path):
+    config = load(scene_with("response.csv", "period: 1 ms"))
+    known = zwidth.MeasuredDevice(LINES, RESPONSE, 1e-9)
+    assert config.scene.to_scene().device == known
+    kept = config.model_dump(mode="json", exclude_none=True)
+    (tmp_path / "response.csv").unlink()
+    again: Any = Config.model_validate(kept).scene
+    assert again.to_scene().device == known
+    (study,) = config.studies
+    (outcome,) = [study.compute(config.scene, True)]
+    told = json.loads(outcome.documents["recommendation.json"])
+    wall = told["recommended"]["stiffness"], told["recommended"]["virtual_damping"]
+    assert RIGID.is_stable(*wall), "every response in the band is stable, and this one is in it"
+    assert told["recommended"]["spectral_radius"] is None
+    text = outcome.documents["recommendation.md"]
+    assert "for every response in the band" in text
+    assert "measured response, 300 lines from 1 to 450 Hz" in text
+
+
+@pytest.mark.parametrize(
+    ("device", "more", "place", "words"),
+    [
+        ("nobody", "period: 1 ms", "scene.device", "published are"),
+        ("phantom_2007", "period: 1 ms", "scene.device", "did you mean 'phantom_2006'?"),
+        ("'1 / x'", "period: 1 ms", "scene.device", "coefficients in s"),
+        ("'1 / 2 / 3'", "period: 1 ms", "scene.device", "coefficients in s"),
+        ("missing.csv", "period: 1 ms", "scene.device.csv", "no such file"),
+        ("{csv: 3}", "period: 1 ms", "scene.device.csv", "write the name of a file"),
+        ("{numerator: [1]}", "period: 1 ms", "scene.device", "'numerator', 'denominator' or"),
+        ("{numerator: [1], poles: [0]}", "period: 1 ms", "scene.device", "a linear system has"),
+        ("{numerator: [1, 0, 0], denominator: [1, 0]}", "period: 1 ms", "scene.device", "add the lag"),
+        ("{numerator: [1], denominator: [x]}", "period: 1 ms", "scene.device.denominator", "list of finite numbers"),
+        ("{numerator: [1], denominator: [true]}", "period: 1 ms", "scene.device.denominator", "list of finite numbers"),
+        ("{poles: ['-3+40j'], gain: 1}", "period: 1 ms", "scene.device", "needed are finite numbers"),
+        ("{numerator: [1], denomnator: [1, 0]}", "period: 1 ms", "scene.device.denomnator", "did you mean"),
+        ("'1 / 0.1 10 0'", "period: 1 ms, mass: 1 kg", "scene.mass", "remove one"),
+        ("'1 / 0.1 10 0'", "period: 1 ms, operator: {mass: 1}", "scene.operator", "remove one"),
+        ("response.csv", "period: 1 ms, delay: 1 ms", "scene.delay", "holds every delay already"),
+        ("response.csv", "period: 2 ms", "scene.device.frequency", "less than half its rate"),
+        ("{frequency: [1, 2], real: [1, 2], imag: [1, 2]}", "period: 1 ms", "scene.device.frequency", "at least 8"),
+    ],
+)
+def test_faults_have_their_place(load, table, device, more, place, words):
+    with pytest.raises(ConfigFileError) as error:
+        load(scene_with(device, more))
+    (fault,) = error.value.faults
+    assert fault.field == place
+    assert words in str(fault)
+
+
+def test_what_needs_a_mass_is_refused(load):
+    with pytest.raises(ConfigFileError, match="a device with"):
+        load(scene_with("'1 / 0.1 10 0'").replace("recommend", "passivity"))
+
+
+def test_devices_are_compared_whatever_they_are_given_by(load, table):
+    text = scene_with("'1 / 0.2 10 0'").replace(
+        "kind: recommend, name: r",
+        "kind: compare, name: c, devices: [{label: of the scene}, {label: rigid, mass: 0.1, damping: 10}, "
+        "{label: measured, device: response.csv, delay: 0 s}]",
+    )
+    config = load(text)
+    (study,) = config.studies
+    found = study.compute(config.scene, True).table["stiffness_N_per_m"]
+    heavy = zwidth.Scene(zwidth.Device(0.2, 10.0), RIGID.timing)
+    assert found[:2] == pytest.approx([heavy.max_stiffness().stiffness, RIGID.max_stiffness().stiffness], rel=1e-12)
+    assert 0.9 * found[1] < found[2] < found[1]

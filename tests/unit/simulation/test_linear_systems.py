@@ -1,0 +1,91 @@
+"""Motions of devices given as linear systems: those of the bodies with the same matrices, and what has no body."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import zwidth
+from zwidth.simulation.result import OF_ENERGY
+
+TIMING = zwidth.Timing(1e-3, 0.7e-3)
+M1, B1, M2, K, C = 0.1, 3.0, 0.05, 20e3, 2.0
+BODIES = zwidth.Device(M1, B1, zwidth.Coupling(M2, K, C))
+RATE = [[0, 0, 1, 0], [0, 0, 0, 1], [-K / M1, K / M1, -(B1 + C) / M1, C / M1], [K / M2, -K / M2, C / M2, -C / M2]]
+SYSTEM = zwidth.LinearDevice((RATE, [[0], [0], [1 / M1], [0]], [[1, 0, 0, 0]]))
+# A hand that pushes now and then.
+HAND = np.repeat(np.random.default_rng(1).normal(0.0, 0.5, 60), 10)
+
+
+@pytest.mark.parametrize(
+    "circumstances",
+    [
+        {},
+        {"contact": "unilateral", "substeps": 3},
+        {"contact": "push_only", "resolution": 1e-6, "max_force": 1.0},
+        {"noise": 1e-6, "max_rate": 500.0, "seed": 7},
+        {"jitter": 2e-4, "seed": 3},
+    ],
+)
+@pytest.mark.parametrize("velocity", [zwidth.BackwardDifference(), zwidth.LowPass(cutoff=100), zwidth.FOAW(1e-6)])
+def test_motions_are_those_of_the_bodies(circumstances, velocity):
+    options = {"periods": HAND.size, "push": 0.3, "push_history": HAND, **circumstances}
+    known, found = (
+        zwidth.Scene(device, TIMING, velocity=velocity).simulate(4e3, 10.0, **options) for device in (BODIES, SYSTEM)
+    )
+    for name in ("position", "velocity", "wall_force", "measured", "estimated_velocity"):
+        size = np.abs(getattr(known, name)).max()
+        np.testing.assert_allclose(getattr(found, name), getattr(known, name), rtol=0, atol=1e-11 * size, err_msg=name)
+    assert found.bounces == known.bounces
+    assert found.penetration == pytest.approx(known.penetration, rel=1e-11)
+    assert all(np.isnan(getattr(found, name)).all() for name in OF_ENERGY), "nobody knows what it stores"
+
+
+@pytest.mark.parametrize("stiffness", [4e3, 40e3])
+def test_the_end_is_that_of_the_poles(stiffness):
+    motion = zwidth.Scene(SYSTEM, TIMING).simulate(stiffness, 10.0, push=0.3)
+    stable = zwidth.Scene(SYSTEM, TIMING).is_stable(stiffness, 10.0)
+    ends = zwidth.MotionKind.REST, zwidth.MotionKind.DECAYING
+    assert (zwidth.MotionKind(int(motion.outcome)) in ends) == stable
+    # Of a wall with one side nothing is proved without bodies.
+    touched = zwidth.Scene(SYSTEM, TIMING).simulate(4e3, 10.0, push=0.3, contact="unilateral")
+    assert touched.outcome == zwidth.MotionKind.UNCLEAR
+
+
+def test_a_batch_may_hold_several_systems_and_bodies():
+    slower = zwidth.LinearDevice(([1.0], [0.2, 3.0, 0.0]))
+    scenes = [zwidth.Scene(device, TIMING) for device in (SYSTEM, slower, BODIES)]
+    together = zwidth.simulate(scenes, 3e3, 10.0, push=0.3, periods=50)
+    for k, scene in enumerate(scenes):
+        alone = scene.simulate(3e3, 10.0, push=0.3, periods=50)
+        np.testing.assert_array_equal(together.position[k], alone.position)
+
+
+def test_a_step_is_that_of_the_state_space():
+    scene = zwidth.Scene(zwidth.LinearDevice(([1.0, 40.0], [0.1, 7.0, 900.0, 0.0])), TIMING)
+    loop = scene.state_space(4e3, 10.0)
+    pushed = scene.simulate(4e3, 10.0, push=1.0, periods=300).position
+    np.testing.assert_allclose(pushed, loop.step(300), rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        ({"start_velocity": 0.1}, "start_velocity: "),
+        ({"start_position": -1e-3}, "start_position: "),
+        ({"coulomb": 1.0}, "coulomb, static: "),
+    ],
+)
+def test_what_needs_a_body_is_refused(options, field):
+    with pytest.raises(zwidth.InputError, match=f"^{field}.*starts at rest"):
+        zwidth.Scene(SYSTEM, TIMING).simulate(4e3, 10.0, **options)
+    # Beside it bodies start as they are told.
+    with pytest.raises(zwidth.InputError, match="starts at rest"):
+        zwidth.simulate([zwidth.Scene(BODIES, TIMING), zwidth.Scene(SYSTEM, TIMING)], 4e3, 10.0, **options)
+
+
+def test_what_moves_at_once_or_between_unknown_samples_is_refused():
+    with pytest.raises(zwidth.InputError, match="moves its velocity at once"):
+        zwidth.Scene(zwidth.LinearDevice(([1.0], [3.0, 0.0])), TIMING).simulate(100.0, 0.0, push=1.0)
+    device = zwidth.LinearDevice(scipy.signal.dlti([4e-6, 4e-6], [1.0, -1.9, 0.9], dt=1e-3))
+    with pytest.raises(zwidth.InputError, match="from sample to sample"):
+        zwidth.Scene(device, zwidth.Timing(1e-3)).simulate(100.0, 0.0, push=1.0)
