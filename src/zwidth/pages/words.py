@@ -104,6 +104,8 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         )
     elif not by_poles:
         best = "none is told by the response"
+    # Of a response the intervals are those that it proves.
+    surely = "" if by_poles else " surely"
     if by_mass:
         words = f"alpha = {plain(verdict.alpha)}, beta = {plain(verdict.beta)}, delta = {plain(verdict.delta)}"
         normalized = [row("normalized", words)]
@@ -115,8 +117,8 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
         *normalized,
         "",
         row("verdict", word),
-        row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B")),
-        row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K")),
+        row("to the boundary in K", _distance(wall.stiffness, verdict.stable_stiffness, "N/m", "K", "B", surely)),
+        row("to the boundary in B", _distance(wall.virtual_damping, verdict.stable_damping, "N s/m", "B", "K", surely)),
         row("passive", passivity_words(scene, verdict)),
         row("stiffest stable wall", best),
         *pole_lines(verdict),
@@ -124,12 +126,12 @@ def verdict_lines(scene: Scene, verdict: Assessment) -> list[str]:
     ]
 
 
-def _distance(value: float, intervals: Intervals, unit: str, name: str, other: str) -> str:
+def _distance(value: float, intervals: Intervals, unit: str, name: str, other: str, surely: str) -> str:
     """How far a value may move inside its stable interval, or must to reach the nearest; all intervals if several."""
     from zwidth.scenes.assessment import nearest_interval
 
     if not intervals:
-        return f"no {name} is stable at this {other}"
+        return f"no {name} is{surely} stable at this {other}"
     ranges = " and ".join(" to ".join(tell_apart(*ends, unit)) for ends in intervals)
     low, high = nearest_interval(intervals, value)
     if low < value < high:
@@ -144,7 +146,7 @@ def _distance(value: float, intervals: Intervals, unit: str, name: str, other: s
 
 def margin_lines(stiffness: float, verdict: Assessment) -> list[str]:
     """The margins of control engineering, where the wall has a stiffness or stands without one."""
-    if stiffness <= 0 and not verdict.stable:
+    if (stiffness <= 0 and not verdict.stable) or verdict.stable is None:
         return []
     parts = [f"gain {plain(verdict.gain_margin)}"]
     if isfinite(verdict.phase_margin):
