@@ -46,7 +46,8 @@ _PACKAGES = ("scipy", "matplotlib", "optimistix", "equinox", "jaxopt")
 
 # As `hidden_beside` calls what is not finished.
 _HALF_MADE = re.compile(r"\..+\.[0-9a-f]{8}\.partial")
-_KEY = "csv"
+# What may name a file; a device may be named otherwise than by its table.
+_KEYS = ("csv", "device")
 
 
 class Record:
@@ -307,7 +308,8 @@ def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[
     """
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
-    places = sorted(find_values(text, _KEY), key=lambda place: place[1])
+    places = find_values(text, "csv") + [place for place in find_values(text, "device") if place[0].endswith(".csv")]
+    places.sort(key=lambda place: place[1])
     for name, _, _ in places:
         if name not in names and (folder / name).is_file():
             copy = _choose_name(name, files)
@@ -338,6 +340,6 @@ def rename_inputs(value: Any, names: dict[str, str]) -> Any:
     if not isinstance(value, dict):
         return value
     return {
-        key: names.get(item, item) if key == _KEY and isinstance(item, str) else rename_inputs(item, names)
+        key: names.get(item, item) if key in _KEYS and isinstance(item, str) else rename_inputs(item, names)
         for key, item in value.items()
     }

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import AnyChain, Resonance, body_position
+from zwidth.loops.linear.chain import Resonance, body_position
 from zwidth.loops.linear.system import System
 from zwidth.words.errors import InputError
 
@@ -41,11 +41,11 @@ class Mechanics(NamedTuple):
     drain: np.ndarray  # (scenes, n + forces, n + forces): the power that dampers take
 
 
-def mechanics(chains: Sequence[AnyChain]) -> Mechanics:
+def mechanics(chains: Sequence[Any]) -> Mechanics:
     """The matrices of chains with equally many bodies and modes, the sensor on the same body; or of one system."""
-    if isinstance(chains[0], System):
-        return _follow(chains)
     first: Any = chains[0]
+    if isinstance(first, System):
+        return _follow(chains)
     together = {
         name: tuple(_stack(parts) for parts in zip(*(getattr(chain, name) for chain in chains), strict=True))
         for name in ("bodies", "links", "modes")
