@@ -53,9 +53,14 @@ def _only_held(value: Any) -> str:
     return str(value)
 
 
+def name_parts(parts: Iterable[str]) -> str:
+    """Names of parts as words; a device that is given as a whole is one of them."""
+    return " and ".join("a system or response in place of its mass" if name == "device" else name for name in parts)
+
+
 def refuse_parts(kind: str, parts: Iterable[str], remedy: str = "") -> PydanticCustomError:
     """The problem of a device with parts in a study that would forget them."""
-    what = f"got a device with {' and '.join(parts)}"
+    what = f"got a device with {name_parts(parts)}"
     allowed = f"the kind {kind!r} answers for a rigid mass with the difference of two samples alone"
     kinds = f"use one of the kinds {listing(name for name in sorted(KINDS) if KINDS[name].takes_parts)}"
     return problem(what, allowed, f"{kinds}, or {remedy}" if remedy else kinds)

@@ -15,7 +15,7 @@ from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members, repeated
 from zwidth.config.parts import list_parts
 from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene, is_with_parts
-from zwidth.config.study import DelayModels, register
+from zwidth.config.study import DelayModels, name_parts, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.boundary import Piece, boundary_point, stable_region
@@ -112,7 +112,7 @@ class BoundaryStudy(CurvesStudy):
             return
         asked = {"plane": "alpha_beta", "delay_models": ("held",), "ridge_path": False, "passivity": False}
         for name in [name for name, known in asked.items() if getattr(self, name) != known]:
-            parts = " and ".join(self.device.parts_beyond)
+            parts = name_parts(self.device.parts_beyond)
             allowed = f"it is known for a rigid mass with the difference of two samples, not for one with {parts}"
             yield (name,), problem(f"got {name!r}", allowed, "remove it", on_key=True)
 

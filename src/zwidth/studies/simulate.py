@@ -18,6 +18,7 @@ from zwidth.config.values import Axis, AxisOf, Delay, Duration, Quantity
 from zwidth.figures.stable_set import name_wall
 from zwidth.figures.table import SI_COLUMNS, stack
 from zwidth.parts.checks import Span
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.velocity import FOAW
 from zwidth.scenes.scene import Scene
 from zwidth.simulation.result import OF_MOTION, OF_WHOLE, Motion, MotionKind
@@ -133,6 +134,9 @@ class SimulatedStudy(ComputedStudy):
 def check_circumstances(given: Circumstances, scene: Scene) -> Iterable[LocatedProblem]:
     """What of the circumstances does not go together, or not with the device."""
     yield from given.find_clashes(scene.timing.period)
+    if isinstance(scene.device, MeasuredDevice):
+        allowed = "a motion needs a model: mass and damping, or a linear system"
+        yield ("device",), problem("got a measured response", allowed, "fit one to a log with the kind 'fit'")
     if given.velocity is not None and not isinstance(placed := given.place(scene).velocity, FOAW):
         try:
             placed.estimate(scene.timing.period)

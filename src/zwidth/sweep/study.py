@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, ValidationError, WithJsonSchema, Wr
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.device_table import DeviceTable, TableField, read_table
-from zwidth.config.devices import DeviceForm
+from zwidth.config.devices import DeviceForm, ResponseSection
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
@@ -286,6 +286,9 @@ class SweepStudy(_Parts, _Swept):
         twice = [] if self.device is None else list(find_second_device(dict.fromkeys(given, True)))
         if twice:
             yield from ((("axes", *path), what) for path, what in twice)
+        elif isinstance(self.device, ResponseSection) and (rates := {"period", "rate", "delay"} & self.sizes.keys()):
+            allowed = "a response holds the rate and the delay that it was measured with"
+            yield ("axes", min(rates)), problem("got several values", allowed, "measure again at others")
         elif (self.device is not None or "mass" in given) and {"period", "rate"} & set(given):
             yield from self._find_part_faults()
 

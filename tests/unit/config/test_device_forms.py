@@ -109,9 +109,18 @@ def test_faults_have_their_place(load, table, device, more, place, words):
     assert words in str(fault)
 
 
-def test_what_needs_a_mass_is_refused(load):
-    with pytest.raises(ConfigFileError, match="a device with"):
-        load(scene_with("'1 / 0.1 10 0'").replace("recommend", "passivity"))
+@pytest.mark.parametrize(
+    ("study", "words"),
+    [
+        ("kind: passivity", "a device with a system or response in place of its mass"),
+        ("kind: boundary, passivity: true", "not for one with a system or response"),
+        ("kind: sweep, axes: {period: [0.5 ms, 1 ms]}, outputs: [stiffness_max]", "it was measured with"),
+        ("kind: simulate, walls: [{stiffness: 1000}]", "a motion needs a model"),
+    ],
+)
+def test_what_needs_a_mass_or_a_model_is_refused(load, table, study, words):
+    with pytest.raises(ConfigFileError, match=words):
+        load(scene_with("response.csv", "period: 1 ms").replace("kind: recommend", study))
 
 
 def test_devices_are_compared_whatever_they_are_given_by(load, table):
