@@ -15,7 +15,7 @@ from matplotlib.patches import Patch
 
 from zwidth.figures import stable_set, style
 from zwidth.figures.stable_set import draw_zeros, mark_wall, shade_region
-from zwidth.figures.table import Table, curves, select, si_scale
+from zwidth.figures.table import Table, curves, draws_tables, select, si_scale
 from zwidth.words.errors import InputError
 
 # A legend of more entries than this is harder to read than a color bar.
@@ -27,7 +27,7 @@ _PANELS = 3
 SHADES = {"stable": "#BFE3F7", "passive": "#F3C46B"}
 
 
-@style.house_style()
+@draws_tables
 def draw_boundary(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw stability boundaries, one panel for every delay, with the stable side shaded.
 
@@ -132,7 +132,7 @@ def _legend_handles(table: Table, colors: dict[float, Any]) -> list[Line2D]:
     return handles
 
 
-@style.house_style()
+@draws_tables
 def draw_map(
     arrays: Mapping[str, np.ndarray],
     output: str,

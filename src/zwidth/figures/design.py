@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import SI_COLUMNS, Table, select
+from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
 from zwidth.words.formatting import header
 from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import is_rotary, own_unit
@@ -28,7 +28,7 @@ _KINDS: dict[str, tuple[Any, str, str]] = {
 _WORDS = {"above": "or more", "below": "or less"}
 
 
-@style.house_style()
+@draws_tables
 def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the stiffest stable wall over the cut-off of a low-pass and over the length of a window.
 
@@ -60,7 +60,7 @@ def draw_filters(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     return panels
 
 
-@style.house_style()
+@draws_tables
 def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the stiffest stable wall over the noise of the velocity that its filter lets through.
 
@@ -115,7 +115,7 @@ def _dots(rows: Table) -> dict[str, Any]:
     return {"marker": "o", "markersize": 3.5} if len(rows[_STIFFNESS]) <= 24 else {}
 
 
-@style.house_style()
+@draws_tables
 def draw_requirement(curve: Table, required: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the stiffest stable wall over a parameter, and where it reaches each wanted stiffness.
 

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import style
 from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
-from zwidth.figures.table import Table, curves, select
+from zwidth.figures.table import Table, curves, draws_tables, select
 from zwidth.words.formatting import header
 from zwidth.words.rotation import ROTARY
 
@@ -28,7 +28,7 @@ _FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.
 _ROWS = ("position", "residuals", "autocorrelation", "walls")
 
 
-@style.house_style()
+@draws_tables
 def draw_device_fit(
     boundary: Table,
     walls: Table,

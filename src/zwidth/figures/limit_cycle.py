@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import SI_COLUMNS, Table, curves
+from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables
 from zwidth.words.formatting import with_unit
 
 _AXES = {
@@ -28,7 +28,7 @@ _BEYOND: dict[str, Any] = {"facecolor": "#D9D9D9", "edgecolor": "#A8A8A8", "hatc
 _PLAIN = FuncFormatter(lambda value, _: f"{value:g}")
 
 
-@style.house_style()
+@draws_tables
 def draw_limit_cycles(
     arrays: Mapping[str, np.ndarray], edges: Table, bounds: tuple[float, float], axes: style.AnyAxes | None = None
 ) -> np.ndarray:
@@ -88,7 +88,7 @@ def _find_beyond(arrays: Mapping[str, np.ndarray], bounds: tuple[float, float]) 
     return (arrays["outcome"] == _DIVERGED) | ~(arrays["amplitude_m"] <= bounds[1])
 
 
-@style.house_style()
+@draws_tables
 def draw_limit_cycle_curves(
     arrays: Mapping[str, np.ndarray],
     edges: Table,

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from zwidth.figures import style
-from zwidth.figures.table import Table, curves
+from zwidth.figures.table import Table, curves, draws_tables
 from zwidth.words.rotation import is_rotary, own_unit
 
 _UNITS = {"time": "_s", "position": "_m", "wall_force": "_N", "final_position": "_m", "settling_time": "_s"}
@@ -29,7 +29,11 @@ _ENERGIES = {
 }
 
 
-@style.house_style()
+def _name_force() -> str:
+    return "wall torque" if is_rotary() else "wall force"
+
+
+@draws_tables
 def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw step responses from force to position, with final values (thin) and settling times (dots).
 
@@ -44,9 +48,7 @@ def draw_step(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     responses = _read_responses(table)
     for ax in panels[1:]:
         _draw_forces(ax, responses, clock)
-        ax.set_ylabel(
-            f"wall {'torque' if is_rotary() else 'force'} in {own_unit('N')}" if unit else "wall force  in $F$"
-        )
+        ax.set_ylabel(f"{_name_force()} in {own_unit('N')}" if unit else "wall force  in $F$")
     for ax in panels:
         # The last sample ends before the time that was asked for.
         ax.set_xlim(0.0, max(float(each.time[-1] + each.time[1]) for each in responses) * clock)
@@ -108,7 +110,7 @@ def _draw_forces(ax: Axes, responses: list[Any], clock: float) -> None:
     ax.axhline(-1.0, color=style.GRAY, linewidth=0.5, zorder=2)
 
 
-@style.house_style()
+@draws_tables
 def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the position of every motion over time and the force of the wall; thin: the bodies behind links.
 
@@ -120,7 +122,7 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     panels = style.panels(axes, 2, 6.4, 4.8, height_ratios=(1.6, 1.0), sharex=True)
     clock, second = style.si_unit([each.time_s[-1] for each in motions], "s")
     behind = [name for name in ("tip_position_m", "hand_position_m") if hasattr(motions[0], name)]
-    quantities = (("position_m", "position  $x$", behind), ("wall_force_N", "wall force", []))
+    quantities = (("position_m", "position  $x$", behind), ("wall_force_N", _name_force(), []))
     for ax, (name, words, others) in zip(panels, quantities, strict=False):
         factor, unit = _limit(ax, "y", [getattr(each, one) for each in motions for one in (name, *others)], name[-1])
         for each in motions:
@@ -139,7 +141,7 @@ def draw_motion(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     return panels
 
 
-@style.house_style()
+@draws_tables
 def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the velocity of every motion over its position, with the wall; a dot where each starts.
 
@@ -165,7 +167,7 @@ def draw_phase_plane(table: Table, axes: style.AnyAxes | None = None) -> np.ndar
     return panels
 
 
-@style.house_style()
+@draws_tables
 def draw_energy(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw for every motion what wall and hand have given, what dampers and friction have taken, and what there is.
 

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from zwidth.figures import grid, style
-from zwidth.figures.table import Table, curves, select
+from zwidth.figures.table import Table, curves, draws_tables, select
 
 # The first scaling of Fig. 10 shows this share of the range of delta.
 _ZOOM = 0.1
@@ -16,7 +16,7 @@ _ZOOM = 0.1
 _LEAST_DELTA = 0.1
 
 
-@style.house_style()
+@draws_tables
 def draw_zero_stiffness(table: Table, ax: Axes | None = None) -> Axes:
     """Draw the virtual damping that is stable for alpha -> 0 over delta, with the stable side shaded.
 
@@ -74,7 +74,7 @@ def _draw_lower_bound(ax: Axes, first: Any, *, several: bool) -> None:
     ax.annotate(text, place, xytext=(8, 6), textcoords="offset points", fontsize=8)
 
 
-@style.house_style()
+@draws_tables
 def draw_ridge(table: Table, axes: style.AnyAxes | None = None, *, two_scalings: bool = False) -> np.ndarray:
     """Draw alpha_max over delta, one curve for every delay and delay model; below a curve some wall is stable.
 
@@ -120,7 +120,7 @@ def _draw_scaling(ax: Axes, table: Table, share: float) -> None:
         ax.legend(handles=handles, loc="upper left")
 
 
-@style.house_style()
+@draws_tables
 def draw_slope(table: Table, slopes: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw alpha_max/delta over delta beside its limit g(d), and g over the delay.
 
@@ -176,7 +176,7 @@ def _draw_limit(ax: Axes, paths: list[Any], models: list[Any], colors: dict[floa
         ax.legend(handles=handles, loc="upper right")
 
 
-@style.house_style()
+@draws_tables
 def draw_passivity_cost(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw the stiffest stable (solid) and the stiffest passive wall (dash-dotted) over delta, and their ratio.
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.figures import style
-from zwidth.figures.table import Table
+from zwidth.figures.table import Table, draws_tables
 
 _NEEDED = ("frequency_Hz", "real_m_per_N", "imag_m_per_N")
 _KNOWN = ("deviation_m_per_N", "open_loop_real", "open_loop_imag")
@@ -15,7 +15,7 @@ _KNOWN = ("deviation_m_per_N", "open_loop_real", "open_loop_imag")
 _REACH = 1.6
 
 
-@style.house_style()
+@draws_tables
 def draw_response(table: Table, axes: style.AnyAxes | None = None) -> np.ndarray:
     """Draw a response over frequency, and, of a wall, the open loop around the point -1 that no response may reach.
 

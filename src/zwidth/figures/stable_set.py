@@ -14,7 +14,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from zwidth.figures import style
 from zwidth.figures.motion import draw_positions
-from zwidth.figures.table import SI_COLUMNS, Table, curves, select
+from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
 from zwidth.words.formatting import with_unit
 from zwidth.words.rotation import own_unit
 
@@ -136,7 +136,7 @@ def name_wall(stiffness: float, virtual_damping: float) -> str:
     return f"K = {with_unit(stiffness, 'N/m')}, B = {with_unit(virtual_damping, 'N s/m')}"
 
 
-@style.house_style()
+@draws_tables
 def draw_stable_set(
     outlines: Table, walls: Table, axes: style.AnyAxes | None = None, *, normalized: bool = False
 ) -> np.ndarray:
@@ -200,7 +200,7 @@ def _draw_pieces(ax: Axes, table: Table, names: tuple[str, ...], color: Any, fac
     return {str(one.piece) for one in found}
 
 
-@style.house_style()
+@draws_tables
 def draw_recommendation(
     found: Mapping[str, Any], region: Table, response: Table | None, axes: style.AnyAxes | None = None
 ) -> np.ndarray:

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import wraps
 from types import SimpleNamespace
-from typing import Any, Protocol
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 import numpy as np
+
+from zwidth.figures.style import house_style
+from zwidth.words.formatting import header
+from zwidth.words.rotation import ROTARY, is_rotary, use_kind
 
 # Walls in SI units, beside alpha and beta.
 SI_COLUMNS = ("stiffness_N_per_m", "virtual_damping_N_s_per_m")
@@ -20,6 +25,39 @@ class Table(Protocol):
     def __iter__(self) -> Iterator[Any]: ...
 
     def __contains__(self, key: Any, /) -> bool: ...
+
+
+# What names of columns end with for rotary devices and, in their place, for linear ones; the longest first.
+_ENDINGS = {header("", turned): header("", unit) for unit, turned in ROTARY.items()}
+_ENDINGS = dict(sorted(_ENDINGS.items(), key=lambda pair: -len(pair[0])))
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Let a function draw in the house's look, and what has columns of rotary devices in their units."""
+
+    @wraps(function)
+    def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        read: Any = [_name_as_linear(each) for each in args]
+        turned = any(new is not old for new, old in zip(read, args, strict=True))
+        with house_style(), use_kind(turned or is_rotary()):
+            return function(*read, **kwargs)
+
+    return within
+
+
+def _name_as_linear(table: Any) -> Any:
+    """A table with the names that figures know; itself where it has them, and what is no table."""
+    if not hasattr(table, "keys") or not any(str(name).endswith(tuple(_ENDINGS)) for name in table):
+        return table
+
+    def rename(name: str) -> str:
+        ending = next((each for each in _ENDINGS if name.endswith(each)), "")
+        return name.removesuffix(ending) + _ENDINGS.get(ending, "")
+
+    return {rename(str(name)): table[name] for name in table}
 
 
 def select(table: Table, **wanted: object) -> dict[str, np.ndarray]:

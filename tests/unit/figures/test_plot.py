@@ -5,6 +5,7 @@ from __future__ import annotations
 import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas
 import pytest
 from matplotlib import cbook
 from matplotlib.figure import Figure
@@ -206,3 +207,27 @@ def test_a_rotary_device_is_drawn_in_its_units():
     np.testing.assert_allclose(second.lines[0].get_xdata(), [10, 20])
     assert third.get_ylabel().endswith("rad for 1 N m")
     assert fourth.get_ylabel().endswith("in mrad")
+
+
+def test_tables_of_rotary_devices_are_drawn_in_their_units(tmp_path):
+    """What a run writes of them has columns in rad and N m, and is drawn again as it was."""
+    studies = [
+        {"kind": "step", "name": "step", "stiffness_fraction": 0.5},
+        {"kind": "simulate", "name": "motion", "stiffness_fraction": 0.5, "duration": "50 ms"},
+    ]
+    scene = {"device": "haptic_wheel", "period": "1 ms", "delay": "1 ms"}
+    assert zwidth.run({"version": 1, "name": "turns", "scene": scene, "studies": studies}, out=tmp_path / "run").ok
+    for name, draw, unit in (("step", figures.draw_step, "N m"), ("motion", figures.draw_motion, "N m")):
+        frame = pandas.read_csv(tmp_path / "run" / f"{name}.csv")
+        assert "position_rad" in frame
+        for table in (frame, {column: frame[column].to_numpy() for column in frame}):
+            labels = " ".join(ax.get_ylabel() for ax in draw(table))
+            assert "rad" in labels
+            assert "wall torque" in labels
+            assert labels.endswith(f"in {unit}")
+    # Those of linear devices in theirs.
+    linear = {"kind": "step", "name": "step", "stiffness_fraction": 0.5}
+    scene = {"mass": 0.1, "damping": 1.0, "period": 1e-3}
+    assert zwidth.run({"version": 1, "name": "moves", "scene": scene, "studies": [linear]}, out=tmp_path / "linear").ok
+    labels = [ax.get_ylabel() for ax in figures.draw_step(pandas.read_csv(tmp_path / "linear" / "step.csv"))]
+    assert not any("rad" in label for label in labels)
