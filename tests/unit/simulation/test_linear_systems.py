@@ -60,11 +60,23 @@ def test_a_batch_may_hold_several_systems_and_bodies():
         np.testing.assert_array_equal(together.position[k], alone.position)
 
 
-def test_a_step_is_that_of_the_state_space():
-    scene = zwidth.Scene(zwidth.LinearDevice(([1.0, 40.0], [0.1, 7.0, 900.0, 0.0])), TIMING)
-    loop = scene.state_space(4e3, 10.0)
-    pushed = scene.simulate(4e3, 10.0, push=1.0, periods=300).position
-    np.testing.assert_allclose(pushed, loop.step(300), rtol=1e-9, atol=1e-15)
+@pytest.mark.parametrize(
+    "system",
+    [
+        ([1.0, 40.0], [0.1, 7.0, 900.0, 0.0]),
+        # Resonances of 2 % and a zero in the right half plane; unstable by itself.
+        ([200.0], [-5.0, -8 + 400j, -8 - 400j, -0.6 + 30j, -0.6 - 30j], 4e5),
+        ([], [3.0, -40.0, -900.0], 5e3),
+    ],
+)
+def test_a_step_is_that_of_the_state_space(system):
+    scene = zwidth.Scene(zwidth.LinearDevice(system), TIMING)
+    wall = 0.02 * scene.units.stiffness, 0.1 * scene.units.virtual_damping
+    known = scene.state_space(*wall).step(300)
+    moved = scene.simulate(*wall, push=1.0, periods=300)
+    np.testing.assert_allclose(moved.position, known, rtol=0, atol=1e-9 * np.abs(known).max())
+    grows = zwidth.MotionKind.GROWING, zwidth.MotionKind.DIVERGED
+    assert (zwidth.MotionKind(int(moved.outcome)) in grows) == (not scene.is_stable(*wall))
 
 
 @pytest.mark.parametrize(
