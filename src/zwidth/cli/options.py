@@ -151,7 +151,7 @@ def _add_option(command: Command, path: str, required: bool = False) -> Command:
         words = (
             "A device with published mass and damping, linear or rotary, as `zwidth devices` lists them; or in place "
             "of mass, damping and all parts a transfer function 'NUM / DEN', coefficients in s as '1 / 0.1 10 0', or "
-            "FILE.csv, a measured response."
+            "FILE.csv (.npz, .mat), a measured response."
         )
         return click.option("--device", metavar="NAME", help=words)(command)
     if path in CHOICES:

@@ -153,7 +153,7 @@ def _read_csv(raw: dict[str, Any]) -> DeviceTable:
 def _read_rows(name: str) -> list[tuple[int, list[str]]]:
     """The header of a CSV file, and its rows; further lines that begin with # are remarks as well."""
     try:
-        rows = [row for row in read_rows(find_file(name), MAX_CSV_BYTES)[0] if not row[1][0].startswith("#")]
+        rows = [row for row in read_rows(find_file(name), MAX_CSV_BYTES) if not row[1][0].startswith("#")]
     except InputError as error:
         what, _, remedy = str(error).partition("; ")
         raise problem(printable(what), "names are relative to this file", remedy) from None

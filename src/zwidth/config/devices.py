@@ -18,6 +18,7 @@ from zwidth.config.values import Quantity
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.linear_device import LinearDevice, split_fraction
 from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.response_table import SUFFIXES
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, suggestion
 from zwidth.words.quantities import POSITIVE
@@ -167,7 +168,7 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
     """A device in any of its forms but its numbers."""
     if isinstance(raw, SystemSection | ResponseSection):
         return raw
-    if isinstance(raw, str) and raw.endswith(".csv"):
+    if isinstance(raw, str) and raw.endswith(SUFFIXES):
         raw = {"csv": raw}
     elif isinstance(raw, str) and "/" in raw:
         try:

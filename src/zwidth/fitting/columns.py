@@ -1,4 +1,4 @@
-"""Logs in files: columns in any order, under any names, in any units, read into SI units (`formats` finds them).
+"""Logs in files: columns in any order, under any names, in any units, read into SI units (`words.tables` finds them).
 
 A velocity is summed up to a position, and a current is a force by the constant of its motor.
 """
@@ -14,11 +14,11 @@ from typing import Any
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit
-from zwidth.fitting.formats import COUNTS, LogTable, read_table, split_head
 from zwidth.fitting.log import fit_log
 from zwidth.words.errors import InputError, UnusableValueError
 from zwidth.words.formatting import describe, suggestion, with_unit
 from zwidth.words.quantities import POSITIVE
+from zwidth.words.tables import COUNTS, NamedColumns, read_columns, split_head
 from zwidth.words.units import ANGLE, FORCE, LENGTH, TIME, TORQUE, Dimension, looks_like_number, read_quantity
 
 QUANTITIES = ("time", "position", "force")
@@ -91,11 +91,14 @@ def read_log(
         InputError: a column is missing, or may be several; a unit is unknown; a cell holds no number; a length is
             paired with a torque; a column of times with their unit contradicts the period.
     """
-    table = read_table(Path(file))
+    table = read_columns(Path(file))
     heads = table.heads
     wanted = [name for name in QUANTITIES if name != "time" or period is None]
     if table.nameless and not all((columns.get(name) or "").partition(":")[0] in heads for name in wanted):
-        raise InputError(table.nameless)
+        raise InputError(
+            f"{table.nameless}; add a line such as 'time [s],position [m],force [N]', or say which column is which by "
+            "its number, as 1:ms, 2:mm and 3:N for time, position and force"
+        )
     places = {name: _find_column(file, heads, name, columns.get(name)) for name in wanted}
     taken = [at for at, _ in places.values()]
     if len(set(taken)) < len(taken):
@@ -151,7 +154,7 @@ def _read_constant(constant: str | None, unit: str) -> tuple[float, str]:
     )
 
 
-def _compare_period(file: str | Path, table: LogTable, period: float) -> None:
+def _compare_period(file: str | Path, table: NamedColumns, period: float) -> None:
     """Raise `InputError` where a column of times, in a unit that it says, is of another period than the one given."""
     heads = [split_head(head) for head in table.heads]
     found = [(at, unit) for at, (name, unit) in enumerate(heads) if name.lower() in _NAMES["time"] and unit]

@@ -15,6 +15,7 @@ from zwidth.parts.device import Device
 from zwidth.parts.linear_device import LinearDevice, split_fraction
 from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.operator import Operator
+from zwidth.parts.response_table import SUFFIXES
 from zwidth.words.errors import InputError, describe_choice
 
 __all__ = ["DEVICES", "HAND", "KnownDevice", "KnownHand", "Published", "find_device"]
@@ -192,8 +193,8 @@ def read_device(text: str) -> KnownDevice | LinearDevice | MeasuredDevice:
 
     Args:
         text: a name that `find_device` knows, ``"NUMERATOR / DENOMINATOR"`` with coefficients in s, highest power
-            first, or the name of a file that ends with ``.csv``.
+            first, or the name of a file as `zwidth.MeasuredDevice.read` takes it.
     """
-    if text.endswith(".csv"):
+    if text.endswith(SUFFIXES):
         return MeasuredDevice.read(text)
     return LinearDevice(split_fraction(text)) if "/" in text else find_device(text)

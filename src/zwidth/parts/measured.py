@@ -112,10 +112,11 @@ class MeasuredDevice:
 
     @classmethod
     def read(cls, file: str | Path) -> MeasuredDevice:
-        """Read a table of frequency and response in CSV, with units in the headers.
+        """Read a table of frequency and response with units in the names of its columns.
 
         Args:
-            file: with a column ``frequency [Hz]`` or ``[rad/s]``; and ``real [m/N]`` and ``imag [m/N]``, or
+            file: a text with commas, semicolons, tabs or blanks, a preamble or a line of units, packed or not; ``.npz``
+                or ``.mat``. With a column ``frequency [Hz]`` or ``[rad/s]``; and ``real [m/N]`` and ``imag [m/N]``, or
                 ``magnitude`` in m/N, mm/N, um/N or dB and ``phase`` in deg or rad, or complex numbers under
                 ``response``; and, where it is known, ``deviation [m/N]``.
         """

@@ -1,7 +1,8 @@
 """Tables of a frequency response as analyzers and programs write them, in SI units.
 
-The first line names the columns. One is the frequency, in Hz or rad/s; the response stands as real and imaginary part,
-as magnitude and phase, or as complex numbers in one column; a column of its deviation may follow.
+Texts, or arrays of NumPy and MATLAB, as `zwidth.words.tables` reads them. One column is the frequency, in Hz or rad/s;
+the response stands as real and imaginary part, as magnitude and phase, or as complex numbers in one column; a column of
+its deviation may follow.
 """
 
 from __future__ import annotations
@@ -14,10 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.words.errors import InputError
-from zwidth.words.formatting import read_rows, split_title, suggestion
+from zwidth.words.formatting import suggestion
+from zwidth.words.tables import read_columns, split_head
 from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE
 
-_MOST_BYTES = 2**28
+# How the names of files end that hold one.
+SUFFIXES = (".csv", ".txt", ".dat", ".npz", ".mat")
 # What each column may be called.
 _NAMES = {
     "frequency": ("frequency", "freq", "f", "omega", "w", "angular frequency"),
@@ -43,27 +46,23 @@ class ResponseTable(NamedTuple):
 def read_response_table(file: str | Path) -> ResponseTable:
     """Read a table; raise `InputError` for columns or units that cannot be told, with what is allowed."""
     file = Path(file)
-    rows, _ = read_rows(file, _MOST_BYTES)
-    if len(rows) < 2:
-        raise InputError(f"{file}: it has no lines of numbers; a line of column names and one a frequency are needed")
-    heads = [split_title(head) for head in rows[0][1]]
+    table = read_columns(file)
+    heads = [split_head(head) for head in table.heads]
     found: dict[str, int] = {}
     for name, known in _NAMES.items():
         places = [k for k, (head, _) in enumerate(heads) if head.lower() in known]
         if len(places) > 1:
-            raise InputError(f"{file}: {name} may be any of {', '.join(rows[0][1][k] for k in places)}; rename one")
+            raise InputError(f"{file}: {name} may be any of {', '.join(table.heads[k] for k in places)}; rename one")
         found |= {name: places[0]} if places else {}
     parts = next((p for p in (("real", "imag"), ("magnitude", "phase"), ("response",)) if set(p) <= found.keys()), None)
     if "frequency" not in found or parts is None:
+        got = table.nameless or f"{file}: got the columns {', '.join(map(repr, table.heads))}"
         raise InputError(
-            f"{file}: got the columns {', '.join(repr(head) for head in rows[0][1])}; needed are 'frequency [Hz]' and "
-            "'real [m/N]' with 'imag [m/N]', or 'magnitude [m/N]' with 'phase [deg]', or 'response [m/N]'"
+            f"{got}; needed are 'frequency [Hz]' and 'real [m/N]' with 'imag [m/N]', or 'magnitude [m/N]' with 'phase "
+            "[deg]', or 'response [m/N]'"
         )
-    columns = {
-        name: _read_column(file, rows, at, complex if name == "response" else float)
-        for name, at in found.items()
-        if name in ("frequency", "deviation", *parts)
-    }
+    names = [name for name in ("frequency", *parts, "deviation") if name in found and name != "response"]
+    columns = dict(zip(names, table.numbers([found[name] for name in names]), strict=True))
     units = {name: heads[at][1] for name, at in found.items()}
     hertz = columns["frequency"] * _hertz(file, units["frequency"])
     scale = _compliance(file, parts[0], units[parts[0]])
@@ -71,8 +70,10 @@ def read_response_table(file: str | Path) -> ResponseTable:
         size = columns["magnitude"]
         size = 10.0 ** (size / 20.0) if units["magnitude"].lower().startswith("db") else size
         answer = size * np.exp(1j * columns["phase"] * _radians(file, units["phase"]))
+    elif parts[0] == "response":
+        (answer,) = table.numbers([found["response"]], complex)
     else:
-        answer = columns["response"] if parts[0] == "response" else columns["real"] + 1j * columns["imag"]
+        answer = columns["real"] + 1j * columns["imag"]
     if parts[0] == "real" and _compliance(file, "imag", units["imag"]) != scale:
         raise InputError(f"{file}: real and imag have different units; write both in one")
     band = None
@@ -90,22 +91,6 @@ def write_response_table(file: str | Path, table: ResponseTable, remarks: tuple[
     lines = [f"# {remark}" for remark in remarks] + [",".join(heads)]
     lines += [",".join(repr(float(value)) for value in line) for line in zip(*columns, strict=True)]
     Path(file).write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _read_column(file: Path, rows: list[tuple[int, list[str]]], at: int, kind: type) -> np.ndarray:
-    """One column of finite numbers; complex ones may be written with i."""
-    values = []
-    for line, cells in rows[1:]:
-        text = cells[at] if at < len(cells) else ""
-        try:
-            value = kind(text.replace(" ", "").replace("i", "j") if kind is complex else text)
-        except ValueError:
-            value = math.nan
-        if "_" in text or not np.isfinite(value):
-            what = repr(text) if text else "nothing"
-            raise InputError(f"{file}:{line}: got {what} under {rows[0][1][at]!r}; a finite number is needed")
-        values.append(value)
-    return np.array(values)
 
 
 def _hertz(file: Path, unit: str) -> float:

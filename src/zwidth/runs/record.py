@@ -19,6 +19,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from zwidth.config.reader import find_values
+from zwidth.parts.response_table import SUFFIXES
 from zwidth.sweep.engine import refuse_changes, refuse_versions
 from zwidth.sweep.files import (
     LOCKS,
@@ -308,7 +309,7 @@ def gather_inputs(text: str, folder: Path) -> tuple[str, dict[str, bytes], dict[
     """
     files: dict[str, bytes] = {}
     names: dict[str, str] = {}
-    places = find_values(text, "csv") + [place for place in find_values(text, "device") if place[0].endswith(".csv")]
+    places = find_values(text, "csv") + [place for place in find_values(text, "device") if place[0].endswith(SUFFIXES)]
     places.sort(key=lambda place: place[1])
     for name, _, _ in places:
         if name not in names and (folder / name).is_file():

@@ -189,15 +189,15 @@ def read_lines(file: Path, most_bytes: int) -> list[str]:
     raise InputError(f"{file}: it is no text in UTF-8, UTF-16 or Latin-1; save it as CSV in UTF-8")
 
 
-def read_rows(file: Path, most_bytes: int) -> tuple[list[tuple[int, list[str]]], str]:
-    """The row of names and those below that hold something, each with its line; and what separates cells."""
+def read_rows(file: Path, most_bytes: int) -> list[tuple[int, list[str]]]:
+    """The row of names and those below that hold something, each with its line."""
     lines = read_lines(file, most_bytes)
     first = next((k for k, line in enumerate(lines) if line.strip() and not _REMARK.match(line)), len(lines))
     separator = next((mark for mark in "\t;" if mark in "".join(lines[first : first + 1])), ",")
     rows = list(split_lines(file, lines, first, separator))
     if separator != ",":
         rows[1:] = [(line, [with_point(cell) for cell in cells]) for line, cells in rows[1:]]
-    return rows, separator
+    return rows
 
 
 def split_lines(file: Path, lines: list[str], first: int, separator: str) -> Iterator[tuple[int, list[str]]]:

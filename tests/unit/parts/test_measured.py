@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.io
 
 import zwidth
+from zwidth.fitting.columns import read_log
 from zwidth.words.errors import InputError
 
 F = np.geomspace(2.0, 400.0, 40)
@@ -84,6 +86,35 @@ def test_complex_numbers_are_read_as_other_programs_spell_them(tmp_path):
     lines = [f"{f!r};{g.real!r}{g.imag:+.17g}i" for f, g in zip(F.tolist(), G.tolist(), strict=True)]
     (tmp_path / "table.csv").write_text("\n".join(["frequency [Hz];response [m/N]", *lines]))
     np.testing.assert_allclose(zwidth.MeasuredDevice.read(tmp_path / "table.csv").response, G, rtol=1e-15)
+
+
+PREAMBLE = "Analyzer 7, averages: 20\nwindow: none\n\n"
+BLANKS = "\n".join(f"{f!r}  {g.real!r} {g.imag!r}" for f, g in zip(F.tolist(), G.tolist(), strict=True))
+FILES = {
+    "blanks": "f_Hz  real_m/N  imag_m/N\n" + BLANKS,
+    "a preamble": PREAMBLE + "freq [Hz],re [m/N],im [m/N]\n" + rows(F, G.real, G.imag),
+    "a row of units": "freq,real,imag\nHz,m/N,m/N\n" + rows(F, G.real, G.imag),
+    "a remark of numpy.savetxt": "# f/Hz real imag\n" + BLANKS,
+}
+
+
+@pytest.mark.parametrize("text", FILES.values(), ids=FILES)
+def test_texts_of_programs_are_read(tmp_path, text):
+    (tmp_path / "table.csv").write_text(text)
+    read = zwidth.MeasuredDevice.read(tmp_path / "table.csv")
+    np.testing.assert_array_equal(read.frequency, F)
+    np.testing.assert_array_equal(read.response, G)
+
+
+def test_arrays_of_numpy_and_matlab_are_read(tmp_path):
+    np.savez(tmp_path / "table.npz", f_Hz=F, H=G, deviation=np.abs(G))
+    scipy.io.savemat(tmp_path / "table.mat", {"omega_rad/s": 1.0, "f_Hz": F, "H": G, "deviation": np.abs(G)})
+    for name in ("table.npz", "table.mat"):
+        assert zwidth.MeasuredDevice.read(tmp_path / name) == device(deviation=np.abs(G))
+    # A log has no complex column.
+    np.savez(tmp_path / "log.npz", t=F, x=G, F=F)
+    with pytest.raises(InputError, match="got complex numbers in 'x'"):
+        read_log(tmp_path / "log.npz", {"time": "t:s", "position": "x:m", "force": "F:N"})
 
 
 BAD_TABLES = {

@@ -162,10 +162,10 @@ REFUSED = {
     "no such time": (b"t;x;F\n10:00:00;1;2\n10:00:61;1;2\n", ":3: got '10:00:61' under 't'; a time"),
     "a cell between blanks": (b"t x F\n0 1 2\n1 no 3\n", ":3: got 'no' under 'x'; a number is needed"),
     "objects": (lambda opened: np.save(opened, np.array([{}, 1], dtype=object)), "it holds objects"),
-    "no column": (lambda opened: np.savez(opened, a=1.0), "a (); give a column of numbers each"),
+    "no column": (lambda opened: np.savez(opened, a=1.0), "a (); give a column of numbers for each"),
     "lengths": (lambda opened: np.savez(opened, t=TIME, x=PLACE[:2], F=FORCE), "'t' 3, 'x' 2, 'F' 3; save them"),
     "no number": (lambda opened: np.savez(opened, t=TIME, x=[0, np.nan, 1], F=FORCE), "got nan in 'x' at sample 1"),
-    "no names": (lambda opened: np.save(opened, np.eye(3)), "its columns have no names; say which column"),
+    "no names": (lambda opened: np.save(opened, np.eye(3)), "its columns have no names; add a line such as"),
 }
 
 

@@ -1,4 +1,4 @@
-"""Files of logs as programs write them: named columns, numbers when asked for.
+"""Tables in files as programs write them: named columns, numbers when asked for.
 
 Texts have their columns between commas, semicolons, tabs or blanks. The first lines of numbers tell by which, and the
 line of names is the nearest one above them with as many cells, behind # or % too; what stands above it is a preamble,
@@ -10,24 +10,24 @@ from __future__ import annotations
 import csv
 import re
 import zipfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import islice, zip_longest
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import read_lines, split_lines, split_title, with_point
-from zwidth.words.units import ANGLE, FORCE, LENGTH, SPEED, TIME, TORQUE, looks_like_number
+from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, SPEED, TIME, TORQUE, looks_like_number
 
 COUNTS = ("counts", "count", "cnt", "cts", "ticks", "inc", "increments")
 """Units of a position that its encoder's resolution translates."""
 
-_KNOWN, _FURTHER = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED), ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s")
+_KNOWN = (TIME, LENGTH, ANGLE, FORCE, TORQUE, SPEED, RATE)
+_FURTHER = ("A", "mA", "rpm", "rad/s", "deg/s", "counts/s", "krad/s", "dB", "m/N", "mm/N", "um/N", "µm/N")
 _MOST_BYTES = 2**28
-_BY_NUMBER = "say which column is which by its number, as 1:ms, 2:mm and 3:N for time, position and force"
 # Lines that may stand above the numbers.
 _PREAMBLE = 500
 # Where a unit may begin behind a name without brackets: time_s, time/s, time s.
@@ -40,16 +40,22 @@ _CLOCK = re.compile(r"(\d{4}-\d\d-\d\d[T ])?(\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?
 _DAY, _AT_ONCE = "1970-01-01T", 20_000
 
 
+class Numbers(Protocol):
+    """Reads some columns by their places, as finite numbers of a kind: float or complex."""
+
+    def __call__(self, places: Sequence[int], kind: type = float) -> list[np.ndarray]: ...
+
+
 @dataclass(frozen=True)
-class LogTable:
+class NamedColumns:
     """Names of columns, and how to get the numbers of some; ``nameless`` says so where the names are 1, 2, ..."""
 
     heads: list[str]
-    numbers: Callable[[Sequence[int]], list[np.ndarray]]
+    numbers: Numbers
     nameless: str = ""
 
 
-def read_table(file: Path) -> LogTable:
+def read_columns(file: Path) -> NamedColumns:
     """The columns of a file of any known kind; raise `InputError` for others, with how to save them."""
     if not file.is_file():
         read_lines(file, _MOST_BYTES)
@@ -77,7 +83,7 @@ def split_head(head: str) -> tuple[str, str]:
 
 
 def is_unit(text: str) -> bool:
-    """Whether a text is the unit of some column of logs."""
+    """Whether a text is the unit of some column of logs or responses."""
     return text in _FURTHER or text.lower() in COUNTS or any(each.in_base("1", 0, text) is not None for each in _KNOWN)
 
 
@@ -111,7 +117,7 @@ def _load(file: Path) -> dict[str, Any]:
         raise InputError(f"{file}: it holds {what}; save columns of numbers, or a CSV file") from error
 
 
-def _table_arrays(file: Path, arrays: dict[str, Any]) -> LogTable:
+def _table_arrays(file: Path, arrays: dict[str, Any]) -> NamedColumns:
     """Columns of equal length; a matrix alone is taken by its columns."""
     columns = {name: array for name, array in arrays.items() if getattr(array, "size", 0) > 1}
     flat = {name: array.ravel() for name, array in columns.items() if max(array.shape) == array.size}
@@ -120,13 +126,13 @@ def _table_arrays(file: Path, arrays: dict[str, Any]) -> LogTable:
     if not flat and len(wide) == 1:
         (matrix,) = wide.values()
         flat = {str(k + 1): column for k, column in enumerate(matrix.T)}
-    flat = {name: array for name, array in flat.items() if array.dtype.kind in "fiubM"}
+    flat = {name: array for name, array in flat.items() if array.dtype.kind in "fiubcM"}
     if not flat:
         shapes = ", ".join(f"{name or 'an array'} {np.shape(array)}" for name, array in arrays.items()) or "nothing"
-        raise InputError(f"{file}: got {shapes[:200]}; give a column of numbers each for time, position and force")
+        raise InputError(f"{file}: got {shapes[:200]}; give a column of numbers for each quantity")
     heads, values = list(flat), list(flat.values())
 
-    def numbers(places: Sequence[int]) -> list[np.ndarray]:
+    def numbers(places: Sequence[int], kind: type = float) -> list[np.ndarray]:
         sizes = {heads[at]: values[at].size for at in places}
         if len(set(sizes.values())) > 1:
             text = ", ".join(f"{name!r} {size}" for name, size in sizes.items())
@@ -134,7 +140,9 @@ def _table_arrays(file: Path, arrays: dict[str, Any]) -> LogTable:
         found = []
         for at in places:
             clock = values[at].dtype.kind == "M"
-            column = _seconds(values[at]) if clock else values[at].astype(float)
+            if values[at].dtype.kind == "c" and kind is float:
+                raise InputError(f"{file}: got complex numbers in {heads[at]!r}; real ones are needed")
+            column = _seconds(values[at]) if clock else values[at].astype(kind)
             bad = np.flatnonzero(~np.isfinite(column))
             if bad.size:
                 raise InputError(
@@ -143,7 +151,7 @@ def _table_arrays(file: Path, arrays: dict[str, Any]) -> LogTable:
             found.append(column)
         return found
 
-    return LogTable(heads, numbers, "" if named else f"{file}: its columns have no names; {_BY_NUMBER}")
+    return NamedColumns(heads, numbers, "" if named else f"{file}: its columns have no names")
 
 
 class _Layout(NamedTuple):
@@ -155,7 +163,7 @@ class _Layout(NamedTuple):
     separator: str
 
 
-def _table_text(file: Path, lines: list[str]) -> LogTable:
+def _table_text(file: Path, lines: list[str]) -> NamedColumns:
     if not any(map(_says, lines)):
         raise InputError(f"{file}: it is empty; a line of column names and a line a sample are needed")
     layout = _lay_out(lines)
@@ -178,15 +186,12 @@ def _table_text(file: Path, lines: list[str]) -> LogTable:
     if not any(line.strip() for line in lines[layout.begin :]):
         raise InputError(f"{file}: it has names of columns and no samples; record some")
 
-    def numbers(places: Sequence[int]) -> list[np.ndarray]:
-        found = _read_quickly(lines, layout, len(heads), places)
-        return _read_each(file, lines, layout, heads, places) if found is None else found
+    def numbers(places: Sequence[int], kind: type = float) -> list[np.ndarray]:
+        found = _read_quickly(lines, layout, len(heads), places) if kind is float else None
+        return _read_each(file, lines, layout, heads, places, kind) if found is None else found
 
-    nameless = (
-        f"{file}:{top + 1}: got numbers where the names of the columns are expected; add a line such as "
-        f"{separator.join(('time [s]', 'position [m]', 'force [N]'))!r}, or {_BY_NUMBER}"
-    )
-    return LogTable(heads, numbers, nameless if names is None else "")
+    nameless = f"{file}:{top + 1}: got numbers where the names of the columns are expected"
+    return NamedColumns(heads, numbers, nameless if names is None else "")
 
 
 def _split(line: str, separator: str) -> list[str]:
@@ -203,7 +208,20 @@ def _says(line: str) -> bool:
 
 
 def _count_numbers(cells: list[str]) -> int:
-    return sum(looks_like_number(with_point(cell)) or cell.lower() == "nan" for cell in cells)
+    return sum(_read_number(with_point(cell), complex) is not None or cell.lower() == "nan" for cell in cells)
+
+
+def _read_number(text: str, kind: type) -> Any:
+    """A finite number, a complex one with i or j; None where there is none."""
+    if looks_like_number(text):
+        return kind(text) if np.isfinite(float(text)) else None
+    if kind is complex and text[-1:] in ("i", "j") and "_" not in text:
+        try:
+            value = complex(text.replace(" ", "").replace("i", "j"))
+        except ValueError:
+            return None
+        return value if np.isfinite(value) else None
+    return None
 
 
 def _lay_out(lines: list[str]) -> _Layout:
@@ -268,7 +286,7 @@ def _read_quickly(lines: list[str], layout: _Layout, count: int, places: Sequenc
 
 
 def _read_each(
-    file: Path, lines: list[str], layout: _Layout, heads: list[str], places: Sequence[int]
+    file: Path, lines: list[str], layout: _Layout, heads: list[str], places: Sequence[int], kind: type
 ) -> list[np.ndarray]:
     """Columns cell by cell; raise `InputError` for the first cell that holds no number."""
     separator, found = layout.separator, [[] for _ in places]
@@ -283,14 +301,13 @@ def _read_each(
             raise InputError(f"{file}:{number}: got {len(cells)} cells for {len(heads)} columns{hint}")
         for column, at in zip(found, places, strict=True):
             got = cells[at] if at < len(cells) else ""
-            value = got if separator == "," else with_point(got)
-            known = _is_time(got) if at in clocks else looks_like_number(value) and np.isfinite(float(value))
-            if not known:
-                kind = "a time such as 2024-05-01T12:00:00.001" if at in clocks else "a number"
+            value = _read_number(got if separator == "," else with_point(got), kind)
+            if not _is_time(got) if at in clocks else value is None:
+                wanted = "a time such as 2024-05-01T12:00:00.001" if at in clocks else "a number"
                 raise InputError(
-                    f"{file}:{number}: got {repr(got) if got else 'nothing'} under {heads[at]!r}; {kind} is needed"
+                    f"{file}:{number}: got {repr(got) if got else 'nothing'} under {heads[at]!r}; {wanted} is needed"
                 )
-            column.append(got if at in clocks else float(value))
+            column.append(got if at in clocks else value)
     columns = zip(places, map(np.array, found), strict=True)
     return [_read_clock(column) if at in clocks else column for at, column in columns]
 
