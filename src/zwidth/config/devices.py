@@ -8,10 +8,10 @@ from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import BeforeValidator, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, ValidationError, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, listing, problem, validation_error
+from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, validation_error
 from zwidth.config.fields import Strict
 from zwidth.config.parts import locate_refusal
 from zwidth.config.values import Quantity
@@ -169,7 +169,11 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
     if isinstance(raw, SystemSection | ResponseSection):
         return raw
     if isinstance(raw, str) and raw.endswith(SUFFIXES):
-        raw = {"csv": raw}
+        try:
+            return ResponseSection.model_validate({"csv": raw})
+        except ValidationError as error:
+            # The text is all there is in the file.
+            raise problems_of(error)[0][1] from None
     elif isinstance(raw, str) and "/" in raw:
         try:
             raw = dict(zip(_OF_SYSTEM[0], split_fraction(raw), strict=True))
