@@ -130,9 +130,9 @@ class LowPass(_Checked):
 
     def __post_init__(self) -> None:
         if (self.cutoff is None) == (self.time_constant is None):
-            count = "none of the two" if self.cutoff is None else "both"
+            got = "none of the two" if self.cutoff is None else "both"
             raise InputError(
-                f"velocity: got {count}; give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
+                f"velocity: got {got}; give either cutoff (Hz) or time_constant (s) of a low-pass, and only one of them"
             )
         check_whole("velocity.order", self.order, 1, 2)
         super().__post_init__()
