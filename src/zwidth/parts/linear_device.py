@@ -11,6 +11,7 @@ from typing import Any, ClassVar, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.words.errors import InputError
+from zwidth.words.formatting import short
 
 Polynomial: TypeAlias = tuple[Fraction, ...]
 """Exact coefficients, highest power first."""
@@ -64,6 +65,13 @@ class LinearDevice:
     def __post_init__(self) -> None:
         if not isinstance(self.system, RationalResponse):
             object.__setattr__(self, "system", _read(self.system))
+
+    def spell_form(self) -> str | dict[str, Any]:
+        """What configurations have under ``device``: coefficients to float64."""
+        top, bottom = ([float(c) for c in part] for part in self.system[:2])
+        if self.dt:
+            return {"numerator": top, "denominator": bottom, "sampled": self.dt}
+        return " / ".join(" ".join(map(short, part)) for part in (top, bottom))
 
     @property
     def dt(self) -> float | None:

@@ -120,11 +120,14 @@ def replace_parameters(scene: AnyScene, changes: dict[str, Any]) -> AnyScene:
 def spell_scene(scene: Any) -> dict[str, Any]:
     """The section ``scene`` of a configuration, with the keys that differ from their defaults."""
     parts: dict[str, Any] = {name: spell_part(part) for name, part in find_parts(scene).items() if name in PARTS}
-    own = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
     if scene.device.modes:
         parts["modes"] = [spell_part(mode) for mode in scene.device.modes]
-    own |= {"damping": scene.device.damping} | spell_part(scene.timing) | spell_part(scene.wall)
-    return own | spell_estimate(scene.velocity) | parts
+    if isinstance(scene.device, LinearDevice):
+        own: dict[str, Any] = {"device": scene.device.spell_form()}
+    else:
+        own = {name: value for name, value in spell_part(scene.device).items() if name not in (*PARTS, "modes")}
+        own |= {"damping": scene.device.damping}
+    return own | spell_part(scene.timing) | spell_part(scene.wall) | spell_estimate(scene.velocity) | parts
 
 
 def spell_estimate(velocity: Velocity, *, every: bool = False) -> dict[str, Any]:

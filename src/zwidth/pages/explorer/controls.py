@@ -10,9 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl, urlencode
 
+from zwidth.config.devices import ResponseSection
 from zwidth.config.reader import read_mapping
 from zwidth.pages.words import unit_of
 from zwidth.parts.device import Device
+from zwidth.parts.linear_device import LinearDevice
 from zwidth.parts.paths import PARTS, find_parts, spell_part, spell_scene
 from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Butterworth, LowPass, WindowedDifference
@@ -180,8 +182,14 @@ class Controls:
             )
         return self
 
+    def _refuse_change(self, name: str, in_parts: bool = True) -> None:
+        """Refuse what belongs to a mass where the device is given as a whole."""
+        if in_parts and isinstance(self.scene.device, LinearDevice):
+            raise InputError(f"{name}: this device is given as a linear system, which holds what belongs to it")
+
     def _turn(self) -> Controls:
         """A device of the other kind, as this one has no numbers in its units, at the same rate and delay."""
+        self._refuse_change("motion")
         other = _SMALL_DEVICE if self.rotary else _SMALL_ROTARY
         return Controls(replace(other, timing=self.scene.timing))
 
@@ -191,6 +199,7 @@ class Controls:
 
     def _replace_part(self, name: str, kind: str) -> Scene:
         scene = self.scene
+        self._refuse_change(name, in_parts=name in PARTS)
         cutoff = min(100.0, 0.1 / scene.timing.period)
         estimates = {
             "BackwardDifference": lambda: BackwardDifference(),
@@ -214,6 +223,7 @@ class Controls:
 
     def _convert(self) -> Controls:
         """The device and wall in the other units; normalized it is rigid, its parts are left out."""
+        self._refuse_change("mode")
         scene, (mass, period, rotary) = self.scene, self.scale
         if not self.normalized:
             numbers = (_round(float(number), 12) for number in scene.normalized)
@@ -265,10 +275,11 @@ def _show_scene(given: Any, origin: Any) -> Controls:
             f"{origin}: scene.delay_model: got {given.delay_model!r}; the page computes the model 'held' alone, "
             "zwidth run draws both"
         )
-    if getattr(given, "device", None) is not None:
+    device = getattr(given, "device", None)
+    if device is not None and (isinstance(device, ResponseSection) or device.sampled):
         raise InputError(
-            f"{origin}: scene.device: the page has sliders for mass, damping and parts, and this device is given as a "
-            "whole; judge it by zwidth check, draw it by zwidth run"
+            f"{origin}: scene.device: the page shows poles and motions at any rate, which a response or a sampled "
+            "system does not tell; judge it by zwidth check, draw it by zwidth run"
         )
     controls = (
         Controls(given.to_scene()) if hasattr(given, "to_scene") else normalized_controls(0, 0, given.delta, given.d)
@@ -359,6 +370,9 @@ def _write_script(controls: Controls) -> str:
 
 def _spell(value: Any, path: str, units: bool) -> str:
     """A part, or a number of one, as Python writes it."""
+    if isinstance(value, LinearDevice):
+        form = tuple([float(c) for c in part] for part in value.system[:2])
+        return f"zwidth.LinearDevice({form})"
     if hasattr(value, "__dataclass_fields__"):
         given = spell_part(value).items()
         words = (f"{name}={_spell(own, f'{path}.{name}'.lstrip('.'), units)}" for name, own in given)

@@ -11,6 +11,7 @@ import numpy as np
 
 from zwidth.pages.explorer import model
 from zwidth.pages.words import check_lines, list_slopes
+from zwidth.parts.device import Device
 from zwidth.scenes.assessment import Assessment, assess, limits_of
 from zwidth.scenes.scene import Scene
 
@@ -57,11 +58,16 @@ def compute_details(wish: Wish) -> Iterator[Update]:
     if wish.contact or (wish.costly and not quick):
         with IMPORTING:
             import jax  # noqa: F401
+    # Of a linear system no damping is known that could grow, and no place to hit the wall from.
+    bodies = isinstance(scene.device, Device)
     if quick or wish.costly:
-        x, y = model.ridge_path(scene)
+        x, y = model.ridge_path(scene) if bodies else (np.empty(0), np.empty(0))
         yield {"ridge": {"x": x, "y": y}}
         yield {"slopes": "\n".join([] if wish.normalized else [slope.line() for slope in list_slopes(scene)])}
-    if wish.contact:
+    if wish.contact and not bodies:
+        empty = {"x": [], "position": [], "force": []}
+        yield {"contact": empty, "contact_words": "(a linear system has no body that comes with a velocity)"}
+    elif wish.contact:
         time, position, force, text = model.contact_motion(scene, 2 * model.length_of(scene, verdict))
         position = position * _length(wish)
         yield {"contact": {"x": time, "position": position, "force": force}, "contact_words": text}

@@ -10,9 +10,10 @@ pytest.importorskip("bokeh", reason="zwidth[explore] is not installed")
 from click.testing import CliRunner
 from open_pages import open_page, say
 
+import zwidth
 from zwidth.cli.commands import cli
 from zwidth.pages.explorer import model
-from zwidth.pages.explorer.controls import Controls
+from zwidth.pages.explorer.controls import Controls, read_controls, read_link
 
 
 @pytest.fixture
@@ -168,3 +169,35 @@ def test_an_address_is_opened_and_an_empty_one_is_the_first_visit(page):
     assert page.controls.scene.mass == 0.2
     say(page, open="", rest=True)
     assert page.controls == Controls()
+
+
+def test_a_linear_system_is_shown_by_what_it_has(tmp_path):
+    file = tmp_path / "system.yaml"
+    scene = "{device: 1900 / 0.1 191 1900 0, period: 1 ms, stiffness: 5 kN/m, virtual_damping: 30}"
+    file.write_text(f"version: 1\nname: s\nscene: {scene}\nstudies: [{{kind: boundary, name: b}}]\n")
+    page = open_page(read_controls(file))
+    say(page, set={"delay": 0.5}, rest=True, contact=True, costly=True)
+    page.queue.work()
+    assert page.texts["error"] == ""
+    assert page.texts["busy"] is False
+    system = zwidth.LinearDevice(([1900.0], [0.1, 191.0, 1900.0, 0.0]))
+    known = zwidth.Scene(system, zwidth.Timing(1e-3, 0.5e-3), zwidth.VirtualWall(5e3, 30.0))
+    assert page.controls.scene == known
+    done = CliRunner().invoke(
+        cli,
+        "check --device '1900 / 0.1 191 1900 0' --period 1ms --delay 0.5ms --stiffness 5e3 --virtual-damping 30",
+    )
+    assert page.texts["verdict"] + "\n" == done.stdout
+    assert len(page.sources["step"].data["x"]) > 10
+    assert len(page.sources["contact"].data["x"]) == 0
+    assert "no body" in page.texts["contact_words"]
+    # What the page copies gives the same scene.
+    names: dict = {}
+    exec(page.texts["python"].partition("verdict =")[0], names)
+    assert names["scene"] == known
+    assert read_link(page.texts["link"]).scene == known
+    (tmp_path / "copied.yaml").write_text(page.texts["yaml"])
+    assert zwidth.load_config(tmp_path / "copied.yaml").scene.to_scene() == known  # pyright: ignore
+    for name, value in (("mode", "normalized"), ("coupling", "tip"), ("motion", "rotary"), ("operator", "rigid")):
+        with pytest.raises(zwidth.InputError, match=f"^{name}: "):
+            page.controls.change({name: value})
