@@ -143,6 +143,9 @@ class Controls:
             "motion": "rotary" if self.rotary else "linear",
             "velocity": type(scene.velocity).__name__,
         }
+        if isinstance(scene.device, LinearDevice):
+            # It holds what a hand, a link or an actuator would add.
+            return found | choices
         return found | choices | {name: forms.get(name, "none") for name in PARTS}
 
     def change(self, shown: Mapping[str, Any]) -> Controls:
