@@ -8,12 +8,12 @@ from types import SimpleNamespace
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
-from pydantic import BeforeValidator, ValidationError, WithJsonSchema, WrapValidator
+from pydantic import BeforeValidator, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
-from zwidth.config.faults import LocatedProblem, listing, problem, problems_of, validation_error
+from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.fields import Strict
-from zwidth.config.parts import locate_refusal
+from zwidth.config.parts import locate_refusal, split_refusal
 from zwidth.config.values import Quantity
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.linear_device import LinearDevice, split_fraction
@@ -117,7 +117,7 @@ def _is_whole(given: Iterable[str]) -> bool:
 
 
 class ResponseSection(Strict):
-    """A device by its measured frequency response: a table as `zwidth respond --save` writes it, or its columns."""
+    """A device by its measured frequency response, the columns of a table."""
 
     what: ClassVar[str] = "a response"
 
@@ -134,24 +134,19 @@ class ResponseSection(Strict):
     """The radius in which the true response lies, in m/N."""
 
     @classmethod
-    def prepare(cls, raw: dict[str, Any]) -> dict[str, Any]:
-        """Put the columns of a file in the place of its name."""
-        if "csv" not in raw:
-            return super().prepare(raw)
-        try:
-            if not isinstance(raw["csv"], str):
-                raise InputError(f"csv: got {describe(raw['csv'])}; write the name of a file")
-            known = MeasuredDevice.read(find_file(raw["csv"]))
-        except InputError as error:
-            raise validation_error(cls.__name__, [(("csv",), locate_refusal(error)[1])]) from None
+    def read(cls, file: str) -> ResponseSection:
+        """The columns of a table, so that a run keeps the numbers and not the name."""
+        known = MeasuredDevice.read(find_file(file))
         columns = {"frequency": known.frequency, "real": known.response.real, "imag": known.response.imag}
         columns |= {} if known.deviation is None else {"deviation": known.deviation}
-        return {name: column.tolist() for name, column in columns.items()} | {k: raw[k] for k in raw if k != "csv"}
+        return cls(**{name: column.tolist() for name, column in columns.items()})
 
     @cached_property
     def _known(self) -> MeasuredDevice:
         real, imag = (_to_array(part) for part in (self.real, self.imag))
-        return MeasuredDevice(self.frequency, real + 1j * imag if real.shape == imag.shape else real, self.deviation)
+        if real.shape != imag.shape:
+            raise InputError(f"imag: got {imag.size} numbers beside {real.size} of real; give one a frequency")
+        return MeasuredDevice(self.frequency, real + 1j * imag, self.deviation)
 
     def to_part(self) -> MeasuredDevice:
         """The device itself."""
@@ -168,22 +163,19 @@ def _read_form(raw: Any) -> SystemSection | ResponseSection:
     """A device in any of its forms but its numbers."""
     if isinstance(raw, SystemSection | ResponseSection):
         return raw
-    if isinstance(raw, str) and raw.endswith(SUFFIXES):
-        try:
-            return ResponseSection.model_validate({"csv": raw})
-        except ValidationError as error:
-            # The text is all there is in the file.
-            raise problems_of(error)[0][1] from None
-    elif isinstance(raw, str) and "/" in raw:
-        try:
+    try:
+        if isinstance(raw, str) and raw.endswith(SUFFIXES):
+            return ResponseSection.read(raw)
+        if isinstance(raw, str) and "/" in raw:
             raw = dict(zip(_OF_SYSTEM[0], split_fraction(raw), strict=True))
-        except InputError as error:
-            raise locate_refusal(error)[1] from None
+    except InputError as error:
+        # Of a table its name is said.
+        raise split_refusal(str(error).removeprefix("device: ")) from None
     if not isinstance(raw, dict):
         names = tuple(device.name for device in DEVICES)
         allowed = f"published are {listing(names)}"
         raise problem(f"got {describe(raw)}", allowed, suggestion(raw, names, f"zwidth devices lists them; or {FORMS}"))
-    return (ResponseSection if {"csv", "frequency"} & set(raw) else SystemSection).model_validate(raw)
+    return (ResponseSection if "frequency" in raw else SystemSection).model_validate(raw)
 
 
 DeviceForm = Annotated[SystemSection | ResponseSection, WrapValidator(lambda raw, _: _read_form(raw))]
