@@ -188,6 +188,16 @@ def test_an_old_file_of_matlab_that_is_broken_is_refused(tmp_path):
         read_log(file, {})
 
 
+def test_a_file_of_matlab_7_3_says_how_to_save_it(tmp_path):
+    file = tmp_path / "log.mat"
+    # The header that HDF5 follows in such files: text, nothing of a subsystem, version 2, and the order of bytes.
+    file.write_bytes(
+        b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(116) + bytes(8) + b"\x00\x02IM" + b"\x89HDF\r\n\x1a\n"
+    )
+    with pytest.raises(InputError, match=r"log.mat: it is of MATLAB's version 7.3; save it again with save\('log.mat'"):
+        read_log(file, {})
+
+
 def test_a_motor_constant_that_is_none_is_told(tmp_path):
     file = tmp_path / "log.csv"
     file.write_text("t,x,i_A\n" + ROWS)
