@@ -191,10 +191,8 @@ def _refuse_bodies(known: list[Any], which: np.ndarray, name: str, values: np.nd
         field, what = _spell(name), "a start names the state of all bodies"
         if name == "static":
             field, what = "coulomb, static", "friction acts on a body"
-        raise InputError(
-            f"{field}: {what}, and of a linear system none is known; it starts at rest at 0: move it by push or "
-            "push_history, or simulate a zwidth.Device"
-        )
+        remedy = "move it by push or push_history, or simulate a zwidth.Device"
+        raise InputError(f"{field}: {what}, and of a linear system none is known; it starts at rest at 0: {remedy}")
 
 
 def _trace_law(force: Any, stiffness: Any, virtual_damping: Any) -> TracedLaw:

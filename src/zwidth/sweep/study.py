@@ -13,16 +13,9 @@ from zwidth.config.device_table import DeviceTable, TableField, read_table
 from zwidth.config.devices import DeviceForm, ResponseSection
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
+from zwidth.config.mass import Rotary, find_second_device, find_second_period, tell_rotary
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
-from zwidth.config.scenes import (
-    AnyScene,
-    PhysicalScene,
-    Rotary,
-    find_second_device,
-    find_second_period,
-    is_with_parts,
-    tell_rotary,
-)
+from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
 from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
