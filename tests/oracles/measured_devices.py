@@ -93,14 +93,14 @@ class TrueDevice:
             total[size + 1 + k, size + k] = 1.0
         return total, force, np.append(C, np.zeros(n + 1))
 
-    def play(self, force: np.ndarray) -> np.ndarray:
-        """The positions that the encoder reads while the force is played."""
+    def play(self, force: np.ndarray, read: bool = True) -> np.ndarray:
+        """The positions while the force is played, as the encoder reads them or as they are."""
         A, B, C = self.sampled()
         given, x, out = np.clip(force, -self.limit, self.limit), np.zeros(B.size), np.empty(force.size)
         for k in range(force.size):
             out[k] = C @ x
             x = A @ x + B * given[k]
-        return self.encoder * np.round(out / self.encoder)
+        return self.encoder * np.round(out / self.encoder) if read else out
 
     def is_stable(self, stiffness: float, virtual_damping: float) -> bool:
         """Whether a wall with the difference of two samples is stable: all eigenvalues inside the unit circle."""

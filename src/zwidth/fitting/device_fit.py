@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from zwidth.fitting.scenes import scene_of
+from zwidth.parts.measured import MeasuredDevice
+from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.formatting import to_json, with_unit
@@ -109,8 +111,9 @@ class DeviceFit:
         resolution: step of the encoder in m that a log was fitted with; 0 of buzzing walls, and where there is none.
         motions: of a log, each with its fit, a `zwidth.FittedMotion`.
         period, velocity: of the loop; the velocity with the cut-off found where that was unknown.
-        seen_to: frequency in Hz up to which a log would show a resonance, by a doubt, that may make three quarters of
-            K_max unstable; what is above is not excluded. 0 where none would show, NaN of buzzing walls.
+        response: of a log, a `zwidth.MeasuredDevice`: the response of the estimated device, with the radius by which a
+            resonance of a damping ratio of 0.005 or more may move it and not show in the log. None of buzzing walls, of
+            a log without noise, and under a doubt of what the fit leaves.
         freedom: degrees of freedom that the noise was estimated with; None where it is known.
     """
 
@@ -134,7 +137,7 @@ class DeviceFit:
     velocity: Velocity
     freedom: int | None = None
     rivals: tuple[RivalDevice, ...] = ()
-    seen_to: float = np.nan
+    response: MeasuredDevice | None = None
 
     @property
     def is_doubted(self) -> bool:
@@ -158,6 +161,11 @@ class DeviceFit:
     def scene(self) -> Scene:
         """The estimated device with its timing and velocity estimate."""
         return scene_of((self.mass, self.damping, self.delay), self.period, self.velocity)
+
+    @cached_property
+    def responding(self) -> Scene:
+        """The same loop with the response in place of the device: what holds for every resonance within its radius."""
+        return Scene(self.response, Timing(self.period), self.velocity)
 
     @cached_property
     def virtual_damping(self) -> float:
@@ -199,22 +207,28 @@ class DeviceFit:
             for name, (value, far) in reaches.items()
         }
 
-    def safe_wall(self, reliability: float = 0.99, *, samples: int | None = None, seed: int = 0) -> SafeWall:
+    def safe_wall(
+        self, reliability: float = 0.99, *, samples: int | None = None, seed: int = 0, rigid: bool = False
+    ) -> SafeWall:
         """Find the stiffest wall that nearly all devices bear that the records allow.
 
         Devices are drawn around the estimate; K is the largest for which there is one B that this share of them bears,
-        at K and at every softer wall of that B, for a person raises K from below.
+        at K and at every softer wall of that B, for a person raises K from below. Of a log, the wall bears every
+        resonance too that may be in the device and not show in the log.
 
         Args:
             reliability: the share, between 0.5 and 1.
             samples: how many devices are drawn, 100 to 100,000; left out, 8,000, or 1,000 with a velocity filter.
             seed: of the draws; equal seeds give equal walls.
+            rigid: whether the device is known to be a rigid mass. Many have resonances of 50 to 300 Hz; a wall that one
+                makes unstable may be far softer than the stiffest one of the mass.
 
         Returns:
             SafeWall: ``stiffness`` K in N/m and ``virtual_damping`` B in N s/m; ``share``, of the drawn devices that
             bear it, counted by their poles' verdicts; ``status``, with NaN where it is not OK: that of the fit, or
             UNDECIDED under a doubt, where the verdicts do not confirm the wall, or where hardly a drawn device is
-            possible. K is 0, and B with it, where no wall is borne by so many.
+            possible; ``resonance``, the frequency in Hz of the hidden one that bounds it, NaN where none does. K is 0,
+            and B with it, where no wall is borne by so many.
 
         Raises:
             InputError: a share, a number of samples or a seed that there cannot be.
@@ -224,7 +238,8 @@ class DeviceFit:
             draws of negative ones are drawn again. A rigid device: rows and columns in closed form, K to 0.1 %, in
             about 0.1 s; of 20,000 other devices of 69 fits each, 98.5 to 99.2 % bore it, and of 2 % more stiffness at
             most 91.4 % at any B. With a filter: boundaries on a grid of frequencies, judged by eigenvalues, in some
-            seconds.
+            seconds. Hidden resonances, one at a time with damping ratios from 0.005 on, by ``response`` and its radius:
+            what the residuals show of each and four standard errors, as `zwidth.MeasuredDevice` decides.
 
         References:
             Hulin, Preusche, Hirzinger 2006, section V (the stable set). Kotz, Nadarajah 2004 (the t distribution).
@@ -239,14 +254,14 @@ class DeviceFit:
         """
         from zwidth.fitting.safe_wall import find_safe_wall
 
-        asked = (reliability, samples, seed)
-        return self._usual_safe_wall if asked == (0.99, None, 0) else find_safe_wall(self, *asked)
+        asked = (reliability, samples, seed, rigid)
+        return self._usual_safe_wall if asked == (0.99, None, 0, False) else find_safe_wall(self, *asked)
 
     @cached_property
     def _usual_safe_wall(self) -> SafeWall:
         from zwidth.fitting.safe_wall import find_safe_wall
 
-        return find_safe_wall(self, 0.99, None, 0)
+        return find_safe_wall(self, 0.99, None, 0, False)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for JSON; None for what is NaN."""
@@ -263,7 +278,6 @@ class DeviceFit:
             "friction": self.friction,
             "resolution": self.resolution,
             "period": self.period,
-            "seen_to": self.seen_to,
             "doubts": list(self.doubts),
             "status": int(self.status),
             "rivals": [rival._asdict() for rival in self.rivals],
@@ -301,7 +315,7 @@ class StiffnessEstimate:
         resolution: float = 0.0,
         motions: tuple[FittedMotion, ...] = (),
         rivals: tuple[RivalDevice, ...] = (),
-        seen_to: float = np.nan,
+        response: MeasuredDevice | None = None,
     ) -> DeviceFit:
         """The result; ``parts`` are a log's offset and friction with their errors, ``freedom`` as for `reach_of`."""
         scene = self.scene
@@ -331,7 +345,7 @@ class StiffnessEstimate:
             velocity=scene.velocity,
             freedom=freedom,
             rivals=rivals,
-            seen_to=seen_to,
+            response=response,
         )
 
 

@@ -2,47 +2,72 @@
 
 A pole that the model lacks leaves in the positions the force, filtered by it. So the residuals are compared with the
 forces filtered by a bank of poles, each cleared of what the numbers of the model explain as well (a score test). That
-sees far less than the spread of the residuals shows, below the step of the encoder too.
+sees far less than the spread of the residuals shows, below the step of the encoder too. What it would not see may be
+in the device nevertheless: how large, at most, is the radius in which the true response lies.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.circle import circle
 from zwidth.fitting.output_error import FittedModel
-from zwidth.loops.linear.margins import open_loop_response
+from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.scenes.scene import Scene
 
-# Frequencies of the bank over the sampling rate, how far apart, and the damping ratios; the last one is a real pole.
-_LOWEST, _HIGHEST, _APART, _RATIOS = 0.005, 0.48, 1.06, (0.03, 0.2, 1.0)
+# Frequencies of the bank over the sampling rate; damping ratios with the steps of their frequencies, the last one that
+# of a real pole. Resonances of the first two and all between are those that may hide.
+_LOWEST, _HIGHEST, _APART = 0.005, 0.49, {LEAST_DAMPING_RATIO: 1.01, 0.03: 1.06, 0.2: 1.06, 1.0: 1.06}
+_RINGING = 2
 # What the model explains of a filtered force but for this share is its own.
 _OWN = 1e-6
-# So many poles are tried, the likeliest first: an encoder errs alike in neighboring samples, which may look like one.
-_TRIED = 3
-# So many of the first samples of each log are looked at.
-_LOOKED = 20_000
-# A resonance shows surely whose size is so many standard errors beyond what chance explains; the one that is asked for.
-_SURELY, _RINGING = 2.0, _RATIOS[0]
+# So many poles are tried, the likeliest first and so far apart: an encoder errs alike in neighboring samples, which may
+# look like one.
+_TRIED, _ELSEWHERE = 3, 1.1
+# So many of the first samples of each log are looked at, and so many numbers at once.
+_LOOKED, _AT_ONCE = 20_000, 4_000_000
+# A resonance may be larger than the residuals say by so many standard errors; these are those of frequencies so near.
+_SURELY, _NEAR = 4.0, 15
+# Of the response: its lowest line, how many there are below the bank, and by what its delay turns it between two lines.
+_FIRST, _BELOW, _TURN = 2e-4, 40, 0.3
 
 
 class HiddenPole(NamedTuple):
-    """The pole that the residuals show: its frequency in turns a period, NaN where chance explains as much.
-
-    ``rings`` tells a resonance from a lag. Up to the frequency ``seen_to`` resonances would show that are large enough
-    to make a wall unstable; 0 where none would.
-    """
+    """The pole that the residuals show: its frequency in turns a period, and whether it rings, as no lag does."""
 
     frequency: float
     rings: bool
-    seen_to: float
 
 
-def find_hidden(best: FittedModel, scene: Scene, stiffness: float, virtual_damping: float) -> HiddenPole:
-    """Look for the pole whose filtered force explains most of the residuals; ``seen_to`` is for the given wall.
+@dataclass(frozen=True)
+class PoleBank:
+    """Poles of one damping ratio and what the residuals say of them, in standard errors of white noise."""
+
+    ratio: float
+    frequency: np.ndarray
+    explained: np.ndarray  # squares of the residuals that each pole explains
+    whole: np.ndarray  # what a mode of each would leave that moves as the whole mass does
+
+    @property
+    def rates(self) -> np.ndarray:
+        """Poles of the continuous device, in periods."""
+        w, ratio = 2.0 * np.pi * self.frequency, self.ratio
+        return w * (-ratio + 1j * np.sqrt(1.0 - ratio**2))
+
+    def bound_modes(self) -> np.ndarray:
+        """How much more than the whole mass a mode of each pole may move, at most."""
+        near = np.convolve(
+            np.pad(self.explained, _NEAR, "edge"), np.full(2 * _NEAR + 1, 1.0 / (2 * _NEAR + 1)), "valid"
+        )
+        with np.errstate(divide="ignore"):
+            return (np.sqrt(self.explained) + _SURELY * np.sqrt(np.maximum(0.5 * near, 1.0))) / self.whole
+
+
+def find_hidden(best: FittedModel) -> tuple[HiddenPole | None, list[PoleBank]]:
+    """Look for the pole whose filtered force explains most of the residuals; None where chance explains as much.
 
     Schwarz's criterion with the numbers that the pole adds, two rates and two sizes; one of each of a real pole.
     """
@@ -50,36 +75,42 @@ def find_hidden(best: FittedModel, scene: Scene, stiffness: float, virtual_dampi
     basis, _ = np.linalg.qr(best.columns[0][:, best.columns[0].any(0)])
     rest = best.model.weigh(best.residuals)
     rest = rest - basis @ (basis.T @ rest)
-    total, chance, found, shown = float(rest @ rest), 2.0 * np.log(best.count), [], []
-    turns = np.geomspace(_LOWEST, _HIGHEST, 1 + round(np.log(_HIGHEST / _LOWEST) / np.log(_APART)))
-    alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
-    loop = open_loop_response(scene.loop.roots, alpha, beta, circle(2.0 * np.pi * turns)).value
-    # A mode that moves as the whole mass does changes the loop at its resonance by the loop over twice its damping.
-    harmful = 2.0 * _RINGING * np.abs(1.0 + 1.0 / loop)
-    for frequency, size in zip(turns.tolist(), harmful.tolist(), strict=True):
-        for ratio in _RATIOS:
-            columns, mode = _filter_forces(best, frequency, ratio)
-            cleared = best.model.weigh(columns)
-            cleared = cleared - basis @ (basis.T @ cleared)
-            if ratio == _RINGING:
-                clear = size * float(np.linalg.norm(cleared @ mode)) / np.sqrt(best.variance * best.excess)
-                shown.append(clear > np.sqrt(2.0 * chance) + _SURELY)
-            if np.linalg.norm(cleared, axis=0).min() <= _OWN * np.linalg.norm(columns, axis=0).max():
-                continue
-            cleared, _ = np.linalg.qr(cleared)
-            along = cleared.T @ rest
-            found.append((float(along @ along), frequency, ratio, cleared, along))
-    first = shown.index(True) if any(shown) else len(shown)
-    seen = np.logical_and.accumulate(shown[first:])
-    seen_to = float(turns[first:][seen].max(initial=0.0))
-    for explained, frequency, ratio, cleared, along in sorted(found, key=lambda one: -one[0])[:_TRIED]:
+    noise = best.variance * best.excess
+    banks = [_test(best, basis, rest, ratio, noise) for ratio in _APART]
+    tried: list[float] = []
+    total, chance = float(rest @ rest), 2.0 * np.log(best.count)
+    found = [(e, f, bank.ratio) for bank in banks for e, f in zip(bank.explained * noise, bank.frequency, strict=True)]
+    for explained, frequency, ratio in sorted(found, reverse=True):
+        if any(max(frequency / other, other / frequency) < _ELSEWHERE for other in tried):
+            continue
+        tried.append(frequency)
+        cleared = _filter_forces(best, np.array([frequency]), ratio)
+        cleared, _ = np.linalg.qr(cleared - basis @ (basis.T @ cleared))
+        along = cleared.T @ rest
         # In squares of standard errors, of errors as kindred as the encoder's and as the sums of neighbors are.
         errors = best.noise.spread(best.model.weigh(cleared))
         known = float(along @ np.linalg.solve(errors, along))
         white = best.count * np.log(total / (total - explained)) if explained < total else np.inf
         if min(known, white) > along.size * chance:
-            return HiddenPole(frequency, ratio < 1.0, seen_to)
-    return HiddenPole(np.nan, False, seen_to)
+            return HiddenPole(float(frequency), ratio < 1.0), banks
+        if len(tried) == _TRIED:
+            break
+    return None, banks
+
+
+def respond_as_fitted(best: FittedModel, scene: Scene, banks: list[PoleBank]) -> MeasuredDevice:
+    """The response of a fitted device, with the radius by which a resonance may move it that the log does not show."""
+    period = scene.timing.period
+    even = np.arange(1.0, 2.0 * np.pi * _HIGHEST * (1.0 + scene.d) / _TURN) * _TURN / (2.0 * np.pi * (1.0 + scene.d))
+    below = np.geomspace(_FIRST, _LOWEST, _BELOW)[:-1]
+    lines = np.unique(np.concatenate([below, even[even > _LOWEST], banks[0].frequency]))
+    response = scene.frequency_response(1.0, 0.0, lines / period)
+    radius, z = np.zeros(lines.size), np.exp(2j * np.pi * lines)[:, None]
+    for bank in banks[:_RINGING]:
+        poles, size = np.exp(bank.rates), _size_modes(best, bank)
+        moved = size / (z - poles) - size.conj() / (z - poles.conj())
+        radius = np.maximum(radius, np.max(0.5 * np.abs(moved) * bank.bound_modes(), axis=1))
+    return MeasuredDevice(lines / period, response, radius)
 
 
 def _glimpse(best: FittedModel) -> FittedModel:
@@ -91,20 +122,45 @@ def _glimpse(best: FittedModel) -> FittedModel:
     return replace(part, model=replace(part.model, noise=part.noise)) if best.model.noise is not None else part
 
 
-def _filter_forces(best: FittedModel, frequency: float, ratio: float) -> tuple[np.ndarray, np.ndarray]:
-    """What a pole makes of all forces, at the positions: real and imaginary part where it rings, else one column.
+def _test(best: FittedModel, basis: np.ndarray, rest: np.ndarray, ratio: float, noise: float) -> PoleBank:
+    """Compare the residuals with the forces filtered by poles of one damping ratio."""
+    frequency = np.geomspace(_LOWEST, _HIGHEST, 1 + round(np.log(_HIGHEST / _LOWEST) / np.log(_APART[ratio])))
+    bank = PoleBank(ratio, frequency, np.zeros(frequency.size), np.zeros(frequency.size))
+    sizes, count = _size_modes(best, bank), max(1, _AT_ONCE // (2 * rest.size))
+    for first in range(0, frequency.size, count):
+        part = slice(first, first + count)
+        columns = _filter_forces(best, frequency[part], ratio)
+        raw = np.linalg.norm(columns, axis=0)
+        cleared = columns - basis @ (basis.T @ columns)
+        each = (-1, 1 if ratio == 1.0 else 2)
+        cleared = cleared.reshape(rest.size, *each)
+        own = np.linalg.norm(cleared, axis=0).min(-1) <= _OWN * raw.reshape(each).max(-1)
+        square, along = np.einsum("nki,nkj->kij", cleared, cleared), np.einsum("nki,n->ki", cleared, rest)
+        by = np.linalg.pinv(square, rcond=_OWN**2, hermitian=True)
+        bank.explained[part] = np.where(own, 0.0, np.einsum("ki,kij,kj->k", along, by, along)) / noise
+        mode = np.stack([sizes.imag, sizes.real], -1)[part, : each[1]]
+        bank.whole[part] = np.sqrt(np.einsum("ki,kij,kj->k", mode, square, mode) / noise)
+    return bank
 
-    And how much of each a mode of that pole adds to the positions that moves as the whole mass does.
-    """
+
+def _filter_forces(best: FittedModel, frequency: np.ndarray, ratio: float) -> np.ndarray:
+    """What poles make of all forces, at the positions: real and imaginary part side by side, or one of a real pole."""
     from scipy.signal import lfilter
 
-    w = 2.0 * np.pi * frequency
-    rate = w * (-ratio + 1j * np.sqrt(1.0 - ratio**2)) if ratio < 1.0 else -w
-    whole, parts = int(best.theta[2]), []
+    bank, ends = PoleBank(ratio, frequency, frequency, frequency), [0]
     for log in best.model.logs:
-        late = lfilter([0.0, 1.0], [1.0, -np.exp(rate)], log.force)[log.skip - whole :]
-        late = late[: log.position.size]
-        parts.append(np.stack([np.real(late), np.imag(late)] if ratio < 1.0 else [late], -1))
-    # The force is held for a period.
-    size = complex(best.theta[0] / w * (np.exp(rate) - 1.0) / rate)
-    return np.concatenate(parts), np.array([size.imag, size.real])
+        ends.append(ends[-1] + log.position.size)
+    parts = 1 if ratio == 1.0 else 2
+    columns, whole = np.empty((ends[-1], frequency.size * parts)), int(best.theta[2])
+    for k, pole in enumerate(np.exp(bank.rates)):
+        for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
+            late = lfilter([0.0, 1.0], [1.0, -pole], log.force)[log.skip - whole :][: end - start]
+            columns[start:end, k * parts] = late.real
+            if parts == 2:
+                columns[start:end, 2 * k + 1] = late.imag
+    return best.model.weigh(columns)
+
+
+def _size_modes(best: FittedModel, bank: PoleBank) -> np.ndarray:
+    """Of a mode of each pole that moves as the whole mass does, under a force that is held for a period."""
+    return best.theta[0] / (2.0 * np.pi * bank.frequency) * (np.exp(bank.rates) - 1.0) / bank.rates

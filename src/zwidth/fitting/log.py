@@ -16,16 +16,17 @@ from zwidth.fitting.device_fit import (
     in_si,
 )
 from zwidth.fitting.encoder import find_resolution, fits_steps
-from zwidth.fitting.hidden import find_hidden
+from zwidth.fitting.hidden import find_hidden, respond_as_fitted
 from zwidth.fitting.output_error import LEAST, FittedModel, fit_model
 from zwidth.fitting.recordings import Log, find_stretches, read_logs
 from zwidth.fitting.scenes import scene_of
 from zwidth.parts.checks import check_number
+from zwidth.parts.measured import MeasuredDevice
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.scenes.scene import Scene
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, with_unit
-from zwidth.words.quantities import NOT_NEGATIVE, RECOMMENDED_SHARE
+from zwidth.words.quantities import NOT_NEGATIVE
 from zwidth.words.status import Status
 from zwidth.words.types import ArrayLike
 
@@ -91,7 +92,8 @@ def fit_log(
         ``stiffness_max`` with ``stiffness_error``; ``intervals``, 95 %; ``noise`` of the position in m; ``residuals``
         and ``motions``; ``doubts``, as of a unit or of residuals that are no noise: then there is no safe wall;
         ``status``: UNREACHABLE where the delay ends the range looked in, NOT_CONVERGED, UNDECIDED where the residuals
-        are no noise: then K_max is NaN; ``seen_to``, up to which Hz a harmful resonance would show so.
+        are no noise: then K_max is NaN; ``response``, with the radius by which a resonance may move it that the log
+        does not show: what bounds the safe wall.
 
     Raises:
         InputError: times are uneven, the force or the position never changes, the device runs away from its force, most
@@ -144,7 +146,7 @@ def fit_log(
     covariance = by_theta @ best.covariance[:3, :3] @ by_theta.T + np.outer(by_period, by_period)
     stiffest = StiffnessEstimate.at(scene_of(values, period, velocity))
     errors = np.sqrt(np.diag(covariance))
-    unexplained, seen_to = _find_unexplained(best, stiffest.scene)
+    unexplained, response = _find_unexplained(best, stiffest.scene)
     doubts = odd + doubts + _doubt(values, errors, best, logs, rotary) + unexplained
     status = Status.OK if best.arrived else Status.NOT_CONVERGED
     # The device that bears K_max is another one then.
@@ -165,28 +167,25 @@ def fit_log(
         parts={"offset": _in_newton(best, -2), "friction": _in_newton(best, -1)},
         resolution=step,
         motions=motions,
-        seen_to=seen_to,
+        response=response,
     )
 
 
-def _find_unexplained(best: FittedModel, scene: Scene) -> tuple[list[str], float]:
-    """What the residuals show beyond noise, with the record to make next, and up to which Hz a resonance would show."""
+def _find_unexplained(best: FittedModel, scene: Scene) -> tuple[list[str], MeasuredDevice | None]:
+    """What the residuals show beyond noise, with the record to make next, and the response with what they would not."""
     way, period = max(float(np.ptp(log.position)) for log in best.model.logs), scene.timing.period
     if float(best.residuals @ best.residuals) <= _EXACT**2 * best.residuals.size * way**2:
         # Nothing but rounding is left.
-        return [], 0.5 / period
-    stiffest = scene.max_stiffness()
-    hidden = find_hidden(best, scene, RECOMMENDED_SHARE * float(stiffest.stiffness), float(stiffest.virtual_damping))
-    seen_to, at = hidden.seen_to / period, with_unit(hidden.frequency / period, "Hz", 3)
-    if hidden.rings:
-        what = f"it follows the force, most like a resonance near {at}"
-    elif np.isfinite(hidden.frequency):
-        what = f"it follows the force with a lag, most like one of {at}"
+        return [], None
+    pole, banks = find_hidden(best)
+    if pole is not None:
+        kind = "most like a resonance near" if pole.rings else "with a lag, most like one of"
+        what = f"it follows the force{',' if pole.rings else ''} {kind} {with_unit(pole.frequency / period, 'Hz', 3)}"
     elif best.excess > _ALIKE:
         what = f"its sums spread {plain(np.sqrt(best.excess), 2)} times as far, as of a hand or a compliance"
     else:
-        return [], seen_to
-    return [f"what the fit leaves is no noise, {what}: {_RECORD_NEXT}"], seen_to
+        return [], respond_as_fitted(best, scene, banks)
+    return [f"what the fit leaves is no noise, {what}: {_RECORD_NEXT}"], None
 
 
 def _in_newton(best: FittedModel, k: int) -> tuple[float, float]:

@@ -7,6 +7,9 @@ bear are counted from the ends of their columns, and K is halved between what th
 With a velocity filter a row ends at its first crossing: the smallest K > 0 at which a pole reaches the unit circle,
 from K -> 0+, where it is stable for all B below the first that puts a pole on the circle there. Both are looked for on
 a grid of frequencies; eigenvalues then judge the wall on every device.
+
+A log bounds resonances as well: how large one may be and not show. The fitted response with that radius decides walls
+as a measured one does (docs/theory/measured.md), and a wall counts that it decides too.
 """
 
 from __future__ import annotations
@@ -52,17 +55,21 @@ _FARTHEST = (20.0, 1.5)
 _SOFTER, _ASTRAY = (1.0, 0.5, 0.1), 2e-3
 
 
-@shown()
+@shown(resonance="Hz")
 class SafeWall(NamedTuple):
-    """K in N/m, B in N s/m, the share of drawn devices that bear it, and the `zwidth.Status`, with NaN if not OK."""
+    """K in N/m, B in N s/m, the share of drawn devices that bear it, and the `zwidth.Status`, with NaN if not OK.
+
+    ``resonance`` is the frequency in Hz of one that may hide in the log and bounds the wall, NaN where none does.
+    """
 
     stiffness: float
     virtual_damping: float
     share: float
     status: int
+    resonance: float = np.nan
 
 
-def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed: int) -> SafeWall:
+def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed: int, rigid: bool) -> SafeWall:
     """See `zwidth.DeviceFit.safe_wall`."""
     if isinstance(reliability, bool | str) or not 0.5 <= reliability < 1:
         raise InputError(f"reliability: got {reliability!r}; a share from 0.5 to below 1 is needed, as 0.99")
@@ -78,14 +85,28 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
     filtered = scene.velocity != BackwardDifference()
     devices = _FilteredDevices(drawn, scene, "cutoff" in fit.errors) if filtered else _RigidDevices(drawn, scene)
-    stiffness, virtual_damping = devices.find(reliability)
+    (stiffness, virtual_damping), resonance = devices.find(reliability), np.nan
+    if not rigid and not bears_resonances(fit, stiffness, virtual_damping):
+        # Nothing is sure of walls with B < 0 that is not of those with B = 0.
+        top = fit.responding.max_stiffness(negative_damping=False)
+        resonance, virtual_damping = float(top.frequency), float(top.virtual_damping)
+        known = top.status == Status.OK
+        stiffness = min(float(top.stiffness), devices.limit(virtual_damping, reliability)) if known else 0.0
     if stiffness == 0:
-        return SafeWall(0.0, 0.0, 1.0, int(Status.OK))
+        return SafeWall(0.0, 0.0, 1.0, int(Status.OK), resonance)
     stiffness *= 1.0 - _BELOW
     share = devices.share(stiffness, virtual_damping)
     if share < reliability - _ASTRAY:
         return SafeWall(np.nan, np.nan, np.nan, int(Status.UNDECIDED))
-    return SafeWall(stiffness, virtual_damping, share, int(Status.OK))
+    return SafeWall(stiffness, virtual_damping, share, int(Status.OK), resonance)
+
+
+def bears_resonances(fit: DeviceFit, stiffness: float, virtual_damping: float) -> bool:
+    """Whether a wall and the softer ones of its damping bear every resonance that the log does not show."""
+    if fit.response is None or stiffness == 0:
+        return True
+    scene = fit.responding
+    return scene.loop.holds_softly(*scene.normalize_walls(stiffness, virtual_damping))
 
 
 def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:
@@ -136,12 +157,16 @@ class _RigidDevices:
         while high > max((1.0 + _CLOSE) * low, least):
             stiffness = 0.5 * (low + high)
             tried = self._most_borne(stiffness)
-            borne = borne_by(self.devices.row_ends(np.array([tried]))[:, 0], reliability)
+            borne = self.limit(tried, reliability)
             if borne > low:
                 low, damping = borne, tried
             if borne < stiffness:
                 high = stiffness
         return (low, damping) if low > least else (0.0, 0.0)
+
+    def limit(self, virtual_damping: float, reliability: float) -> float:
+        """The K up to which so many devices bear walls of a damping."""
+        return borne_by(self.devices.row_ends(np.array([virtual_damping]))[:, 0], reliability)
 
     def _most_borne(self, stiffness: float) -> float:
         """The middle of the dampings at which most devices bear this stiffness."""
@@ -203,11 +228,15 @@ class _FilteredDevices:
         width, found, damping = top / (_DAMPINGS - 1), {}, 0.0
         tried = np.linspace(0.0, top, _DAMPINGS)
         for _ in range(1 + _TIMES):
-            found |= {damping: self._borne_by(self._row_ends(damping), reliability) for damping in tried.tolist()}
+            found |= {damping: self.limit(damping, reliability) for damping in tried.tolist()}
             damping = max(found, key=lambda one: found[one])
             tried = np.clip(np.linspace(damping - width, damping + width, _REFINED), 0.0, top)
             width /= 0.5 * (_REFINED - 1)
         return (found[damping], damping) if found[damping] > 0 else (0.0, 0.0)
+
+    def limit(self, virtual_damping: float, reliability: float) -> float:
+        """The K up to which so many devices bear walls of a damping."""
+        return self._borne_by(self._row_ends(virtual_damping), reliability)
 
     def _row_ends(self, damping: float) -> np.ndarray:
         wall = self.q - (damping / self.rate)[:, None] * self.f

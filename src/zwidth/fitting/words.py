@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from zwidth.fitting.device_fit import DeviceFit, RivalDevice
+from zwidth.fitting.safe_wall import SafeWall, bears_resonances
 from zwidth.parts.paths import spell_estimate
 from zwidth.words import rotation
 from zwidth.words.formatting import plain, with_unit
@@ -31,8 +32,6 @@ _TROUBLES = {
     Status.UNDECIDED: "another device fits as well",
     Status.UNREACHABLE: "the delay ends the range looked in",
 }
-# As a share of the sampling rate; what shows up to there shows everywhere.
-_EVERYWHERE = 0.4
 _SEE_MORE = "play a record of zwidth.excite, push harder, or read a finer encoder"
 NO_WALL = "under a doubt no safe wall is given, and none to set; do what it says, and record again"
 
@@ -71,18 +70,19 @@ class WallChoice(NamedTuple):
     why: str
 
 
-def choose_wall(fit: DeviceFit) -> WallChoice | None:
-    """What the study ``recommend`` sets, or what 99 % of the devices bear where that is less.
+def choose_wall(fit: DeviceFit, rigid: bool = False) -> WallChoice | None:
+    """What the study ``recommend`` sets, or `DeviceFit.safe_wall` where that is softer, or bears more.
 
-    None where none holds, and under a doubt, by `DeviceFit.safe_wall`.
+    None where none holds, and under a doubt.
     """
-    safe = fit.safe_wall()
+    safe = fit.safe_wall(rigid=rigid)
     if safe.status != Status.OK or not safe.stiffness > 0:
         return None
-    share = RECOMMENDED_SHARE * fit.stiffness_max
-    if share <= safe.stiffness and fit.scene.is_stable(share, fit.virtual_damping):
-        return WallChoice(share, fit.virtual_damping, f"{100 * RECOMMENDED_SHARE:g} % of K_max")
-    return WallChoice(safe.stiffness, safe.virtual_damping, "what 99 % of the devices bear, less than usual")
+    usual = RECOMMENDED_SHARE * fit.stiffness_max, fit.virtual_damping
+    if usual[0] <= safe.stiffness and fit.scene.is_stable(*usual) and (rigid or bears_resonances(fit, *usual)):
+        return WallChoice(*usual, f"{100 * RECOMMENDED_SHARE:g} % of K_max")
+    bearing = "99 % of the devices bear" if math.isnan(safe.resonance) else "hidden resonances leave"
+    return WallChoice(safe.stiffness, safe.virtual_damping, f"what {bearing}, less than usual")
 
 
 def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[tuple[str, str]]:
@@ -111,20 +111,19 @@ def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list
             rows.append(("step of the encoder", units.spell("position", fit.resolution, 3)))
     rows += [("or as well", spell_rival(rival, units)) for rival in fit.rivals]
     safe, wall = fit.safe_wall(), choose_wall(fit)
-    if safe.status == Status.OK:
-        bound = f"K = {units.spell('stiffness', safe.stiffness)}, B = {units.spell('damping', safe.virtual_damping)}"
-        rows.append(("safe wall", f"{bound}: stable on 99 % of the rigid devices that these records allow"))
+    if safe.status == Status.OK and safe.stiffness > 0:
+        rows.append(
+            ("safe wall", f"{_spell_wall(safe, units)}: stable on 99 % of the devices that these records allow")
+        )
     if fit.is_doubted:
         rows.append(("no wall", NO_WALL))
     if wall is not None:
-        K, B = units.spell("stiffness", wall.stiffness), units.spell("damping", wall.virtual_damping)
-        rows.append(("set", f"K = {K}, B = {B}: {wall.why}"))
+        rows.append(("set", f"{_spell_wall(wall, units)}: {wall.why}"))
     rows += [("doubt", doubt) for doubt in list_doubts(fit, units)]
-    if not fit.is_doubted and fit.seen_to * fit.period < _EVERYWHERE:
-        at = with_unit(fit.seen_to, "Hz", 3)
-        rows.append(
-            ("not seen", f"a resonance above {at} may make such walls unstable and not show in this log: {_SEE_MORE}")
-        )
+    if not fit.is_doubted and (rigid := choose_wall(fit, rigid=True)) not in (None, wall):
+        at = "" if math.isnan(safe.resonance) else f" near {with_unit(safe.resonance, 'Hz', 3)}"
+        hidden = f"a resonance{at} may make stiffer walls unstable, K_max too, and not show in this log: {_SEE_MORE}"
+        rows += [("not seen", hidden), ("if it is rigid", f"{_spell_wall(rigid, units)}: {rigid.why}")]
     if fit.next is not None:
         step = fit.next
         B, K = units.spell("damping", step.virtual_damping, 3), units.spell("stiffness", step.stiffness, 3)
@@ -158,6 +157,11 @@ def spell_rival(rival: RivalDevice, units: AxisUnits = LINEAR) -> str:
     parts |= {} if rival.cutoff is None else {SYMBOLS["cutoff"]: units.spell("cutoff", rival.cutoff)}
     parts[SYMBOLS["stiffness_max"]] = units.spell("stiffness", rival.stiffness_max)
     return ", ".join(f"{symbol} = {text}" for symbol, text in parts.items())
+
+
+def _spell_wall(wall: SafeWall | WallChoice, units: AxisUnits) -> str:
+    K, B = units.spell("stiffness", wall.stiffness), units.spell("damping", wall.virtual_damping)
+    return f"K = {K}, B = {B}"
 
 
 def _spell(fit: DeviceFit, name: str, units: AxisUnits) -> str:
@@ -212,10 +216,18 @@ def write_scene(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[
     if fit.is_doubted:
         lines += [f"studies: [] # {NO_WALL}"]
     else:
+        safe = fit.safe_wall()
+        if not math.isnan(safe.resonance):
+            lines += [
+                "# As of a rigid device. A resonance that the log does not show may make walls unstable,",
+                f"# if they are stiffer than {_spell_wall(safe, units)}: {_SEE_MORE}.",
+            ]
         lines += ["studies:", "  - kind: recommend # what to set on this device", "    name: recommended"]
     if fit.friction and math.isfinite(fit.errors["friction"]):
         friction = f"{_write(fit, 'friction')} {units.force}, {_between(fit, 'friction', units)}"
         lines.append(f"# For studies of kind simulate: coulomb: {friction}.")
     if fit.resolution:
-        lines.append(f"# For studies of kind simulate: resolution: {fit.resolution!r} {units.position}.")
+        lines.append(
+            f"# For studies of kind simulate: resolution: {float(f'{fit.resolution:.12g}')!r} {units.position}."
+        )
     return lines
