@@ -71,18 +71,17 @@ class WallChoice(NamedTuple):
 
 
 def choose_wall(fit: DeviceFit, rigid: bool = False) -> WallChoice | None:
-    """What the study ``recommend`` sets, or `DeviceFit.safe_wall` where that is softer, or bears more.
-
-    None where none holds, and under a doubt.
-    """
+    """What the study ``recommend`` sets, or what `DeviceFit.safe_wall` leaves; None without one, as under a doubt."""
     safe = fit.safe_wall(rigid=rigid)
     if safe.status != Status.OK or not safe.stiffness > 0:
         return None
     usual = RECOMMENDED_SHARE * fit.stiffness_max, fit.virtual_damping
     if usual[0] <= safe.stiffness and fit.scene.is_stable(*usual) and (rigid or bears_resonances(fit, *usual)):
         return WallChoice(*usual, f"{100 * RECOMMENDED_SHARE:g} % of K_max")
-    bearing = "99 % of the devices bear" if math.isnan(safe.resonance) else "hidden resonances leave"
-    return WallChoice(safe.stiffness, safe.virtual_damping, f"what {bearing}, less than usual")
+    if math.isnan(safe.resonance):
+        return WallChoice(safe.stiffness, safe.virtual_damping, "what 99 % of the devices bear, less than usual")
+    share = f"{100 * RECOMMENDED_SHARE:g} % of the safe wall"
+    return WallChoice(RECOMMENDED_SHARE * safe.stiffness, safe.virtual_damping, share)
 
 
 def describe_fit(fit: DeviceFit, source: str, units: AxisUnits = LINEAR) -> list[tuple[str, str]]:
