@@ -282,6 +282,7 @@ class DeviceFit:
             "status": int(self.status),
             "rivals": [rival._asdict() for rival in self.rivals],
             "next": None if self.next is None else self.next._asdict(),
+            "safe_wall": self.safe_wall()._asdict(),
         }
         return to_json(numbers)
 

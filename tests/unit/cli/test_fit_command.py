@@ -39,6 +39,7 @@ def test_walls_are_fitted_as_in_python():
     expected = zwidth.fit_buzz(POINTS, period=1e-3, noise=0.02)
     assert found["mass"] == expected.mass
     assert found["next"] == expected.as_dict()["next"] != {}
+    assert found["safe_wall"]["stiffness"] == expected.safe_wall().stiffness
     words = run(*WALLS, "--period", "1 ms", "--noise", "0.02")
     assert "m                     100.0 g (95 % between" in words
     assert "measure next" in words
