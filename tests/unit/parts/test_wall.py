@@ -93,7 +93,9 @@ def test_scenes_of_one_simulation_each_mean_their_own_wall():
     other = SCENES["rigid"].replace(stiffness=5e3)
     found = zwidth.simulate([SCENES["rigid"], other], start_position=1e-4, periods=20).position
     for row, scene in zip(found, (SCENES["rigid"], other), strict=True):
-        assert np.array_equal(row, scene.simulate(start_position=1e-4, periods=20).position)
+        alone = scene.simulate(start_position=1e-4, periods=20).position
+        # Compiled for two lanes and for one, to the last places.
+        np.testing.assert_allclose(row, alone, rtol=0, atol=1e-13 * np.abs(alone).max())
     with pytest.raises(InputError, match="the scene has no wall"):
         zwidth.simulate([other, zwidth.Scene(DEVICE, TIMING)])
 

@@ -98,7 +98,8 @@ def test_a_command_acts_its_delay_later_and_substeps_change_nothing(delay):
     fine, coarse = run(scene, substeps=20, stiffness=100.0), run(scene, stiffness=100.0)
     late = round(20 * delay)
     expected = np.append(np.zeros(late), np.repeat(fine.command, 20))[: 20 * 200]
-    np.testing.assert_array_equal(fine.wall_force, expected)
+    # Of two compiled programs: one may round a product and a sum once where the other does twice.
+    np.testing.assert_allclose(fine.wall_force, expected, rtol=1e-12, atol=1e-15 * np.abs(expected).max())
     for name in ("position", "velocity", "energy", "wall_work", "damping_loss"):
         value = getattr(coarse, name)
         assert getattr(fine, name)[::20] == pytest.approx(value, rel=0, abs=1e-12 * np.abs(value).max())
