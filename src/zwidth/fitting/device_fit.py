@@ -163,9 +163,9 @@ class DeviceFit:
         return scene_of((self.mass, self.damping, self.delay), self.period, self.velocity)
 
     @cached_property
-    def responding(self) -> Scene:
+    def responding(self) -> Scene | None:
         """The same loop with the response in place of the device: what holds for every resonance within its radius."""
-        return Scene(self.response, Timing(self.period), self.velocity)
+        return None if self.response is None else Scene(self.response, Timing(self.period), velocity=self.velocity)
 
     @cached_property
     def virtual_damping(self) -> float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from zwidth.fitting.output_error import FittedModel
 from zwidth.loops.measured.curve import LEAST_DAMPING_RATIO
@@ -52,10 +53,10 @@ class PoleBank:
     whole: np.ndarray  # what a mode of each would leave that moves as the whole mass does
 
     @property
-    def rates(self) -> np.ndarray:
+    def rates(self) -> npt.NDArray[np.complex128]:
         """Poles of the continuous device, in periods."""
         w, ratio = 2.0 * np.pi * self.frequency, self.ratio
-        return w * (-ratio + 1j * np.sqrt(1.0 - ratio**2))
+        return np.asarray(w * complex(-ratio, np.sqrt(1.0 - ratio**2)), np.complex128)
 
     def bound_modes(self) -> np.ndarray:
         """How much more than the whole mass a mode of each pole may move, at most."""
@@ -154,13 +155,15 @@ def _filter_forces(best: FittedModel, frequency: np.ndarray, ratio: float) -> np
     columns, whole = np.empty((ends[-1], frequency.size * parts)), int(best.theta[2])
     for k, pole in enumerate(np.exp(bank.rates)):
         for log, start, end in zip(best.model.logs, ends, ends[1:], strict=False):
-            late = lfilter([0.0, 1.0], [1.0, -pole], log.force)[log.skip - whole :][: end - start]
+            late = np.asarray(lfilter([0.0, 1.0], [1.0, -pole], log.force), np.complex128)[log.skip - whole :][
+                : end - start
+            ]
             columns[start:end, k * parts] = late.real
             if parts == 2:
                 columns[start:end, 2 * k + 1] = late.imag
     return best.model.weigh(columns)
 
 
-def _size_modes(best: FittedModel, bank: PoleBank) -> np.ndarray:
+def _size_modes(best: FittedModel, bank: PoleBank) -> npt.NDArray[np.complex128]:
     """Of a mode of each pole that moves as the whole mass does, under a force that is held for a period."""
     return best.theta[0] / (2.0 * np.pi * bank.frequency) * (np.exp(bank.rates) - 1.0) / bank.rates

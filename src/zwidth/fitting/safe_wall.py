@@ -86,7 +86,7 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
     filtered = scene.velocity != BackwardDifference()
     devices = _FilteredDevices(drawn, scene, "cutoff" in fit.errors) if filtered else _RigidDevices(drawn, scene)
     (stiffness, virtual_damping), resonance = devices.find(reliability), np.nan
-    if not rigid and not bears_resonances(fit, stiffness, virtual_damping):
+    if not rigid and fit.responding is not None and not bears_resonances(fit, stiffness, virtual_damping):
         # Nothing is sure of walls with B < 0 that is not of those with B = 0.
         top = fit.responding.max_stiffness(negative_damping=False)
         resonance, virtual_damping = float(top.frequency), float(top.virtual_damping)
@@ -103,10 +103,11 @@ def find_safe_wall(fit: DeviceFit, reliability: float, samples: int | None, seed
 
 def bears_resonances(fit: DeviceFit, stiffness: float, virtual_damping: float) -> bool:
     """Whether a wall and the softer ones of its damping bear every resonance that the log does not show."""
-    if fit.response is None or stiffness == 0:
-        return True
     scene = fit.responding
-    return scene.loop.holds_softly(*scene.normalize_walls(stiffness, virtual_damping))
+    if scene is None or stiffness == 0:
+        return True
+    alpha, beta = scene.normalize_walls(stiffness, virtual_damping)
+    return scene.loop.holds_softly(float(alpha), float(beta))
 
 
 def draw_devices(fit: DeviceFit, count: int, seed: int) -> np.ndarray | None:

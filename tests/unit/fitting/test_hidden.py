@@ -134,8 +134,10 @@ def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
     safe, rigid = fit.safe_wall(), fit.safe_wall(rigid=True)
     assert hidden.is_stable(*safe[:2])
     assert not hidden.is_stable(*rigid[:2])
-    assert choose_wall(fit)[:2] == (0.75 * safe.stiffness, safe.virtual_damping)
-    assert hidden.is_stable(*choose_wall(fit)[:2])
+    wall = choose_wall(fit)
+    assert wall is not None
+    assert wall[:2] == (0.75 * safe.stiffness, safe.virtual_damping)
+    assert hidden.is_stable(*wall[:2])
     said = dict(describe_fit(fit, "a log"))
     assert "may make stiffer walls unstable" in said["not seen"]
     assert said["if it is rigid"].startswith("K = ")
@@ -145,6 +147,7 @@ def test_a_resonance_that_a_coarse_encoder_hides_bounds_the_safe_wall():
 def test_a_hidden_resonance_lies_within_the_radius_of_the_response():
     force, position = record(add_mode(RIGID, 200, 0.03, 0.4), 3, step=2e-4)
     response = zwidth.fit_log(PERIOD, position, force).response
+    assert response is not None
     devices = (zwidth.Device(MASS, DAMPING, modes=modes) for modes in ([zwidth.Mode(200, 0.03, MASS / 0.4)], []))
     timing = zwidth.Timing(period=PERIOD, delay=DELAY)
     more, rigid = (zwidth.Scene(device, timing).frequency_response(1.0, 0.0, response.frequency) for device in devices)
