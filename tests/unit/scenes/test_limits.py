@@ -84,5 +84,7 @@ def test_amplifier_and_structure():
     assert found["modes"].stiffness == pytest.approx(stiffer.max_stiffness().stiffness, rel=1e-12)
 
 
-def test_a_window_too_long_for_twice_the_rate_has_no_such_step():
+def test_a_window_too_long_for_twice_the_rate_has_no_such_step(monkeypatch):
+    # Which steps there are does not depend on how stiff they make the wall.
+    monkeypatch.setattr(assessment, "_stiffness", lambda of: 1.0)
     assert "period" not in {limit.name for limit in limits_of(RIGID.replace(velocity=WindowedDifference(70)))}

@@ -40,7 +40,8 @@ def test_units_of_a_rotary_device_make_it_one():
     assert zwidth.devices.find_device("haptic_wheel").to_device().rotary
 
 
-@pytest.mark.parametrize("seed", range(12))
+# Couplings, modes and neither, each with a filter and with a hand.
+@pytest.mark.parametrize("seed", [1, 2, 3, 5, 6, 10])
 def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
     random = np.random.default_rng(seed)
     mass, damping, period = 10.0 ** random.uniform([-7, -6, -4], [-2, -3, -2])

@@ -23,9 +23,8 @@ from zwidth.words.types import DELAY_MODELS as MODELS
 REFERENCE = Path(__file__).resolve().parents[3] / "reference" / "ridge_extended.json"
 # The corner takes over at d = 0: this float64 is the last smooth one, 4e-18 below.
 TAKE_OVER = 3.659361627421783507
-# One size for all derivatives of a model: one compilation, and a quick one.
+# One size for all derivatives of a model: one compilation.
 SIZE = 320
-QUICK = {"xla_disable_hlo_passes": "fusion"}
 
 
 @cache
@@ -52,7 +51,7 @@ def compiled_derivatives(model):
         )
         return jax.jacfwd(three)(point), gradient, hessian
 
-    return jax.jit(jax.vmap(everything), compiler_options=QUICK)
+    return jax.jit(jax.vmap(everything), compiler_options=QUICKLY)
 
 
 def derivatives(model, delta, d):
@@ -264,7 +263,7 @@ def test_gradient_agrees_with_an_independent_implicit_derivative(model):
     delta, d = 10 ** rng.uniform(-0.5, 1, 24), rng.uniform(0.3, 5, 24)
     with jax.enable_x64(True):
         three = jax.vmap(jax.jacrev(independent_ridge(model)))
-        oracle = jax.jit(three, compiler_options=QUICK)(np.stack([delta, d], axis=1))
+        oracle = jax.jit(three, compiler_options=QUICKLY)(np.stack([delta, d], axis=1))
     got = derivatives(model, delta, d)[0]
     # alpha's slope sees the oracle's omega only to second order.
     np.testing.assert_allclose(got[:, 0], oracle[:, 0], rtol=tol.RIDGE_ORACLE.float64)
