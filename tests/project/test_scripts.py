@@ -138,8 +138,9 @@ def test_every_processor_is_tried_even_when_one_fails(project):
     held = f"echo ${{XLA_FLAGS##*=}} $OPENBLAS_CORETYPE >> '{calls}'; [ $OPENBLAS_CORETYPE != Haswell ]\n"
     stand_in(project / ".venv" / "bin" / "pytest", calls, held)
     code, called = calls_of(project, "test-processors", "-x")
-    pages = ["tests/project/test_readme.py", "tests/project/test_docs.py"]
-    tested = ["pytest", *ON_EVERY_CORE, "@tests/quick.txt", *pages, "-x"]
+    # The longest file begins, lest it end alone.
+    pages = ["tests/project/test_docs.py", "tests/project/test_readme.py"]
+    tested = ["pytest", *ON_EVERY_CORE, *pages, "@tests/quick.txt", "-x"]
     assert (code, called[0]) == (1, ["setup", "test"])
     assert called[1::2] == [tested, tested]
     assert called[2::2] == [["AVX2", "Haswell"], ["SSE4_2", "Nehalem"]]
