@@ -1,5 +1,7 @@
 """Configurations of runs, runs of them, and what their folders hold."""
 
+import shutil
+
 import pytest
 from run_folders import BOTH, SMALL
 
@@ -21,15 +23,23 @@ def both(tmp_path):
     return file
 
 
-@pytest.fixture
-def finished(both, tmp_path):
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory):
     """The folder of a run that nothing disturbed."""
-    result = run(both, out=tmp_path / "out")
+    folder = tmp_path_factory.mktemp("undisturbed")
+    (folder / "both.yaml").write_text(BOTH, encoding="utf-8")
+    result = run(folder / "both.yaml", out=folder / "out")
     assert result.ok
     assert [(study.name, study.state) for study in result.studies] == [
         (name, "done") for name in ("one", "two", "swept")
     ]
     return result.folder
+
+
+@pytest.fixture
+def finished(undisturbed, tmp_path):
+    """A copy of it, for a test to do with as it likes."""
+    return shutil.copytree(undisturbed, tmp_path / "out")
 
 
 @pytest.fixture
