@@ -49,8 +49,8 @@ def pytest_configure(config: pytest.Config) -> None:
     """What holds for a run as a whole."""
     # Most tests inside transformations keep JAX's default precision on purpose.
     config.addinivalue_line("filterwarnings", "ignore::zwidth.words.errors.PrecisionWarning")
-    # Files begin in the order in which they are collected, the long ones of tests/contract and tests/e2e before those of
-    # tests/unit: pytest-xdist would begin with those of the most tests, and one process would end with the longest alone.
+    # Files begin in the order in which they are collected, the long ones of tests/contract and tests/e2e before those
+    # of tests/unit: pytest-xdist would begin with those of the most tests, and a process would end with the longest.
     config.option.loadscopereorder = False
 
 
