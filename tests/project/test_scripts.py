@@ -140,7 +140,8 @@ def test_every_processor_is_tried_even_when_one_fails(project):
     code, called = calls_of(project, "test-processors", "-x")
     # The longest file begins, lest it end alone.
     pages = ["tests/project/test_docs.py", "tests/project/test_readme.py"]
-    tested = ["pytest", *ON_EVERY_CORE, *pages, "@tests/quick.txt", "-x"]
+    left_out = ["--deselect", "tests/project/test_project.py"]
+    tested = ["pytest", *ON_EVERY_CORE, *pages, "@tests/quick.txt", *left_out, "-x"]
     assert (code, called[0]) == (1, ["setup", "test"])
     assert called[1::2] == [tested, tested]
     assert called[2::2] == [["AVX2", "Haswell"], ["SSE4_2", "Nehalem"]]
