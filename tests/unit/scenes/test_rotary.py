@@ -69,6 +69,8 @@ def test_a_rotary_scene_has_the_numbers_of_the_linear_one(seed):
         other.virtual_damping,
         other.limited_by,
     )
+    assert one.verdict is not None
+    assert other.verdict is not None
     np.testing.assert_equal(dataclasses.asdict(one.verdict), dataclasses.asdict(other.verdict))
     walls = [scene.replace(stiffness=K[0], virtual_damping=B[0]) for scene in (linear, rotary)]
     first, second = (dataclasses.asdict(zwidth.assess(scene)) for scene in walls)
