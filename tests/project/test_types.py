@@ -15,7 +15,7 @@ import zwidth
 from zwidth.loops.rigid.aberth import aberth_kernel, discs, product_form
 from zwidth.loops.rigid.boundary import sample_lobe
 from zwidth.loops.rigid.folding import find_degree
-from zwidth.loops.rigid.poles import companion, pole_kernel, radius_kernel, unstable_poles
+from zwidth.loops.rigid.poles import companion, pole_kernel, radius_by_companion
 from zwidth.loops.rigid.polynomial import affine, coefficients, frequency_boundary, frequency_loop
 from zwidth.loops.rigid.response import step_response
 from zwidth.words import types as _types
@@ -36,7 +36,7 @@ ROOTS_FIRST = np.moveaxis(pole_kernel(**KERNEL), -1, 0)
 CALLS = [
     (zwidth.char_poly, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
     (zwidth.poles, {**WALL, "d": np.array([1.0, 2.0, 0.5])}),
-    (unstable_poles, {**WALL, "d": np.float64(1.5)}),
+    (radius_by_companion, {**WALL, "d": np.float64(1.5)}),
     (
         zwidth.count_poles,
         {"zeros": np.ones((3, 1)), "poles": np.ones((2, 1, 2)), "gain": np.float64(0.1), "lag": np.array([1, 2, 3])},
@@ -48,7 +48,6 @@ CALLS = [
     (coefficients, KERNEL),
     (companion, {"monic": coefficients(**KERNEL)}),
     (pole_kernel, KERNEL),
-    (radius_kernel, KERNEL),
     (aberth_kernel, {**KERNEL, "spring": False}),
     (discs, {"z": ROOTS_FIRST, "form": product_form(**KERNEL, spring=False)}),
     (frequency_boundary, {"omega": np.full((2, 3), 0.3), "loop": LOOP, "delay_model": "held"}),

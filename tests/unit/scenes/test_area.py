@@ -11,7 +11,7 @@ import oracles
 import zwidth
 from zwidth import passive_area, stable_area
 from zwidth.loops.rigid.boundary import Piece
-from zwidth.loops.rigid.poles import unstable_poles
+from zwidth.loops.rigid.poles import radius_by_companion
 
 # Undamped; cut by the line of z = -1 before and after the corner becomes the ridge; delayed; held.
 POINTS = [(0.0, 0.0), (0.5, 0.0), (3.0, 0.0), (10.0, 0.0), (0.1, 1.0), (1.0, 4.0), (40.0, 0.125), (2.0, 0.6)]
@@ -56,7 +56,7 @@ def test_the_area_is_the_share_of_stable_walls(delta, d):
     random = np.random.default_rng(7)
     low, high = outline.beta.min(), outline.beta.max()
     alpha, beta = random.uniform(0, outline.alpha.max(), 20_000), random.uniform(low, high, 20_000)
-    share = np.mean(np.asarray(unstable_poles(alpha, beta, delta, d)) == 0)
+    share = np.mean(np.asarray(radius_by_companion(alpha, beta, delta, d)) < 1)
     box = outline.alpha.max() * (high - low)
     # Four standard deviations of the count.
     assert abs(share - stable_area(np.array([delta]), d)[0] / box) < 4 * np.sqrt(share * (1 - share) / 20_000)

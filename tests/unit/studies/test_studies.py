@@ -9,7 +9,7 @@ import zwidth
 from zwidth.config.scenes import PhysicalScene
 from zwidth.figures.table import stack
 from zwidth.loops.rigid.passivity import passive_stiffness_slope
-from zwidth.loops.rigid.poles import unstable_poles
+from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.studies.boundary import BoundaryStudy, outline, stable_intervals
 from zwidth.studies.map import MapStudy
 from zwidth.studies.outcome import csv_text
@@ -32,10 +32,10 @@ def test_the_interval_at_zero_stiffness_is_where_poles_cross():
     alpha, step = 1e-7, 1e-3
     for found in stable_intervals(DELTAS, DELAYS, "held"):
         lower, upper, d = found["beta_lower"], found["beta_upper"], found["d"]
-        inside = unstable_poles(alpha, np.stack([lower + step, upper - step]), DELTAS, d)
-        beyond = unstable_poles(alpha, np.stack([lower - step, upper + step]), DELTAS, d)
-        assert np.all(inside == 0), d
-        assert np.all(beyond > 0), d
+        inside = radius_by_companion(alpha, np.stack([lower + step, upper - step]), DELTAS, d)
+        beyond = radius_by_companion(alpha, np.stack([lower - step, upper + step]), DELTAS, d)
+        assert np.all(inside < 1), d
+        assert np.all(beyond >= 1), d
 
 
 def test_both_models_give_one_interval_for_whole_periods():

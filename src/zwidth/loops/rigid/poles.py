@@ -8,7 +8,7 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, map_blocks
+from zwidth.arrays.evaluate import as_float64, map_blocks, to_caller
 from zwidth.arrays.xp import is_traced, namespace, repeat
 from zwidth.loops.rigid.aberth import aberth_kernel, evaluate, join, product_form, replace_invalid, split, with_zero
 from zwidth.loops.rigid.device import wall_status
@@ -18,7 +18,7 @@ from zwidth.loops.rigid.polynomial import check_has_poles, coefficients
 from zwidth.words.errors import InputError, check_choice
 from zwidth.words.quantities import LONGEST_DELAY, MOST_POLES
 from zwidth.words.status import Status
-from zwidth.words.types import Array, ArrayLike, Coefficients, Counts, Matrices, Reals, Roots, RootsFirst
+from zwidth.words.types import Array, ArrayLike, Coefficients, Matrices, Reals, Roots, RootsFirst
 
 PoleMethod: TypeAlias = Literal["auto", "aberth", "companion"]
 
@@ -85,15 +85,6 @@ def _polish_poles(z: Array, alpha: Reals, beta: Reals, delta: Reals, d: Reals, d
     return with_zero(xp.moveaxis(xp.where(better, last, first), 0, -1), spring) + spoiled[..., None]
 
 
-def radius_kernel(
-    alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool = False, find: Any = pole_kernel
-) -> Reals:
-    """The spectral radius from the companion matrix; at least 1 without stiffness, for a pole is there."""
-    xp = namespace(alpha, beta, delta, d)
-    radius = xp.max(xp.abs(find(alpha, beta, delta, d, degree, spring)), axis=-1)
-    return xp.where(alpha == 0, xp.maximum(radius, 1.0), radius)
-
-
 def is_spring(beta: ArrayLike) -> bool:
     """Whether all walls are known to be without virtual damping: one pole less to compute."""
     return not is_traced(beta) and np.size(values := as_float64("beta", beta)) > 0 and not np.any(values)
@@ -120,46 +111,36 @@ def _check(values: tuple[ArrayLike, ...], delay_model: str = "held", method: str
     check_degree(values[3])
 
 
-def _of_all_poles(kernel: Callable[..., Any], values: tuple[ArrayLike, ...]) -> Any:
-    """What a kernel makes of the poles that its last argument finds."""
-    _check(values)
-    static = (is_spring(values[1]),)
-    if is_traced(*values):
-        return map_by_degree(_inside_jax(kernel), values, *static, pole_kernel)
-    return map_by_degree(_by_companion, values, *static, kernel, route="numpy")
+def _companion_poles(values: tuple[ArrayLike, ...]) -> Roots:
+    """All poles by eigenvalues."""
+    kernel = _inside_jax() if is_traced(*values) else _by_companion
+    return map_by_degree(kernel, values, is_spring(values[1]), route="numpy")
 
 
 @cache
-def _inside_jax(kernel: Callable[..., Any]) -> Any:
+def _inside_jax() -> Any:
     """The kernel as one program: differentiated outside `jit`, every operation would be compiled alone."""
     import jax
 
-    return jax.jit(kernel, static_argnums=(4, 5, 6))
+    return jax.jit(pole_kernel, static_argnums=(4, 5))
 
 
-def _found_poles(*arguments: Any) -> Roots:
-    *wall, find = arguments
-    return find(*wall)
-
-
-def _by_companion(*arguments: Any) -> Any:
-    """A kernel for NumPy columns of one degree, with the eigenvalues from LAPACK on every processor."""
-    *columns, degree, spring, kernel = arguments
+def _by_companion(*arguments: Any) -> np.ndarray:
+    """Poles of NumPy columns of one degree, with the eigenvalues from LAPACK on every processor."""
+    *columns, degree, spring = arguments
     # Of large matrices the eigenvalues take so long that nothing else is worth a compilation.
     few = columns[0].size <= few_poles(degree)
-    find = pole_kernel if few or degree.poles > _MOST_AT_ONE_TIME else _compiled_around_lapack
+    compiled = not few and degree.poles <= _MOST_AT_ONE_TIME
 
-    def block(*walls: np.ndarray) -> Any:
-        with np.errstate(all="ignore"):
-            return kernel(*walls, degree, spring, find)
+    def block(alpha: Any, beta: Any, delta: Any, d: Any) -> np.ndarray:
+        if not compiled:
+            with np.errstate(all="ignore"):
+                return pole_kernel(alpha, beta, delta, d, degree, spring)
+        walls = alpha, beta, delta, d
+        matrices = np.asarray(_compile_by_degree(_matrices, degree, spring)(*walls))
+        return np.asarray(_compile_by_degree(_polish_poles, degree, spring)(_eigenvalues(matrices), *walls))
 
     return block(*columns) if few else map_blocks(block, columns, _block(_MATRICES // degree.poles**2))
-
-
-def _compiled_around_lapack(*arguments: Any) -> np.ndarray:
-    *walls, degree, spring = arguments
-    before, after = _compile_by_degree(_matrices, degree, spring), _compile_by_degree(_polish_poles, degree, spring)
-    return np.asarray(after(_eigenvalues(np.asarray(before(*walls))), *walls))
 
 
 @cache
@@ -228,7 +209,7 @@ def poles(
             "method: 'aberth' falls back on the host; inside a JAX transformation use 'auto' or 'companion'"
         )
     if method == "companion" or is_traced(*values):
-        return _of_all_poles(_found_poles, values)
+        return _companion_poles(values)
     return map_by_degree(_found_on_host, values, is_spring(values[1]), method, route="numpy")
 
 
@@ -238,7 +219,7 @@ def _found_on_host(*arguments: Any) -> Roots:
     columns = [alpha, beta, delta, d]
     few = alpha.size <= few_poles(degree)
     if method == "companion" or (method == "auto" and (few or degree.poles > _MOST_AT_ONE_TIME)):
-        return _by_companion(*columns, degree, spring, _found_poles)
+        return _by_companion(*columns, degree, spring)
     if few:
         z, _, proved = aberth_kernel(alpha, beta, delta, d, degree, spring)
     else:
@@ -246,24 +227,20 @@ def _found_on_host(*arguments: Any) -> Roots:
         z, _, proved = map_blocks(_compile_by_degree(aberth_kernel, degree, spring), columns, block)
     left = np.flatnonzero(~proved & (wall_status(alpha, beta, delta, d) == Status.OK))
     if left.size:
-        z[left] = _by_companion(*(column[left] for column in columns), degree, spring, _found_poles)
+        z[left] = _by_companion(*(column[left] for column in columns), degree, spring)
     return z
 
 
 def radius_by_companion(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Reals:
-    """The spectral radius at every point, from the poles."""
-    return _of_all_poles(radius_kernel, (alpha, beta, delta, d))
-
-
-def unstable_poles(alpha: ArrayLike, beta: ArrayLike, delta: ArrayLike, d: ArrayLike) -> Counts:
-    """How many poles lie on or outside the unit circle; -1 where the input is out of range."""
-    return _of_all_poles(_count_kernel, (alpha, beta, delta, d))
-
-
-def _count_kernel(alpha: Reals, beta: Reals, delta: Reals, d: Reals, degree: Degree, spring: bool, find: Any) -> Counts:
-    xp = namespace(alpha, beta, delta, d)
-    z = find(alpha, beta, delta, d, degree, spring)
-    count = xp.sum(xp.abs(z) >= 1.0, axis=-1)
+    """The spectral radius at every point, from the poles; NaN where the input is out of range."""
+    values = (alpha, beta, delta, d)
+    _check(values)
+    found = _companion_poles(values)
+    xp = namespace(found) if is_traced(*values) else np
+    z: Any = xp.asarray(found)
+    # Of a wall that has fewer poles than others.
+    missing = xp.isnan(z.real) & ~xp.isnan(z[..., :1].real)
+    radius = xp.max(xp.where(missing, 0.0, xp.abs(z)), axis=-1)
     # Without stiffness a pole is at 1, whatever rounding makes of it.
-    count = xp.where(alpha == 0, xp.maximum(count, 1), count)
-    return xp.where(xp.isnan(z[..., 0].real), -1, count)
+    radius = xp.where(xp.asarray(alpha) == 0, xp.maximum(radius, 1.0), radius)
+    return radius if xp is not np else to_caller(radius, values)

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 import numpy as np
 
 from zwidth.arrays.evaluate import evaluate
-from zwidth.arrays.xp import epsilon, horner, namespace, nan_unless, push_forward
+from zwidth.arrays.xp import epsilon, frozen, horner, namespace, nan_unless, push_forward
 from zwidth.loops.rigid.device import (
     ANY,
     DelayClasses,
@@ -29,7 +29,6 @@ from zwidth.loops.rigid.ridge_newton import (
     expand_curve,
     guess_start,
     is_undelayed,
-    sides,
     solve,
     stationarity,
     wall,
@@ -68,39 +67,35 @@ def plant_slopes(delta: Array, fraction: Array) -> tuple[Plant, Plant]:
     return Plant(-c, c, a2, a1, a0, a2 - a1 + a0), Plant(zero, zero, -slow, slow - fast, fast, 2.0 * (fast - slow))
 
 
-def alpha_change(s: Array, plant: Plant, lag: Array, change: Plant, undelayed: bool = False) -> Array:
-    """How alpha moves at a fixed s (1 at a corner) when the plant does."""
-    xp = namespace(s, plant.a2)
-    curve = expand_curve(plant)
-    at = wave(s, lag, undelayed)
-    g1, g2, m, rho = sides(at, curve)
-    y, q, tau, kappa = at.y, at.q, at.tau, at.kappa
-    b, k, dk, sin2 = change.a2 + change.a0, curve.k, change.a2 - change.a0, 4.0 * y * q
-    dm = xp.where(y < 0.5, b * (1.0 - 2.0 * y) + change.a1, 2.0 * b * q - change.gap)
-    # dM conj M = h1 + j h2 sin omega
-    h1, h2 = dm * m + dk * k * sin2, dk * m - dm * k
-    turned = tau * (g1 * h1 - g2 * h2 * sin2) + kappa * (g1 * h2 + g2 * h1)
-    return -4.0 * y * (change.c * (tau * m - kappa * k) + turned / rho) / rho
-
-
-def alpha_by_lag(ridge: Ridge, lag: Array) -> Array:
-    """How alpha moves with the exponent D; -inf at a corner, which the fractional power leaves like -d^(2/3)."""
-    xp = namespace(ridge.s, lag)
-    at = wave(ridge.s, lag, True)
-    slope = -8.0 * at.y * at.half * at.per_sin * (ridge.beta + 0.5 * ridge.alpha)
-    return xp.where(ridge.s >= 1.0, -np.inf, slope)
-
-
 def differentiable_plant(delta: Array, fraction: Array) -> Plant:
     """`loops.rigid.device.held_plant`, in JAX with its derivatives in closed form."""
     return held_plant(delta, fraction) if namespace(delta, fraction) is np else _jax_plant()(delta, fraction)
+
+
+def follow(
+    s: Array, plant: Plant, lag: Array, delay_model: str, kind: DelayClasses
+) -> tuple[Array, Array, Array, Array]:
+    """alpha, beta, omega and s of a ridge known to be at ``s``, as they move with plant and lag.
+
+    One step of Newton's method, through which derivatives pass: it is exact to the first order. A corner stays at 1,
+    and at a maximum alpha moves as if s stood still.
+    """
+    xp = namespace(s, plant.a2, lag)
+    undelayed, curve, corner = is_undelayed(delay_model, kind), expand_curve(plant), s >= 1.0
+    inside = xp.where(corner, 0.5, s)
+    first, second = stationarity(inside, curve, lag, undelayed)
+    inside = xp.where(corner, 0.5, inside - first / xp.where(corner, 1.0, second))
+    moved = xp.where(corner, 1.0, inside)
+    # Not by the series of `wave`, whose derivative has fewer digits.
+    omega = xp.where(corner, np.pi, 2.0 * xp.arctan(inside / xp.sqrt((1.0 - inside) * (1.0 + inside))))
+    alpha, beta = (wall(wave(place, lag, undelayed), curve) for place in (s, moved))
+    return alpha[0], beta[1], omega, moved
 
 
 def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: str, kind: DelayClasses) -> Ridge:
     """`loops.rigid.ridge_newton.solve`, in JAX with derivatives in plant and lag to any order."""
     if namespace(plant.a2, lag) is np:
         return solve(plant, lag, start, delay_model, kind)
-    import jax
     import jax.numpy as jnp
 
     ridge = _jax_ridge()(plant, lag, start, delay_model, kind)
@@ -113,30 +108,8 @@ def differentiable_ridge(plant: Plant, lag: Array, start: Start, delay_model: st
     # largest alpha has t = -a1 q: it moves by 3 a1 q, beta by (b1 - a1) q.
     phi1, body = plant.a2 + plant.a1, plant.a1 * (1.0 + plant.a2 * ridge.beta)
     lean = plant.a2 + plant.c * plant.a1 - plant.a1 * (2.0 * ridge.beta * phi1 + ridge.alpha * plant.a2)
-    share = jax.lax.stop_gradient(jnp.where(corner, (body / lean - 1.0) / 3.0, 0.0))
+    share = frozen(jnp.where(corner, (body / lean - 1.0) / 3.0, 0.0), jnp)
     return ridge._replace(alpha=ridge.alpha - fall, beta=ridge.beta - share * fall, omega=ridge.omega - fall)
-
-
-def move_ridge(
-    ridge: Ridge, plant: Plant, lag: Array, change: Plant, lag_change: Array, delay_model: str, kind: DelayClasses
-) -> Ridge:
-    """How the ridge moves when the plant and the lag do; whole periods do not."""
-    xp = namespace(ridge.s, plant.a2)
-    corner = ridge.s >= 1.0
-    undelayed = is_undelayed(delay_model, kind)
-    alpha = alpha_change(ridge.s, plant, lag, change, undelayed)
-    if delay_model == "fractional_power":
-        alpha += xp.where(corner, 0.0, alpha_by_lag(ridge, lag)) * lag_change
-    else:
-        lag_change = xp.zeros_like(lag)
-    curve = expand_curve(plant)
-    along = (push_forward(expand_curve, (plant,), (change,), xp), lag_change)
-    first = push_forward(lambda curve, lag: stationarity(ridge.s, curve, lag, undelayed)[0], (curve, lag), along, xp)
-    _, second = stationarity(ridge.s, curve, lag, undelayed)
-    s = xp.where(corner, 0.0, -first / xp.where(corner, 1.0, second))
-    _, beta = push_forward(lambda s, curve, lag: wall(s, curve, lag, undelayed), (ridge.s, curve, lag), (s, *along), xp)
-    root = xp.sqrt(xp.where(corner, 1.0, (1.0 - ridge.s) * (1.0 + ridge.s)))
-    return Ridge(alpha, beta, 2.0 * s / root, s, xp.zeros_like(s))
 
 
 @cache
@@ -162,10 +135,13 @@ def _jax_ridge() -> Any:
 
     @function.defjvp
     def rule(delay_model: str, kind: DelayClasses, primals: tuple, tangents: tuple) -> tuple[Ridge, Ridge]:
-        # The rule calls the function itself and is made of differentiable formulas: hence right to any order.
-        plant, lag, start = primals
-        ridge = function(plant, lag, start, delay_model, kind)
-        return ridge, move_ridge(ridge, plant, lag, tangents[0], tangents[1], delay_model, kind)
+        # s moves by this rule again: hence right to any order.
+        ridge = function(*primals, delay_model, kind)
+
+        def moving(plant: Plant, lag: Array) -> Ridge:
+            return Ridge(*follow(ridge.s, plant, lag, delay_model, kind), ridge.last)
+
+        return ridge, jax.jvp(moving, primals[:2], tangents[:2])[1]
 
     return function
 
@@ -242,11 +218,11 @@ def move_point(
 ) -> tuple[RidgePoint, tuple[RidgePoint, RidgePoint]]:
     """`ridge_kernel` of a held delay, and how it moves with delta and d."""
     ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
-    point, still, arrived = _point(ridge, status), np.zeros_like(lag), converged(ridge)
+    point, arrived = _point(ridge, status), converged(ridge)
 
     def move(change: Plant) -> RidgePoint:
-        alpha, beta, omega, *_ = move_ridge(ridge, plant, lag, change, still, delay_model, kind)
-        return point._replace(**dict(zip(RidgePoint._fields, nan_unless(arrived, alpha, beta, omega), strict=False)))
+        moved = push_forward(lambda plant: follow(ridge.s, plant, lag, delay_model, kind), (plant,), (change,), np)
+        return point._replace(**dict(zip(RidgePoint._fields, nan_unless(arrived, *moved[:3]), strict=False)))
 
     by_delta, by_f = plant_slopes(delta, f)
     return point, (move(by_delta), move(by_f))
@@ -263,11 +239,15 @@ class RidgeSlopes(NamedTuple):
 def slopes_kernel(delta: Array, d: Array, delay_model: str, kind: DelayClasses = ANY) -> RidgeSlopes:
     """`alpha_max` and the derivatives of alpha in delta and d, elementwise; at whole delays those from the right."""
     ridge, status, plant, lag, (delta, f) = _solve_ridge(delta, d, delay_model, kind)
-    by_delta, by_f = plant_slopes(delta, f)
-    undelayed = is_undelayed(delay_model, kind)
-    fractional = delay_model == "fractional_power"
-    by_d = alpha_by_lag(ridge, lag) if fractional else alpha_change(ridge.s, plant, lag, by_f, undelayed)
-    by_delta = alpha_change(ridge.s, plant, lag, by_delta, undelayed)
+    xp, at = namespace(ridge.s), wave(ridge.s, lag, is_undelayed(delay_model, kind))
+
+    def move(change: Plant) -> Array:
+        return push_forward(lambda plant: wall(at, expand_curve(plant))[0], (plant,), (change,), xp)
+
+    by_delta, by_d = map(move, plant_slopes(delta, f))
+    if delay_model == "fractional_power":
+        by_d = -8.0 * at.y * at.half * at.per_sin * (ridge.beta + 0.5 * ridge.alpha)
+        by_d = xp.where(ridge.s >= 1.0, -np.inf, by_d)
     by_delta, by_d = nan_unless(converged(ridge), by_delta, by_d)
     return RidgeSlopes(_point(ridge, status), by_delta, by_d)
 

@@ -26,6 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.roots import bisect
 from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
 from zwidth.loops.rigid.device import ANY, DelayClasses, Plant
 from zwidth.words.types import Array
@@ -112,9 +113,8 @@ def sides(at: Wave, curve: Curve) -> Sides:
     return Sides(g1, g2, m, m * m + curve.k * curve.k * (4.0 * at.y * at.q))
 
 
-def wall(s: Array, curve: Curve, lag: Array, undelayed: bool = False) -> tuple[Array, Array]:
+def wall(at: Wave, curve: Curve) -> tuple[Array, Array]:
     """(alpha, beta) of the curve at one s."""
-    at = wave(s, lag, undelayed)
     g1, g2, _, rho = sides(at, curve)
     per_rho = 1.0 / rho
     alpha = 4.0 * at.y * (at.tau * g1 + at.kappa * g2) * per_rho
@@ -190,7 +190,6 @@ _LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
 # Below one period T bends more; so much that the power matters.
 _POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
 _HELD_STEPS = 3
-_FRACTIONAL_STEPS = 12
 
 
 def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
@@ -242,39 +241,13 @@ def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tupl
 
 
 def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Array]:
-    """The same with a shrinking bracket.
-
-    For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2): there the step is
-    Newton's for ``T q^(3/2)`` as a function of ``q^(5/2)``.
-    """
+    """By halving: for small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2)."""
     xp = namespace(curve.b, lag)
-    d = lag
     # d = 0 may end at pi itself, where 1/sin omega is infinite.
-    rest = xp.maximum(0.3 * xp.minimum(d, 0.05) ** (2.0 / 3.0), epsilon(d))
+    rest = xp.maximum(0.3 * xp.minimum(lag, 0.05) ** (2.0 / 3.0), epsilon(lag))
     lower, upper = 0.5 * start.scale, xp.minimum(xp.sqrt(1.0 - rest), 1.05 * start.scale)
-
-    def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        s, lower, upper = state
-        value, slope = stationarity(s, curve, lag)
-        rising = value > 0.0
-        lower, upper = xp.where(rising, s, lower), xp.where(rising, upper, s)
-        q = (1.0 - s) * (1.0 + s)
-        near = (q < 0.5) & (d > 0.0)
-        # dq = -2 s ds
-        scaled = 3.0 * s * value - q * slope
-        ratio = 1.0 - 5.0 * s * value / scaled
-        usable = xp.where(near, (scaled > 0.0) & (ratio > 0.0), slope < 0.0)
-        power = xp.where(near & usable, ratio, 1.0) ** 0.4
-        candidate = xp.where(near, xp.sqrt(1.0 - q * power), s - value / slope)
-        candidate = xp.minimum(xp.maximum(candidate, lower), upper)
-        # Off the bracket, towards pi, q is bisected geometrically: it may be small.
-        inner = xp.sqrt(1.0 - xp.sqrt((1.0 - lower * lower) * (1.0 - upper * upper)))
-        return xp.where(usable, candidate, xp.where(rising, inner, 0.5 * (lower + upper))), lower, upper
-
-    first = xp.minimum(xp.maximum(start.s, lower), upper)
-    state = repeat(_FRACTIONAL_STEPS - 1, step, (first, lower, upper), xp)
-    s = step(state)[0]
-    return s, s - state[0]
+    s = bisect(lambda s: stationarity(s, curve, lag)[0] > 0.0, lower, upper)
+    return s, 0.0 * s
 
 
 def is_undelayed(delay_model: str, kind: DelayClasses) -> bool:
@@ -293,8 +266,8 @@ def solve(plant: Plant, lag: Array, start: Start, delay_model: str, kind: DelayC
         s, last = _solve_held(curve, lag, start, undelayed)
     # Just before the take-over a smooth optimum may round to the corner's place.
     s = xp.minimum(s, 1.0 - 0.5 * epsilon(s))
-    alpha, beta = wall(s, curve, lag, undelayed)
-    ridge = Ridge(alpha, beta, 2.0 * wave(s, lag, True).half, s, last)
+    at = wave(s, lag, undelayed)
+    ridge = Ridge(*wall(at, curve), 2.0 * at.half, s, last)
     if not kind.short:
         return ridge
     at_end = corner(curve, lag)

@@ -11,7 +11,7 @@ from zwidth.arrays.xp import is_traced
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import classify_delays, wall_status
 from zwidth.loops.rigid.folding import NAMES, Points, fold_arguments
-from zwidth.loops.rigid.poles import radius_by_companion, unstable_poles
+from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.loops.rigid.polynomial import check_has_poles
 from zwidth.loops.rigid.row_limit import boundary_map
 from zwidth.words.errors import InputError, check_choice
@@ -94,7 +94,7 @@ def is_stable(
                 "method: 'certified' decides in arbitrary precision on the host; inside a JAX transformation use "
                 "'auto', 'crossover' or 'companion'"
             )
-        return unstable_poles(*values) == 0
+        return radius_by_companion(*values) < 1.0
     laid = fold_arguments(values)
     return to_caller(laid.spread(_decide(laid.points, method)[0]), values)
 

@@ -14,7 +14,7 @@ import oracles
 import zwidth
 from zwidth.loops.rigid.aberth import aberth_kernel
 from zwidth.loops.rigid.folding import map_by_degree
-from zwidth.loops.rigid.poles import _eigenvalues, companion, radius_by_companion, unstable_poles
+from zwidth.loops.rigid.poles import _eigenvalues, companion, radius_by_companion
 from zwidth.words.errors import InputError
 from zwidth.words.status import Status
 
@@ -36,14 +36,6 @@ def test_no_label_is_wrong_outside_the_band(labels, radius):
     judged = np.abs(labels["margin"]) > tol.LABEL_BAND.float64
     assert judged.mean() > 0.9
     np.testing.assert_array_equal((radius < 1)[judged], labels["stable"][judged])
-
-
-def test_unstable_poles_are_counted(labels):
-    some = (labels["d"] == 2) & (np.abs(labels["margin"]) > tol.LABEL_BAND.float64)
-    count = unstable_poles(*(labels[name][some] for name in ("alpha", "beta", "delta", "d")))
-    np.testing.assert_array_equal(count == 0, labels["stable"][some])
-    assert count.max() > 1
-    assert unstable_poles(0.1, 0.1, -1.0, 0) == -1
 
 
 def test_the_radius_has_all_its_digits(labels, radius):
@@ -154,7 +146,6 @@ def test_without_stiffness_nothing_is_stable():
     rng = np.random.default_rng(3)
     beta, delta, d = rng.uniform(-1, 1, 3000), 10.0 ** rng.uniform(-3, 2, 3000), rng.choice([0.0, 1.0, 2.0, 0.5], 3000)
     assert (np.asarray(radius_by_companion(0.0, beta, delta, d)) >= 1.0).all()
-    assert (np.asarray(unstable_poles(0.0, beta, delta, d)) >= 1).all()
 
 
 def test_a_scalar_beyond_the_domain_is_refused():

@@ -10,7 +10,7 @@ from mpmath import mp
 import oracles
 import zwidth
 from zwidth.loops.rigid.boundary import Piece, sample_lobe, stable_region
-from zwidth.loops.rigid.poles import unstable_poles
+from zwidth.loops.rigid.poles import radius_by_companion
 from zwidth.words.errors import InputError
 
 # Lobe, lobe cut by the line at z = -1, held and whole, weakly and strongly damped.
@@ -65,7 +65,7 @@ def test_area_by_counting_poles_on_a_grid(regions, device):
     width, height = 1.2 * region.alpha.max(), 1.2 * (high - low)
     alpha = (np.arange(cells)[:, None] + 0.5) / cells * width
     beta = low - 0.1 * (high - low) + (np.arange(cells) + 0.5) / cells * height
-    stable = unstable_poles(alpha, beta, *device) == 0
+    stable = radius_by_companion(alpha, beta, *device) < 1
     counted = stable.mean() * width * height
     assert region.area == pytest.approx(counted, rel=tol.AREA_GRID.float64)
 
