@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from zwidth.arrays.xp import tree_map
 from zwidth.simulation.lanes import Lanes, Options
 
 # Squarings of a map, at most; rounding hides slower motions.
@@ -57,10 +58,12 @@ class LaneGroup(NamedTuple):
 
 def _rows(part: Any, at: np.ndarray) -> Any:
     """Some lanes of arrays whose last axis they are, as their first."""
-    if isinstance(part, tuple):
-        return type(part)(*(_rows(each, at) for each in part))
-    part = np.moveaxis(np.asarray(part), -1, 0)
-    return part[at] if len(part) > 1 else np.broadcast_to(part, (at.size, *part.shape[1:]))
+
+    def pick(leaf: Any) -> np.ndarray:
+        first = np.moveaxis(np.asarray(leaf), -1, 0)
+        return first[at] if len(first) > 1 else np.broadcast_to(first, (at.size, *first.shape[1:]))
+
+    return tree_map(pick, part)
 
 
 def _compose(lanes: Lanes, options: Options, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -224,9 +227,7 @@ def solve_lanes(A: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def take(part: Any, own: np.ndarray) -> Any:
     """Some lanes of a group, by their places or a mask."""
-    if isinstance(part, tuple):
-        return type(part)(*(take(each, own) for each in part))
-    return part[own] if isinstance(part, np.ndarray) else part
+    return tree_map(lambda leaf: leaf[own] if isinstance(leaf, np.ndarray) else leaf, part)
 
 
 def find_kept(group: LaneGroup, seen: bool, held: bool) -> np.ndarray:

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from functools import cache, wraps
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -128,20 +128,7 @@ def _solve(line: str, start: Array, number: Array, loop: FrequencyLoop, delay_mo
     return omega, frequency_boundary(omega, loop, delay_model)
 
 
-def _on_each_point(kernel: Callable[..., Any]) -> Callable[..., Any]:
-    """An elementwise kernel of arrays out of one of single points; what is no array is the same for all of them."""
-
-    @wraps(kernel)
-    def elementwise(*arguments: Any) -> Any:
-        arrays = [value for value in arguments if hasattr(value, "ndim")]
-        options, shape = arguments[len(arrays) :], arrays[0].shape
-        found = jax.vmap(lambda *point: kernel(*point, *options))(*(array.reshape(-1) for array in arrays))
-        return tuple(leaf.reshape(shape) for leaf in found)
-
-    return elementwise
-
-
-@_on_each_point
+@partial(jnp.vectorize, excluded=(2,))
 def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
     """The fields of `zwidth.alpha_max` for one point."""
     status = device_status(delta, d)
@@ -173,7 +160,7 @@ def kkt_kernel(delta: Array, d: Array, delay_model: str) -> tuple[Array, ...]:
     )
 
 
-@_on_each_point
+@partial(jnp.vectorize, excluded=(3, 4, 5))
 def point_kernel(
     delta: Array, d: Array, number: Array, line: str, delay_model: str, find_ridge: Callable[..., Any]
 ) -> tuple[Array, ...]:

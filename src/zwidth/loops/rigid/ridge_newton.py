@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.roots import bisect
+from zwidth.arrays.roots import newton
 from zwidth.arrays.xp import ARCSINE, COSINE, SINE, epsilon, frozen, horner, namespace, repeat, store_once
 from zwidth.loops.rigid.device import ANY, DelayClasses, Plant
 from zwidth.words.types import Array
@@ -190,6 +190,7 @@ _LONG = ((0.542, -0.06693, 0.1218), (0.6279, 0.002018), (-0.1571,))
 # Below one period T bends more; so much that the power matters.
 _POWER = ((4.61, -11.6, 6.73), (-6.78, 10.3), (0.712,))
 _HELD_STEPS = 3
+_FRACTIONAL_STEPS = 16
 
 
 def _polynomial(t: Array, u: Array, rows: tuple[tuple[float, ...], ...]) -> Array:
@@ -241,13 +242,20 @@ def _solve_held(curve: Curve, lag: Array, start: Start, undelayed: bool) -> tupl
 
 
 def _solve_fractional(curve: Curve, lag: Array, start: Start) -> tuple[Array, Array]:
-    """By halving: for small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2)."""
+    """The same with a shrinking bracket.
+
+    For small d the ridge sits near omega = pi, where T behaves like A + B q - C d q^(-3/2).
+    """
     xp = namespace(curve.b, lag)
     # d = 0 may end at pi itself, where 1/sin omega is infinite.
     rest = xp.maximum(0.3 * xp.minimum(lag, 0.05) ** (2.0 / 3.0), epsilon(lag))
     lower, upper = 0.5 * start.scale, xp.minimum(xp.sqrt(1.0 - rest), 1.05 * start.scale)
-    s = bisect(lambda s: stationarity(s, curve, lag)[0] > 0.0, lower, upper)
-    return s, 0.0 * s
+
+    def falling(s: Array) -> tuple[Array, Array]:
+        value, slope = stationarity(s, curve, lag)
+        return -value, -slope
+
+    return newton(falling, lower, upper, xp.minimum(xp.maximum(start.s, lower), upper), _FRACTIONAL_STEPS)
 
 
 def is_undelayed(delay_model: str, kind: DelayClasses) -> bool:
