@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64, check_scalars, evaluate
+from zwidth.arrays.evaluate import as_number, check_count, check_scalars, evaluate
 from zwidth.arrays.roots import integrate
 from zwidth.arrays.xp import frozen, namespace, nan_with_nan_slopes, repeat
 from zwidth.loops.rigid.curve import (
@@ -245,17 +245,12 @@ def sample_lobe(
 ) -> tuple[Vertices, Vertices, Vertices]:
     """Frequencies along the first lobe of the boundary curve, and its alpha and beta there."""
     check_delay_model(delay)
-    for name, value in (("delta", delta), ("d", d)):
-        number = as_float64(name, value)
-        if number.ndim or not (np.isfinite(number) and number >= 0):
-            raise InputError(f"{name}: got {value!r}; a single finite number of at least 0 is needed")
-    check_scalars({"delta": float(delta), "d": float(d)})
-    if not isinstance(points, int | np.integer) or isinstance(points, bool) or points < 8:
-        raise InputError(f"points: got {points!r}; a whole number of at least 8 is needed")
+    known = {"delta": as_number("delta", delta, 0.0), "d": as_number("d", d, 0.0)}
+    check_scalars(known)
+    check_count("points", points, 8)
     kind = classify_delays(d)
     with np.errstate(all="ignore"):
-        numbers = np.float64(delta), np.float64(d)
-        whole = lobe(*numbers, delay, kind)
+        whole = lobe(np.float64(known["delta"]), np.float64(known["d"]), delay, kind)
         top = peak(whole, delay, kind).x
         first, last = (float(frequency(x, whole)) for x in (top, whole.end))
     # Closer together at both ends and round the ridge, where the outline bends most.

@@ -12,20 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from zwidth.arrays.xp import along, apply_each, frozen, namespace, repeat
+from zwidth.arrays.xp import along, apply_each, find_turn, frozen, namespace, repeat
 from zwidth.loops.rigid.crossover import Crossover, gain_crossover
 from zwidth.loops.rigid.device import DeviceTerms
 from zwidth.words.types import Array
 
 
 def find_angle(crossover: Crossover) -> Array:
-    """w of u and 2 - u, from the smaller of them."""
-    xp = namespace(crossover.u)
-    near = crossover.u <= 1.0
-    small = xp.maximum(xp.where(near, crossover.u, crossover.y), 0.0)
-    angle = 2.0 * xp.arcsin(xp.sqrt(0.5 * xp.where(small > 0, small, 1.0)))
-    angle = xp.where(small > 0, angle, 0.0)
-    return xp.where(near, angle, np.pi - angle)
+    """w of u and 2 - u."""
+    return find_turn(0.5 * crossover.u, 0.5 * crossover.y, namespace(crossover.u))
 
 
 def size_and_phase(w: Array, alpha: Array, beta: Array, here: DeviceTerms) -> tuple[Array, Array]:

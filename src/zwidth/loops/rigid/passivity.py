@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import FEW, as_float64, check_scalars, evaluate, evaluate_columns, to_caller
+from zwidth.arrays.evaluate import FEW, as_number, check_scalars, evaluate, evaluate_columns, to_caller
 from zwidth.arrays.roots import integrate
 from zwidth.arrays.xp import frozen, horner, is_traced, namespace, nan_with_nan_slopes
 from zwidth.loops.rigid.device import ANY, DelayClasses, classify_delays, valid_device, valid_wall
 from zwidth.loops.rigid.folding import NAMES, fold_arguments, group_by
 from zwidth.loops.rigid.needed_damping import directions, larger_root, needed_damping
-from zwidth.words.errors import InputError
 from zwidth.words.quantities import LONGEST_DELAY
 from zwidth.words.types import Array, ArrayLike
 
@@ -207,10 +206,8 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
     held delay the direction is searched: the passive set is convex, so that it has one tip.
     """
     check_scalars({"d": d})
-    delay = as_float64("d", d)
-    if delay.ndim or not (np.isfinite(delay) and delay >= 0):
-        raise InputError(f"d: got {d!r}; a single finite number of at least 0 is needed")
-    period = float(delay) + 1.0
+    delay = as_number("d", d, 0.0)
+    period = delay + 1.0
     if period == np.floor(period):
         half = np.pi / (4.0 * period)
         slope = 2.0 * np.tan(half)
@@ -219,7 +216,7 @@ def passive_stiffness_slope(d: float) -> tuple[float, float]:
 
     def stiffness(angles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         alpha, beta = unit * np.cos(angles), np.sin(angles)
-        needed = needed_damping(alpha, beta, np.full(angles.shape, float(delay)))
+        needed = needed_damping(alpha, beta, np.full(angles.shape, delay))
         return alpha / needed, beta / needed
 
     lower, upper = -0.49 * np.pi, 0.49 * np.pi

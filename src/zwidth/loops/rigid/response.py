@@ -20,14 +20,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import as_float64
+from zwidth.arrays.evaluate import as_number, check_count
 from zwidth.arrays.roots import bisect
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import phi_functions
 from zwidth.loops.rigid.folding import find_degree
 from zwidth.loops.rigid.poles import poles
 from zwidth.loops.rigid.polynomial import coefficients
-from zwidth.words.errors import InputError
 from zwidth.words.quantities import LONGEST_SETTLING
 from zwidth.words.showing import shown
 from zwidth.words.types import Array, Samples
@@ -58,9 +57,7 @@ class Modes(NamedTuple):
     def shape(self, t: np.ndarray) -> np.ndarray:
         """``r_i g_i(t)``, shape (instants, modes)."""
         t = np.asarray(t, dtype=float)[:, None]
-        first, second = np.minimum(t, self.f), np.maximum(t - self.f, 0.0)
-        x, v = advance(1.0, self.speed, self.older, first, self.delta)
-        return self.residue * advance(x, v, self.newer, second, self.delta)[0]
+        return self.residue * move(1.0, self.speed, self.older, self.newer, t, self.delta, self.f)[0]
 
     def deviation(self, time: np.ndarray) -> np.ndarray:
         """The deviation at any instants, in periods."""
@@ -72,6 +69,12 @@ def advance(x: Array, v: Array, force: Array, t: Array, delta: float) -> tuple[A
     """The exact state of the damped mass after time t under a constant force."""
     at = phi_functions(delta * t)
     return x + t * at.phi1 * v + t * t * at.phi2 * force, np.exp(-delta * t) * v + t * at.phi1 * force
+
+
+def move(x: Array, v: Array, older: Array, newer: Array, t: Array, delta: float, f: float) -> tuple[Array, Array]:
+    """The state at the instant t of a period, whose force changes at the fraction f."""
+    x, v = advance(x, v, older, np.minimum(t, f), delta)
+    return advance(x, v, newer, np.maximum(t - f, 0.0), delta)
 
 
 def modes(alpha: float, beta: float, delta: float, d: float) -> Modes | None:
@@ -90,8 +93,7 @@ def modes(alpha: float, beta: float, delta: float, d: float) -> Modes | None:
     # The mode's force as computed at a sample of 1, and as it arrives n + 1 and n samples later.
     computed = -(alpha + beta - beta / z)
     newer, older = computed * z**-n, computed * z ** -(n + 1.0)
-    x_f, v_f = advance(0.0, 0.0, older, np.float64(f), delta)
-    reached, _ = advance(x_f, v_f, newer, np.float64(1.0 - f), delta)
+    reached, _ = move(0.0, 0.0, older, newer, np.float64(1.0), delta, f)
     speed = (z - 1.0 - reached) / here.phi1
     found = Modes(z, residue, speed, older, newer, float(delta), float(f))
     # At rest at first; one period later under the applied force alone.
@@ -217,17 +219,6 @@ def _run(alpha: float, beta: float, delta: float, d: float, applied: float, peri
     return np.array(rows).T
 
 
-def _interpolate(samples: Array, fractions: np.ndarray, delta: float, f: float, applied: float) -> tuple[Array, ...]:
-    """Position, velocity and force at the instants ``fractions`` of every period; rows are periods."""
-    x, v, older, newer = samples[:, :, None]
-    x_bend, v_bend = advance(x, v, applied + older, np.float64(f), delta)
-    before = fractions < f
-    span = np.where(before, fractions, fractions - f)
-    force = np.where(before, older, newer)
-    x, v = advance(np.where(before, x, x_bend), np.where(before, v, v_bend), applied + force, span, delta)
-    return x, v, force
-
-
 def step_response(
     alpha: float, beta: float, delta: float, d: float, *, periods: int = 100, substeps: int = 10, force: float = 1.0
 ) -> StepResponse:
@@ -264,22 +255,18 @@ def step_response(
         >>> print(f"{response.position[-1] * 0.108:.2f}")
         1.00
     """
-    arguments = {"alpha": alpha, "beta": beta, "delta": delta, "d": d, "force": force}
-    numbers = {name: as_float64(name, value) for name, value in arguments.items()}
-    for name, number in numbers.items():
-        if number.ndim or not np.isfinite(number):
-            raise InputError(f"{name}: got {arguments[name]!r}; a single finite number is needed")
-        if name in ("delta", "d") and number < 0:
-            raise InputError(f"{name}: got {arguments[name]!r}; it must be at least 0")
-    for name, count in {"periods": periods, "substeps": substeps}.items():
-        if not isinstance(count, int | np.integer) or isinstance(count, bool) or count < 1:
-            raise InputError(f"{name}: got {count!r}; a whole number of at least 1 is needed")
-    alpha, beta, delta, d, force = (float(number) for number in numbers.values())
+    alpha, beta, force = as_number("alpha", alpha), as_number("beta", beta), as_number("force", force)
+    delta, d = as_number("delta", delta, 0.0), as_number("d", d, 0.0)
+    check_count("periods", periods, 1)
+    check_count("substeps", substeps, 1)
     fractions = np.arange(substeps) / substeps
     with np.errstate(all="ignore"):
         samples = _run(alpha, beta, delta, d, force, int(periods))
-        history = _interpolate(samples, fractions, delta, d - math.floor(d), force)
-    position, velocity, wall_force = (np.broadcast_to(part, (periods, substeps)).ravel() for part in history)
+        x, v, older, newer = samples[:, :, None]
+        f = d - math.floor(d)
+        x, v = move(x, v, force + older, force + newer, fractions, delta, f)
+        parts = (np.broadcast_to(part, (periods, substeps)) for part in (x, v, np.where(fractions < f, older, newer)))
+    position, velocity, wall_force = (part.ravel() for part in parts)
     time = (np.arange(periods)[:, None] + fractions).ravel()
     final = force / alpha if alpha != 0 else math.nan
     settled = settling_time(alpha, beta, delta, d) if force != 0 else 0.0

@@ -150,8 +150,8 @@ def test_a_scene_responds_in_si_units():
 @pytest.mark.parametrize(
     "changes, message",
     [
-        ({"delta": -1e-9}, r"delta: got -1e-09; it must be at least 0"),
-        ({"d": -1}, r"d: got -1; it must be at least 0"),
+        ({"delta": -1e-9}, r"delta: got -1e-09; a single finite number of at least 0"),
+        ({"d": -1}, r"d: got -1; a single finite number of at least 0"),
         ({"alpha": np.nan}, r"alpha: got nan; a single finite number is needed"),
         ({"beta": [1.0, 2.0]}, r"beta: got \[1.0, 2.0\]; a single finite number is needed"),
         ({"force": np.inf}, r"force: got inf; a single finite number is needed"),
