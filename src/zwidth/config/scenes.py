@@ -101,15 +101,21 @@ class _PhysicalPlant(_Parts, SampledMass):
 
 
 class _NormalizedPlant(OneKind):
-    """The same as two dimensionless numbers."""
+    """The same as two dimensionless numbers, those of a mass of 1 kg at a period of 1 s."""
 
     foreign: ClassVar[frozenset[str]] = PHYSICAL_KEYS
+    period: ClassVar[float] = 1.0
+    parts_beyond: ClassVar[tuple[str, ...]] = ()
 
     delta: NonNegative
     """Normalized damping b T/m of the device, >= 0."""
 
     d: Annotated[float, quantity_of("d")] = 0.0
     """Delay in periods, whole or not, >= 0."""
+
+    def to_scene(self) -> Scene:
+        """That mass and its timing."""
+        return Scene(Device(1.0, self.delta), Timing(self.period, self.d))
 
 
 class PhysicalDevice(_PhysicalPlant):
@@ -176,17 +182,12 @@ class PhysicalScene(_PhysicalPlant):
     @property
     def bare(self) -> PhysicalDevice:
         """The scene without its wall, for studies that need a linear velocity estimate."""
-        return PhysicalDevice(**self._device_keys)
+        return self.without_wall(PhysicalDevice)
 
-    @property
-    def simulated_device(self) -> SimulatedDevice:
-        """The scene without its wall."""
-        return SimulatedDevice(**self._device_keys)
-
-    @property
-    def _device_keys(self) -> dict[str, Any]:
+    def without_wall(self, kind: type[PhysicalDevice]) -> PhysicalDevice:
+        """The scene without its wall, as a device of a kind."""
         own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay", "rotary")}
-        return {name: value for name, value in own.items() if value is not None} | list_parts(self)
+        return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
 
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
@@ -261,17 +262,10 @@ def is_adaptive(owner: Any) -> bool:
     return velocity is not None and velocity.part is FOAW
 
 
-def is_with_parts(owner: AnyScene | AnyDevice) -> bool:
-    """Whether a scene or a device is more than a rigid mass with the difference of two samples."""
-    return isinstance(owner, PhysicalScene | PhysicalDevice) and bool(owner.parts_beyond)
-
-
 def normalized_wall(device: AnyDevice, wall: AnyWall) -> tuple[float, float]:
-    """``alpha`` and ``beta`` of a wall on a device; a wall in SI units needs a device in SI units."""
+    """``alpha`` and ``beta`` of a wall on a device."""
     if isinstance(wall, NormalizedWall):
         return wall.alpha, wall.beta
-    if isinstance(device, NormalizedDevice):
-        raise InputError("wall: got one in SI units for a normalized device; give alpha and beta")
     alpha, beta = device.to_scene().normalize_walls(wall.stiffness, wall.virtual_damping)
     return float(alpha), float(beta)
 

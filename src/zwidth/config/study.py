@@ -12,7 +12,7 @@ from pydantic_core import PydanticCustomError
 from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Name, Strict, members
 from zwidth.config.parts import NO_LINEAR_FORM, SIMULATED, list_parts
-from zwidth.config.scenes import AnyScene, PhysicalScene, is_adaptive, is_with_parts
+from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene, SimulatedDevice, is_adaptive
 from zwidth.words.formatting import describe
 from zwidth.words.types import DELAY_MODELS, DelayModel
 
@@ -117,7 +117,7 @@ class Study(Strict):
             "delay_models": [scene.delay_model],
         }
         if "device" in cls.from_scene and isinstance(scene, PhysicalScene):
-            supplied["device"] = scene.simulated_device if cls.simulates else scene.bare
+            supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
         if "devices" in cls.from_scene:
             supplied["devices"] = [scene.bare]
         return {**{name: supplied[name] for name in cls.from_scene if name in supplied}, **raw}
@@ -131,7 +131,7 @@ class Study(Strict):
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         """Refuse a scene with parts of which the study would take numbers and forget the rest."""
         taken = cls._list_taken(raw)
-        if taken and not cls.takes_parts and is_with_parts(scene):
+        if taken and not cls.takes_parts and scene.parts_beyond:
             raise refuse_parts(cls.kind_name(), list_parts(scene), f"give {' and '.join(taken)} here")
 
     @classmethod

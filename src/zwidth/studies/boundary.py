@@ -14,7 +14,7 @@ from zwidth import figures
 from zwidth.config.faults import LocatedProblem, problem
 from zwidth.config.fields import members, repeated
 from zwidth.config.parts import list_parts
-from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene, is_with_parts
+from zwidth.config.scenes import AnyScene, LabeledDevice, PhysicalDevice, PhysicalScene
 from zwidth.config.study import DelayModels, name_parts, register
 from zwidth.figures.stable_set import tabulate_walls, trace_outlines
 from zwidth.figures.table import stack
@@ -69,14 +69,14 @@ class BoundaryStudy(CurvesStudy):
 
     @classmethod
     def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        if "device" in raw or (is_with_parts(scene) and not {"delta", "d"} & set(raw)):
+        if "device" in raw or (scene.parts_beyond and not {"delta", "d"} & set(raw)):
             return {"delay_models": [scene.delay_model], "device": scene.bare, **raw}
         return super().fill(raw, scene)
 
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         given = [name for name in ("delta", "d") if name in raw]
-        if len(given) == 1 and "device" not in raw and is_with_parts(scene):
+        if len(given) == 1 and "device" not in raw and scene.parts_beyond:
             remedy = f"remove {given[0]!r}, or give both delta and d"
             raise problem(f"got {given[0]!r} beside a scene with parts", "a device with parts has its own", remedy)
 

@@ -137,16 +137,13 @@ class WallsStudy(ComputedStudy):
 _CHOICE = ("stiffness_fraction", "walls")
 
 
-def add_si_columns(table: Table, device: PhysicalDevice | PhysicalScene) -> Table:
-    """A table with its walls in N/m and N s/m as well."""
-    stiffness, damping = device.to_scene().units
-    return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
-
-
 def add_si_of_scene(table: Table, delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> Table:
     """A table of walls, in SI units as well where delta and d are those of a rigid scene or device alone."""
     device = _find_owner(delta, d, owner)
-    return add_si_columns(table, device) if device is not None else table
+    if device is None:
+        return table
+    stiffness, damping = device.to_scene().units
+    return {**table, SI_COLUMNS[0]: table["alpha"] * stiffness, SI_COLUMNS[1]: table["beta"] * damping}
 
 
 def share_of_device(delta: Axis, d: Axis, owner: AnyScene | AnyDevice | None) -> float:

@@ -23,7 +23,6 @@ from zwidth.config.scenes import (
     NormalizedDevice,
     PhysicalDevice,
     PhysicalWall,
-    is_with_parts,
     normalized_wall,
 )
 from zwidth.config.study import HeldOnly, refuse_parts, register
@@ -61,9 +60,7 @@ class ResponseStudy(ComputedStudy):
     def periods(self, device: AnyDevice) -> float:
         """Length of the response of a device in sampling periods."""
         # By plain division: seconds may be many more periods than the rounding of a delay is made for.
-        if self.duration.unit == "s" and isinstance(device, PhysicalDevice):
-            return self.duration.value / device.period
-        return self.duration.value
+        return self.duration.value / (device.period if self.duration.unit == "s" else 1.0)
 
     def respond(
         self, device: AnyDevice, alpha: float, beta: float, *, label: str, physical: bool
@@ -75,12 +72,8 @@ class ResponseStudy(ComputedStudy):
         """
         periods = max(1, round(self.periods(device)))
         raw = step_response(alpha, beta, device.delta, device.d, periods=periods, substeps=self.substeps)
-        clock, length, units = 1.0, 1.0, ("", "", "", "")
-        if physical:
-            assert isinstance(device, PhysicalDevice), "only a device with mass and period has SI units"
-            clock, length = device.period, 1.0 / device.to_scene().units.stiffness
-            units = ("_s", "_m", "_m_per_s", "_N")
-        second, meter, speed, newton = units
+        clock, length = (device.period, 1.0 / device.to_scene().units.stiffness) if physical else (1.0, 1.0)
+        second, meter, speed, newton = ("_s", "_m", "_m_per_s", "_N") if physical else ("",) * 4
         time, settling_time = raw.time * clock, raw.settling_time * clock
         columns = {
             **{"label": label, "alpha": alpha, "beta": beta, "delta": device.delta, "d": device.d},
@@ -128,7 +121,7 @@ class StepStudy(WallsStudy, ResponseStudy):
     def limits(self) -> Iterable[LocatedProblem]:
         yield from super().limits()
         for index, device in enumerate(self.devices):
-            if is_with_parts(device):
+            if device.parts_beyond:
                 yield ("devices", index), refuse_parts("step", list_parts(device))
         sizes = len(self.devices), len(self.walls or (None,))
         if min(sizes) > 1 and sizes[0] != sizes[1]:

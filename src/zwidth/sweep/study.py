@@ -15,7 +15,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.mass import Rotary, find_second_device, find_second_period, tell_rotary
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
-from zwidth.config.scenes import AnyScene, PhysicalScene, is_with_parts
+from zwidth.config.scenes import AnyScene, PhysicalScene
 from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
@@ -218,7 +218,7 @@ class SweepStudy(_Parts, _Swept):
     @classmethod
     def check_parts(cls, raw: dict[str, Any], scene: AnyScene) -> None:
         axes = raw.get("axes")
-        if not isinstance(axes, dict) or not is_with_parts(scene):
+        if not isinstance(axes, dict) or not scene.parts_beyond:
             return
         keys = {key for key in axes if key in PARAMETERS} | _columns(axes.get("devices"))
         if not keys & set(PHYSICAL) and not {"delta", "d"} <= keys:
