@@ -14,7 +14,7 @@ from pydantic import PlainSerializer, PlainValidator, ValidationError, WithJsonS
 from pydantic_core import PydanticCustomError
 
 from zwidth.config.faults import LocatedProblem, listing, printable, problem, problems_of, validation_error
-from zwidth.config.values import Entry, in_one_unit, quantity_of, read_entries
+from zwidth.config.values import quantity_of, read_entries
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import describe, from_cell, read_rows, resembling, split_title, suggestion
 from zwidth.words.quantities import PARAMETERS
@@ -91,7 +91,7 @@ def _read_lists(raw: dict[str, Any]) -> DeviceTable:
             what = problem(f"got {describe(cells)}", "a column of devices is a list", "write [value, value, ...]")
             found.append(((key,), what))
         else:
-            entry, units = _cell_reader(key)
+            entry, units = (_check_label, set()) if key == LABEL else quantity_of(key).read_alike()
             try:
                 columns[key] = read_entries(cells, entry, distinct=False) if cells or key != LABEL else ()
             except (PydanticCustomError, ValidationError) as error:
@@ -100,14 +100,6 @@ def _read_lists(raw: dict[str, Any]) -> DeviceTable:
     if found:
         raise validation_error("devices", found)
     return _check_lengths(columns, in_periods)
-
-
-def _cell_reader(key: str) -> tuple[Entry, set[str]]:
-    """What reads the cells of a column, and of delays the unit of those read so far."""
-    if key == LABEL:
-        return _check_label, set()
-    quantity = quantity_of(key)
-    return in_one_unit(quantity.read) if quantity.periods else (quantity.read, set())
 
 
 def _check_label(cell: Any) -> Any:
@@ -198,35 +190,26 @@ def _map_columns(header: list[str], mapping: Any, name: str) -> dict[str, tuple[
 
 
 def _parse_rows(rows: list[tuple[int, list[str]]], chosen: dict[str, tuple[int, str]], name: str) -> DeviceTable:
-    """The chosen columns of a file's rows."""
-    columns: dict[str, tuple[Any, ...]] = {}
-    in_periods = False
+    """The chosen columns of a file's rows, read as lists are; a fault is told with its line."""
+    lists: dict[str, list[Any]] = {key: [] for key in chosen}
     for key, (index, unit) in chosen.items():
-        cells = []
         for line, row in rows[1:]:
             if index >= len(row) or not row[index]:
                 allowed = "every device has a value for every parameter"
                 raise problem(f"{printable(name)}, line {line}: {key} is missing", allowed, "fill the cell")
-            cells.append((f"{printable(name)}, line {line}: {key}", row[index]))
-        if key == LABEL:
-            columns[key] = tuple(from_cell(cell) for _, cell in cells)
-            continue
-        entry, units = _cell_reader(key)
-        columns[key] = tuple(_read_cell(entry, cell, unit, place) for place, cell in cells)
-        in_periods |= "periods" in units
-    return _check_lengths(columns, in_periods)
-
-
-def _read_cell(entry: Entry, cell: str, unit: str, place: str) -> float:
-    """One value of a CSV file: a number in the header's unit, or a number with a unit of its own."""
-    raw: float | str = cell
-    if looks_like_number(cell):
-        raw = f"{cell} {unit}" if unit else float(cell)
+            lists[key].append(from_cell(row[index]) if key == LABEL else _to_value(row[index], unit))
     try:
-        return entry(raw)
-    except PydanticCustomError as error:
-        context = error.context or {}
+        return _read_lists(lists)
+    except ValidationError as error:
+        ((key, row), what), *_ = problems_of(error)
+        context = what.context or {}
+        place = f"{printable(name)}, line {rows[1 + int(row)][0]}: {key}"
         raise problem(f"{place}: {context['what']}", context["allowed"], context["remedy"]) from None
+
+
+def _to_value(cell: str, unit: str) -> float | str:
+    """A number in the header's unit, or a number with a unit of its own."""
+    return cell if not looks_like_number(cell) else f"{cell} {unit}" if unit else float(cell)
 
 
 def _make_schema() -> dict[str, Any]:

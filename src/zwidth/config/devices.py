@@ -12,8 +12,7 @@ from pydantic import BeforeValidator, WithJsonSchema, WrapValidator
 
 from zwidth.config.device_table import find_file
 from zwidth.config.faults import LocatedProblem, listing, problem
-from zwidth.config.fields import Strict
-from zwidth.config.parts import locate_refusal, split_refusal
+from zwidth.config.parts import PartSection, split_refusal
 from zwidth.config.values import Quantity
 from zwidth.parts.devices import DEVICES
 from zwidth.parts.linear_device import LinearDevice, split_fraction
@@ -50,7 +49,7 @@ def _check_numbers(raw: Any) -> Any:
 _Numbers = Annotated[Any, BeforeValidator(_check_numbers), WithJsonSchema({"type": ["array", "number"]})]
 
 
-class SystemSection(Strict):
+class SystemSection(PartSection):
     """A device as a linear system, from commanded force in N to sensed position in m."""
 
     what: ClassVar[str] = "a linear system"
@@ -82,10 +81,6 @@ class SystemSection(Strict):
     sampled: Annotated[float, Quantity("s", POSITIVE)] | None = None
     """The period of a system from sample to sample, that of the loop; a continuous one has none."""
 
-    def to_part(self) -> LinearDevice:
-        """The device itself."""
-        return self._known
-
     @cached_property
     def _known(self) -> LinearDevice:
         form = next(form for form in _OF_SYSTEM if getattr(self, form[-1]) is not None)
@@ -103,12 +98,8 @@ class SystemSection(Strict):
             yield (), problem(f"got {given}", f"a linear system has {forms}", "write one of these")
 
     def limits(self) -> Iterable[LocatedProblem]:
-        if not _is_whole(self.model_fields_set):
-            return
-        try:
-            self.to_part()
-        except InputError as error:
-            yield (), locate_refusal(error)[1]
+        # Of its keys at large, for the message tells which.
+        return [((), what) for _, what in super().limits()] if _is_whole(self.model_fields_set) else []
 
 
 def _is_whole(given: Iterable[str]) -> bool:
@@ -116,7 +107,7 @@ def _is_whole(given: Iterable[str]) -> bool:
     return any(set(form) - {"zeros"} <= set(given) <= {*form, "sampled"} for form in _OF_SYSTEM)
 
 
-class ResponseSection(Strict):
+class ResponseSection(PartSection):
     """A device by its measured frequency response, the columns of a table."""
 
     what: ClassVar[str] = "a response"
@@ -147,16 +138,6 @@ class ResponseSection(Strict):
         if real.shape != imag.shape:
             raise InputError(f"imag: got {imag.size} numbers beside {real.size} of real; give one a frequency")
         return MeasuredDevice(self.frequency, real + 1j * imag, self.deviation)
-
-    def to_part(self) -> MeasuredDevice:
-        """The device itself."""
-        return self._known
-
-    def limits(self) -> Iterable[LocatedProblem]:
-        try:
-            self.to_part()
-        except InputError as error:
-            yield locate_refusal(error)
 
 
 def _read_form(raw: Any) -> SystemSection | ResponseSection:

@@ -91,7 +91,6 @@ def tell_rotary(value: Any = None) -> bool | None:
 
 
 Rotary = Annotated[bool | None, PlainValidator(tell_rotary, json_schema_input_type=bool)]
-_LISTED = "zwidth devices lists them"
 
 
 def _add_device(schema: dict[str, Any]) -> None:

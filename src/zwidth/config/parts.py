@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import MISSING, dataclass, fields
+from functools import cached_property
 from math import isfinite
 from typing import Annotated, Any, ClassVar, Literal, Union
 
@@ -57,6 +58,11 @@ class PartSection(Strict):
     part: ClassVar[Any]
 
     def to_part(self) -> Any:
+        """The part itself."""
+        return self._known
+
+    @cached_property
+    def _known(self) -> Any:
         given = {name: getattr(self, name) for name in type(self).model_fields if name != "kind"}
         return self.part(**given)
 
@@ -65,7 +71,8 @@ class PartSection(Strict):
             self.to_part()
         except InputError as error:
             path, what = locate_refusal(error)
-            yield path[1:], what
+            # A whole part begins the path with its name; a field of the section is its own place.
+            yield path if path[0] in type(self).model_fields else path[1:], what
 
 
 def _read_coefficients(raw: Any) -> tuple[float, ...]:

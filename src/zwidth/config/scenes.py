@@ -155,81 +155,6 @@ class NormalizedDevice(_NormalizedPlant):
     """Name of the device in legends."""
 
 
-class PhysicalScene(_PhysicalPlant):
-    """The file's device, timing and wall in SI units."""
-
-    what: ClassVar[str] = "a scene"
-
-    stiffness: Annotated[float, quantity_of("stiffness")] | None = None
-    """Stiffness K of the wall in N/m."""
-
-    virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
-    """Damping B of the wall in N s/m."""
-
-    velocity: SimulatedVelocityField | None = None
-    """How the velocity is estimated; the difference of two samples where left out."""
-
-    delay_model: DelayModel = "held"
-    """How a delay that is not whole is modeled."""
-
-    def to_scene(self) -> Scene:
-        """Device, timing and wall; a wall that is not given has no stiffness and no damping."""
-        bare = super().to_scene()
-        wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
-        timing = Timing(period=bare.timing.period, delay=bare.timing.delay, delay_model=self.delay_model)
-        return replace(bare, timing=timing, wall=wall)
-
-    @property
-    def bare(self) -> PhysicalDevice:
-        """The scene without its wall, for studies that need a linear velocity estimate."""
-        return self.without_wall(PhysicalDevice)
-
-    def without_wall(self, kind: type[PhysicalDevice]) -> PhysicalDevice:
-        """The scene without its wall, as a device of a kind."""
-        own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay", "rotary")}
-        return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
-
-    def limits(self) -> Iterable[LocatedProblem]:
-        yield from super().limits()
-        if not self._is_double and self.delay_model not in self.to_scene().loop.delay_models:
-            allowed = "velocity filters, hands and other parts are computed in the model 'held'"
-            yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
-
-    @property
-    def wall(self) -> PhysicalWall | None:
-        """The scene's wall, where one is given."""
-        if self.stiffness is None and self.virtual_damping is None:
-            return None
-        return PhysicalWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
-
-
-class NormalizedScene(_NormalizedPlant):
-    """The file's device, timing and wall, normalized."""
-
-    what: ClassVar[str] = "a scene"
-
-    alpha: Number | None = None
-    """Normalized stiffness K T^2/m of the wall."""
-
-    beta: Number | None = None
-    """Normalized damping B T/m of the wall."""
-
-    delay_model: DelayModel = "held"
-    """How a delay that is not whole is modeled."""
-
-    @property
-    def bare(self) -> NormalizedDevice:
-        """The scene without its wall."""
-        return NormalizedDevice(delta=self.delta, d=self.d)
-
-    @property
-    def wall(self) -> NormalizedWall | None:
-        """The scene's wall, where one is given."""
-        if self.alpha is None and self.beta is None:
-            return None
-        return NormalizedWall(alpha=self.alpha or 0.0, beta=self.beta or 0.0)
-
-
 class PhysicalWall(OneKind):
     """A wall in SI units."""
 
@@ -254,6 +179,82 @@ class NormalizedWall(OneKind):
 
     beta: Number = 0.0
     """Normalized damping B T/m."""
+
+
+def _pick_wall(scene: Any, kind: Any) -> Any:
+    """The wall of a scene, of which one number is enough; None where none is given."""
+    given = {name: getattr(scene, name) for name in kind.model_fields}
+    return None if set(given.values()) == {None} else kind(**{name: value or 0.0 for name, value in given.items()})
+
+
+class PhysicalScene(_PhysicalPlant):
+    """The file's device, timing and wall in SI units."""
+
+    what: ClassVar[str] = "a scene"
+
+    stiffness: Annotated[float, quantity_of("stiffness")] | None = None
+    """Stiffness K of the wall in N/m."""
+
+    virtual_damping: Annotated[float, quantity_of("virtual_damping")] | None = None
+    """Damping B of the wall in N s/m."""
+
+    velocity: SimulatedVelocityField | None = None
+    """How the velocity is estimated; the difference of two samples where left out."""
+
+    delay_model: DelayModel = "held"
+    """How a delay that is not whole is modeled."""
+
+    def to_scene(self) -> Scene:
+        """Device, timing and wall; a wall that is not given has no stiffness and no damping."""
+        bare = super().to_scene()
+        wall = VirtualWall(stiffness=self.stiffness or 0.0, virtual_damping=self.virtual_damping or 0.0)
+        return replace(bare, timing=replace(bare.timing, delay_model=self.delay_model), wall=wall)
+
+    @property
+    def bare(self) -> PhysicalDevice:
+        """The scene without its wall, for studies that need a linear velocity estimate."""
+        return self.without_wall(PhysicalDevice)
+
+    def without_wall(self, kind: type[PhysicalDevice]) -> PhysicalDevice:
+        """The scene without its wall, as a device of a kind."""
+        own = {name: getattr(self, name) for name in ("mass", "damping", "period", "delay", "rotary")}
+        return kind(**{name: value for name, value in own.items() if value is not None}, **list_parts(self))
+
+    def limits(self) -> Iterable[LocatedProblem]:
+        yield from super().limits()
+        if not self._is_double and self.delay_model not in self.to_scene().loop.delay_models:
+            allowed = "velocity filters, hands and other parts are computed in the model 'held'"
+            yield ("delay_model",), problem(f"got {self.delay_model!r}", allowed, "write 'delay_model: held'")
+
+    @property
+    def wall(self) -> PhysicalWall | None:
+        """The scene's wall, where one is given."""
+        return _pick_wall(self, PhysicalWall)
+
+
+class NormalizedScene(_NormalizedPlant):
+    """The file's device, timing and wall, normalized."""
+
+    what: ClassVar[str] = "a scene"
+
+    alpha: Number | None = None
+    """Normalized stiffness K T^2/m of the wall."""
+
+    beta: Number | None = None
+    """Normalized damping B T/m of the wall."""
+
+    delay_model: DelayModel = "held"
+    """How a delay that is not whole is modeled."""
+
+    @property
+    def bare(self) -> NormalizedDevice:
+        """The scene without its wall."""
+        return NormalizedDevice(delta=self.delta, d=self.d)
+
+    @property
+    def wall(self) -> NormalizedWall | None:
+        """The scene's wall, where one is given."""
+        return _pick_wall(self, NormalizedWall)
 
 
 def is_adaptive(owner: Any) -> bool:

@@ -107,6 +107,20 @@ class Quantity:
             return _whole_number(self.allowed) if self.whole else _number(self.allowed, self.remedy)
         return raise_problems(self._read_quantity)
 
+    def read_alike(self) -> tuple[Entry, set[str]]:
+        """What reads several values, lengths of time all in seconds or all in periods; and the unit of those read."""
+        units: set[str] = set()
+
+        def entry(raw: Any) -> float:
+            value, unit = self.read(raw)
+            if units - {unit}:
+                allowed = "the delays of an axis are all in seconds or all in periods"
+                raise problem(f"got {describe(raw)}", allowed, f"write all of them in {next(iter(units))}")
+            units.add(unit)
+            return value
+
+        return entry if self.periods else self.read, units
+
     def _read_quantity(self, value: Any) -> float:
         with use_kind(self.turns and is_rotary()):
             return read_quantity(value, find_dimension(self.unit), self.allowed)[0]
@@ -220,21 +234,6 @@ def read_entries(raw: list[Any] | tuple[Any, ...], entry: Entry, *, distinct: bo
     return tuple(entries)
 
 
-def in_one_unit(read: Callable[[Any], Span]) -> tuple[Entry, set[str]]:
-    """Read lengths of time that are all in seconds or all in sampling periods; and the unit that those read have."""
-    units: set[str] = set()
-
-    def entry(raw: Any) -> float:
-        value, unit = read(raw)
-        if units - {unit}:
-            allowed = "the delays of an axis are all in seconds or all in periods"
-            raise problem(f"got {describe(raw)}", allowed, f"write all of them in {next(iter(units))}")
-        units.add(unit)
-        return value
-
-    return entry, units
-
-
 @dataclass(frozen=True)
 class AxisOf:
     """Makes an `Axis` one of a quantity: read, checked, spelled and described in the schema."""
@@ -263,7 +262,7 @@ class AxisOf:
                 unknown = problem("unknown key", f"an axis is {_FORMS}", remedy, on_key=True)
                 raise validation_error("axis", [((form,), unknown)])
         quantity = self._forms.get(form, self.quantity)
-        entry, units = in_one_unit(quantity.read) if quantity.periods else (quantity.read, set())
+        entry, units = quantity.read_alike()
         if quantity.whole:
             # 5.0 is 5, as a store spells the ends of equal steps.
             entry = _accept_whole_floats(entry)

@@ -68,22 +68,16 @@ def make_edges(store: Store) -> Edges:
 
 
 def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:
-    slices = tuple(slice(k, k + 1) for k in place)
+    parameters = store.grid.scene_block(tuple(slice(k, k + 1) for k in place)).parameters
     try:
+        scene = store.study.make_scene({name: float(values[0]) for name, values in parameters.items()})
         if store.study.with_parts:
-            parameters = store.grid.scene_block(slices).parameters
-            scene = store.study.make_scene({name: float(values[0]) for name, values in parameters.items()})
             pieces = scene.stable_region()
             return {"stable": [(np.stack([one.stiffness, one.virtual_damping], -1), one.hole) for one in pieces]}
-        block = store.grid.block(slices)
-        delta, d = float(block.delta[0]), float(block.d[0])
-        found = find_edges(delta, d)
+        found = find_edges(float(scene.delta), float(scene.d))
     except InputError:
         return {}
-    units = np.ones(2)
-    if block.mass.size:
-        rate = float(block.mass[0] / block.period[0])
-        units = np.array([rate / float(block.period[0]), rate])
+    units = np.array(scene.units)
     return {name: [(points * units, hole) for points, hole in outlines] for name, outlines in found.items()}
 
 

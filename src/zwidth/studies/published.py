@@ -12,6 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from zwidth.arrays.roots import bisect
 from zwidth.config.scenes import AnyScene
 from zwidth.config.study import register
 from zwidth.loops.normalization import normalize
@@ -96,12 +97,7 @@ def line_appears() -> float:
     The boundary curve ends at omega = pi, in the corner where two poles meet at z = -1. The line starts there, so it
     bounds the stable set (alpha > 0) from the delta on at which the corner crosses alpha = 0.
     """
-    # Slow to load, and no other kind of study has a use for it.
-    from scipy.optimize import root_scalar
-
-    # To the last digits of float64.
-    exact: dict[str, Any] = {"bracket": (1.0, 6.0), "method": "brentq", "xtol": 1e-15, "rtol": 1e-15}
-    return float(root_scalar(lambda delta: float(boundary(np.pi, delta, 0).alpha), **exact).root)
+    return float(bisect(lambda delta: boundary(np.pi, delta, 0).alpha < 0, np.float64(1.0), np.float64(6.0)))
 
 
 def corner_takes_over() -> float:
@@ -110,12 +106,8 @@ def corner_takes_over() -> float:
     For d = 0 the curve is a graph over beta, ``alpha = (1 - c + beta (phi2 + c psi) - beta^2 psi phi1)/(psi (1 + phi2
     beta))``. Its maximum passes the corner, where the curve ends, when ``d alpha/d beta = 0`` there.
     """
-
     # Extended precision where the machine has it: in float64 rounding blurs the last two digits of this root.
-    low, high = np.longdouble(2.5), np.longdouble(6.0)
-    while low < (middle := (low + high) / 2) < high:
-        low, high = (middle, high) if _slope_at_corner(middle) < 0 else (low, middle)
-    return float(high)
+    return float(bisect(lambda delta: _slope_at_corner(delta) < 0, np.longdouble(2.5), np.longdouble(6.0)))
 
 
 def _slope_at_corner(delta: np.longdouble) -> np.longdouble:

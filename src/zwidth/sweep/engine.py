@@ -10,7 +10,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from zwidth.sweep.files import differences, digest, versions
 from zwidth.sweep.jobs import Finished, Job, LostSchedulerError, in_this_process, in_workers
@@ -89,46 +89,30 @@ def compute_sweeps(
             from zwidth.sweep.distributed import connected
 
             client = stack.enter_context(connected(scheduler))
-        stores, repaired = _prepare_stores(planned, folder, about, shard)
-        sweeps = Sweeps(
-            {name: SweepResult(store.path, repaired=tuple(repaired[name])) for name, store in stores.items()}
-        )
-        chunks: dict[Job, _Chunk] = {}
-        for name, store in stores.items():
-            tasks, sweep = _pick_share(store.plan, shard), sweeps.results[name]
-            missing = [task for task in tasks if not store.is_done(task)]
-            chunks |= {Job(str(store.path), task): _Chunk(name, store, task) for task in missing}
-            sweep.total, sweep.skipped = len(tasks), len(tasks) - len(missing)
-        if chunks:
+        sweeps, stores, jobs = Sweeps({}), {}, []
+        for study, plan in planned:
+            store, repaired = _prepare_store(study, plan, folder, about, shard)
+            tasks = _pick_share(store.plan, shard)
+            missing = [Job(str(store.path), task) for task in tasks if not store.is_done(task)]
+            skipped, total = len(tasks) - len(missing), len(tasks)
+            sweeps.results[study.name] = SweepResult(store.path, 0, skipped, total, repaired)
+            stores[str(store.path)] = store
+            jobs += missing
+        if jobs:
             if client is not None:
                 from zwidth.sweep.distributed import on_cluster
 
-                finished = on_cluster(list(chunks), client, perform)
+                finished = on_cluster(jobs, client, perform)
             elif workers is not None:
-                finished = in_workers(list(chunks), workers, perform)
+                finished = in_workers(jobs, workers, perform)
             else:
-                finished = in_this_process(list(chunks), perform)
+                finished = in_this_process(jobs, perform)
             try:
-                _follow(finished, chunks, sweeps, progress)
+                _follow(finished, jobs, stores, sweeps, progress)
             except LostSchedulerError as error:
                 sweeps.lost = f"scheduler: {scheduler} {error}"
-            _count(chunks, sweeps)
+            _count(jobs, stores, sweeps)
         return sweeps
-
-
-class _Chunk(NamedTuple):
-    """One chunk of one sweep."""
-
-    study: str
-    store: Store
-    task: Task
-
-    @property
-    def points(self) -> int:
-        return self.store.plan.points(self.task)
-
-    def __str__(self) -> str:
-        return f"{self.study}/{self.store.plan.describe(self.task)}"
 
 
 def _pick_share(plan: Plan, shard: tuple[int, int] | None) -> list[Task]:
@@ -149,42 +133,42 @@ def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool)
         check_same(Store(path), study)
 
 
-def _prepare_stores(
-    planned: Sequence[tuple[SweepStudy, Plan]], folder: Path, about: Mapping[str, Any], shard: tuple[int, int] | None
-) -> tuple[dict[str, Store], dict[str, list[str]]]:
-    """The stores of all sweeps, made or found, and what was repaired in them."""
-    stores, repaired = {}, {}
-    for study, plan in planned:
-        path = store_path(folder, study)
-        if path.exists():
-            stores[study.name] = store = Store(path)
-            if shard is None:
-                # Unfinished files of a run that was killed.
-                for left in path.rglob("*.partial"):
-                    left.unlink(missing_ok=True)
-            repaired[study.name] = [f"{study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard))]
-        else:
-            stores[study.name] = new_store(folder, study, plan, about, shared=shard is not None)
-            repaired[study.name] = []
-    return stores, repaired
+def _prepare_store(
+    study: SweepStudy, plan: Plan, folder: Path, about: Mapping[str, Any], shard: tuple[int, int] | None
+) -> tuple[Store, tuple[str, ...]]:
+    """The store of a sweep, made or found, and what was repaired in it."""
+    path = store_path(folder, study)
+    if not path.exists():
+        return _make_store(path, study, plan, about), ()
+    store = Store(path)
+    if shard is None:
+        # Unfinished files of a run that was killed.
+        for left in path.rglob("*.partial"):
+            left.unlink(missing_ok=True)
+    return store, tuple(f"{study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard)))
 
 
 def _follow(
-    results: Generator[Finished], chunks: dict[Job, _Chunk], sweeps: Sweeps, progress: Callable[[Progress], None]
+    results: Generator[Finished],
+    jobs: list[Job],
+    stores: dict[str, Store],
+    sweeps: Sweeps,
+    progress: Callable[[Progress], None],
 ) -> None:
     start, ended, computed = time.perf_counter(), 0, 0
-    total = sum(chunk.points for chunk in chunks.values())
+    total = sum(stores[job.path].plan.points(job.task) for job in jobs)
     try:
         for number, finished in enumerate(results, start=1):
-            chunk = chunks[finished.job]
-            ended += chunk.points
+            store, task = stores[finished.job.path], finished.job.task
+            points, name = store.plan.points(task), store.study.name
+            ended += points
             if finished.error:
-                sweeps.results[chunk.study].failed[str(chunk)] = finished.error
+                sweeps.results[name].failed[store.name(task)] = finished.error
             else:
-                computed += chunk.points
+                computed += points
             rate = computed / max(time.perf_counter() - start, 1e-9)
             left = (total - ended) / rate if rate else math.nan
-            progress(Progress(chunk.study, number, len(chunks), ended, total, rate, left, finished.error))
+            progress(Progress(name, number, len(jobs), ended, total, rate, left, finished.error))
             if finished.hopeless:
                 sweeps.hopeless = finished.error
                 return
@@ -195,25 +179,26 @@ def _follow(
         results.close()
 
 
-def _count(chunks: dict[Job, _Chunk], sweeps: Sweeps) -> None:
+def _count(jobs: list[Job], stores: dict[str, Store], sweeps: Sweeps) -> None:
     """Count the chunks that are done: not those that an engine calls so, but those that the stores hold."""
     over = sweeps.hopeless or sweeps.interrupted or sweeps.lost
-    for chunk in chunks.values():
-        sweep = sweeps.results[chunk.study]
-        if chunk.store.holds(chunk.task):
+    for path, task in jobs:
+        store = stores[path]
+        sweep = sweeps.results[store.study.name]
+        if store.holds(task):
             sweep.computed += 1
             # Somebody else has done it in the meantime, a worker that was given up say.
-            sweep.failed.pop(str(chunk), None)
+            sweep.failed.pop(store.name(task), None)
         elif not over:
-            sweep.failed.setdefault(str(chunk), "it was computed, and is not in the store")
+            sweep.failed.setdefault(store.name(task), "it was computed, and is not in the store")
 
 
 def store_path(folder: Path, study: SweepStudy) -> Path:
     return folder / f"{study.name}{SUFFIX}"
 
 
-def new_store(folder: Path, study: SweepStudy, plan: Plan, about: Mapping[str, Any], *, shared: bool) -> Store:
-    """Make the store of a study; where other runs share it, one of them may have been faster."""
+def _make_store(path: Path, study: SweepStudy, plan: Plan, about: Mapping[str, Any]) -> Store:
+    """Make the store of a study; where other runs share the folder, one of them may have been faster."""
     attributes = {
         "title": f"{about['name']}: {study.name}",
         "comment": about["description"],
@@ -226,7 +211,7 @@ def new_store(folder: Path, study: SweepStudy, plan: Plan, about: Mapping[str, A
         "study": study.model_dump(mode="json", exclude_none=True),
         "plan": plan.as_dict(),
     }
-    store = create(store_path(folder, study), attributes, may_exist=shared)
+    store = create(path, attributes)
     check_same(store, study)
     return store
 

@@ -26,7 +26,7 @@ from zwidth.sweep.files import checksum, content, digest, hidden_beside, remove_
 from zwidth.sweep.grid import Grid
 from zwidth.sweep.plan import Plan, Task, kept_plan
 from zwidth.sweep.study import SweepStudy
-from zwidth.words.errors import InputError, StoreError, StoreExistsError
+from zwidth.words.errors import InputError, StoreError
 from zwidth.words.quantities import NOT_COMPUTED, OUTPUTS, STATUS_OF, status_flags
 from zwidth.words.rotation import own_unit
 
@@ -120,6 +120,10 @@ class Store:
         # To look whether a chunk holds its fill value alone takes Zarr longer than to write it.
         return {name: array.with_config({"write_empty_chunks": True}) for name, array in arrays.items()}
 
+    def name(self, task: Task) -> str:
+        """A chunk by its study, for messages."""
+        return f"{self.study.name}/{self.plan.describe(task)}"
+
     def files(self, task: Task) -> list[Path]:
         """The files that hold a chunk, in the order of its variables."""
         family = self.plan.family(task.family)
@@ -202,18 +206,14 @@ class Store:
                 os.replace(fresh / name, self.path / name)
 
 
-def create(path: Path, attributes: dict[str, Any], *, may_exist: bool = False) -> Store:
+def create(path: Path, attributes: dict[str, Any]) -> Store:
     """Make an empty store, at once and whole, or take one that another process has made in the meantime."""
     with _build_beside(path, attributes) as fresh:
         try:
             os.rename(fresh, path)
-        except OSError as error:
+        except OSError:
             if not path.exists():
                 raise
-            if not may_exist:
-                raise StoreExistsError(
-                    f"out: {path} exists already; go on with it with --resume, or choose another folder with --out DIR"
-                ) from error
     return Store(path)
 
 

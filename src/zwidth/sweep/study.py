@@ -15,7 +15,7 @@ from zwidth.config.faults import LocatedProblem, listing, problem, unlisted
 from zwidth.config.fields import Strict, describe_parameter, members
 from zwidth.config.mass import Rotary, find_second_device, find_second_period, tell_rotary
 from zwidth.config.parts import build_parts, list_parts, locate_refusal, make_parts_base
-from zwidth.config.scenes import AnyScene, PhysicalScene
+from zwidth.config.scenes import AnyScene, NormalizedDevice, PhysicalScene
 from zwidth.config.study import HeldOnly, Study, register
 from zwidth.config.values import Axis, Quantity, axis_of
 from zwidth.loops.linear.passivity import find_obstacle
@@ -320,6 +320,8 @@ class SweepStudy(_Parts, _Swept):
 
     def make_scene(self, values: dict[str, float]) -> Scene:
         """The scene at a point of the grid, from the parameters that the axes give."""
+        if not self.axes.physical:
+            return NormalizedDevice(delta=values["delta"], d=values["d"]).to_scene()
         given = dict(values)
         period = 1.0 / given.pop("rate") if "rate" in given else given.pop("period")
         delay = given.pop("delay", 0.0) * (period if self.axes.delay_in_periods else 1.0)

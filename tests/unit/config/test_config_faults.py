@@ -1,6 +1,7 @@
 """Every faulty file is reported in full, at the exact place, with a remedy."""
 
 import pickle
+import re
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,17 @@ from zwidth.config.faults import ConfigFileError
 from zwidth.config.reader import _Tree, read_mapping
 from zwidth.studies.document import Config, load_config
 
-FOLDER = Path(__file__).parents[2] / "data" / "bad_configs"
+# The files by their names: texts below each other, each behind a line with its name, and those that are no plain text.
+_PARTS = re.split(r"^=== (\w+)\n", (Path(__file__).parent / "bad_configs.txt").read_text(encoding="utf-8"), flags=re.M)
+FILES = {name: text.encode() for name, text in zip(_PARTS[1::2], _PARTS[2::2], strict=True)} | {
+    "control_character": b"version: 1\nname: bad\ndescription: a\x07b\n",
+    "not_utf8": b"version: 1\nname: bad\ndescription: caf\xe9\n",
+    "tab": b"version: 1\nname: bad\nscene:\n\tmass: 0.1 kg\n\tperiod: 1 ms\n",
+    "too_many_values": b"version: 1\nname: bad\nstudies: [" + 50_001 * b"1," + b"]\n",
+    "utf16": "version: 1\nname: bad\nstudies:\n  - kind: ridge\n    name: r\n    delta: [0, 1]\n    d: 1\n".encode(
+        "utf-16"
+    ),
+}
 
 # file: for each fault, in the order of their places, how its message begins (line:column: field: problem)
 # and how its remedy begins.
@@ -165,13 +176,25 @@ def faults_of(path):
     return caught.value
 
 
-def test_the_table_and_the_folder_agree():
-    assert {path.stem for path in FOLDER.iterdir()} == set(FAULTS)
+@pytest.fixture
+def faulty(tmp_path):
+    """What writes one of the files."""
+
+    def write(name):
+        path = tmp_path / f"{name}.yaml"
+        path.write_bytes(FILES[name])
+        return path
+
+    return write
+
+
+def test_every_file_has_its_faults():
+    assert set(FILES) == set(FAULTS)
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_faults_and_their_places(name):
-    path = FOLDER / f"{name}.yaml"
+def test_faults_and_their_places(faulty, name):
+    path = faulty(name)
     error = faults_of(path)
     lines = str(error).splitlines()
     assert len(lines) == len(error.faults) == len(FAULTS[name])
@@ -182,8 +205,8 @@ def test_faults_and_their_places(name):
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_dict_has_the_faults_of_a_file_without_places(name):
-    file = FOLDER / f"{name}.yaml"
+def test_a_dict_has_the_faults_of_a_file_without_places(faulty, name):
+    file = faulty(name)
     try:
         tree = _Tree(str(file), file.read_text(encoding="utf-8-sig"))
     except ValueError:
@@ -234,8 +257,8 @@ def test_a_device_instead_of_a_file():
     assert str(faults_of("/dev/zero")).startswith("/dev/zero: got no regular file; ")
 
 
-def test_the_error_travels_between_processes():
-    error = faults_of(FOLDER / "many_faults.yaml")
+def test_the_error_travels_between_processes(faulty):
+    error = faults_of(faulty("many_faults"))
     copy = pickle.loads(pickle.dumps(error))
     assert str(copy) == str(error)
     assert copy.faults == error.faults
