@@ -41,23 +41,15 @@ def make_edges(store: Store) -> Edges:
     The part is one of `zwidth.figures.grid.prepare`. Outlines are in its units, stiffness first. Of what is not a
     plane of walls, and where nothing is proved, there are none.
     """
-    grid = store.grid
+    known = store.grid.coordinates()
+    dims = [dim.replace(".", "_") for dim in store.grid.device_dims]
     at_device = cache(lambda place: _outline(store, place))
 
     def edges(part: xarray.Dataset) -> dict[str, Outlines]:
         walls = {str(dim) for dim in part.dims}
         if walls not in _PLANES:
             return {}
-        places = []
-        for dim in grid.device_dims:
-            if dim not in part.coords:
-                places.append(0)
-            elif dim == "device":
-                labels = [str(label) for label in grid.coordinates()["device"][1]]
-                places.append(labels.index(str(part["device"].values)))
-            else:
-                value = float(part[dim]) / part[dim].attrs["factor"]
-                places.append(int(np.argmin(np.abs(np.asarray(grid.coordinates()[dim][1]) - value))))
+        places = [_find_place(known[dim][1], part[dim]) if dim in part.coords else 0 for dim in dims]
         factors = [
             part[dim].attrs["factor"] for dim in sorted(walls, key=lambda dim: dim not in ("alpha", "stiffness"))
         ]
@@ -65,6 +57,13 @@ def make_edges(store: Store) -> Edges:
         return {name: [(points * factors, hole) for points, hole in outlines] for name, outlines in found.items()}
 
     return edges
+
+
+def _find_place(values: np.ndarray, coordinate: xarray.DataArray) -> int:
+    """The index of a part's value among those of the sweep."""
+    if values.dtype.kind == "U":
+        return values.tolist().index(str(coordinate.values))
+    return int(np.argmin(np.abs(values - float(coordinate) / coordinate.attrs["factor"])))
 
 
 def _outline(store: Store, place: tuple[int, ...]) -> dict[str, Outlines]:

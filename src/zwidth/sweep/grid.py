@@ -84,13 +84,9 @@ class Grid:
                 else own_unit(PARAMETERS[name].unit)
             )
             attributes = {"long_name": PARAMETERS[name].long_name, "units": units}
-            variable = PARAMETERS[name].variable
-            if table is not None and name in table.columns:
-                found[variable] = (("device",), values, attributes)
-            elif name in self.sizes:
-                found[variable] = ((variable,), values, attributes)
-            else:
-                found[variable] = ((), values[0], attributes)
+            variable, dim = PARAMETERS[name].variable, self._dim_of(name)
+            dims = () if dim is None else (dim.replace(".", "_"),)
+            found[variable] = (dims, values if dims else values[0], attributes)
         return found
 
     def block(self, place: tuple[slice, ...]) -> Block:

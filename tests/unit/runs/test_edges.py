@@ -25,6 +25,7 @@ IN_SI = {
     "delay": "1 ms",
 }
 FILTERED = {**IN_SI, "devices": {"label": ["one"], "mass": [0.1], "damping": [5]}}
+CUT_OFF = {**FILTERED, "velocity.cutoff": ["50 Hz", "400 Hz"]}
 
 
 @pytest.fixture(scope="module")
@@ -34,6 +35,7 @@ def folder(tmp_path_factory):
         study("walls", axes=WALLS, outputs=("stable", "passive")),
         study("si", axes=IN_SI, outputs=("stable", "settling_time")),
         study("filtered", axes=FILTERED, velocity={"kind": "low_pass", "cutoff": "50 Hz"}),
+        study("cut_off", axes=CUT_OFF, velocity={"kind": "low_pass", "cutoff": "50 Hz"}),
     ]
     assert run_sweeps(config_of(*studies), folder).ok
     return folder
@@ -85,6 +87,14 @@ def test_scenes_with_parts_have_their_own_edges(folder):
         assert set(scene.is_stable(1e3 * stiffness, damping)) == {stable}
     (ax,) = draw_plane(data, "stable", edges=edges)
     assert exact_lines(ax)
+
+
+@pytest.mark.parametrize("k, cutoff", [(0, 50.0), (1, 400.0)])
+def test_each_value_of_a_part_has_its_own_edge(folder, k, cutoff):
+    data, edges = opened(folder, "cut_off")
+    ((points, _), *_) = edges(prepare(data, ["stable"]).isel(velocity_cutoff=k))["stable"]
+    scene = Scene(Device(mass=0.1, damping=5), Timing(period=1e-3, delay=1e-3), velocity=LowPass(cutoff))
+    assert 1e3 * points[:, 0].max() == pytest.approx(float(scene.max_stiffness().stiffness), rel=1e-3)
 
 
 def exact_lines(ax):
