@@ -118,6 +118,7 @@ class Study(Strict):
         }
         if "device" in cls.from_scene and isinstance(scene, PhysicalScene):
             supplied["device"] = scene.without_wall(SimulatedDevice if cls.simulates else PhysicalDevice)
+            supplied |= {"stiffness": scene.stiffness} if scene.stiffness else {}
         if "devices" in cls.from_scene:
             supplied["devices"] = [scene.bare]
         return {**{name: supplied[name] for name in cls.from_scene if name in supplied}, **raw}

@@ -163,33 +163,34 @@ def run(
     folder, clock = Path(os.path.abspath(shown)), time.perf_counter()
     pieces = [study for study in config.studies if isinstance(study, ComputedStudy)]
     pieces = pieces if shard is None or shard[0] == 1 else []
-    planned = [(study, make_plan(study, memory=memory)) for study in config.studies if isinstance(study, SweepStudy)]
-    if planned:
+    plans = [make_plan(study, memory=memory) for study in config.studies if isinstance(study, SweepStudy)]
+    sweeps = [plan.study for plan in plans]
+    if plans:
         check_installed()
     # What does not fit, or not belong there, is refused before anything is made.
     Record(folder).check_free(text, overwrite=overwrite, going_on=going_on)
-    begun = {study.name for study, _ in planned if store_path(folder, study).exists()}
-    check_resources([plan for _, plan in planned], folder, workers or 1, begun=set() if overwrite else begun)
+    begun = {study.name for study in sweeps if store_path(folder, study).exists()}
+    check_resources(plans, folder, workers or 1, begun=set() if overwrite else begun)
     with holding(folder, shard):
         record = Record(folder)
         record.check_free(text, overwrite=overwrite, going_on=going_on)
         inputs = _list_inputs(config, names)
         if overwrite:
             record.clear()
-            for study, _ in planned:
+            for study in sweeps:
                 remove(folder, study)
-        record.check_same({study.name: inputs[study.name] for study in (*pieces, *(one for one, _ in planned))})
-        check_stores([study for study, _ in planned], folder, going_on=going_on)
+        record.check_same({study.name: inputs[study.name] for study in (*pieces, *sweeps)})
+        check_stores(sweeps, folder, going_on=going_on)
         if shard is None:
             record.sweep_up()
-        job = _Run(config, record, inputs, progress or (lambda event: None), len(pieces) + len(planned))
+        job = _Run(config, record, inputs, progress or (lambda event: None), len(pieces) + len(plans))
         digest = hashlib.sha256(text.encode("utf-8")).hexdigest()
         record.start(name=config.name, description=config.description, config_sha256=digest)
         record.keep_config(text, files)
         job.do(pieces)
         about = {"name": config.name, "description": config.description, "config": _spell(config)}
-        if planned and not job.over:
-            job.sweep(planned, about, shard=shard, workers=workers, scheduler=scheduler)
+        if plans and not job.over:
+            job.sweep(plans, about, shard=shard, workers=workers, scheduler=scheduler)
     seconds = time.perf_counter() - clock
     ends = job.hopeless, job.interrupted, job.lost
     return RunResult(shown, tuple(job.results), seconds, tuple(job.repaired), *ends)
@@ -273,10 +274,10 @@ class _Run:
         about = study.name, study.kind_name(), state, seconds, files
         return StudyResult(*about, outcome.notes, outcome.answer, _describe_error(error), error)
 
-    def sweep(self, planned: list[tuple[SweepStudy, Plan]], about: dict[str, Any], **options: Any) -> None:
+    def sweep(self, plans: list[Plan], about: dict[str, Any], **options: Any) -> None:
         """Compute the sweeps, all together, so that workers are started once."""
         clock = time.perf_counter()
-        number = {study.name: len(self.results) + k for k, (study, _) in enumerate(planned, start=1)}
+        number = {plan.study.name: len(self.results) + k for k, plan in enumerate(plans, start=1)}
         begun: set[str] = set()
 
         def follow(progress: Progress) -> None:
@@ -286,18 +287,18 @@ class _Run:
                 self.tell(replace(event, progress=None))
             self.tell(event)
 
-        for study, _ in planned:
+        for plan in plans:
             # Named before it is made: what a killed run leaves is its own.
-            self.record.note(self._spell_sweep(study, "open"))
+            self.record.note(self._spell_sweep(plan.study, "open"))
         try:
             with use_kind(self.config.rotary):
-                sweeps = compute_sweeps(planned, self.record.folder, about, progress=follow, **options)
+                sweeps = compute_sweeps(plans, self.record.folder, about, progress=follow, **options)
         except KeyboardInterrupt:
             # Before the first chunk began.
             self.interrupted = True
             return
         self.hopeless, self.interrupted, self.lost = sweeps.hopeless, sweeps.interrupted, sweeps.lost
-        for study, _ in planned:
+        for study in (plan.study for plan in plans):
             sweep = sweeps.results[study.name]
             self.repaired += sweep.repaired
             # A shard that ends last finds the others' chunks done as well.

@@ -15,7 +15,7 @@ from pydantic import BeforeValidator, ValidationInfo, WithJsonSchema
 from zwidth import figures
 from zwidth.config.faults import LocatedProblem, listing, problem
 from zwidth.config.parts import locate_refusal
-from zwidth.config.scenes import AnyScene, PhysicalDevice, PhysicalScene
+from zwidth.config.scenes import AnyScene, PhysicalDevice
 from zwidth.config.study import register
 from zwidth.config.values import Axis, Fraction, Quantity, axis_of, quantity_of, read_entries
 from zwidth.figures.table import SI_COLUMNS, stack
@@ -101,13 +101,6 @@ class DesignStudy(ComputedStudy):
 
     samples: Count | None = None
     """Devices drawn for each wanted stiffness; 10000, or 200 of a device with parts, where left out."""
-
-    @classmethod
-    def fill(cls, raw: dict[str, Any], scene: AnyScene) -> dict[str, Any]:
-        if not isinstance(scene, PhysicalScene):
-            return raw
-        wanted = {} if not scene.stiffness else {"stiffness": scene.stiffness}
-        return {"device": scene.bare, **wanted, **raw}
 
     @classmethod
     def missing(cls, name: str) -> tuple[str, str]:

@@ -65,7 +65,7 @@ class Sweeps:
 
 
 def compute_sweeps(
-    planned: Sequence[tuple[SweepStudy, Plan]],
+    plans: Sequence[Plan],
     folder: Path,
     about: Mapping[str, Any],
     *,
@@ -90,12 +90,12 @@ def compute_sweeps(
 
             client = stack.enter_context(connected(scheduler))
         sweeps, stores, jobs = Sweeps({}), {}, []
-        for study, plan in planned:
-            store, repaired = _prepare_store(study, plan, folder, about, shard)
+        for plan in plans:
+            store, repaired = _prepare_store(plan, folder, about, shard)
             tasks = _pick_share(store.plan, shard)
             missing = [Job(str(store.path), task) for task in tasks if not store.is_done(task)]
             skipped, total = len(tasks) - len(missing), len(tasks)
-            sweeps.results[study.name] = SweepResult(store.path, 0, skipped, total, repaired)
+            sweeps.results[plan.study.name] = SweepResult(store.path, 0, skipped, total, repaired)
             stores[str(store.path)] = store
             jobs += missing
         if jobs:
@@ -134,18 +134,18 @@ def check_stores(studies: Sequence[SweepStudy], folder: Path, *, going_on: bool)
 
 
 def _prepare_store(
-    study: SweepStudy, plan: Plan, folder: Path, about: Mapping[str, Any], shard: tuple[int, int] | None
+    plan: Plan, folder: Path, about: Mapping[str, Any], shard: tuple[int, int] | None
 ) -> tuple[Store, tuple[str, ...]]:
     """The store of a sweep, made or found, and what was repaired in it."""
-    path = store_path(folder, study)
+    path = store_path(folder, plan.study)
     if not path.exists():
-        return _make_store(path, study, plan, about), ()
+        return _make_store(path, plan, about), ()
     store = Store(path)
     if shard is None:
         # Unfinished files of a run that was killed.
         for left in path.rglob("*.partial"):
             left.unlink(missing_ok=True)
-    return store, tuple(f"{study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard)))
+    return store, tuple(f"{plan.study.name}/{what}" for what in repair(store, _pick_share(store.plan, shard)))
 
 
 def _follow(
@@ -197,10 +197,10 @@ def store_path(folder: Path, study: SweepStudy) -> Path:
     return folder / f"{study.name}{SUFFIX}"
 
 
-def _make_store(path: Path, study: SweepStudy, plan: Plan, about: Mapping[str, Any]) -> Store:
+def _make_store(path: Path, plan: Plan, about: Mapping[str, Any]) -> Store:
     """Make the store of a study; where other runs share the folder, one of them may have been faster."""
     attributes = {
-        "title": f"{about['name']}: {study.name}",
+        "title": f"{about['name']}: {plan.study.name}",
         "comment": about["description"],
         "source": f"zwidth {versions()['zwidth']}",
         "history": f"{datetime.now(UTC).isoformat(timespec='seconds')} made by zwidth run",
@@ -208,11 +208,11 @@ def _make_store(path: Path, study: SweepStudy, plan: Plan, about: Mapping[str, A
         "versions": versions(),
         "config": about["config"],
         "config_sha256": digest(about["config"]),
-        "study": study.model_dump(mode="json", exclude_none=True),
+        "study": plan.study.model_dump(mode="json", exclude_none=True),
         "plan": plan.as_dict(),
     }
     store = create(path, attributes)
-    check_same(store, study)
+    check_same(store, plan.study)
     return store
 
 

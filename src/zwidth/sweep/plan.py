@@ -97,7 +97,7 @@ class FamilyPlan:
 class Plan:
     """What a sweep will do."""
 
-    study: str
+    study: SweepStudy
     families: tuple[FamilyPlan, ...]
     methods: Methods  # of every output that is found by a method of its own
     reasons: Methods  # why it is that one
@@ -133,7 +133,7 @@ class Plan:
         }
 
     def lines(self) -> Iterator[str]:
-        yield f"study {self.study}"
+        yield f"study {self.study.name}"
         for family in self.families:
             chunk = " x ".join(map(str, family.chunks))
             points = math.prod(family.shape)
@@ -172,7 +172,7 @@ def make_plan(study: SweepStudy, *, memory: int = MEMORY) -> Plan:
     disk = sum(math.prod(plan.shape) * each for plan, each in zip(families, bits, strict=True)) // 8 + 2**16
     reasons = {name: reason for name, (_, reason) in chosen.items()}
     model = "device with parts, held delay" if study.with_parts else _model(study.axes.most_periods)
-    return Plan(study.name, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
+    return Plan(study, tuple(families), methods, reasons, model, largest + _LAID_OUT_BYTES, disk, seconds)
 
 
 def kept_plan(study: SweepStudy, kept: dict[str, Any]) -> Plan:
@@ -223,13 +223,14 @@ def check_resources(plans: list[Plan], folder: Path, workers: int, begun: Collec
     if not plans:
         return
     free = shutil.disk_usage(existing(folder)).free
-    disk = sum(plan.disk for plan in plans if plan.study not in begun)
+    new = [plan for plan in plans if plan.study.name not in begun]
+    disk = sum(plan.disk for plan in new)
     if disk > free:
-        largest = max((plan for plan in plans if plan.study not in begun), key=lambda plan: plan.disk)
+        largest = max(new, key=lambda plan: plan.disk)
         raise ResourceError(
             f"out: {folder} has {_size(free)} free, but the results may take {_size(disk)}, most of them of "
-            f"studies[{largest.study}].axes ({largest.extent}); choose another folder with --out DIR, fewer outputs or "
-            "fewer values on an axis"
+            f"studies[{largest.study.name}].axes ({largest.extent}); choose another folder with --out DIR, fewer "
+            "outputs or fewer values on an axis"
         )
     total = _machine_memory()
     memory = max(workers * (plan.memory + IDLE_MEMORY) for plan in plans)
