@@ -19,7 +19,7 @@ from zwidth.parts.velocity import (
     WindowedDifference,
 )
 from zwidth.scenes.answers import SceneAnswers
-from zwidth.scenes.stiffest import StiffestWall, stiffest_wall
+from zwidth.scenes.stiffest import StiffestWall
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import plain, tell_apart, to_json, with_unit
 from zwidth.words.rotation import in_own_units
@@ -289,7 +289,7 @@ def describe_islands(scene: Scene) -> list[str]:
 def _stiffness(scene: Scene) -> float:
     """K_max in N/m; NaN where there is none or it cannot be computed."""
     try:
-        wall = stiffest_wall(scene)
+        wall = scene.max_stiffness()
     except InputError:
         # At twice the rate a long delay may be more periods than the model is computed for.
         return float("nan")

@@ -24,7 +24,8 @@ from zwidth.parts.timing import Timing
 from zwidth.parts.velocity import BackwardDifference, Velocity
 from zwidth.parts.wall import NoWall, VirtualWall
 from zwidth.scenes.answers import SceneAnswers
-from zwidth.scenes.optima import SceneOptima
+from zwidth.scenes.recommendation import SceneAdvice
+from zwidth.scenes.stiffest import SceneOptima
 from zwidth.simulation.simulate import simulate
 from zwidth.words.errors import InputError
 from zwidth.words.rotation import in_own_units, wrap_methods
@@ -49,7 +50,7 @@ class WallSI(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene(SceneAnswers, SceneOptima):
+class Scene(SceneAnswers, SceneOptima, SceneAdvice):
     """A device, its timing, the velocity estimate, the hand and, where one is chosen, the wall that is rendered.
 
     Args:

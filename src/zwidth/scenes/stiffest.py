@@ -1,4 +1,4 @@
-"""The stiffest stable wall of a scene in SI units."""
+"""What is best on a scene: its stiffest wall, what buys more, what a stiffness requires, the damping that suits it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from zwidth.arrays.xp import is_jax, is_traced
 from zwidth.loops.linear.margins import OpenLoop
+from zwidth.loops.linear.ridge import SceneSensitivities
 from zwidth.parts.checks import read_texts
 from zwidth.parts.velocity import BackwardDifference
 from zwidth.parts.wall import resolve_wall
@@ -38,16 +39,6 @@ class StiffestWall(NamedTuple):
 def allows_negative(scene: Any, negative_damping: bool | None) -> bool:
     """Whether walls with B < 0 count: by default only where B acts on the plain difference of two samples."""
     return isinstance(scene.velocity, BackwardDifference) if negative_damping is None else bool(negative_damping)
-
-
-def stiffest_wall(scene: Any, negative_damping: bool | None = None) -> StiffestWall:
-    """See `zwidth.Scene.max_stiffness`."""
-    alpha, beta, omega, kind, status = scene.loop.stiffest(allows_negative(scene, negative_damping))
-    mass, period = (value if is_traced(value) else float(value) for value in (scene.mass, scene.timing.period))
-    rate = mass / period
-    # In the order of `zwidth.max_stiffness`, for the same last digit.
-    values = (alpha * rate / period, beta * rate, omega / (2.0 * math.pi * period), kind, status)
-    return StiffestWall(*(value if is_jax(value) else np.asarray(value)[()] for value in values))
 
 
 def choose_damping(scene: Any, top: StiffestWall, stiffness: float) -> float:
@@ -100,55 +91,12 @@ class RequiredValue(NamedTuple):
     status: Status
 
 
-def require(
-    scene: Any,
-    parameter: str,
-    stiffness: Any,
-    within: tuple[Any, Any] | None = None,
-    negative_damping: bool | None = None,
-) -> RequiredValue:
-    """See `zwidth.Scene.required`."""
-    stiffness = read_texts("stiffness", stiffness, "N/m")
+def _read_stiffness(given: Any) -> float:
+    """A stiffness that is wanted, in N/m."""
+    stiffness = read_texts("stiffness", given, "N/m")
     if not (isinstance(stiffness, int | float | np.number) and math.isfinite(stiffness) and stiffness > 0):
         raise InputError(f"stiffness: got {stiffness!r}; it must be finite and greater than 0 (in {own_unit('N/m')})")
-    now = _present_value(scene, parameter)
-    low, high = _range(parameter, now, within)
-
-    def surplus(value: float) -> float:
-        """How K_max compares with the wanted stiffness, in logarithms; NaN where it cannot be computed."""
-        wall = stiffest_wall(scene.replace(**{parameter: value}), negative_damping)
-        if wall.status == Status.NO_BOUNDARY:
-            return -_HARDLY_ANY
-        return math.log(wall.stiffness / stiffness) if wall.status == Status.OK else math.nan
-
-    grid, values = [], []
-    for value in np.geomspace(low, high, _POINTS).tolist():
-        try:
-            values.append(surplus(value))
-        except InputError:
-            # The range ends where values are refused, as for a cut-off at half the sampling rate.
-            continue
-        grid.append(value)
-    if not grid:
-        raise InputError(f"within: {parameter} cannot have any value from {low:g} to {high:g}")
-    low, high = grid[0], grid[-1]
-    enough = [value >= 0 for value in values if not math.isnan(value)]
-    if not enough or not any(enough):
-        status = Status.UNREACHABLE if enough and len(enough) == len(values) else Status.NOT_CONVERGED
-        return RequiredValue(math.nan, "nowhere", (), (low, high), status)
-    if len(enough) == len(values) and all(enough):
-        return RequiredValue(min(max(now, low), high), "everywhere", (), (low, high), Status.OK)
-    found = tuple(
-        _cross(surplus, grid[k], grid[k + 1])
-        for k in range(len(grid) - 1)
-        if (values[k] >= 0) != (values[k + 1] >= 0) and not math.isnan(values[k] + values[k + 1])
-    )
-    proved = tuple(crossing for crossing in found if crossing is not None)
-    if not proved or len(proved) < len(found):
-        return RequiredValue(math.nan, "nowhere", proved, (low, high), Status.NOT_CONVERGED)
-    middle = now if now > 0 else low
-    best = min(proved, key=lambda crossing: abs(math.log(crossing.value / middle)))
-    return RequiredValue(best.value, best.enough, proved, (low, high), Status.OK)
+    return float(stiffness)
 
 
 def _present_value(scene: Any, parameter: str) -> float:
@@ -204,35 +152,6 @@ class BestDamping(NamedTuple):
     status: Status
 
 
-def find_best_damping(
-    scene: Any, stiffness: float | str | None, goal: Goal, negative_damping: bool | None = None
-) -> BestDamping:
-    """See `zwidth.Scene.best_damping`."""
-    check_choice("goal", goal, get_args(Goal))
-    given = resolve_wall(scene.wall, None, None)[0] if stiffness is None else stiffness
-    stiffness = float(read_texts("stiffness", given, "N/m"))
-    if not (math.isfinite(stiffness) and stiffness > 0):
-        raise InputError(f"stiffness: got {stiffness:g}; it must be finite and greater than 0 (in {own_unit('N/m')})")
-
-    units = scene.units
-
-    def radius(beta: Any) -> np.ndarray:
-        return scene.spectral_radius(stiffness, beta * units.virtual_damping)
-
-    @np.vectorize
-    def margin(beta: float) -> float:
-        loop = scene.loop
-        wall = OpenLoop.lay_out(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
-        return wall.least_distance()[0]
-
-    cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
-    columns = soft_dampings(scene, stiffness, negative_damping)
-    if not columns:
-        return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
-    best = min((find_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))
-    return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)
-
-
 def find_lowest(
     cost: Callable[[np.ndarray], np.ndarray], low: float, high: float, samples: int = _SAMPLES, steps: int = _STEPS
 ) -> float:
@@ -253,3 +172,189 @@ def find_lowest(
         left, right = np.where(is_right, left, end), np.where(is_right, end, right)
         middle, value = np.where(better, trial, middle), np.where(better, reached, value)
     return float(middle[np.argmin(value)])
+
+
+class SceneOptima:
+    """The questions of `zwidth.Scene` that look for a wall, or for a device that bears it."""
+
+    def max_stiffness(self: Any, *, negative_damping: bool | None = None) -> StiffestWall:
+        """The stiffest stable wall that soft ones lead to, and what binds it.
+
+        ``sup {K : some B is stable}`` over the pieces of the stable set that contain soft walls, down to K = 0: along a
+        path of stable walls K and B can rise to it. Walls apart from these are `islands`.
+
+        Args:
+            negative_damping: whether walls with B < 0 count. By default they do with the backward difference; behind a
+                filter a negative B is a lead compensator and no damper, and B >= 0 is meant. What is a piece does not
+                depend on it: a path may lead through B < 0.
+
+        Returns:
+            ``stiffness`` in N/m; ``virtual_damping`` in N s/m; ``frequency`` in Hz of the pole pair on the unit circle,
+            of the higher one at a corner; ``kind``, a code of `zwidth.RidgeKind`; ``status`` of `zwidth.Status`, with
+            NaN where it is not 0: NO_BOUNDARY where no such wall with K > 0 is stable.
+
+        Numerics:
+            Closed form for a rigid device. Otherwise the highest point of all edges of the stable set (50 to 150 ms),
+            about 1e-13 relative, refused where rows of the plane contradict it. Inside a JAX transformation it is
+            finished by optimistix, with implicit derivatives in every parameter of every part. The delay and, with
+            one, the period must be plain numbers there (`TracedDelayError`).
+
+        Example:
+            >>> import zwidth
+            >>> timing = zwidth.Timing(period=1e-3, delay=1e-3)
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), timing, velocity=zwidth.LowPass(cutoff=100))
+            >>> print(f"{scene.max_stiffness().stiffness:.0f} N/m")
+            11942 N/m
+        """
+        alpha, beta, omega, kind, status = self.loop.stiffest(allows_negative(self, negative_damping))
+        mass, period = (value if is_traced(value) else float(value) for value in (self.mass, self.timing.period))
+        rate = mass / period
+        # In the order of `zwidth.max_stiffness`, for the same last digit.
+        values = (alpha * rate / period, beta * rate, omega / (2.0 * math.pi * period), kind, status)
+        return StiffestWall(*(value if is_jax(value) else np.asarray(value)[()] for value in values))
+
+    def sensitivities(self: Any, *, negative_damping: bool | None = None) -> SceneSensitivities:
+        """What a little more of every parameter of every part buys.
+
+        Args:
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``stiffness``, K_max in N/m; ``per``, its derivatives by dotted path ("mass", "velocity.cutoff",
+            "operator.mass", ...) in N/m per SI unit, each with all others held fixed; ``status``, NOT_CONVERGED where
+            one of them is NaN, as all are without a K_max. Whole numbers and coefficients of a filter have none. At
+            zero they are those from the right, at a whole delay both sides agree.
+
+        Numerics:
+            Closed form for a rigid device; otherwise implicit derivatives of the conditions that bind, some ms a
+            parameter: right to 1e-6, or where one is nearly 0, to 1e-11 of K_max over the parameter.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> print(f"{scene.sensitivities().per['damping']:.0f} N/m per N s/m")
+            572 N/m per N s/m
+        """
+        return self.loop.sensitivities(allows_negative(self, negative_damping))
+
+    def required(
+        self: Any,
+        parameter: str,
+        stiffness: float | str,
+        *,
+        within: tuple[Any, Any] | None = None,
+        negative_damping: bool | None = None,
+    ) -> RequiredValue:
+        """The value of one parameter at which K_max reaches a wanted stiffness, all others as they are.
+
+        Args:
+            parameter: its dotted path, such as "damping", "velocity.cutoff" or "rate".
+            stiffness: wanted, in N/m, > 0.
+            within: the range that is searched, 0 < low < high; by default a thirtieth to 30 times the present value.
+            negative_damping: as for `max_stiffness`.
+
+        Returns:
+            ``value``, the nearest to the present one, itself enough; ``enough``, the side of it on which there is
+            enough ("above", "below"), or "everywhere" in the range (then ``value`` is the present one, or the end next
+            to it), or "nowhere"; ``crossings``, all that were found, each proved by a K_max on either side; ``range``;
+            ``status``, UNREACHABLE with NaN where the range never reaches the stiffness.
+
+        Numerics:
+            25 values across the range, then each crossing to 1e-11 relative. K_max need not be monotone; two crossings
+            between neighboring values are not seen.
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> needed = scene.required("damping", 25e3)
+            >>> print(f"{needed.value:.2f} N s/m or {needed.enough}")
+            18.62 N s/m or above
+        """
+        stiffness = _read_stiffness(stiffness)
+        now = _present_value(self, parameter)
+        low, high = _range(parameter, now, within)
+
+        def surplus(value: float) -> float:
+            """How K_max compares with the wanted stiffness, in logarithms; NaN where it cannot be computed."""
+            wall = self.replace(**{parameter: value}).max_stiffness(negative_damping=negative_damping)
+            if wall.status == Status.NO_BOUNDARY:
+                return -_HARDLY_ANY
+            return math.log(wall.stiffness / stiffness) if wall.status == Status.OK else math.nan
+
+        grid, values = [], []
+        for value in np.geomspace(low, high, _POINTS).tolist():
+            try:
+                values.append(surplus(value))
+            except InputError:
+                # The range ends where values are refused, as for a cut-off at half the sampling rate.
+                continue
+            grid.append(value)
+        if not grid:
+            raise InputError(f"within: {parameter} cannot have any value from {low:g} to {high:g}")
+        low, high = grid[0], grid[-1]
+        enough = [value >= 0 for value in values if not math.isnan(value)]
+        if not enough or not any(enough):
+            status = Status.UNREACHABLE if enough and len(enough) == len(values) else Status.NOT_CONVERGED
+            return RequiredValue(math.nan, "nowhere", (), (low, high), status)
+        if len(enough) == len(values) and all(enough):
+            return RequiredValue(min(max(now, low), high), "everywhere", (), (low, high), Status.OK)
+        found = tuple(
+            _cross(surplus, grid[k], grid[k + 1])
+            for k in range(len(grid) - 1)
+            if (values[k] >= 0) != (values[k + 1] >= 0) and not math.isnan(values[k] + values[k + 1])
+        )
+        proved = tuple(crossing for crossing in found if crossing is not None)
+        if not proved or len(proved) < len(found):
+            return RequiredValue(math.nan, "nowhere", proved, (low, high), Status.NOT_CONVERGED)
+        middle = now if now > 0 else low
+        best = min(proved, key=lambda crossing: abs(math.log(crossing.value / middle)))
+        return RequiredValue(best.value, best.enough, proved, (low, high), Status.OK)
+
+    def best_damping(
+        self: Any, stiffness: float | str | None = None, *, goal: Goal = "fast", negative_damping: bool | None = None
+    ) -> BestDamping:
+        """The virtual damping that suits a stiffness best.
+
+        Args:
+            stiffness: K in N/m, > 0; that of the scene's own wall where left out.
+            goal: "fast", the smallest spectral radius, with which the wall settles fastest; "robust", the largest
+                modulus margin, with which it bears the largest unknown change of the loop at every frequency.
+            negative_damping: as for `max_stiffness`, as is the piece of the stable set that is meant.
+
+        Returns:
+            ``virtual_damping`` in N s/m; ``spectral_radius`` and ``modulus_margin`` there; ``status``, NO_BOUNDARY with
+            NaN where no damping is stable in that piece.
+
+        Numerics:
+            Samples across the stable dampings, then golden section round the three lowest dips: the optimum is usually
+            a kink, where poles meet. The radius is right to about 1e-8 where two poles meet; 0.1 to 1 s.
+
+        References:
+            Hulin, Preusche, Hirzinger 2006, section VIII. Landau 1990 (modulus margin).
+
+        Example:
+            >>> import zwidth
+            >>> scene = zwidth.Scene(zwidth.Device(0.1, 10), zwidth.Timing(period=1e-3, delay=1e-3))
+            >>> best = scene.best_damping(5e3)
+            >>> print(f"{best.virtual_damping:.1f} N s/m, spectral radius {best.spectral_radius:.3f}")
+            25.8 N s/m, spectral radius 0.759
+        """
+        check_choice("goal", goal, get_args(Goal))
+        stiffness = _read_stiffness(resolve_wall(self.wall, None, None)[0] if stiffness is None else stiffness)
+        units = self.units
+
+        def radius(beta: Any) -> np.ndarray:
+            return self.spectral_radius(stiffness, beta * units.virtual_damping)
+
+        @np.vectorize
+        def margin(beta: float) -> float:
+            loop = self.loop
+            wall = OpenLoop.lay_out(loop.roots, stiffness / units.stiffness, beta, loop.boundary.w)
+            return wall.least_distance()[0]
+
+        cost: Callable[[Any], np.ndarray] = radius if goal == "fast" else lambda beta: -margin(beta)
+        columns = soft_dampings(self, stiffness, negative_damping)
+        if not columns:
+            return BestDamping(math.nan, math.nan, math.nan, Status.NO_BOUNDARY)
+        best = min((find_lowest(cost, low, high) for low, high in columns), key=lambda beta: float(cost(beta)))
+        return BestDamping(best * units.virtual_damping, float(radius(best)), float(margin(best)), Status.OK)
