@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from dataclasses import fields, is_dataclass
 from fractions import Fraction
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -106,12 +105,12 @@ def _without_one(p: flint.arb_poly) -> flint.arb_poly:
 def _polynomials(scene: Any) -> BallPolynomials:
     import flint
 
-    period = flint.arb(float(scene.timing.period))
-    chain = chain_of(_exact(scene, period), (scene.d, int(scene.d)))
+    exact = _exact(scene)
+    period = exact.timing.period
+    chain = chain_of(exact, (scene.d, int(scene.d)), _NOTHING)
     answer, device = _device(chain)
     top, bottom = _estimate(scene.velocity, period)
-    mass: Any = chain.estimate
-    unit = period * period / mass
+    unit = period * period / exact.mass
     whole = chain.whole + (1 if chain.d > chain.whole else 0)
     waiting = flint.arb_poly([0] * whole + device.coeffs())
     # F(1) is exactly 0 where a sum of exact fractions is; all other estimates are differences.
@@ -120,29 +119,20 @@ def _polynomials(scene: Any) -> BallPolynomials:
     return BallPolynomials(waiting * bottom, answer * bottom * unit, answer * top * unit, rest)
 
 
-def _exact(scene: Any, period: flint.arb) -> Any:
-    """The scene's numbers as exact balls, for `chain_of`; in the estimate's place the mass in kg."""
+def _exact(part: Any) -> Any:
+    """A scene, or a part of one, with exact balls for numbers, past the checks of these."""
     import flint
 
-    def exact(part: Any) -> Any:
-        """The same with balls for numbers, past the checks of these."""
-        if isinstance(part, tuple):
-            return tuple(map(exact, part))
-        if isinstance(part, LinearDevice):
-            # Exact by itself.
-            return part
-        if isinstance(part, float) or not is_dataclass(part):
-            return flint.arb(part) if isinstance(part, float) else part
-        # Without what the part has computed from its numbers.
-        made = object.__new__(type(part))
-        for item in fields(part):
-            object.__setattr__(made, item.name, exact(getattr(part, item.name)))
-        return made
-
-    made = exact(scene)
-    own = {item.name: getattr(made, item.name) for item in fields(made)}
-    own |= {"timing": SimpleNamespace(period=period), "velocity": SimpleNamespace(estimate=lambda period: made.mass)}
-    return SimpleNamespace(**own)
+    if isinstance(part, tuple):
+        return tuple(map(_exact, part))
+    if isinstance(part, LinearDevice) or not is_dataclass(part):
+        # A linear device is exact by itself.
+        return flint.arb(part) if isinstance(part, float) else part
+    # Without what the part has computed from its numbers.
+    made = object.__new__(type(part))
+    for item in fields(part):
+        object.__setattr__(made, item.name, _exact(getattr(part, item.name)))
+    return made
 
 
 def prove_zeros(device: LinearDevice, period: float, delay: tuple[float, int]) -> tuple[float, np.ndarray]:
