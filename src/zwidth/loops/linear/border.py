@@ -18,13 +18,11 @@ from zwidth.words.showing import shown
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
 _ROUNDS = 11
-# The ends of straight edges are drawn only.
-_LINE_ROUNDS = 6
 # Steps towards a corner, and how far beside it, as a share of w, the edge must be seen to end.
 _STEPS, _BESIDE = 60, 1e-11
 _SHARES = np.arange(1, 32) / 32.0
-# Points of a straight edge, and how far beyond the corners one is looked for.
-_LINE_POINTS, _BEYOND = 257, 0.05
+# How far beyond the corners a straight edge is looked for.
+_BEYOND = 0.05
 # Lines whose slopes differ by less, as a share, do not meet.
 _PARALLEL = 1e-12
 # Dampings of corners that differ by less, as a share, are one.
@@ -160,37 +158,25 @@ class Border:
 
     @cached_property
     def straight(self) -> list[Edge]:
-        """The edges on which a real pole, or a pair at one frequency, is on the circle."""
-        betas = np.concatenate([*(edge.beta for edge in self.curved), self._line_corners()])
-        betas = betas if betas.size else np.zeros(1)
+        """The edges on which a real pole, or a pair at one frequency, is on the circle.
+
+        They end where an edge of the curve does, where two lines meet, or where the curve meets the line.
+        """
+        lines = self.boundary.lines
+        crossed = [beta for k, line in enumerate(lines) for beta in _meetings(lines[:k], line)]
+        betas = np.concatenate([*(edge.beta for edge in self.curved), crossed, [0.0] if not self.curved else []])
         size = np.ptp(betas) + 1e-300
+        first, last = betas.min() - _BEYOND * size, betas.max() + _BEYOND * size
+        ends = np.concatenate([*(edge.beta[[0, -1]] for edge in self.curved), crossed, [m.meeting for m in lines]])
+        ends = np.unique(ends[(ends > first) & (ends < last)])
+        ends = np.concatenate([[first], ends[np.diff(ends, prepend=first) > _SAME * size], [last]])
         edges = []
-        for place, line in enumerate(self.boundary.lines):
-            ends = betas.min() - _BEYOND * size, betas.max() + _BEYOND * size
-            corners = np.concatenate([*(edge.beta[[0, -1]] for edge in self.curved), self._line_corners()])
-            beta = np.linspace(*ends, _LINE_POINTS)
-            corners = corners[(corners > ends[0]) & (corners < ends[1])]
-            near = np.concatenate([corners - 1e-6 * size, corners + 1e-6 * size])
-            beta = np.unique(np.concatenate([beta, near]))
-            held = self.boundary.line_borders(place, beta)
+        for place, line in enumerate(lines):
+            held = self.boundary.line_borders(place, 0.5 * (ends[1:] + ends[:-1]))
             for start, stop in _runs(held, 0 * held):
-                low = self._line_end(place, beta, start, -1)
-                high = self._line_end(place, beta, stop, 1)
-                both = np.array([low, high])
+                both = ends[[start, stop + 1]]
                 edges.append(Edge(np.full(2, line.w), line.q - both * line.f, both, place))
         return edges
-
-    def _line_corners(self) -> np.ndarray:
-        """The dampings at which two of the lines meet."""
-        lines = self.boundary.lines
-        return np.array([beta for k, line in enumerate(lines) for beta in _meetings(lines[:k], line)])
-
-    def _line_end(self, place: int, beta: np.ndarray, k: int, side: int) -> float:
-        after = k + side
-        if not 0 <= after < beta.size:
-            return float(beta[k])
-        ends = float(beta[k]), float(beta[after])
-        return _narrow(lambda at: self.boundary.line_borders(place, at), *ends, _LINE_ROUNDS)[0]
 
     def line_meetings(self) -> list[tuple[float, float, float]]:
         """Corners of two lines: all other highest points are on the curve."""
