@@ -165,37 +165,66 @@ def _corner(border: Border, alpha: float, beta: float) -> BoundRidge:
 
 def _polish(loop: LoopRoots, start: BoundRidge) -> BoundRidge | None:
     """Newton's method on a corner of two different angles; None where it does not hold near the start."""
-    x = np.array([start.alpha, start.beta, start.w1, start.w2])
-    moves = np.array([start.first == Condition.PAIR, start.second == Condition.PAIR])
-    best, worst = x, np.inf
+    now, best, worst = start, start, np.inf
     for _ in range(_MOST_STEPS):
-        at = circle(x[2:])
-        q, f = loop.required_wall(at), loop.estimate.jet(at)
-        rest, slope = x[0] + x[1] * f.value - q.value, x[1] * f.slope - q.slope
-        size = np.abs(q.value) + np.abs(x[1] * f.value) + 1e-300
-        error = float(np.max(np.abs(np.where(moves, rest, rest.real)) / size))
+        held = _conditions(loop, now)
+        error = float(np.linalg.norm(held.rest / held.size))
         if not error < worst:
             break
-        best, worst = x, error
-        matrix, right = np.zeros((4, 4)), np.zeros(4)
-        for k in range(2):
-            matrix[2 * k, :2], right[2 * k] = (1.0, f.value[k].real), rest[k].real
-            if moves[k]:
-                matrix[2 * k + 1, 1], right[2 * k + 1] = f.value[k].imag, rest[k].imag
-                matrix[2 * k : 2 * k + 2, 2 + k] = slope[k].real, slope[k].imag
-            else:
-                matrix[2 * k + 1, 2 + k] = 1.0
+        best, worst = now, error
+        x = np.array(now[:4])
         try:
-            x = x - np.linalg.solve(matrix, right)
+            x[held.columns] -= np.linalg.solve(held.matrix, held.rest)
         except np.linalg.LinAlgError:
             break
-        if not np.all((x[2:] > 0) & (x[2:] < np.pi) | ~moves):
+        now = BoundRidge._make([*x.tolist(), now.first, now.second])
+        if not all(0 < x[k] < np.pi for k in held.columns[2:]):
             break
-    near = abs(best[0] - start.alpha) <= _NEAR * abs(start.alpha) and abs(best[3] - best[2]) > 1e-7
-    if worst > _HOLDS or not near:
-        return None
-    alpha, beta, w1, w2 = (float(value) for value in best)
-    return start._replace(alpha=alpha, beta=beta, w1=w1, w2=w2)
+    near = abs(best.alpha - start.alpha) <= _NEAR * abs(start.alpha) and abs(best.w2 - best.w1) > 1e-7
+    return best if worst <= _HOLDS and near else None
+
+
+class _Binding(NamedTuple):
+    """The conditions that bind a wall, and how they move with what may move."""
+
+    rest: np.ndarray
+    size: np.ndarray  # of which each is a difference
+    matrix: np.ndarray
+    rows: list[int]  # which of the five
+    columns: list[int]  # which of alpha, beta, w1 and w2
+
+
+def _conditions(loop: LoopRoots, wall: BoundRidge) -> _Binding:
+    """Of ``r = alpha + beta F - q``: Re and Im at w1, the same at w2, and Im dr/dw at w1, where w stays.
+
+    At a smooth optimum the angle may stay where it is: to first order it does not matter.
+    """
+    at = circle(np.array([wall.w1, wall.w2]))
+    with np.errstate(all="ignore"):
+        q, f = loop.required_wall(at), loop.estimate.jet(at)
+        rest, slope = wall.alpha + wall.beta * f.value - q.value, wall.beta * f.slope - q.slope
+        size = np.abs(q.value) + np.abs(wall.beta * f.value) + 1e-300
+    matrix = np.zeros((5, 4))
+    matrix[[0, 2], 0] = 1.0
+    matrix[:, 1] = _list_conditions(f.value, f.slope)
+    matrix[:2, 2], matrix[2:4, 3] = _list_conditions(slope, slope)[:4].reshape(2, 2)
+    pair = wall.first == Condition.PAIR, wall.second == Condition.PAIR
+    rows, columns = [0, 1] if pair[0] else [0], [0]
+    if wall.second != Condition.NO_DAMPING:
+        columns.append(1)
+    if wall.second <= Condition.PLUS_ONE:
+        rows += [2, 3] if pair[1] else [2]
+    elif wall.second == Condition.STATIONARY and not pair[0]:
+        rows.append(4)
+    if wall.second != Condition.STATIONARY:
+        columns += [2 + k for k in range(2) if pair[k]]
+    rest, size = _list_conditions(rest, slope)[rows], np.repeat(size, (2, 3))[rows]
+    return _Binding(rest, size, matrix[np.ix_(rows, columns)], rows, columns)
+
+
+def _list_conditions(rest: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """The five parts of r and dr/dw, or of what moves them, at two angles."""
+    return np.array([rest[0].real, rest[0].imag, rest[1].real, rest[1].imag, slope[0].imag])
 
 
 def _is_reached(border: Border, top: _Top, least: float) -> bool:
@@ -277,7 +306,7 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
     The derivatives of the conditions are exact in the wall and its angles. In the parameter they are exact but for the
     rates of the chain and the velocity estimate, which are smooth over its own size (docs/theory/scenes.md, V21).
     """
-    matrix, rows = _conditions(scene, found)
+    held = _conditions(scene.loop.roots, found)
     at, whole = circle(np.array([found.w1, found.w2])), scene.whole_delay
     for weights in _stencils(scene, path):
         try:
@@ -293,9 +322,8 @@ def _slope(scene: Any, found: BoundRidge, path: str) -> float:
         )
         q, q_slope = _needed_slopes(scene, at, by_rate, by_push, by_delay)
         rest, slope = found.beta * by_f - q, found.beta * by_f_slope - q_slope
-        moved = np.array([rest[0].real, rest[0].imag, rest[1].real, rest[1].imag, slope[0].imag])
         try:
-            by_alpha = -np.linalg.solve(matrix, moved[rows])[0]
+            by_alpha = -np.linalg.solve(held.matrix, _list_conditions(rest, slope)[held.rows])[0]
         except np.linalg.LinAlgError:
             break
         return float(scene.units.stiffness * by_alpha + found.alpha * by_unit)
@@ -342,35 +370,6 @@ def _needed_slopes(
                 slopes[0, k] = value * by_p[0]
                 slopes[1, k] = slope * by_p[0] + value * (by_both[0] - 2.0 * by_p[0] * by_w[0] / moved[0])
     return slopes[0], slopes[1]
-
-
-def _conditions(scene: Any, found: BoundRidge) -> tuple[np.ndarray, list[int]]:
-    """The derivatives of the binding conditions in alpha and what moves with it; their rows of `_state`.
-
-    At a smooth optimum the angle may stay where it is: to first order it does not matter.
-    """
-    at, loop = circle(np.array([found.w1, found.w2])), scene.loop.roots
-    with np.errstate(all="ignore"):
-        q, f = loop.required_wall(at), loop.estimate.jet(at)
-        # Of r = alpha + beta F - q.
-        slope = found.beta * f.slope - q.slope
-    by_alpha = np.array([1.0, 0.0, 1.0, 0.0, 0.0])
-    by_beta = np.array([f.value[0].real, f.value[0].imag, f.value[1].real, f.value[1].imag, f.slope[0].imag])
-    columns = [by_alpha]
-    pair = (found.first == Condition.PAIR, found.second == Condition.PAIR)
-    rows = [0, 1] if pair[0] else [0]
-    if found.second != Condition.NO_DAMPING:
-        columns.append(by_beta)
-    if found.second <= Condition.PLUS_ONE:
-        rows += [2, 3] if pair[1] else [2]
-    elif found.second == Condition.STATIONARY and not pair[0]:
-        rows.append(4)
-    for k in range(2):
-        if pair[k] and found.second != Condition.STATIONARY:
-            column = np.zeros(5)
-            column[2 * k : 2 * k + 2] = slope[k].real, slope[k].imag
-            columns.append(column)
-    return np.stack(columns, -1)[rows], rows
 
 
 def _stencils(scene: Any, path: str) -> Iterator[list[tuple[float, float]]]:
