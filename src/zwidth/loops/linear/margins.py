@@ -5,10 +5,10 @@ nearly vanishes they are halved. Between neighbors |L| and its phase then hardly
 sign, or as a dip that the tangents at both ends announce, and is polished from there.
 
 One period more of delay changes nothing but the phase of L, by the angle w itself: at a gain crossover of phase
-``p = arg(-L)`` a pole is on the circle m periods later if ``p - m w`` is a multiple of 2 pi. So the loops of 33 delays
-within one period, each exact, serve all longer ones. Where that phase passes a multiple from one of them to the next,
-the delay is found between the two, each trial with the exact loop of its own. Real poles come to z = -1 where
-``|L(-1)|`` passes 1.
+``p = arg(-L)`` a pole is on the circle m periods later if ``p - m w`` is a multiple of 2 pi. So the loops of delays
+within one period serve all longer ones: where the m of one of them is nearly whole, the delay is found by Newton's
+method, each step with the exact loop of its own. Real poles come to z = -1 where ``|L(-1)|`` passes 1. Poles counted
+before and beyond must confirm the first of these delays.
 """
 
 from __future__ import annotations
@@ -160,42 +160,36 @@ def margins_of(wall: OpenLoop, stable: bool) -> Margins:
         if value is not None and np.isfinite(value) and value < 0:
             places.append(place)
             values.append(-value)
-    gain, phase_at = (np.inf if stable else 0.0), np.nan
-    if places:
-        nearest = int(np.argmin(np.abs(np.log(values))))
-        gain, phase_at = 1.0 / values[nearest], places[nearest]
-    crossed = wall.gain_crossovers()
-    phase, gain_at = (np.inf if stable else np.nan), np.nan
+    w = wall.gain_crossovers()
+    nearest = find_nearest(stable, np.array(places), np.array(values), w, np.angle(-wall.at(w).value))
+    gain, phase, phase_at, gain_at = nearest
+    distance, closest = wall.least_distance()
+    return Margins(gain, phase, np.nan, distance, phase_at, gain_at, closest)
+
+
+def find_nearest(
+    stable: bool, places: np.ndarray, sizes: np.ndarray, crossed: np.ndarray, turns: Array
+) -> tuple[float, float, float, float]:
+    """Gain and phase margin and where they are taken, by the sizes of L where it is negative and its turns from -1."""
+    gain, phase_at, phase, gain_at = (np.inf if stable else 0.0), np.nan, (np.inf if stable else np.nan), np.nan
+    if places.size:
+        nearest = int(np.argmin(np.abs(np.log(sizes))))
+        gain, phase_at = 1.0 / sizes[nearest], places[nearest]
     if crossed.size:
-        phases: Array = np.abs(np.angle(-wall.at(crossed).value, deg=True))
+        phases = np.degrees(np.abs(turns))
         nearest = int(np.argmin(phases))
         phase, gain_at = phases[nearest] * (1.0 if stable else -1.0), crossed[nearest]
-    distance, closest = wall.least_distance()
-    return Margins(float(gain), float(phase), np.nan, distance, float(phase_at), float(gain_at), closest)
+    return float(gain), float(phase), float(phase_at), float(gain_at)
 
 
-_PARTS = 32
-_LONGEST = 1 << 17
-_TURN = 2.0 * np.pi
+# Parts of a period at whose ends crossovers are looked for, and by how many of them a start may miss its own.
+_PARTS, _SPARE = 8, 1.5
+# The longest delay that is looked for, in periods; the step of a derivative in it.
+_LONGEST, _STEP = 1 << 17, 1e-5
+# Newton steps at most, and a logarithm of L that is rounding.
+_TRIALS, _ROUNDED = 30, 1e-9
 # Shares of the margin at which the wall must still be stable, and one at which it must not be.
 _WITNESSES, _BEYOND = (0.25, 0.5, 0.75, 1.0 - 1e-5), 1.0 + 1e-5
-_TRIALS = 60
-
-
-class Crossovers(NamedTuple):
-    """Of one wall at one delay: gain crossovers, their phases ``arg(-L)``, and L at z = -1."""
-
-    w: np.ndarray
-    phase: np.ndarray
-    last: float
-
-
-class Passage(NamedTuple):
-    """Between which delays of the first period, and after how many more, a pole comes to the circle."""
-
-    cell: int
-    periods: int
-    curve: int  # of the gain crossovers; -1 at z = -1
 
 
 @dataclass(frozen=True)
@@ -209,7 +203,7 @@ class DelayedLoops:
 
     @classmethod
     def lay_out(cls, chain: AnyChain) -> DelayedLoops:
-        """At every thirty-second of a period, whole ones among them."""
+        """At every eighth of a period, whole ones among them."""
         own = float(chain.d)
         grid = (np.floor(own * _PARTS) + 1.0 + np.arange(_PARTS)) / _PARTS
         delays = np.concatenate([[own], grid[(grid > own + 1e-9) & (grid < own + 1.0 - 1e-9)], [own + 1.0]])
@@ -222,74 +216,53 @@ def loop_at(chain: AnyChain, delay: float) -> LoopRoots:
     return find_roots(replace(chain, d=float(delay), whole=int(np.floor(delay))))
 
 
-def _cross(loop: LoopRoots, alpha: float, beta: float, nodes: np.ndarray) -> Crossovers:
-    wall = OpenLoop.lay_out(loop, alpha, beta, nodes)
-    w = wall.gain_crossovers()
-    return Crossovers(w, np.angle(-wall.at(w).value), float(wall.L.value[-1].real))
-
-
 def delay_margin(loops: DelayedLoops, alpha: float, beta: float) -> float:
     """Periods of delay that a stable wall bears; infinite where no delay is too long, NaN where that is in doubt."""
-    found = [_cross(loop, alpha, beta, nodes) for loop, nodes in zip(loops.loops, loops.nodes, strict=True)]
-    passages = [p for cell in range(len(found) - 1) for p in _passages(cell, found[cell], found[cell + 1])]
-    if not passages:
-        return np.inf if not any(part.w.size for part in found) else np.nan
-    first = min(passages, key=lambda p: loops.delays[p.cell] + p.periods)
-    # Two in one cell are told apart by where they are.
-    rivals = [p for p in passages if (p.cell, p.periods) == (first.cell, first.periods)]
-    margin = min(_refine(loops, found, alpha, beta, rival) for rival in rivals) - float(loops.chain.d)
-    return margin if _is_first_loss(loops.chain, alpha, beta, margin) else np.nan
+    chain, wall = loops.chain, (alpha, beta)
+    laid = [OpenLoop.lay_out(loop, *wall, nodes) for loop, nodes in zip(loops.loops, loops.nodes, strict=True)]
+    crossed = [each.gain_crossovers() for each in laid]
+    ends = []
+    for delay, each, w in zip(loops.delays, laid, crossed, strict=True):
+        # So many periods more turn L to -1; whole ones leave its size as it is.
+        more = np.mod(np.angle(-each.at(w).value), 2.0 * np.pi) / w
+        near = (np.abs(more - np.round(more)) <= _SPARE / _PARTS) & (more < _LONGEST)
+        starts = zip(w[near].tolist(), (delay + more[near]).tolist(), strict=True)
+        ends += [_follow(chain, wall, w, delay) for w, delay in starts]
+    last = np.array([each.L.value[-1].real for each in laid])
+    for k in np.flatnonzero((np.abs(last[1:]) > 1.0) != (np.abs(last[:-1]) > 1.0)):
+        low, high = loops.delays[k : k + 2]
+        sign = 1.0 if abs(last[k]) > 1.0 else -1.0
+        at_low, at_high = sign * np.log(np.abs(last[k : k + 2]))
+
+        def size(delay: np.float64, sign: float = sign) -> np.float64:
+            L = open_loop_response(loop_at(chain, float(delay)), *wall, circle(np.array([np.pi])))
+            return sign * np.log(np.abs(L.value[0].real))
+
+        end = false_position(size, low, high, at_low, at_high, _TRIALS, 1e-13 * (1.0 + high))
+        ends.append(float(end) + (0 if last[k] < 0 else 1))
+    ends = [end - float(chain.d) for end in ends if end > chain.d]
+    if not ends:
+        return np.nan if any(w.size for w in crossed) else np.inf
+    return min(ends) if _is_first_loss(chain, alpha, beta, min(ends)) else np.nan
 
 
-def _passages(cell: int, here: Crossovers, there: Crossovers) -> list[Passage]:
-    out = []
-    for curve, w in enumerate(here.w):
-        if not there.w.size:
+def _follow(chain: AnyChain, wall: tuple[float, float], w: float, delay: float) -> float:
+    """The delay near a start with which a pole is on the circle, by Newton's method on ``log(-L)``; NaN where none is.
+
+    Each trial has the exact loop of its own.
+    """
+    for _ in range(_TRIALS):
+        if not (0.0 < w < np.pi and delay >= 0.0):
             break
-        other = int(np.argmin(np.abs(there.w - w)))
-        if np.argmin(np.abs(here.w - there.w[other])) != curve:
-            continue
-        phase, w_next = here.phase[curve], there.w[other]
-        after = there.phase[other] + _TURN * np.round((phase - there.phase[other]) / _TURN)
-        # Until a whole turn has passed, and one more for the change of w.
-        most = min(int(2.0 * _TURN / min(w, w_next)) + 3, _LONGEST)
-        m: Array = np.arange(most)
-        passed = np.floor((phase - m * w) / _TURN) != np.floor((after - m * w_next) / _TURN)
-        if passed.any():
-            out.append(Passage(cell, int(np.argmax(passed)), curve))
-    if (abs(here.last) > 1.0) != (abs(there.last) > 1.0):
-        out.append(Passage(cell, 0 if here.last < 0 else 1, -1))
-    return out
-
-
-def _refine(loops: DelayedLoops, found: list[Crossovers], alpha: float, beta: float, at: Passage) -> float:
-    """The delay of a passage, by false position with the exact loop of each trial."""
-    low, high = loops.delays[at.cell], loops.delays[at.cell + 1]
-    ends = found[at.cell], found[at.cell + 1]
-    w0 = w1 = center = 0.0
-    if at.curve >= 0:
-        w0 = float(ends[0].w[at.curve])
-        w1 = float(ends[1].w[int(np.argmin(np.abs(ends[1].w - w0)))])
-        # The multiple of 2 pi next to which it passes.
-        before = float(ends[0].phase[at.curve]) - at.periods * w0
-        center = _TURN * np.round(before / _TURN)
-
-    def excess(delay: np.float64) -> np.float64:
-        loop = loop_at(loops.chain, float(delay))
-        if at.curve < 0:
-            last = OpenLoop.lay_out(loop, alpha, beta, np.array([3.0])).L.value[-1].real
-            return np.log(np.abs(last))
-        here = _cross(loop, alpha, beta, nodes_of(loop))
-        share = (delay - low) / (high - low)
-        place = int(np.argmin(np.abs(here.w - (w0 + share * (w1 - w0)))))
-        turned = here.phase[place] - at.periods * here.w[place]
-        return turned - _TURN * np.round((turned - center) / _TURN) - center
-
-    first, last = excess(low), excess(high)
-    sign = 1.0 if first > 0 else -1.0
-    width = 1e-13 * (1.0 + high)
-    passed = false_position(lambda x: sign * excess(x), low, high, sign * first, sign * last, _TRIALS, width)
-    return float(passed) + at.periods
+        at = circle(np.array([w]))
+        here, beside = (open_loop_response(loop_at(chain, delay + h), *wall, at) for h in (0.0, _STEP))
+        rest, turn = np.log(-here.value[0]), here.slope[0] / here.value[0]
+        slope = np.log(beside.value[0] / here.value[0]) / _STEP
+        by_w, by_delay = np.linalg.solve([[turn.real, slope.real], [turn.imag, slope.imag]], [rest.real, rest.imag])
+        w, delay = w - by_w, delay - by_delay
+        if abs(by_delay) <= 1e-14 * (1.0 + delay):
+            return delay if abs(rest) < _ROUNDED else np.nan
+    return np.nan
 
 
 def _is_first_loss(chain: AnyChain, alpha: float, beta: float, margin: float) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from zwidth.loops.linear.chain import AnyChain
+from zwidth.loops.linear.margins import find_nearest
 from zwidth.loops.linear.rows import Island
 from zwidth.loops.loop import LinearLoop, SlowestMotion
 from zwidth.loops.measured.curve import ResponseCurve
@@ -222,24 +223,14 @@ class MeasuredLoop(LinearLoop):
         with np.errstate(all="ignore"):
             k, share = _zeros(L.imag)
             at, real = c.w[k] + share * np.diff(c.w)[k], L.real[k] + share * np.diff(L.real)[k]
-            at, sizes = at[real < 0], -real[real < 0]
-            gain, gain_at = (np.inf if stable else 0.0), np.nan
-            if sizes.size:
-                nearest = int(np.argmin(np.abs(np.log(sizes))))
-                gain, gain_at = 1.0 / sizes[nearest], at[nearest]
+            places, sizes = at[real < 0], -real[real < 0]
             k, share = _zeros(np.log(np.abs(L)))
             at = c.w[k] + share * np.diff(c.w)[k]
             turns: Any = np.angle(-L[k]) + share * np.angle(L[k + 1] / L[k])
-            phase, phase_at, delay = (np.inf if stable else np.nan), np.nan, np.inf if stable else 0.0
-            if at.size:
-                nearest = int(np.argmin(np.abs(turns)))
-                phase, phase_at = np.degrees(abs(turns[nearest])) * (1.0 if stable else -1.0), at[nearest]
-                delay = float(np.min(np.mod(turns, 2.0 * np.pi) / at)) if stable else 0.0
+            gain, phase, phase_at, gain_at = find_nearest(stable, places, sizes, at, turns)
+            delay = float(np.min(np.mod(turns, 2.0 * np.pi) / at, initial=np.inf)) if stable else 0.0
         closest = int(np.argmin(np.abs(1.0 + L)))
-        return Margins(
-            float(gain), float(phase), delay, float(abs(1.0 + L[closest])), float(gain_at), float(phase_at),
-            float(c.w[closest]),
-        )  # fmt: skip
+        return Margins(gain, phase, delay, float(abs(1.0 + L[closest])), phase_at, gain_at, float(c.w[closest]))
 
 
 def _zeros(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
