@@ -28,33 +28,34 @@ _NODES, _ROUNDS, _MOST = 129, 80, 1 << 18
 _PROVED = 1e-13
 
 
-def find_obstacle(
-    *, coupling: Any = None, actuator: Any = None, modes: Any = (), system: Any = None, response: Any = None, **_: Any
-) -> str:
+# What of a device has no such condition: with what, and where none is known.
+_OBSTACLES = {
+    "response": ("a measured response", "without a model; measure the device with the hands it meets"),
+    "system": (
+        "a linear device",
+        "where damping is not that of one body; ask is_stable of devices with the hands they meet",
+    ),
+    "actuator": (
+        "an actuator",
+        "where the force lags behind the command; ask is_stable with the hand as operator, or leave the actuator out",
+    ),
+    "modes": (
+        "modes",
+        "where the sensor sees more than the body that the hand holds; ask is_stable with the hand as operator, or "
+        "leave the modes out",
+    ),
+}
+
+
+def find_obstacle(*, coupling: Any = None, **parts: Any) -> str:
     """Why parts of a device have no such condition; nothing where they have.
 
     It is about a force that acts as it is commanded, and the motion of the point where it does.
     """
-    if response is not None:
-        return (
-            "with a measured response: no passivity condition of this kind is known without a model; measure the "
-            "device with the hands it meets"
-        )
-    if system is not None:
-        return (
-            "with a linear device: no passivity condition of this kind is known where damping is not that of one body; "
-            "ask is_stable of devices with the hands they meet"
-        )
-    if actuator is not None:
-        return (
-            "with an actuator: no passivity condition of this kind is known where the force lags behind the command; "
-            "ask is_stable with the hand as operator, or leave the actuator out"
-        )
-    if modes:
-        return (
-            "with modes: no passivity condition of this kind is known where the sensor sees more than the body that "
-            "the hand holds; ask is_stable with the hand as operator, or leave the modes out"
-        )
+    for name, (what, where) in _OBSTACLES.items():
+        part = parts.get(name)
+        if part if isinstance(part, tuple | list) else part is not None:
+            return f"with {what}: no passivity condition of this kind is known {where}"
     if coupling is not None and coupling.sensor == "tip":
         return (
             "with the sensor at the tip: there is no passivity condition of this kind, for force and sensed motion are "
