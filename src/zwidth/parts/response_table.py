@@ -17,7 +17,7 @@ import numpy as np
 from zwidth.words.errors import InputError
 from zwidth.words.formatting import suggestion
 from zwidth.words.tables import read_columns, split_head
-from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE
+from zwidth.words.units import ANGLE, FORCE, LENGTH, RATE, Dimension
 
 # How the names of files end that hold one.
 SUFFIXES = (".csv", ".txt", ".dat", ".npz", ".mat")
@@ -69,7 +69,7 @@ def read_response_table(file: str | Path) -> ResponseTable:
     if parts[0] == "magnitude":
         size = columns["magnitude"]
         size = 10.0 ** (size / 20.0) if units["magnitude"].lower().startswith("db") else size
-        answer = size * np.exp(1j * columns["phase"] * _radians(file, units["phase"]))
+        answer = size * np.exp(1j * columns["phase"] * _size(file, "phase", units["phase"], ANGLE, ("deg", "rad")))
     elif parts[0] == "response":
         (answer,) = table.numbers([found["response"]], complex)
     else:
@@ -96,16 +96,14 @@ def write_response_table(file: str | Path, table: ResponseTable, remarks: tuple[
 def _hertz(file: Path, unit: str) -> float:
     if unit in _ANGULAR:
         return (1e3 if unit[0] == "k" else 1.0) / (2.0 * math.pi)
-    size = RATE.in_base("1", 0, unit) if unit else None
-    if size is None:
-        raise InputError(f"{file}: frequency in {unit or 'no unit'}; {_remedy(unit, (*RATE.units, *_ANGULAR))}")
-    return size
+    return _size(file, "frequency", unit, RATE, (*RATE.units, *_ANGULAR))
 
 
-def _radians(file: Path, unit: str) -> float:
-    size = ANGLE.in_base("1", 0, unit) if unit else None
+def _size(file: Path, name: str, unit: str, dimension: Dimension, known: tuple[str, ...]) -> float:
+    """What one of a unit is in the SI unit."""
+    size = dimension.in_base("1", 0, unit) if unit else None
     if size is None:
-        raise InputError(f"{file}: phase in {unit or 'no unit'}; {_remedy(unit, ('deg', 'rad'))}")
+        raise InputError(f"{file}: {name} in {unit or 'no unit'}; {_remedy(unit, known)}")
     return size
 
 

@@ -64,7 +64,7 @@ def _decide(scene: Any, stiffness: float, damping: float, known: dict[int, BallP
             at_one = stiffness == 0 and rest
             if at_one:
                 # z = 1 is a pole; the others decide whether it is the only one not inside.
-                p = _without_one(p)
+                p = p // flint.arb_poly([-1, 1])
             verdict = all_inside(p)
         if verdict is not None:
             return (False, Status.ON_BOUNDARY if verdict else Status.OK) if at_one else (verdict, Status.OK)
@@ -89,17 +89,6 @@ def all_inside(p: flint.arb_poly) -> bool | None:
         reduced = (p * (1 / last) - mirrored * (first / last / last)).coeffs()
         p = flint.arb_poly(reduced[1 : len(coefficients)])
     return True
-
-
-def _without_one(p: flint.arb_poly) -> flint.arb_poly:
-    """The quotient by z - 1, which divides it."""
-    import flint
-
-    total, found = flint.arb(0), []
-    for coefficient in reversed(p.coeffs()[1:]):
-        total = total + coefficient
-        found.append(total)
-    return flint.arb_poly(found[::-1])
 
 
 def _polynomials(scene: Any) -> BallPolynomials:
@@ -186,12 +175,11 @@ def _device(chain: AnyChain) -> tuple[flint.arb_poly, flint.arb_poly]:
     device = step.charpoly()
 
     def numerator(state: flint.arb_mat) -> flint.arb_poly:
-        markov = []
-        for _ in range(size):
-            markov.append(state[0, 0])
-            state = step * state
-        product = (flint.arb_poly(device.coeffs()[::-1]) * flint.arb_poly(markov)).coeffs()[:size]
-        return flint.arb_poly(product[::-1])
+        """``C adj(z - A) push``, by the lemma of the determinant; C is the first number of the state."""
+        changed = flint.arb_mat(step)
+        for k in range(size):
+            changed[k, 0] = changed[k, 0] - state[k, 0]
+        return changed.charpoly() - device
 
     if chain.d == chain.whole:
         return numerator(full), device
