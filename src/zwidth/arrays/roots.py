@@ -89,6 +89,26 @@ def last_cell(function: Function, inner: Array, outer: Array, offset: Array) -> 
     return low, high, crossed
 
 
+# Of a step of golden section.
+_GOLDEN = 0.3819660112501051
+
+
+def narrow_dips(
+    cost: Function, left: Array, middle: Array, right: Array, value: Array, steps: int
+) -> tuple[Array, Array]:
+    """Lowest places of a function between two others, and its values there, by golden section; in NumPy."""
+    for _ in range(steps):
+        upwards = right - middle > middle - left
+        trial = middle + _GOLDEN * np.where(upwards, right - middle, left - middle)
+        reached = cost(trial)
+        # Of the trial and the middle the lower one becomes the middle, the other one an end.
+        better = reached < value
+        end, is_right = np.where(better, middle, trial), better ^ (trial > middle)
+        left, right = np.where(is_right, left, end), np.where(is_right, end, right)
+        middle, value = np.where(better, trial, middle), np.where(better, reached, value)
+    return middle, value
+
+
 class _Bracket(NamedTuple):
     low: Any
     high: Any

@@ -8,6 +8,7 @@ from typing import Any, Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
+from zwidth.arrays.roots import narrow_dips
 from zwidth.arrays.xp import is_jax, is_traced
 from zwidth.loops.linear.margins import OpenLoop
 from zwidth.loops.linear.ridge import SceneSensitivities
@@ -139,7 +140,6 @@ Goal = Literal["fast", "robust"]
 
 # Samples across a column, how many of their dips are refined, and by how many steps of golden section.
 _SAMPLES, _DIPS, _STEPS = 66, 3, 52
-_GOLDEN = 0.3819660112501051
 
 
 @shown()
@@ -161,16 +161,7 @@ def find_lowest(
     values = np.pad(cost(grid[1:-1]), 1, constant_values=math.inf)
     dips = 1 + np.flatnonzero((values[1:-1] <= values[:-2]) & (values[1:-1] <= values[2:]))
     dips = dips[np.argsort(values[dips])][:_DIPS]
-    left, middle, right, value = grid[dips - 1], grid[dips], grid[dips + 1], values[dips]
-    for _ in range(steps):
-        upwards = right - middle > middle - left
-        trial = middle + _GOLDEN * np.where(upwards, right - middle, left - middle)
-        reached = cost(trial)
-        # Of the trial and the middle the lower one becomes the middle, the other one an end.
-        better = reached < value
-        end, is_right = np.where(better, middle, trial), better ^ (trial > middle)
-        left, right = np.where(is_right, left, end), np.where(is_right, end, right)
-        middle, value = np.where(better, trial, middle), np.where(better, reached, value)
+    middle, value = narrow_dips(cost, grid[dips - 1], grid[dips], grid[dips + 1], values[dips], steps)
     return float(middle[np.argmin(value)])
 
 

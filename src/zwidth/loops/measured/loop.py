@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from zwidth.arrays.roots import narrow_dips
 from zwidth.loops.linear.chain import AnyChain
 from zwidth.loops.linear.margins import find_nearest
 from zwidth.loops.linear.rows import Island
@@ -23,7 +24,7 @@ from zwidth.words.types import Array
 
 # Rows on each side of beta = 0, denser towards it, and again across those with stable walls; steps to the highest row.
 _ROWS, _DENSER, _AGAIN = 60, 5.0, 49
-_STEPS, _GOLDEN = 30, 0.3819660112501051
+_STEPS = 30
 _INSIDE = 1e-9
 
 
@@ -162,15 +163,9 @@ class MeasuredLoop(LinearLoop):
         if not top[best] > 0:
             return RidgePoint(nan, nan, nan, kind, np.int32(Status.UNDECIDED))
         low, middle, high = (float(beta[k]) for k in (max(best - 1, 0), best, min(best + 1, beta.size - 1)))
-        low, value = low if negative else max(low, 0.0), float(top[best])
-        for _ in range(_STEPS):
-            upwards = high - middle > middle - low
-            trial = middle + _GOLDEN * ((high if upwards else low) - middle)
-            reached = self._top(trial)
-            better = reached > value
-            end = middle if better else trial
-            low, high = (end, high) if better == upwards else (low, end)
-            middle, value = (trial, reached) if better else (middle, value)
+        low, held = low if negative else max(low, 0.0), float(top[best])
+        found = narrow_dips(lambda beta: np.array(-self._top(float(beta))), low, middle, high, np.array(-held), _STEPS)
+        middle, value = float(found[0]), -float(found[1])
         # Just inside: the end itself is not decided.
         value *= 1.0 - _INSIDE
         omega = self.walls.curve.w[self.walls.binding(value, middle)]
