@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.loops.linear.chain import Resonance
+from zwidth.loops.linear.chain import Resonance, body_position
 from zwidth.loops.linear.system import System
 from zwidth.words.errors import InputError
 
@@ -57,7 +57,10 @@ def mechanics(chains: Sequence[Any]) -> Mechanics:
     rate = np.moveaxis(np.concatenate([A, np.stack(forces, 1)], 1), -1, 0)
     bodies, links, modes = together.values()
     here, count, size = len(bodies), len(bodies) + len(modes), len(A)
-    place = np.pad(first.places, ((0, 0), (0, size - count)))
+    place = np.zeros((here, size))
+    for body in range(here):
+        for entry, sign in body_position(body, first.sensor, here, len(modes)):
+            place[body, entry] = sign
     motion = np.roll(place, count, axis=1)
     axes = np.eye(size)
     stretch, stretching = axes[1:here], axes[count + 1 : count + here]

@@ -100,15 +100,6 @@ class Chain:
         return _realize(self)
 
     @cached_property
-    def places(self) -> np.ndarray:
-        """The position of every body by the coordinates: the sensed one, extensions up to the body, and modes."""
-        bodies, beyond = len(self.bodies), np.tri(len(self.bodies))
-        places = np.full((bodies, bodies + len(self.modes)), -1.0)
-        places[:, :bodies] = beyond - beyond[self.sensor]
-        places[:, 0] = 1.0
-        return places
-
-    @cached_property
     def continuous(self) -> tuple[np.ndarray, np.ndarray]:
         """The finite zeros and the poles in s of what the sensor sees of a command."""
         seen, stiffness = compliance(self)
@@ -193,51 +184,67 @@ def is_zero(value: Any) -> bool:
 
 
 def _realize(chain: Chain) -> Realization:
-    """The same text for numbers, arrays of them, JAX's and balls.
+    """Rows of numbers, JAX's arrays or balls alike."""
+    lag = chain.actuator
+    numbers = [value for part in (*chain.bodies, *chain.links, *chain.modes) for value in part]
+    xp = namespace(*numbers, *(lag if isinstance(lag, Resonance) else () if lag is None else (lag,)))
+    bodies, modes = len(chain.bodies), len(chain.modes)
+    count, behind = bodies + modes, 0 if lag is None else 2 if isinstance(lag, Resonance) else 1
+    zero = 0.0 * (chain.bodies[0].mass + chain.bodies[-1].damping + sum(mode.rate for mode in chain.modes))
+    size = 2 * count + behind
 
-    A spring's force is its stiffness times its elongation, a row of numbers 0 and 1 in the coordinates; what it does to
-    bodies and modes is the same row in their motions. The same of dampers.
-    """
-    lag, modes = chain.actuator, chain.modes
-    bodies, count = len(chain.bodies), len(chain.bodies) + len(modes)
-    lags = lag if isinstance(lag, Resonance) else [] if lag is None else [lag]
-    xp = namespace(*(value for part in (*chain.bodies, *chain.links, *modes, lags) for value in part))
-    zero = 0.0 * (chain.bodies[0].mass + chain.bodies[-1].damping + sum(mode.rate for mode in modes))
+    def row(*entries: tuple[int, Any]) -> list[Any]:
+        found = [zero] * size
+        for place, value in entries:
+            found[place] = found[place] + value
+        return found
 
-    def stack(values: list[Any]) -> Any:
-        return xp.stack([xp.asarray(value + zero) for value in values])
+    accelerations = []
+    for k, body in enumerate(chain.bodies):
+        force = row()
+        for j, side in body_position(k, chain.sensor, bodies, modes):
+            force[j] = force[j] - side * body.stiffness
+            force[count + j] = force[count + j] - side * body.damping
+        if k:
+            link = chain.links[k - 1]
+            force[k], force[count + k] = force[k] - link.stiffness, force[count + k] - link.damping
+        if k + 1 < bodies:
+            link = chain.links[k]
+            force[k + 1], force[count + k + 1] = force[k + 1] + link.stiffness, force[count + k + 1] + link.damping
+        accelerations.append([value / body.mass for value in force])
+    swings = [
+        row((bodies + k, -mode.rate * mode.rate), (count + bodies + k, -2.0 * mode.damping_ratio * mode.rate))
+        for k, mode in enumerate(chain.modes)
+    ]
+    seen = accelerations[chain.sensor]
+    for swing in swings:
+        seen = [a + b for a, b in zip(seen, swing, strict=True)]
+    stretches = [[a - b for a, b in zip(accelerations[k], accelerations[k - 1], strict=True)] for k in range(1, bodies)]
+    rows = [row((count + k, 1.0)) for k in range(count)] + [seen, *stretches, *swings]
+    first = 1.0 / chain.bodies[0].mass + zero
+    # A body beyond a link feels the push through the link alone.
+    push = [zero] * count + [zero if chain.sensor else first] + [-first, zero][: bodies - 1] + [zero] * modes
+    swung = [1.0 / mode.mass + zero for mode in chain.modes]
+    driven = [zero] * count + [push[count] + sum(swung, zero)] + push[count + 1 : count + bodies] + swung
+    push, driven = push + [zero] * behind, driven + [zero] * behind
+    if lag is not None:
+        rows = [[*line[: 2 * count], force, *[zero] * (behind - 1)] for line, force in zip(rows, driven, strict=False)]
+        driven = [zero] * size
+        if isinstance(lag, Resonance):
+            square = lag.rate * lag.rate
+            rows += [row((size - 1, 1.0)), row((size - 2, -square), (size - 1, -2.0 * lag.damping_ratio * lag.rate))]
+            driven[-1] = square + zero
+        else:
+            rows.append(row((size - 1, -lag)))
+            driven[-1] = lag + zero
+    A = xp.stack([xp.stack([xp.asarray(v) for v in r]) for r in rows])
+    return Realization(A, *(xp.stack([xp.asarray(v) for v in column]) for column in (driven, push)))
 
-    def spread(rows: np.ndarray) -> Any:
-        return rows.reshape(*rows.shape, *(1,) * np.ndim(zero))
 
-    motions = np.concatenate([chain.places, np.eye(count)[bodies:]])
-    coordinates = np.round(np.linalg.inv(motions))
-    elongations = np.concatenate([chain.places, np.eye(count)[1:]])
-    masses = stack([*(body.mass for body in chain.bodies), *[1.0] * len(modes)])[:, None]
-
-    def accelerate(values: list[Any]) -> Any:
-        """The coordinates' accelerations by the coordinates, or by their velocities."""
-        force = xp.tensordot(-(elongations @ coordinates).T, stack(values)[:, None] * spread(elongations), 1)
-        return xp.tensordot(coordinates, force / masses, 1)
-
-    elements = *chain.bodies, *chain.links
-    springs = accelerate([*(part.stiffness for part in elements), *(mode.rate * mode.rate for mode in modes)])
-    dampers = [*(part.damping for part in elements), *(2.0 * mode.damping_ratio * mode.rate for mode in modes)]
-    still = spread(np.zeros((count, count))) + zero
-    moving = xp.concatenate([springs, accelerate(dampers)], 1)
-    A = xp.concatenate([xp.concatenate([still, still + spread(np.eye(count))], 1), moving])
-    pushed = [1.0 / chain.bodies[0].mass, *[0.0] * (count - 1)]
-    swung = [*pushed[:bodies], *(1.0 / mode.mass for mode in modes)]
-    push, driven = (xp.concatenate([still[0], xp.tensordot(coordinates, stack(f), 1)]) for f in (pushed, swung))
-    if lag is None:
-        return Realization(A, driven, push)
-    second = isinstance(lag, Resonance)
-    own = [[0.0, 1.0], [-lag.rate * lag.rate, -2.0 * lag.damping_ratio * lag.rate]] if second else [[-lag]]
-    none = stack([0.0] * len(own))
-    A = xp.concatenate([A, driven[:, None] * spread(np.eye(1, len(own)))], 1)
-    A = xp.concatenate([A, xp.stack([xp.concatenate([0.0 * push, stack(row)]) for row in own])])
-    driven = xp.concatenate([0.0 * push, none[1:], stack([-own[-1][0]])])
-    return Realization(A, driven, xp.concatenate([push, none]))
+def body_position(body: int, sensor: int, bodies: int, modes: int) -> list[tuple[int, float]]:
+    """The position of a body as a sum of the sensed one, of extensions and of modes: which, and their signs."""
+    between = [(j, 1.0) for j in range(sensor + 1, body + 1)] + [(j, -1.0) for j in range(body + 1, sensor + 1)]
+    return [(0, 1.0), *between, *((j, -1.0) for j in range(bodies, bodies + modes))]
 
 
 def compliance(chain: Chain) -> tuple[np.ndarray, np.ndarray]:
