@@ -285,7 +285,7 @@ class SceneAnswers:
         beyond do not confirm it); ``modulus_margin`` is the least distance of L from -1. Where no factor, turn or delay
         brings a pole there, the first three are infinite for a stable wall, and 0, NaN and 0 for an unstable one.
         Walls out of range are NaN. A rigid scene answers by `zwidth.margins`. A wall takes some milliseconds, its
-        delay margin some 0.2 s.
+        delay margin some 0.1 s.
         """
         alpha, beta = np.broadcast_arrays(*self.normalize_walls(stiffness, virtual_damping))
         hertz = 1.0 / (2.0 * np.pi * self.timing.period)
