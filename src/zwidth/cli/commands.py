@@ -92,7 +92,9 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
     scene = replace(scene, timing=replace(scene.timing, delay_model=delay_model))
     wall = scene.max_stiffness()
     if int(wall.status) != Status.OK:
-        raise click.UsageError(f"no wall with K > 0 is stable on this device: {Status(int(wall.status)).message}")
+        none = int(wall.status) == Status.NO_BOUNDARY
+        what = "no wall with K > 0 is stable on this device" if none else "K_max of this device was not found"
+        raise click.UsageError(f"{what}: {Status(int(wall.status)).message}")
     top, kind = scene.normalize_walls(wall.stiffness, wall.virtual_damping), name_kind(wall)
     by_mass = isinstance(scene.device, Device)
     result: dict[str, Any] = {

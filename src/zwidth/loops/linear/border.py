@@ -13,7 +13,8 @@ from zwidth.arrays.circle import circle
 from zwidth.arrays.roots import false_position
 from zwidth.loops.linear.boundary import Boundary
 from zwidth.loops.linear.curve import CrossingLine, curve_at, zeros_of
-from zwidth.loops.linear.rows import Island, StablePieces
+from zwidth.loops.linear.rows import Island, StablePieces, bound_intervals
+from zwidth.words.errors import InputError
 from zwidth.words.showing import shown
 
 # The place where an edge ends is told to the last digit by so many rounds over so many places.
@@ -21,6 +22,11 @@ _ROUNDS = 11
 # Steps towards a corner, and how far beside it, as a share of w, the edge must be seen to end.
 _STEPS, _BESIDE = 60, 1e-11
 _SHARES = np.arange(1, 32) / 32.0
+# How often rows are looked at beside the ends of edges, and how far beside, as a share of what these span; edges of few
+# nodes get so many.
+_LOOKS, _BESIDE_ENDS, _FEW, _FILLED = 4, 1e-6, 5, 33
+# A curve whose dampings differ by less, as a share, is none.
+_ONE_DAMPING = 1e-12
 # How far beyond the corners a straight edge is looked for.
 _BEYOND = 0.05
 # Lines whose slopes differ by less, as a share, do not meet.
@@ -46,12 +52,34 @@ class Border:
 
     @cached_property
     def curved(self) -> list[Edge]:
-        """The edges on the curve of complex pairs."""
+        """The edges on the curve of complex pairs.
+
+        A resonance may sweep past the stable set between two nodes: beside the ends of the edges that the nodes show,
+        rows tell what else bounds it.
+        """
+        w = self.boundary.w
+        beta = curve_at(self.boundary.loop, w).beta
+        if np.ptp(beta) <= _ONE_DAMPING * np.abs(beta).max():
+            raise InputError(
+                "device: the pole pairs of a system of first order, not late and behind the difference of two samples, "
+                "are all at one damping, which is no curve; give the lag of its amplifier or its delay"
+            )
+        edges = self._edges_among(w)
+        for _ in range(_LOOKS):
+            more = self._find_missed(edges)
+            if not more.size:
+                break
+            w = np.union1d(w, more)
+            edges = self._edges_among(w)
+        return edges
+
+    def _edges_among(self, w: np.ndarray) -> list[Edge]:
+        """The edges that nodes show."""
         b = self.boundary
-        here = curve_at(b.loop, b.w)
-        tops = zeros_of(b.loop, b.w, here.alpha_slope, "alpha_slope")
+        here = curve_at(b.loop, w)
+        tops = zeros_of(b.loop, w, here.alpha_slope, "alpha_slope")
         tops = tops[np.isfinite(curve_at(b.loop, tops).alpha)] if tops.size else tops
-        w = np.unique(np.concatenate([b.w, tops]))
+        w = np.unique(np.concatenate([w, tops]))
         piece = np.searchsorted(b.infinite, w)
         held = b.borders(w)
         edges = []
@@ -65,6 +93,23 @@ class Border:
                     alpha[k], beta[k] = self.at_end(end)
             edges.append(Edge(at, alpha, beta, -1))
         return edges
+
+    def _find_missed(self, edges: list[Edge]) -> np.ndarray:
+        """Angles on edges that are not among these, and within those of few nodes."""
+        b = self.boundary
+        few = [edge.w for edge in edges if edge.w.size < _FEW]
+        within = [np.linspace(w[0], w[-1], _FILLED)[1:-1] for w in few]
+        ends = np.concatenate([edge.beta[[0, -1]] for edge in edges]) if edges else np.empty(0)
+        ends = ends[np.isfinite(ends)]
+        if not ends.size:
+            return np.empty(0)
+        rows = (ends[:, None] + _BESIDE_ENDS * (np.ptp(ends) or np.abs(ends).max()) * np.array([-1.0, 1.0])).ravel()
+        intervals, crossed = bound_intervals(b, rows), b.crossings(rows).w
+        for column in np.concatenate([intervals.below, intervals.above], 1).T:
+            on = np.flatnonzero((column >= 0) & (column < len(b.arcs)))
+            w = crossed[on, column[on]]
+            within.append(w[[not any(e.w[0] - _BESIDE <= at <= e.w[-1] + _BESIDE for e in edges) for at in w]])
+        return np.unique(np.concatenate(within))
 
     def at_end(self, w: float) -> tuple[float, float]:
         """The curve's limit at z = 1 or z = -1."""

@@ -117,3 +117,60 @@ def test_what_asks_for_the_stiffest_wall_leaves_islands_out():
 def test_a_rigid_scene_has_no_islands():
     assert PHANTOM.islands() == []
     assert [outline.island for outline in PHANTOM.stable_region()] == [False]
+
+
+def swept_by(modes, cutoff, mass, damping, velocity, delay):
+    """A device whose resonance takes the boundary past the stable walls within 1e-5 of the sampling rate."""
+    device = Device(mass, damping, modes=[zwidth.Mode(*mode) for mode in modes], actuator=zwidth.Actuator(cutoff))
+    return Scene(device, Timing(1e-3, delay), velocity=velocity)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        swept_by(
+            [(430.735, 0.00210914, 1.45971), (29.2526, 0.0150854, 0.0487502), (663.756, 0.00467683, 0.0577636)],
+            3817.53 / (2 * np.pi),
+            0.0664063,
+            0.150808,
+            zwidth.BackwardDifference(),
+            0.0,
+        ),
+        swept_by(
+            [(189.887, 0.00215821, 1.44521), (382.025, 0.0169526, -0.507537)],
+            568.96 / (2 * np.pi),
+            0.25984,
+            4.36215,
+            LowPass(time_constant=1.02432e-3, order=2),
+            1e-3,
+        ),
+    ],
+    ids=["undelayed", "filtered"],
+)
+def test_an_edge_between_two_nodes_belongs_to_the_outline(scene):
+    (outline,) = scene.stable_region()
+    # Where the hidden edge is: beside the softest walls, at their largest damping.
+    softest = scene.stable_damping(1e-3)
+    assert outline.virtual_damping.max() == pytest.approx(softest.max(), rel=1e-3)
+    area = float(np.trapezoid(*_widths(scene, outline.virtual_damping)))
+    assert outline.area == pytest.approx(area, rel=2e-3)
+
+
+def _widths(scene, dampings):
+    """How wide the rows of dampings are, by the intervals of each, and the dampings."""
+    rows = np.linspace(dampings.min(), dampings.max(), 801)[1:-1]
+    return [float(np.sum(np.diff(scene.stable_stiffness(row)))) for row in rows.tolist()], rows
+
+
+def test_the_pole_pairs_of_a_first_order_are_no_curve():
+    scene = Scene(zwidth.LinearDevice(([1.0], [0.1, 10.0])), Timing(1e-3))
+    with pytest.raises(zwidth.InputError, match="first order"):
+        scene.stable_region()
+    assert scene.max_stiffness().status == zwidth.Status.NOT_CONVERGED
+    # z^2 + (gK + gB/T - a) z - gB/T: rows and labels are known nevertheless.
+    pole = np.exp(-0.1)
+    gain = (1.0 - pole) / 10.0
+    assert scene.stable_stiffness(0.0)[0] == pytest.approx([-10.0, (1.0 + pole) / gain], rel=1e-12)
+    assert scene.stable_damping(1.0)[0] == pytest.approx(
+        1e-3 / gain * np.array([-1.0, (1.0 + pole - gain) / 2.0]), rel=1e-12
+    )
