@@ -11,12 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks, run_in_threads
+from zwidth.arrays.evaluate import BLOCK, FEW, map_blocks
 from zwidth.arrays.xp import WIDE
 from zwidth.loops.rigid.circle import count, factor_loop
 from zwidth.loops.rigid.crossover import stable_kernel
 from zwidth.loops.rigid.device import classify_delays, wall_status
 from zwidth.loops.rigid.folding import Points, fold
+from zwidth.loops.rigid.pole_groups import DOUBTFUL
 from zwidth.loops.rigid.pole_map import Area, fill_up, follow_poles
 from zwidth.loops.rigid.pole_search import (
     Found,
@@ -32,18 +33,15 @@ from zwidth.words.status import Status
 # Multiples of the accuracy at which the two circles are tried where the rounding of a count is too large for it.
 _LADDER = 10.0 ** np.arange(12)
 _LARGEST_ERROR = 0.1
-# Closer to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is: of the
-# radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
-_DOUBTFUL = 1e-8
-_BELOW_ONE = 1.0 - 2.0**-53
-# A rate of which no more is proved than this share of it is no answer; on maps a smaller one is looked at wall by wall.
-_LARGEST_SHARE, _KNOWN = 1e-3, 1e-6
+_BELOW_ONE, _ROUNDED = 1.0 - 2.0**-53, 1e-13
+# A rate of which no more is proved than this share of it is no answer.
+_LARGEST_SHARE = 1e-3
 # Poles so near to the real axis are taken for single ones.
 _REAL = 1e-6
 # Smaller maps are not worth their cells.
 SMALLEST_MAP = 1 << 11
-# Walls of a map that become radii at one time, and listed ones whose poles are found without a compiler.
-_STRIP, _AT_ONCE = 1 << 15, 1 << 10
+# Listed walls whose poles are found at one time without a compiler.
+_AT_ONCE = 1 << 10
 # Points that are compiled together: one size for all batches that are worth it.
 PIECE = BLOCK >> 3
 
@@ -108,6 +106,8 @@ def _finish_poles(columns: list[np.ndarray], found: Found, accuracy: float, kind
     """What is not proved once more, in place: with all crossovers, by halvings, then with larger errors."""
     error = np.where(found.proved, accuracy, np.inf)
     left = np.flatnonzero(~found.proved)
+    # Nothing is proved of bad walls.
+    left = left[np.asarray(wall_status(*(column[left] for column in columns))) == Status.OK]
     with np.errstate(all="ignore"):
         for start in range(0, left.size, FEW):
             _patiently(columns, found, error, left[start : start + FEW], accuracy, kind)
@@ -179,26 +179,18 @@ def area_poles(area: Area, accuracy: float, with_rate: bool = False) -> WallPole
 
     Nothing is compiled, and a wall's value does not depend on the others of its window.
     """
-    re, arrays = follow_poles(area, accuracy, _KNOWN if with_rate else np.inf), area.arrays()
-    proved, rate = np.ones(re.shape, bool), -re if with_rate else _NONE
-    strip = max(1, _STRIP // re.shape[2])
-    strips = [(k, slice(i, i + strip)) for k in range(re.shape[0]) for i in range(0, re.shape[1], strip)]
-
-    def finish(place: Any) -> Any:
-        return _to_radii(re[place], accuracy, [array[place] for array in arrays])
-
-    def at(place: Any, missing: np.ndarray) -> Any:
-        return np.full(missing[0].size, place[0]), missing[0] + place[1].start, missing[1]
-
-    missing = [at(place, left) for place, left in zip(strips, run_in_threads(finish, strips), strict=True)]
-    places = tuple(map(np.concatenate, zip(*missing, strict=True)))
-    if places[0].size:
-        full = tuple(map(fill_up, places))
-        found = list_poles([array[full] for array in arrays], accuracy, with_rate, few=full[0].size)
-        for whole, leaf in zip((re, proved, rate), found, strict=True):
+    found = follow_poles(area, accuracy, with_rate)
+    (radius, rate, places), proved = found, np.ones(found.radius.shape, bool)
+    columns, missing = area.walls(np.stack(places)), np.isnan(radius[places])
+    near, left = (tuple(place[part] for place in places) for part in (~missing, missing))
+    radius[near] = _on_its_side(radius[near], [column[~missing] for column in columns])
+    if left[0].size:
+        full = fill_up(np.flatnonzero(missing))
+        alone = list_poles([column[full] for column in columns], accuracy, with_rate, few=full.size)
+        for whole, leaf in zip((radius, proved, rate), alone, strict=True):
             if whole.size:
-                whole[places] = leaf[: places[0].size]
-    return WallPoles(re, proved, rate)
+                whole[left] = leaf[: left[0].size]
+    return WallPoles(radius, proved, rate if with_rate else _NONE)
 
 
 def list_poles(columns: list[np.ndarray], accuracy: float, with_rate: bool = False, few: int = FEW) -> WallPoles:
@@ -215,13 +207,11 @@ def slowest_pole(wall: tuple[float, float, float, float]) -> tuple[float, float,
 def _find_listed(
     columns: list[np.ndarray], accuracy: float, with_rate: bool, few: int
 ) -> tuple[WallPoles, OutermostPoles]:
-    columns, status = usable(columns)
-    found, bad = outermost_poles(columns, accuracy, few), status != Status.OK
+    found = outermost_poles(columns, accuracy, few)
     rate = rates(found, columns, accuracy) if with_rate else _NONE
-    rate[bad[: rate.size]] = np.nan
-    found.error[bad] = np.inf
-    radius = np.where(np.isinf(found.error), np.nan, found.re)
-    _to_radii(radius, accuracy, columns)
+    radius = np.exp(np.where(np.isinf(found.error), np.nan, found.re))
+    near = np.flatnonzero(np.abs(found.re) <= np.maximum(DOUBTFUL, np.where(np.isinf(found.error), 0.0, found.error)))
+    radius[near] = _on_its_side(radius[near], [column[near] for column in columns])
     return WallPoles(radius, found.error <= accuracy, rate), found
 
 
@@ -262,27 +252,13 @@ def rates(found: OutermostPoles, columns: list[np.ndarray], accuracy: float) -> 
     return np.where(error <= allowed, rate, np.nan)
 
 
-def usable(columns: list[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """The columns with some good wall in place of every bad one, and the status of the walls."""
-    status = np.asarray(wall_status(*columns))
-    ok = status == Status.OK
-    if not ok.all():
-        columns = [np.where(ok, column, fill) for column, fill in zip(columns, (0.1, 0.1, 1.0, 0.0), strict=True)]
-    return columns, status
-
-
-def _to_radii(re: np.ndarray, accuracy: float, arrays: list[np.ndarray]) -> Any:
-    """In place, the radii on the verdict's side of the circle, which errors alone may not tell; where there is none."""
-    # Of a flat mask NumPy finds the few places ten times faster.
-    special = np.unravel_index(np.flatnonzero(~(np.abs(re) > _DOUBTFUL)), re.shape)
-    missing = np.isnan(re[special])
-    near, missing = (tuple(place[part] for place in special) for part in (~missing, missing))
-    np.exp(re, out=re)
-    if near[0].size:
-        alpha, beta, delta, d = (array[near] for array in arrays)
-        with np.errstate(all="ignore"):
-            stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
-        # The largest number below 1 is as near to the truth as 1 itself. A wall without stiffness has a pole at 1.
-        known = np.where((alpha == 0) & (re[near] <= 1.0 + accuracy), 1.0, np.maximum(re[near], 1.0))
-        re[near] = np.where(stable, np.minimum(re[near], _BELOW_ONE), known)
-    return missing
+def _on_its_side(radius: np.ndarray, columns: list[np.ndarray]) -> np.ndarray:
+    """Radii next to 1 on the verdict's side of it, which errors alone may not tell."""
+    if not radius.size:
+        return radius
+    alpha, beta, delta, d = columns
+    with np.errstate(all="ignore"):
+        stable = np.asarray(stable_kernel(alpha, beta, delta, d, classify_delays(d)))
+    # A wall without stiffness has a pole at 1. The largest number below 1 is as near to the truth as 1 itself.
+    outside = np.where((alpha == 0) & (radius < 1.0 + _ROUNDED), 1.0, np.maximum(radius, 1.0))
+    return np.where(stable, np.minimum(radius, _BELOW_ONE), outside)

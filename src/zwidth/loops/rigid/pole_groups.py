@@ -11,6 +11,7 @@ over a group are integrals along a circle around it. The steps C1 to C3 are thos
 
 from __future__ import annotations
 
+from functools import cache
 from math import comb
 from typing import Any, NamedTuple
 
@@ -20,10 +21,18 @@ from zwidth.loops.rigid.circle import Loop
 from zwidth.loops.rigid.pole_step import join
 
 # Orders of the polynomials in xi and eta; each group takes the least that will do.
-ORDERS = (4, 8, 12, 20)
-# Terms of A by u.
-_TERMS = 36
-_PLACES = np.arange(_TERMS + 1)
+ORDERS = (2, 4, 8, 12, 20)
+# Terms of A by u, and points of a mean for each pole; of both half as many where less is asked for than that.
+_TERMS, _POINTS, _COARSE = 36, 48, 1e-5
+# So near to the circle (in the logarithm of the radius) the verdict in closed form says on which side a pole is: of the
+# radii of walls with alpha from 1e-18 on one in ten rounds to 1, of those within 1e-10 of the boundary as many err.
+DOUBTFUL = 1e-7
+# Of the errors allowed, for sums of two poles: their difference is a square root.
+_FINER = 1e-3
+# Of a rate: one that is known less well is looked at wall by wall.
+_RATE_SHARE = 1e-6
+# Poles so near to the real axis are on it.
+REAL = 1e-7
 # Steps to the middles of groups.
 _STEPS = 4
 # Radii of circles over the largest; how many places on the next one is that a mean over a group of one or two needs.
@@ -31,13 +40,38 @@ _CIRCLES = 2.0 ** (-0.5 * np.arange(14))
 _BESIDE = {1: 2, 2: 1}
 # More than this A need not be over what walls change.
 _AMPLE = 100.0
-# Points on a circle and their weights: all around for one pole, and above the real axis, twice as dense, for two.
-_POINTS = {1: np.exp(2j * np.pi * np.arange(48) / 48), 2: np.exp(1j * np.pi * np.arange(49) / 48)}
-_WEIGHTS = {1: np.full(48, 1.0 / 48.0), 2: np.pad(np.full(47, 1.0 / 48.0), 1, constant_values=0.5 / 48.0)}
 # Rounding errors of the polynomials, in units of what the circle allows.
 ROUNDING = 1e-14
 # How many ways lead to a power of xi and eta, over its order (eta first).
 _SHARES = np.array([[comb(i + j, j) / max(i + j, 1) for i in range(ORDERS[-1] + 1)] for j in range(ORDERS[-1] + 1)])
+
+
+class Wanted(NamedTuple):
+    """The errors that logarithms of radii may have: the accuracy, and for a rate a share of themselves."""
+
+    accuracy: float
+    with_rate: bool
+
+    @property
+    def is_coarse(self) -> bool:
+        """Whether half of the terms and points will do, and poles need not be told apart that are as large as that."""
+        return self.accuracy > _COARSE and not self.with_rate
+
+    @property
+    def spare(self) -> float:
+        """What is left for other poles that may be larger."""
+        return 0.5 * self.accuracy if self.is_coarse else 0.0
+
+    @property
+    def doubt(self) -> float:
+        """The size up to which logarithms may have the wrong sign."""
+        return DOUBTFUL + min(self.accuracy, _COARSE)
+
+    def allowed(self, size: np.ndarray) -> Any:
+        """The errors of logarithms of some size."""
+        if self.with_rate:
+            return np.minimum(self.accuracy, _RATE_SHARE * size)
+        return np.minimum(self.accuracy - self.spare, np.maximum(size, _COARSE))
 
 
 class Cells(NamedTuple):
@@ -51,6 +85,7 @@ class Cells(NamedTuple):
 class Group(NamedTuple):
     """One or two poles of each cell, by A around a center e^(re + j im) and a circle around them (C2)."""
 
+    poles: int
     re: np.ndarray
     im: np.ndarray
     a: Any  # complex coefficients of A by u, (terms, cells)
@@ -59,11 +94,34 @@ class Group(NamedTuple):
     disk: np.ndarray  # the circle's radius in u
     low: np.ndarray  # the least logarithm of a modulus in the cell
     error: np.ndarray  # of sums to each order, in units of what the circle allows (orders, cells)
+    order: np.ndarray  # which of the orders is needed; none of them where it is their number
+
+    @property
+    def many(self) -> np.ndarray:
+        """How many poles that are, with their conjugates."""
+        return np.where((self.poles == 1) & (np.sin(self.im) < REAL), 1, 2)
+
+    @property
+    def doubt(self) -> np.ndarray:
+        """How far logarithms of single poles may be off, and those of the disk of two (orders, cells)."""
+        return (self.error + ROUNDING) * (self.disk / (1.0 - self.disk)) + ROUNDING * np.abs(self.re)
+
+    @property
+    def least(self) -> np.ndarray:
+        """The least size of a logarithm in the cell."""
+        return np.abs(self.re) - (self.re - self.low)
+
+    def is_apart(self, other: Group) -> np.ndarray:
+        """Whether no pole is in both groups."""
+        places = [np.exp(group.re + 1j * group.im) for group in (self, other)]
+        return np.abs(places[0] - places[1]) > np.abs(places[0]) * self.disk + np.abs(places[1]) * other.disk
 
 
 def pick(tree: Any, index: Any) -> Any:
     """Some of the cells of arrays whose last axis they are."""
-    return type(tree)(*(pick(leaf, index) for leaf in tree)) if isinstance(tree, tuple) else tree[..., index]
+    if isinstance(tree, tuple):
+        return type(tree)(*(pick(leaf, index) for leaf in tree))
+    return tree[..., index] if isinstance(tree, np.ndarray) else tree
 
 
 def _expand(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool, terms: int) -> tuple[Any, ...]:
@@ -115,10 +173,12 @@ def find_middle(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) ->
     return re, im
 
 
-def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional: bool) -> Group:
+def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional: bool, wanted: Wanted) -> Group:
     """The circle on which the group's term of A is the largest, over all of the others and what walls change (C2)."""
-    loop = cells.loop
-    a, f, w, (near, off, lead, rho, late) = _expand(re, im, loop, fractional, _TERMS)
+    fewer = 2 if wanted.is_coarse and poles == 1 else 1
+    loop, terms, points = cells.loop, _TERMS // fewer, _POINTS // fewer * poles
+    places = np.arange(terms + 1)
+    a, f, w, (near, off, lead, rho, late) = _expand(re, im, loop, fractional, terms)
     r, level, by, sizes = np.exp(re), np.abs(f), np.abs(w), np.abs(a)
     limit = 1.0 / np.maximum(1.0, np.maximum(rho, late) if fractional else rho)
     largest = np.minimum(2.0 / loop.turns, 0.4 * limit)
@@ -128,15 +188,15 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
     most = lead * np.exp(loop.turns * wide) * (near + r * wide) * (off + r * wide) / (1.0 - rho * wide)
     if fractional:
         most *= (1.0 + wide) / (1.0 - late * wide)
-    rest = (most + np.abs(loop.beta) * by / (1.0 - wide)) * (disk / wide) ** (_TERMS + 1)
-    total = ((sizes * largest ** _PLACES[:, None]).T[:, None] @ _CIRCLES ** _PLACES[:, None])[:, 0].T
+    rest = (most + np.abs(loop.beta) * by / (1.0 - wide)) * (disk / wide) ** (terms + 1)
+    total = ((sizes * largest ** places[:, None]).T[:, None] @ _CIRCLES ** places[:, None])[:, 0].T
     # Of P's own rounding errors what `pole_step` says, too.
     rounding = 2.0**-52 * (16.0 + loop.turns * (np.abs(re) + im))
     rest += rounding * (total + 2.0 * (np.abs(loop.alpha) + np.abs(loop.beta) * level))
     main = sizes[poles] * disk**poles
     low = 2.0 * main - total - rest
     ratio = low / (cells.a + cells.b * (level + by * disk / (1.0 - disk)))
-    score = np.where(ratio > 1.02, ratio / (1.0 + 1e12 * rest / low), 0.0)
+    score = np.where(ratio > 1.02, ratio / (1.0 + 1e3 / wanted.accuracy * rest / low), 0.0)
     # With circles beside it between which no pole is either, means of points on it are nearly exact.
     beside, cells_of = _BESIDE[poles], np.arange(re.size)
     # Where all is small enough for every order, a smaller circle is farther from what is outside.
@@ -147,7 +207,7 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
         outer, inner = np.maximum(best - step, 0), np.minimum(best + step, _CIRCLES.size - 1)
         between = (outer + inner == 2 * best) & (np.minimum(score[outer, cells_of], score[inner, cells_of]) > 0)
         # Of the sums of powers of tau/A, and as often as there are points that of the middle's own poles.
-        missed = 2.0 ** (-24 * step * poles) * (1 + 48 * poles)
+        missed = 2.0 ** (-0.5 * step * points) * (1 + points)
         missed = missed * (4.5 * spread[outer, cells_of] + spread[inner, cells_of])
         alias = np.where(between, np.fmin(alias, missed), alias)
     good = score[own] > 0
@@ -164,7 +224,10 @@ def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional
         farthest = np.where((ratio > 1.02) & (reach < 0.98), np.log1p(-reach) * disk / (1.0 - disk), -np.inf)
     else:
         farthest = np.where(ratio > 1.02, np.log1p(-disk), -np.inf)
-    return Group(re, im, a, f, w, disk[own], re + farthest.max(0), error)
+    group = Group(poles, re, im, a, f, w, disk[own], re + farthest.max(0), error, best)
+    # Some of a cell's walls may have to be computed by themselves.
+    most = wanted.allowed(np.maximum(group.least, DOUBTFUL)) * (1.0 if poles == 1 else _FINER)
+    return group._replace(order=(~(group.doubt <= most)).sum(0))
 
 
 def _powers(x: Any, count: int, first: Any = 1.0) -> np.ndarray:
@@ -177,13 +240,26 @@ def _powers(x: Any, count: int, first: Any = 1.0) -> np.ndarray:
     return powers.view(float).transpose(1, 0, 2)
 
 
-def sum_up(poles: int, group: Group, cells: Cells, order: int) -> list[np.ndarray]:
+@cache
+def _points(poles: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points on a circle and their weights: all around for one pole, and above the real axis for two."""
+    points = np.exp(2j * np.pi * np.arange(count) / count)
+    weights = np.full(count, 1.0 / count)
+    if poles == 2:
+        points, weights = points[: count // 2 + 1], 2.0 * weights[: count // 2 + 1]
+        weights[[0, -1]] *= 0.5
+    return points, weights
+
+
+def sum_up(group: Group, cells: Cells, order: int) -> list[np.ndarray]:
     """The log |1 + u| of one pole, or sums of u/disk and its square over two, by powers of eta and xi (C1)."""
-    points, weights, count = _POINTS[poles], _WEIGHTS[poles], 48 * poles
+    terms, poles = group.a.shape[0], group.poles
+    count, powers = _POINTS * (terms - 1) // _TERMS * poles, np.arange(terms)
+    points, weights = _points(poles, count)
     u = group.disk[:, None] * points
-    terms = (group.a * group.disk ** _PLACES[:, None]).T
-    inverse = 1.0 / np.fft.ifft(terms, count, norm="forward")[:, : points.size]
-    turn = np.fft.ifft(terms * _PLACES, count, norm="forward")[:, : points.size] * inverse
+    coefficients = (group.a * group.disk ** powers[:, None]).T
+    inverse = 1.0 / np.fft.ifft(coefficients, count, norm="forward")[:, : points.size]
+    turn = np.fft.ifft(coefficients * powers, count, norm="forward")[:, : points.size] * inverse
     along_xi = _powers(np.conj(cells.a[:, None] * inverse), order + 1).transpose(0, 2, 1)
     along_eta = cells.b[:, None] * inverse * (group.f[:, None] + group.w[:, None] * (u / (1.0 + u)))
     places, sums = np.arange(order + 1), []

@@ -1,13 +1,12 @@
 """Outermost poles of maps: one expansion a cell of walls, and one proof for all of its walls.
 
 In each cell one or two groups of poles are followed (`loops.rigid.pole_groups`), and one count says that no other pole
-of any of its walls is larger. The proofs, C1 to C5, are in docs/theory/maps.md. Cells that fail are cut in four; what
+of any of its walls is larger. The proofs, C1 to C6, are in docs/theory/maps.md. Cells that fail are cut in four; what
 is left of the smallest is for single walls.
 """
 
 from __future__ import annotations
 
-from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,10 +14,13 @@ import numpy as np
 from zwidth.arrays.evaluate import processors, run_in_threads, work_beside
 from zwidth.loops.rigid.circle import Loop, count_in_cell, factor_loop
 from zwidth.loops.rigid.pole_groups import (
+    DOUBTFUL,
     ORDERS,
+    REAL,
     ROUNDING,
     Cells,
     Group,
+    Wanted,
     enclose,
     find_middle,
     knows_larger,
@@ -33,10 +35,8 @@ from zwidth.loops.rigid.pole_step import halley_step
 _SIDES = (128, 64, 32, 16, 8)
 # Cells of one list, and of those how many have their sums made at one time, and walls: what they need stays in caches.
 _LIST, _BATCH, _WALLS = 1 << 9, 1 << 7, 1 << 14
-# Of Halley's method on both starts. Centers so near to the real axis are put on it.
-_STEPS, _REAL = 5, 1e-7
-# Of the accuracy, for sums of two poles: their difference is a square root.
-_FINER = 1e-3
+# Of Halley's method on both starts.
+_STEPS = 5
 # How far inside of the groups the circles of a count are, in units of how far the groups move in the cell.
 _INSIDE = (0.3, 1.5, 6.0)
 
@@ -95,75 +95,51 @@ def fill_up(index: np.ndarray) -> np.ndarray:
     return np.concatenate([index, np.repeat(index[-1:], -index.size % 16)])
 
 
+def _on_one_side(re: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
+    """Logarithms of radii, smaller and larger by an error, on the same side of the unit circle and not next to it."""
+    gap = 2.0 * DOUBTFUL
+    return (
+        np.where(re > 0, np.maximum(re - error, gap), re - error),
+        np.where(re > 0, re + error, np.minimum(re + error, -gap)),
+    )
+
+
 def _find_poles(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
     """The slow pole and the first pair of the ring, nearly, the larger one first: (2, cells)."""
     re, im = map(np.stack, zip(*both_starts(loop, fractional), strict=True))
     for _ in range(_STEPS):
         re, im = halley_step(re, im, loop, fractional)
-    im = np.where(im < _REAL, 0.0, np.where(np.pi - im < _REAL, np.pi, im))
+    im = np.where(im < REAL, 0.0, np.where(np.pi - im < REAL, np.pi, im))
     larger = (re[0] >= re[1]) | np.isnan(re[1])
     return np.where(larger, re, re[::-1]), np.where(larger, im, im[::-1])
 
 
-class _GroupOfCell(NamedTuple):
-    """The group about one start that is to be followed in each cell, of one pole or of two."""
+class Followed(NamedTuple):
+    """Radii (devices, betas, alphas), rates of decay if wanted, and where a radius is next to 1 or NaN."""
 
-    groups: tuple[Group, ...]
-    needed: np.ndarray  # the order of each group that is known well enough (groups, cells)
-    best: np.ndarray  # which of the groups
-
-    @classmethod
-    def of(cls, accuracy: float, *groups: Group) -> _GroupOfCell:
-        """The groups that need the least order."""
-        wanted = accuracy, accuracy * _FINER
-        shares = [
-            (group.error + ROUNDING) * (group.disk / (1.0 - group.disk)) + ROUNDING * np.abs(group.re)
-            for group in groups
-        ]
-        needed = np.stack([(~(share <= most)).sum(0) for share, most in zip(shares, wanted, strict=False)])
-        return cls(groups, needed, needed.argmin(0))
-
-    @property
-    def known(self) -> np.ndarray:
-        """Where one of the groups is known."""
-        return self.needed.min(0) < len(ORDERS)
-
-    @property
-    def many(self) -> np.ndarray:
-        """How many poles that are, with their conjugates."""
-        return np.where((self.best == 0) & (np.sin(self.groups[0].im) < _REAL), 1, 2)
-
-    def _choose(self, name: str) -> np.ndarray:
-        return np.choose(self.best, [getattr(group, name) for group in self.groups])
-
-    def inside(self, share: float) -> np.ndarray:
-        """The logarithm of a radius below all moduli in the cell, by so much of what these may differ."""
-        low = self._choose("low")
-        return low - share * (self._choose("re") - low)
-
-    def is_apart(self, other: _GroupOfCell) -> np.ndarray:
-        """Whether no pole is in both groups."""
-        places = [np.exp(choice._choose("re") + 1j * choice._choose("im")) for choice in (self, other)]
-        return np.abs(places[0] - places[1]) > sum(
-            np.abs(place) * choice._choose("disk") for place, choice in zip(places, (self, other), strict=True)
-        )
+    radius: np.ndarray
+    rate: np.ndarray
+    special: tuple[np.ndarray, ...]
 
 
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, accuracy: float, share: float, out: np.ndarray, first: list[int]) -> None:
-        self.area, self.side, self.accuracy, self.share, self.first = area, side, accuracy, share, first
+    def __init__(self, area: Area, side: int, wanted: Wanted, radius: np.ndarray, rate: np.ndarray) -> None:
+        self.area, self.side, self.wanted, self.radius, self.rate = area, side, wanted, radius, rate
         self.axes = _cut(area.alpha, side), _cut(area.beta, side)
-        self.tiles = out.reshape(out.shape[0], -1, side, out.shape[2] // side, side)
+        # Devices, rows and columns of walls whose radius is next to 1 or NaN.
+        self.special: list[np.ndarray] = []
 
     def split(self, places: np.ndarray) -> np.ndarray:
-        """Each cell in four, without what is beyond the ends of the axes."""
+        """Each cell in four, without what is beyond the window."""
         device, row, column = np.repeat(places, 4, axis=1)
         row, column = (
             2 * part + np.tile(place, places.shape[1]) for part, place in ((row, [0, 0, 1, 1]), (column, [0, 1, 0, 1]))
         )
-        inside = (row < self.axes[1].middle.shape[1]) & (column < self.axes[0].middle.shape[1])
+        rows, columns = self.area.window
+        inside = (self.side * row < rows.stop) & (self.side * (row + 1) > rows.start)
+        inside &= (self.side * column < columns.stop) & (self.side * (column + 1) > columns.start)
         return np.stack([device, row, column])[:, inside]
 
     def solve_all(self, places: np.ndarray, fractional: bool, begin: Any) -> np.ndarray:
@@ -181,21 +157,26 @@ class _Level:
         loop = factor_loop(alpha, beta, self.area.delta[places[0]], self.area.d[places[0]], fractional)
         cells = Cells(loop, *half)
         re, im = _find_poles(loop, fractional)
-        one = _GroupOfCell.of(self.accuracy, enclose(1, re[0], im[0], cells, fractional))
-        written = self._try([[one]], places, cells, fractional, begin)
-        left = fill_up(np.flatnonzero(~written))
-        if left.size:
-            # Next to a double pole the two are followed together; where another pole is about to take over, both.
-            own, twice = pick(cells, left), pick(cells, np.tile(left, 2))
-            singles = pick(one.groups[0], left), enclose(1, re[1, left], im[1, left], own, fractional)
-            middles = find_middle(re[:, left].reshape(-1), im[:, left].reshape(-1), twice.loop, fractional)
-            pairs = enclose(2, *middles, twice, fractional)
-            larger, other = (
-                _GroupOfCell.of(self.accuracy, single, pick(pairs, part))
-                for single, part in zip(singles, (slice(left.size), slice(left.size, None)), strict=True)
-            )
-            written[left] = self._try([[larger], [larger, other]], places[:, left], own, fractional, begin)
-        return places[:, :count][:, ~written[:count]]
+        single = enclose(1, re[0], im[0], cells, fractional, self.wanted)
+        done = self._prove([single], places, cells, fractional, begin)
+        if self.wanted.is_coarse:
+            index = fill_up(np.flatnonzero(~done))
+            if index.size:
+                done[index] = self._prove_flat(re[0, index], places[:, index], pick(cells, index), fractional, begin)
+        known = (single.order < len(ORDERS)) | done
+        # Where another pole is about to take over, both are followed; next to a double pole the two together.
+        for left, poles in ((known & ~done, 1), (~known, 2)):
+            index = fill_up(np.flatnonzero(left))
+            if not index.size:
+                continue
+            some = pick(cells, index)
+            if poles == 1:
+                followed = [pick(single, index), enclose(1, re[1, index], im[1, index], some, fractional, self.wanted)]
+            else:
+                middle = find_middle(re[0, index], im[0, index], some.loop, fractional)
+                followed = [enclose(2, *middle, some, fractional, self.wanted)]
+            done[index] = self._prove(followed, places[:, index], some, fractional, begin)
+        return places[:, :count][:, ~done[:count]]
 
     def _along(self, places: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """The pieces of alpha's axis and of beta's in which cells are."""
@@ -205,48 +186,59 @@ class _Level:
             for axis, place in zip(self.axes, (column, row), strict=True)
         ]
 
-    def _try(
-        self, proposals: list[list[_GroupOfCell]], places: np.ndarray, cells: Cells, fractional: bool, begin: Any
-    ) -> np.ndarray:
-        """Write the cells in which groups are known and hold the outermost pole whatever the wall (C4, C5)."""
-        wanted, indices, radii = [], [], []
-        for followed in proposals:
-            known = np.logical_and.reduce([choice.known for choice in followed])
-            if len(followed) == 2:
-                known &= followed[0].is_apart(followed[1])
-            index = fill_up(np.flatnonzero(known))
-            wanted.append(sum(choice.many for choice in followed))
-            indices.append(np.tile(index, len(_INSIDE)))
-            for inside in _INSIDE:
-                radii.append(np.minimum.reduce([choice.inside(inside)[index] for choice in followed]))
-        loop, a, b = pick(cells, np.concatenate(indices))
+    def _prove(self, groups: list[Group], places: np.ndarray, cells: Cells, fractional: bool, begin: Any) -> np.ndarray:
+        """Write the cells in which groups are known and hold the outermost pole whatever the wall (C4 to C6)."""
+        known = np.logical_and.reduce([group.order < len(ORDERS) for group in groups])
+        if len(groups) == 2:
+            known &= groups[0].is_apart(groups[1])
+        index = fill_up(np.flatnonzero(known))
+        groups = [pick(group, index) for group in groups]
+        circles = [np.minimum.reduce([group.low - x * (group.re - group.low) for group in groups]) for x in _INSIDE]
+        many = [sum(group.many for group in groups)] * len(circles)
+        if self.wanted.is_coarse:
+            # Others may be larger by what is spared, on the same side of the unit circle.
+            low = np.maximum.reduce([group.low for group in groups])
+            circles.append(_on_one_side(low, self.wanted.spare)[1])
+            many.append(0 * many[0])
+        loop, a, b = pick(cells, np.tile(index, len(circles)))
         # One count for all of the circles.
-        outside, sure = count_in_cell(np.concatenate(radii), loop, (a, b), fractional)
-        proved, start = np.zeros((2, places.shape[1]), bool), 0
-        for followed, many, index in zip(proposals, wanted, indices, strict=True):
-            part = slice(start, start + index.size)
-            proved[len(followed) - 1, index[sure[part] & (outside[part] == many[index])]], start = True, part.stop
-        known = np.asarray(proved.any(0))
-        begin(self._follow, proposals[-1][0], known, places, cells, False)
-        if proved[1].any():
-            begin(self._follow, proposals[-1][1], proved[1] & ~proved[0], places, cells, True)
-        return known
+        outside, sure = count_in_cell(np.concatenate(circles), loop, (a, b), fractional)
+        shape = len(circles), index.size
+        proved = np.zeros(places.shape[1], bool)
+        proved[index[(sure.reshape(shape) & (outside.reshape(shape) == many)).any(0)]] = True
+        where, places, cells = np.flatnonzero(proved[index]), places[:, index], pick(cells, index)
+        for k, group in enumerate(groups):
+            begin(self._follow, group, where, places, cells, k > 0)
+        return proved
 
-    def _follow(self, choice: _GroupOfCell, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
-        """Write the groups of some cells, in batches of one kind."""
-        for (poles, group), k in product(enumerate(choice.groups, 1), range(len(ORDERS))):
-            index = np.flatnonzero(where & (choice.best == poles - 1) & (choice.needed[poles - 1] == k))
+    def _prove_flat(self, re: np.ndarray, places: np.ndarray, cells: Cells, fractional: bool, begin: Any) -> np.ndarray:
+        """Write one value in the cells in which all outermost poles are as large within the accuracy (C6)."""
+        loop, a, b = pick(cells, np.tile(np.arange(re.size), 2))
+        circles = np.concatenate(_on_one_side(re, self.wanted.accuracy))
+        outside, sure = (part.reshape(2, -1) for part in count_in_cell(circles, loop, (a, b), fractional))
+        flat = sure.all(0) & (outside[0] > 0) & (outside[1] == 0)
+        begin(self._fill, np.where(re > 0, *_on_one_side(re, 0.0))[flat], places[:, flat])
+        return flat
+
+    def _fill(self, re: np.ndarray, places: np.ndarray) -> None:
+        for value, cell in zip(np.exp(re).tolist(), places.T, strict=True):
+            self.radius[self._place(cell)[0]] = value
+
+    def _follow(self, group: Group, where: np.ndarray, places: np.ndarray, cells: Cells, merge: bool) -> None:
+        """Write a group in some cells, in batches of one order."""
+        for k, order in enumerate(ORDERS):
+            index = where[group.order[where] == k]
             for start in range(0, index.size, _BATCH):
                 some = index[start : start + _BATCH]
                 full = fill_up(some)
                 batch = pick(group, full)
                 with np.errstate(all="ignore"):
-                    sums = sum_up(poles, batch, pick(cells, full), ORDERS[k])
-                    self._write(places[:, some], sums, batch, k, merge)
+                    self._write(places[:, some], sum_up(batch, pick(cells, full), order), batch, k, merge)
 
     def _write(self, places: np.ndarray, sums: list[np.ndarray], group: Group, k: int, merge: bool) -> None:
         """The poles of all walls of some cells, or the larger ones of these and of what is there."""
         size, order = max(1, _WALLS // self.side**2), ORDERS[k] + 1
+        memories = np.empty((len(sums), min(size, places.shape[1]), self.side, self.side))
         if len(sums) == 1:
             sums[0][:, 0, 0] += group.re
         for start in range(0, places.shape[1], size):
@@ -255,50 +247,70 @@ class _Level:
             xi, eta = (
                 axis.powers[place][..., :order] for axis, place in zip(self.axes, self._along(some), strict=True)
             )
-            along_xi = [x[part] @ xi.transpose(0, 2, 1) for x in sums]
-            device, row, column = some[0], some[1] - self.first[0], some[2] - self.first[1]
-            if len(sums) == 1 and not merge and self.share == np.inf:
-                # To where they belong at once: copies would take as long.
-                for one, other, *cell in zip(eta, along_xi[0], device, row, column, strict=True):
-                    np.matmul(one, other, out=self.tiles[cell[0], cell[1], :, cell[2]])
-                continue
-            values = [eta @ x for x in along_xi]
-            re, disk, error = (x[part, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
-            if len(sums) == 1:
-                values, allowed = values[0], self.allowed(values[0])
-                known = disk / (1.0 - disk) * error <= allowed
-            else:
-                values, inside = larger_of_two(*values, disk)
-                values += re
-                known = knows_larger(inside, disk, error, self.allowed(values))
-            if not known.all():
-                values[np.broadcast_to(~known, values.shape)] = np.nan
-            walls = device, row, slice(None), column
-            self.tiles[walls] = np.maximum(self.tiles[walls], values) if merge else values
+            # Into the same memory: new memory takes as long to get as all of this.
+            values, *others = (
+                np.matmul(eta, x[part] @ xi.transpose(0, 2, 1), out=memory[: some.shape[1]])
+                for x, memory in zip(sums, memories, strict=True)
+            )
+            if others or self.wanted.with_rate:
+                re, disk, error = (x[part, None, None] for x in (group.re, group.disk, group.error[k] + ROUNDING))
+                if others:
+                    values, inside = larger_of_two(values, others[0], disk)
+                    values += re
+                    known = knows_larger(inside, disk, error, self.wanted.allowed(np.abs(values)))
+                else:
+                    known = disk / (1.0 - disk) * error + ROUNDING * np.abs(re) <= self.wanted.allowed(np.abs(values))
+                values[~known] = np.nan
+            self._note(some, values)
+            for cell, value in zip(some.T, values, strict=True):
+                tile, inside = self._place(cell)
+                # Of whole cells, then to their places: how numbers are rounded may depend on how many there are, and
+                # NumPy 2.4 negates strided ones wrongly.
+                if self.rate.size:
+                    rate = (-value)[inside]
+                    self.rate[tile] = np.minimum(self.rate[tile], rate) if merge else rate
+                radius = np.exp(value, out=value)[inside]
+                self.radius[tile] = np.maximum(self.radius[tile], radius) if merge else radius
 
-    def allowed(self, values: np.ndarray) -> Any:
-        """The errors that walls may have."""
-        return self.accuracy if self.share == np.inf else np.minimum(self.accuracy, self.share * np.abs(values))
+    def _place(self, cell: np.ndarray) -> tuple[Any, Any]:
+        """Where a cell lies in the window, and what of it does."""
+        device, *corner = cell.tolist()
+        starts = [self.side * k - axis.start for k, axis in zip(corner, self.area.window, strict=True)]
+        tile = [
+            slice(max(0, start), min(start + self.side, axis.stop - axis.start))
+            for start, axis in zip(starts, self.area.window, strict=True)
+        ]
+        return (device, *tile), tuple(
+            slice(part.start - start, part.stop - start) for part, start in zip(tile, starts, strict=True)
+        )
 
     def forget(self, places: np.ndarray) -> None:
         """NaN for all walls of some cells."""
-        self.tiles[places[0], places[1] - self.first[0], :, places[2] - self.first[1]] = np.nan
+        self._note(places, np.full((places.shape[1], self.side, self.side), np.nan))
+        for cell in places.T:
+            tile, _ = self._place(cell)
+            self.radius[tile] = np.nan
+
+    def _note(self, places: np.ndarray, logarithms: np.ndarray) -> None:
+        """Note the walls whose side of the circle is in doubt, or that are NaN."""
+        flat, doubt = logarithms.reshape(-1, self.side**2), self.wanted.doubt
+        for index in np.flatnonzero(~((flat.min(1) > doubt) | (flat.max(1) < -doubt))):
+            (device, rows, columns), inside = self._place(places[:, index])
+            row, column = np.nonzero(~(np.abs(logarithms[index][inside]) > doubt))
+            self.special.append(np.stack([np.full(row.size, device), row + rows.start, column + columns.start]))
 
 
-def follow_poles(area: Area, accuracy: float, share: float = np.inf) -> np.ndarray:
-    """Logarithms of the moduli of the outermost poles in the window (devices, betas, alphas).
+def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Followed:
+    """The outermost poles of a window of a map, NaN where no cell knows them well enough.
 
-    NaN where no cell knows them to the accuracy and to that share of themselves. A wall's value does not depend on the
-    window: cells lie on the whole map, and each is computed by itself.
+    A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
     """
     longest = max(area.alpha.shape[1], area.beta.shape[1])
     sides = [side for side in _SIDES if side < 2 * longest or side == _SIDES[-1]]
-    top, window = sides[0], area.window
-    first = [part.start // top for part in window]
-    last = [-(-part.stop // top) for part in window]
-    out = np.empty((area.d.size, *(top * (stop - start) for start, stop in zip(first, last, strict=True))))
+    shape = area.d.size, *(part.stop - part.start for part in area.window)
+    radius, rate = np.empty(shape), np.empty(shape if with_rate else 0)
     held = area.d != np.floor(area.d)
-    levels = [_Level(area, side, accuracy, share, out, [start * (top // side) for start in first]) for side in sides]
+    levels = [_Level(area, side, Wanted(accuracy, with_rate), radius, rate) for side in sides]
 
     def follow(kind: bool, cells: np.ndarray) -> None:
         with np.errstate(all="ignore"), work_beside() as begin:
@@ -306,13 +318,15 @@ def follow_poles(area: Area, accuracy: float, share: float = np.inf) -> np.ndarr
                 cells = level.solve_all(cells if level is levels[0] else level.split(cells), kind, begin)
             levels[-1].forget(cells)
 
-    pieces = []
+    pieces, corners = [], [np.arange(part.start // sides[0], -(-part.stop // sides[0])) for part in area.window]
     for kind in (False, True):
-        axes = np.flatnonzero(held == kind), *map(np.arange, first, last)
-        cells = np.stack([part.reshape(-1) for part in np.meshgrid(*axes, indexing="ij")])
+        devices = np.flatnonzero(held == kind)
+        cells = np.stack([part.reshape(-1) for part in np.meshgrid(devices, *corners, indexing="ij")])
         # What is hard lies together: each thread gets its share of it. Two are needed to find poles and to write them.
         count = min(max(1, processors() // 2), cells.shape[1])
         pieces += [(kind, cells[:, k::count]) for k in range(count)]
     run_in_threads(lambda piece: follow(*piece), pieces)
-    inside = tuple(slice(w.start - top * start, w.stop - top * start) for w, start in zip(window, first, strict=True))
-    return out[:, *inside]
+    special = np.concatenate([np.empty((3, 0), int), *(part for level in levels for part in level.special)], axis=1)
+    # Walls at which two groups were compared may be there twice.
+    flat = np.unique(np.ravel_multi_index(tuple(special), shape))
+    return Followed(radius, rate, np.unravel_index(flat, shape))

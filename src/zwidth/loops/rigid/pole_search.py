@@ -87,6 +87,8 @@ def _pair(loop: Loop, fractional: bool) -> tuple[Array, Array]:
     """The first pair of the ring, where T and B have one size as they change with |z| from the unit circle on."""
     xp = namespace(loop.alpha)
     im = np.pi / (loop.lag + 1.0)
+    # Where W is nearly a negative multiple of z - 1, the phases of T and B meet a half turn later.
+    im = xp.where((loop.alpha < -loop.beta * im) & (loop.turns > 1), 2.0 * im, im)
     x = xp.sin(0.5 * im) ** 2
     sizes = [(1.0 - zero) * (1.0 - zero) + 4.0 * zero * x for zero in (1.0, loop.c)]
     body = (loop.a2 + loop.h) ** 2 - 4.0 * loop.a2 * loop.h * x

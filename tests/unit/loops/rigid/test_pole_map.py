@@ -6,7 +6,7 @@ from bounds import bound_radius
 
 import zwidth
 from zwidth.loops.rigid.folding import Points, fold
-from zwidth.loops.rigid.outermost_poles import SMALLEST_MAP, as_area, outermost_poles
+from zwidth.loops.rigid.outermost_poles import SMALLEST_MAP, area_poles, as_area, outermost_poles
 from zwidth.loops.rigid.pole_map import Area, follow_poles
 from zwidth.words.status import Status
 
@@ -56,7 +56,8 @@ def test_every_accuracy_is_kept(d, accuracy):
     """Against walls found one by one; nearly all come from series, and coarser ones are not as right by chance."""
     rng = np.random.default_rng(3)
     alpha, beta = np.linspace(0.001, 1.5 / (1.0 + d), 320), np.linspace(0.0, 1.5 / (1.0 + d), 320)
-    found = follow_poles(Area.whole(alpha[None], beta[None], np.array([0.1]), np.array([d])), accuracy)[0]
+    area = Area.whole(alpha[None], beta[None], np.array([0.1]), np.array([d]))
+    found = np.log(follow_poles(area, accuracy).radius[0])
     left = np.isnan(found)
     assert left.mean() < 0.1
     row, column = rng.integers(0, 320, (2, 2000))
@@ -117,7 +118,8 @@ def test_two_poles_that_meet_are_followed_together(z, d, width):
     """A map across a double pole: half of its walls have two real poles, the others a pair."""
     alpha, beta = double_pole(z, 0.1, d)
     alphas, betas = (middle * (1.0 + width * np.linspace(-1.0, 1.0, 64)) for middle in (alpha, beta))
-    found = follow_poles(Area.whole(alphas[None], betas[None], np.array([0.1]), np.array([d])), 1e-9)[0]
+    area = Area.whole(alphas[None], betas[None], np.array([0.1]), np.array([d]))
+    found = np.log(follow_poles(area, 1e-9).radius[0])
     assert np.isnan(found).sum() < 64
     columns = [np.tile(alphas, 64), np.repeat(betas, 64), np.full(4096, 0.1), np.full(4096, d)]
     alone = outermost_poles(columns, 1e-9)
@@ -127,3 +129,37 @@ def test_two_poles_that_meet_are_followed_together(z, d, width):
     assert zwidth.spectral_radius(alpha, beta, 0.1, d) == pytest.approx(z, abs=1e-6)
     real = np.sin(alone.im) < 1e-6
     assert 0.1 < real.mean() < 0.9
+
+
+@pytest.mark.parametrize("accuracy", [1e-2, 1e-9])
+@pytest.mark.parametrize("d", [0.37, 50.0])
+def test_a_window_has_the_bits_of_the_whole_map(d, accuracy):
+    """Windows that end inside of cells, one wall from their edge too; a rate is that of its radius."""
+    alpha, beta = np.linspace(0.0, 0.8 / (1.0 + d), 209)[None], np.linspace(-0.2, 1.0, 150)[None]
+    devices = np.array([0.1, 0.7]), np.full(2, d)
+    whole = area_poles(Area.whole(alpha, beta, *devices), accuracy, with_rate=True)
+    known = np.isfinite(whole.rate)
+    np.testing.assert_allclose(np.exp(-whole.rate[known]), whole.radius[known], rtol=2e-9)
+    for rows, columns in (
+        (slice(40, 101), slice(87, 200)),
+        (slice(15, 33), slice(7, 209)),
+        (slice(0, 150), slice(8, 9)),
+    ):
+        part = area_poles(Area(alpha, beta, *devices, (rows, columns)), accuracy, with_rate=True)
+        for leaf, found in zip(whole, part, strict=True):
+            np.testing.assert_array_equal(leaf[:, rows, columns], found)
+
+
+@pytest.mark.parametrize(("d", "low"), [(8.0, 0.3), (500.0, 0.9)])
+def test_poles_of_nearly_one_size_need_not_be_told_apart(d, low):
+    """Of a coarse map next to all poles of a ring, and where the outermost one changes, cells find nearly all."""
+    alpha, beta = np.linspace(1e-4, 0.9, 128) / (1.0 + d), np.linspace(0.1, 0.54, 128)
+    found = follow_poles(Area.whole(alpha[None], beta[None], np.array([0.5]), np.array([d])), 1e-2).radius[0]
+    known = ~np.isnan(found)
+    assert known.mean() > low
+    row, column = np.nonzero(known)
+    alone = outermost_poles([alpha[column], beta[row], np.full(row.size, 0.5), np.full(row.size, d)], 1e-9)
+    assert (np.abs(np.log(found[known]) - alone.re) <= 1e-2 + alone.error).all()
+    stable = zwidth.is_stable(alpha[column], beta[row], 0.5, d)
+    sure = np.abs(alone.re) > 1.1e-5
+    np.testing.assert_array_equal((found[known] < 1)[sure], stable[sure])
