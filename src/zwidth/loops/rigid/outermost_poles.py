@@ -238,7 +238,7 @@ def rates(found: OutermostPoles, columns: list[np.ndarray], accuracy: float) -> 
     error = np.minimum(found.error, found.doubt + beyond)
     # Without stiffness and damping both poles next to 1 are at 1.
     error[(found.re == 0) & (columns[0] == 0) & (columns[1] == -columns[2])] = 0.0
-    held = columns[3] % 1.0 != 0.0
+    held = columns[3] != np.floor(columns[3])
     with np.errstate(all="ignore"):
         for kind in (False, True):
             part = np.flatnonzero((error > allowed) & (found.doubt <= allowed) & (held == kind))

@@ -55,11 +55,6 @@ class Area(NamedTuple):
         """All of a map."""
         return cls(alpha, beta, delta, d, (slice(0, beta.shape[1]), slice(0, alpha.shape[1])))
 
-    def arrays(self) -> list[np.ndarray]:
-        """alpha, beta, delta and d of the window, each in its shape (devices, betas, alphas)."""
-        beta, alpha = self.beta[:, self.window[0], None], self.alpha[:, None, self.window[1]]
-        return list(np.broadcast_arrays(alpha, beta, self.delta[:, None, None], self.d[:, None, None]))
-
     def walls(self, place: np.ndarray) -> list[np.ndarray]:
         """alpha, beta, delta and d at places (3, walls) by device, row and column in the window."""
         device, row, column = place

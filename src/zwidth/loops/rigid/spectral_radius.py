@@ -47,8 +47,8 @@ def spectral_radius(
         method: "newton" (and "auto") finds the outermost pole and proves each value by counts of the poles inside
             a circle, at a cost that does not grow with d; "companion" computes all poles.
         accuracy: relative error to prove, 1e-9 by default, at least 1e-12. On a map (alpha along one axis, beta along
-            another) a larger one is quicker; single walls have nearly all digits whatever is asked for. "companion"
-            takes any.
+            another) a larger one is quicker, at long delays above all, and errors are nearly as large in places; single
+            walls keep most digits. "companion" takes any.
         delay: only "held" has poles.
 
     Returns:
