@@ -46,7 +46,7 @@ ROUNDING = 1e-14
 _SHARES = np.array([[comb(i + j, j) / max(i + j, 1) for i in range(ORDERS[-1] + 1)] for j in range(ORDERS[-1] + 1)])
 
 
-class Wanted(NamedTuple):
+class AllowedErrors(NamedTuple):
     """The errors that logarithms of radii may have: the accuracy, and for a rate a share of themselves."""
 
     accuracy: float
@@ -173,7 +173,7 @@ def find_middle(re: np.ndarray, im: np.ndarray, loop: Loop, fractional: bool) ->
     return re, im
 
 
-def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional: bool, wanted: Wanted) -> Group:
+def enclose(poles: int, re: np.ndarray, im: np.ndarray, cells: Cells, fractional: bool, wanted: AllowedErrors) -> Group:
     """The circle on which the group's term of A is the largest, over all of the others and what walls change (C2)."""
     fewer = 2 if wanted.is_coarse and poles == 1 else 1
     loop, terms, points = cells.loop, _TERMS // fewer, _POINTS // fewer * poles

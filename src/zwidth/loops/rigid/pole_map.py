@@ -18,9 +18,9 @@ from zwidth.loops.rigid.pole_groups import (
     ORDERS,
     REAL,
     ROUNDING,
+    AllowedErrors,
     Cells,
     Group,
-    Wanted,
     enclose,
     find_middle,
     knows_larger,
@@ -109,7 +109,7 @@ def _find_poles(loop: Loop, fractional: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.where(larger, re, re[::-1]), np.where(larger, im, im[::-1])
 
 
-class Followed(NamedTuple):
+class FollowedPoles(NamedTuple):
     """Radii (devices, betas, alphas), rates of decay if wanted, and where a radius is next to 1 or NaN."""
 
     radius: np.ndarray
@@ -120,7 +120,7 @@ class Followed(NamedTuple):
 class _Level:
     """The cells of one size of some devices."""
 
-    def __init__(self, area: Area, side: int, wanted: Wanted, radius: np.ndarray, rate: np.ndarray) -> None:
+    def __init__(self, area: Area, side: int, wanted: AllowedErrors, radius: np.ndarray, rate: np.ndarray) -> None:
         self.area, self.side, self.wanted, self.radius, self.rate = area, side, wanted, radius, rate
         self.axes = _cut(area.alpha, side), _cut(area.beta, side)
         # Devices, rows and columns of walls whose radius is next to 1 or NaN.
@@ -295,7 +295,7 @@ class _Level:
             self.special.append(np.stack([np.full(row.size, device), row + rows.start, column + columns.start]))
 
 
-def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Followed:
+def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> FollowedPoles:
     """The outermost poles of a window of a map, NaN where no cell knows them well enough.
 
     A wall's value does not depend on the window: cells lie on the whole map, and each is computed by itself.
@@ -305,7 +305,7 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
     shape = area.d.size, *(part.stop - part.start for part in area.window)
     radius, rate = np.empty(shape), np.empty(shape if with_rate else 0)
     held = area.d != np.floor(area.d)
-    levels = [_Level(area, side, Wanted(accuracy, with_rate), radius, rate) for side in sides]
+    levels = [_Level(area, side, AllowedErrors(accuracy, with_rate), radius, rate) for side in sides]
 
     def follow(kind: bool, cells: np.ndarray) -> None:
         with np.errstate(all="ignore"), work_beside() as begin:
@@ -324,4 +324,4 @@ def follow_poles(area: Area, accuracy: float, with_rate: bool = False) -> Follow
     special = np.concatenate([np.empty((3, 0), int), *(part for level in levels for part in level.special)], axis=1)
     # Walls at which two groups were compared may be there twice.
     flat = np.unique(np.ravel_multi_index(tuple(special), shape))
-    return Followed(radius, rate, np.unravel_index(flat, shape))
+    return FollowedPoles(radius, rate, np.unravel_index(flat, shape))
