@@ -95,6 +95,11 @@ FOUND = {
 REGION = in_si(stack([outline(0.1, 1.0), passive_outline(0.1, 1.0)]))
 
 # What each function draws; the name is the function's, and what is special about the case.
+_POSE = np.meshgrid(np.linspace(0.0, 120.0, 5), np.linspace(30.0, 150.0, 4))
+POSES: dict[str, np.ndarray] = {"shoulder_deg": _POSE[0].ravel(), "elbow_deg": _POSE[1].ravel()}
+POSES["stiffness_N_per_m"] = 1e4 + 50.0 * POSES["shoulder_deg"] + POSES["elbow_deg"] ** 2
+SCATTERED = {name: column[:-3] for name, column in POSES.items()}
+
 EVERY_FIGURE = {
     "draw_boundary": (BOUNDARY,),
     "draw_boundary with a line": (stack([outline(1.0), outline(3.0, line=True)]),),
@@ -108,6 +113,8 @@ EVERY_FIGURE = {
     "draw_slope": (RIDGE, SLOPES),
     "draw_passivity_cost": (COSTS,),
     "draw_response": (RESPONSE,),
+    "draw_workspace": (POSES, "shoulder_deg", "elbow_deg"),
+    "draw_workspace of scattered poses": (SCATTERED, "shoulder_deg", "elbow_deg"),
     "draw_response without a wall": ({name: RESPONSE[name] for name in list(RESPONSE)[:4]},),
     "draw_step": (stack([response("first"), response("second", np.nan)]),),
     "draw_step normalized": (stack([response("first", physical=False)]),),

@@ -114,7 +114,7 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         # No mass is known, in whose units normalized numbers are.
         result, lines = {"kind": kind}, []
     if not normalized:
-        slopes, notes = words.list_slopes(scene), words.scene_notes(scene)
+        slopes, notes = words.list_slopes(scene), words.scene_notes(scene) + _say_stiffer(scene)
         found = wall.stiffness, wall.virtual_damping, wall.frequency
         named = dict(zip(("stiffness_max", "virtual_damping", "frequency"), map(float, found), strict=True))
         result |= named | {
@@ -132,6 +132,21 @@ def ridge(delta: float | None, d: float | None, scene: Any, delay_model: str, as
         ]
         lines += [*(slope.line() for slope in slopes), *words.note_lines(notes)]
     words.tell(result, lines, as_json)
+
+
+def _say_stiffer(scene: Any) -> list[str]:
+    """Why no stiffer wall is sure on a measured response, and what to measure for one."""
+    from zwidth.parts.measured import MeasuredDevice
+
+    if not isinstance(scene.device, MeasuredDevice):
+        return []
+    from zwidth.fitting.respond import find_nominal_limit
+
+    top = find_nominal_limit(scene)
+    said = scene.explain_undecided(float(top.stiffness), float(top.virtual_damping)) if top.status == 0 else []
+    return [
+        f"K_max = {with_unit(float(top.stiffness), 'N/m')} by the curve without its deviation; {text}" for text in said
+    ]
 
 
 @cli.command()

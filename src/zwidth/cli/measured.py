@@ -50,7 +50,6 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
 @cli.command()
 @click.argument("logs", metavar="LOG.csv...", nargs=-1, required=True, type=_FILE)
 @click.option("--period", type=_PERIOD, help="T, in s; in place of --time.")
-@click.option("--table", is_flag=True, help="The file is a table of a response; needs --period.")
 @click.option("--cycle", type=_PERIOD, help="Period of the force, in s; found from a force that repeats exactly.")
 @click.option("--time", help="Column of the time: its header, or HEADER:ms. Found by its name where left out.")
 @click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts.")
@@ -64,7 +63,6 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
 def respond(
     logs: tuple[Path, ...],
     period: float | None,
-    table: bool,
     cycle: float | None,
     resolution: str | None,
     motor_constant: str | None,
@@ -76,30 +74,24 @@ def respond(
 ) -> None:
     """Find a device's frequency response with its band, and the walls that are safe by it, without a model.
 
-    From logs of a force that `zwidth excite` designed, or of any other; or from the table of an analyzer.
+    From logs of a force that `zwidth excite` designed, or of any other. What --save keeps, and any table of an
+    analyzer, is a device of the other commands: `zwidth ridge --device FILE.csv` answers of it.
     """
     from zwidth.fitting.columns import read_log
     from zwidth.fitting.respond import find_nominal_limit, respond_to_logs
-    from zwidth.parts.measured import MeasuredDevice
     from zwidth.parts.timing import Timing
     from zwidth.parts.velocity import BackwardDifference
     from zwidth.scenes.scene import Scene
 
-    doubts: tuple[str, ...] = ()
-    if table:
-        if period is None or len(logs) != 1:
-            raise click.UsageError("--table takes one file, and --period")
-        device, source = MeasuredDevice.read(logs[0]), logs[0].name
-    else:
-        if columns["time"] is not None and period is not None:
-            raise click.UsageError("give one of --time and --period")
-        options = {"resolution": resolution, "motor_constant": motor_constant, "period": period}
-        tell_long_logs(logs)
-        motions = [read_log(log, columns, **options) for log in logs]
-        found = respond_to_logs(motions, period=period, cycle=cycle)
-        device, period, doubts = found.device, found.period, found.doubts
-        kind = "stretches of a force that repeats" if found.cycle else "pieces"
-        source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"
+    if columns["time"] is not None and period is not None:
+        raise click.UsageError("give one of --time and --period")
+    options = {"resolution": resolution, "motor_constant": motor_constant, "period": period}
+    tell_long_logs(logs)
+    motions = [read_log(log, columns, **options) for log in logs]
+    found = respond_to_logs(motions, period=period, cycle=cycle)
+    device, period, doubts = found.device, found.period, found.doubts
+    kind = "stretches of a force that repeats" if found.cycle else "pieces"
+    source = f"{' and '.join(log.name for log in logs)}, {found.records} {kind}"
     scene = Scene(device, Timing(period), velocity=velocity or BackwardDifference())
     top, safe = find_nominal_limit(scene), scene.max_stiffness()
     low, high = (with_unit(float(end), "Hz") for end in device.frequency[[0, -1]])

@@ -14,6 +14,7 @@ JSON file, too):
     draw_map              stable, spectral radius or passive over alpha and beta
     draw_recommendation   the recommended wall of a device, in SI units
     draw_stable_set       outlines of devices with a velocity filter, a hand or a coupling
+    draw_workspace        maximum stiffness over two coordinates of a pose
     draw_filters          maximum stiffness over the cut-off of a velocity filter and over its window
     draw_filter_noise     the same over the noise that the filter lets through
     draw_motion           simulated positions and wall forces over time

@@ -25,3 +25,4 @@ from .stable_set import draw_recommendation as draw_recommendation
 from .stable_set import draw_stable_set as draw_stable_set
 from .style import house_style as house_style
 from .style import save as save
+from .workspace import draw_workspace as draw_workspace

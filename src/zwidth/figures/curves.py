@@ -52,15 +52,15 @@ def draw_curves(
     panels = panel_grid(axes, len(parts), columns)
     picked = style.pick_evenly(data.sizes[several[0]], _CURVES) if several else [0]
     labels = [grid.spell(data[several[0]][k]) for k in picked] if several else [""]
-    colors = style.ordered_colors(len(picked))
+    looks = _list_looks(several[0] if several else "", len(picked))
     few, whole_numbers = data.sizes[x] <= 12, x in VARIABLES and VARIABLES[x].whole
     whole = np.concatenate([part[name].values.ravel() for part in parts])
     for part, ax in zip(parts, panels, strict=False):
         curves = [part.isel({several[0]: k}) for k in picked] if several else [part]
         shown = [np.where(np.isfinite(curve[name].values), curve[name].values, np.nan) for curve in curves]
-        for values, label, color in zip(shown, labels, colors, strict=True):
-            look = style.POINTS if whole_numbers else {"marker": "o" if few else "", "markersize": 3.5}
-            ax.plot(data[x].values, values, color=color, label=label, **look)
+        for values, label, look in zip(shown, labels, looks, strict=True):
+            dots = style.POINTS if whole_numbers else {"marker": "o" if few else "", "markersize": 3.5}
+            ax.plot(data[x].values, values, label=label, **look | dots)
         grid.scale_axis(ax, "x", data[x])
         ax.set_title(grid.title(part))
         ax.margins(y=0.06)
@@ -73,7 +73,7 @@ def draw_curves(
     if few and not grid.logarithmic(values):
         panels[0].set_xlim(*style.span(float(values.min()), float(values.max())))
     style.label_axes(panels, grid.axis_label(data, x), grid.output_label(data, name), once=axes is None)
-    _name_colors(panels, labels, colors, outside=axes is None)
+    _name_looks(panels, labels, looks, outside=axes is None)
     return panels
 
 
@@ -104,32 +104,44 @@ def draw_outlines(data: xarray.Dataset, axes: style.AnyAxes | None = None, *, ed
     parts, columns = grid.panels(data, [family, *dims], plane=dims)
     panels = panel_grid(axes, len(parts), columns)
     picked = style.pick_evenly(data.sizes[family], _CURVES)
-    colors = style.ordered_colors(len(picked))
+    looks = _list_looks(family, len(picked))
     labels = [grid.spell(data[family][k]) for k in picked]
     for part, ax in zip(parts, panels, strict=False):
         grid.scale_axis(ax, "x", part[x])
         grid.scale_axis(ax, "y", part[y])
-        for k, color in zip(picked, colors, strict=True):
+        for k, look in zip(picked, looks, strict=True):
             device = part.isel({family: k}).transpose(y, x)
             shown = np.ma.masked_invalid(device[name].values)
             level = boundary_level(name)
             stable = np.ma.filled(shown < level if OUTPUTS[name].below else shown > level, False)
             known = find_outlines(device, edges).get("stable")
             if known is not None and agrees(known, part[x].values, part[y].values, stable):
-                draw_region(ax, fit_axes(known, ax), "none", color=color, linewidth=1.4, label="exact edge")
+                draw_region(ax, fit_axes(known, ax), "none", linewidth=1.4, label="exact edge", **look)
             elif shown.count() and shown.min() < level < shown.max():
-                ax.contour(part[x].values, part[y].values, shown, levels=[level], colors=[color], linewidths=1.4)
+                line = {"colors": [look["color"]], "linestyles": [look["linestyle"]], "linewidths": 1.4}
+                ax.contour(part[x].values, part[y].values, shown, levels=[level], **line)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
         ax.set_title(grid.title(part))
     style.label_axes(panels, grid.axis_label(data, x), grid.axis_label(data, y), once=axes is None)
-    _name_colors(panels, labels, colors, outside=axes is None, title="boundaries of the stable walls")
+    _name_looks(panels, labels, looks, outside=axes is None, title="boundaries of the stable walls")
     return panels
 
 
-def _name_colors(
-    axes: np.ndarray, names: list[str], colors: list[Any], *, outside: bool, title: str | None = None
+def _list_looks(family: str, count: int) -> list[dict[str, Any]]:
+    """Colors of curves in the order of their values; of devices, which have no order, line styles too."""
+    if family == "device":
+        return [style.look(k) for k in range(count)]
+    return [{"color": color, "linestyle": style.SOLID} for color in style.ordered_colors(count)]
+
+
+def _name_looks(
+    axes: np.ndarray, names: list[str], looks: list[dict[str, Any]], *, outside: bool, title: str | None = None
 ) -> None:
     longest = max(10 if "$" in name else len(name) for name in names)
     columns = max(1, min(len(names), 6, _LINE // max(longest, 1)))
-    handles = [style.line(name, color=color) for name, color in zip(names, colors, strict=True) if name]
+    handles = [
+        style.line(name, look["linestyle"], color=look["color"])
+        for name, look in zip(names, looks, strict=True)
+        if name
+    ]
     style.legend(axes, handles, outside=outside, ncols=columns, title=title, title_fontsize=8)

@@ -12,7 +12,7 @@ from zwidth.figures import grid, style
 from zwidth.figures.table import SI_COLUMNS, Table, draws_tables, select
 from zwidth.words.formatting import header
 from zwidth.words.quantities import PARAMETERS
-from zwidth.words.rotation import is_rotary, own_unit
+from zwidth.words.rotation import own_unit
 
 _STIFFNESS, _NOISE = SI_COLUMNS[0], "velocity_noise_m_per_s"
 _OVER = {
@@ -71,6 +71,7 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
     """
     (ax,) = panels = style.panels(axes, 1, 5.6, 4.0)
     colors, factor, words = _scale(table)
+    speed, spelled = style.si_unit(np.append(table[_NOISE], limit), "m/s")
     kinds = {kind: look for kind, look in _KINDS.items() if kind in np.asarray(table["estimate"])}
     handles: list[Any] = []
     for damping, color in colors.items():
@@ -78,14 +79,14 @@ def draw_filter_noise(table: Table, limit: float, axes: style.AnyAxes | None = N
             rows = select(table, damping_N_s_per_m=damping, estimate=kind)
             mark = {"marker": marker, "markersize": 4.5} if marker else _dots(rows)
             look = {"linestyle": dash, "color": color, "label": f"{kind}, b = {damping:g}", **mark}
-            ax.plot(rows[_NOISE] * 1e3, rows[_STIFFNESS] * factor, **look)
-        best = _mark_best(ax, select(table, damping_N_s_per_m=damping, best=True), color, factor, words)
+            ax.plot(rows[_NOISE] * speed, rows[_STIFFNESS] * factor, **look)
+        best = _mark_best(ax, select(table, damping_N_s_per_m=damping, best=True), color, (speed, factor), words)
         handles.append(style.line(rf"$b = {damping:g}$ {own_unit('N s/m')}{best}", color=color))
     if np.isfinite(limit):
-        ax.axvline(limit * 1e3, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
-    style.use_logarithmic(ax, "x", table[_NOISE], style.DECADES)
+        ax.axvline(limit * speed, color=style.GRAY, linewidth=0.9, linestyle=style.DASHED, zorder=0.5, label="limit")
+    style.use_logarithmic(ax, "x", speed * np.asarray(table[_NOISE]), style.DECADES)
     style.use_logarithmic(ax, "y", table[_STIFFNESS], style.DECADES)
-    ax.set(xlabel=rf"noise of the velocity  $\sigma_v$  in {'mrad/s' if is_rotary() else 'mm/s'}", ylabel=words)
+    ax.set(xlabel=rf"noise of the velocity  $\sigma_v$  in {spelled}", ylabel=words)
     handles += [style.line(words, dash, marker=marker, markersize=4.5) for dash, marker, words in kinds.values()]
     style.legend(panels, handles, outside=axes is None, ncols=2)
     return panels
@@ -98,15 +99,15 @@ def _scale(table: Table) -> tuple[dict[float, Any], float, str]:
     return style.color_by_value(table["damping_N_s_per_m"]), factor, words
 
 
-def _mark_best(ax: Axes, rows: Table, color: Any, factor: float, words: str) -> str:
+def _mark_best(ax: Axes, rows: Table, color: Any, factors: tuple[float, float], words: str) -> str:
     """Mark the stiffest wall within the limit; returns the filter that allows it, for the legend."""
     spelled = ""
     for row in zip(*(rows[name] for name in (_NOISE, _STIFFNESS, "cutoff_Hz", "samples")), strict=True):
         noise, stiffness, cutoff, samples = map(float, row)
         which = f"n = {samples:g}" if np.isfinite(samples) else rf"f_c = {cutoff:.3g}\,\mathrm{{Hz}}"
         look = {"marker": "o", "markersize": 7, "markerfacecolor": "white", "markeredgecolor": color, "zorder": 5}
-        ax.plot(noise * 1e3, stiffness * factor, linestyle="", label="best", **look)
-        spelled = f":  ${which}$,  {stiffness * factor:.3g} {words.rpartition('  in ')[2]}"
+        ax.plot(noise * factors[0], stiffness * factors[1], linestyle="", label="best", **look)
+        spelled = f":  ${which}$,  {stiffness * factors[1]:.3g} {words.rpartition('  in ')[2]}"
     return spelled
 
 

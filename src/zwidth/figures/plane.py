@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import matplotlib
@@ -219,6 +219,13 @@ def _draw_contours(
     others = _draw_edge(ax, x, y, values, name, outlines)
     peak = _find_peak(part)
     others += [np.array([peak])] if peak else []
+    draw_contours(ax, x, y, values, output, norm, others)
+
+
+def draw_contours(
+    ax: Axes, x: np.ndarray, y: np.ndarray, values: Any, output: Output, norm: Any, others: Sequence[np.ndarray] = ()
+) -> None:
+    """Labelled contours of an output at round numbers; labels keep away from the points of other lines."""
     levels = _levels(values, output, norm)
     if not levels.size:
         return
@@ -228,7 +235,7 @@ def _draw_contours(
     colors = [("white" if dark < 0.5 else "#303030") for dark in luminance]
     drawn = ax.contour(x, y, values, levels=levels, colors=colors, linewidths=0.7)
     within = (values < levels.max()) if output.below or output.look == "steep" else (values > levels.min())
-    if within.filled(False).mean() > _LABELLED:
+    if np.ma.filled(within, False).mean() > _LABELLED:
         label_contours(ax, drawn, colors, shades, others)
 
 

@@ -16,7 +16,6 @@ from zwidth.figures import style
 from zwidth.figures.motion import draw_positions
 from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
 from zwidth.words.formatting import with_unit
-from zwidth.words.rotation import own_unit
 
 if TYPE_CHECKING:
     from zwidth.scenes.scene import Scene
@@ -62,11 +61,10 @@ def _close(points: np.ndarray) -> np.ndarray:
     return points if np.array_equal(points[0], points[-1]) else np.append(points, points[:1], 0)
 
 
-def mark_wall(
-    ax: Axes, wall: Any, label: str, *, kind: str, color: Any = style.BLACK, text: str = "", right: bool = False
-) -> None:
+def mark_wall(ax: Axes, wall: Any, label: str, *, kind: str, text: str = "", right: bool = False, **look: Any) -> None:
     """Mark a wall, its stiffness and damping, with words to the left of it or to the right."""
-    ax.plot(*wall, linestyle="", color=color, label=label, zorder=5, clip_on=False, **MARKS[kind])
+    look = {"linestyle": "", "color": style.BLACK, "zorder": 5, "clip_on": False, **MARKS[kind], **look}
+    ax.plot(*wall, label=label, **look)
     if text:
         place: Any = {"xytext": (6 if right else -8, 0), "ha": "left" if right else "right"}
         ax.annotate(text, wall, textcoords="offset points", va="center", fontsize=8, zorder=6, **place)
@@ -78,10 +76,10 @@ def draw_zeros(ax: Axes) -> None:
     ax.axhline(0.0, color=style.GRAY, linewidth=0.4, zorder=0.5)
 
 
-def name_axes(ax: Axes, spring: str, damper: str = "N s/m") -> None:
+def name_axes(ax: Axes, spring: str, damper: str) -> None:
     """Label the axes of stiffness and damping, normalized where they have no unit, with lines where these are zero."""
     draw_zeros(ax)
-    in_si = f"stiffness  $K$  in {spring}", f"virtual damping  $B$  in {own_unit(damper)}"
+    in_si = f"stiffness  $K$  in {spring}", f"virtual damping  $B$  in {damper}"
     style.label_axes(np.array([ax]), *(in_si if spring else (style.ALPHA_LABEL, style.BETA_LABEL)), once=False)
 
 
@@ -157,41 +155,57 @@ def draw_stable_set(
     labels = list(dict.fromkeys(label for table in tables for label in np.asarray(table["label"]).tolist()))
     alone = len(labels) == 1
     colors = {label: style.look(k)["color"] for k, label in enumerate(labels)}
+    markers = {label: style.MARKERS[k % len(style.MARKERS)] for k, label in enumerate(labels)}
     names = ("alpha", "beta") if normalized else SI_COLUMNS
-    stiffness = np.concatenate([np.asarray(table[names[0]]) for table in tables])
-    factor, unit = (1.0, "") if normalized else style.si_unit(stiffness, "N/m")
+    factors, units = scale_walls(tables, names)
     pieces = set()
     for label, color in colors.items() if "label" in outlines else ():
-        pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factor, 0.5 / (1 + len(labels)))
-    symbols = ((r"\alpha", ""), (r"\beta", "")) if normalized else (("K", f" {unit}"), ("B", f" {own_unit('N s/m')}"))
+        pieces |= _draw_pieces(ax, select(outlines, label=label), names, color, factors, 0.5 / (1 + len(labels)))
     rows = select(walls)
     for kind, label, *wall in zip(*(rows[name] for name in ("wall", "label", *names)), strict=True):
-        wall[0] *= factor
-        numbers = [f"${symbol} = {value:.3g}${own}" for value, (symbol, own) in zip(wall, symbols, strict=True)]
+        wall = [value * factor for value, factor in zip(wall, factors, strict=True)]
+        symbols = zip((r"\alpha", r"\beta") if normalized else "KB", wall, units, strict=True)
+        numbers = [f"${symbol} = {value:.3g}$ {unit}".rstrip() for symbol, value, unit in symbols]
         text = "\n".join([kind, *numbers]) if alone and np.isfinite(wall[0]) else ""
-        color = style.BLACK if alone else colors[label]
-        mark_wall(ax, wall, kind, kind=kind.split()[0], color=color, text=text, right=kind == "stiffest")
-    name_axes(ax, unit)
+        which = kind.split()[0]
+        look = {"color": style.BLACK} if alone else {"color": colors[label]}
+        look |= {"marker": markers[label]} if which == "stiffest" else {}
+        mark_wall(ax, wall, kind, kind=which, text=text, right=kind == "stiffest", **look)
+    name_axes(ax, *units)
     ax.margins(0.04)
     if alone and np.isfinite(rows[names[0]]).any():
         # Room for words to the right of the stiffest wall, as wide as they are in a narrow panel too.
         (low, high), spec = ax.get_xlim(), ax.get_subplotspec()
         width = style.figure_of(ax).get_figwidth() / (spec.get_gridspec().ncols if spec else 1)
         ax.set_xlim(low, high + 0.28 * max(1.0, 5.6 / width) * (high - low))
-    handles = [style.line(style.literal(label), color=color) for label, color in colors.items() if not alone]
+    handles: list[Any] = []
+    for label, color in colors.items() if not alone else ():
+        mark = {**MARKS["stiffest"], "marker": markers[label]}
+        handles.append(style.line(style.literal(label), color=color, **mark))
     handles += [style.line(name, dash) for name, dash in _DASHES.items() if name in pieces and name != "outline"]
-    if not alone:
-        handles.append(style.line("stiffest wall", "", color=style.GRAY, **MARKS["stiffest"]))
+    handles += [] if alone else [style.line("mark: stiffest wall", "")]
     style.legend(panels, handles, outside=axes is None, ncols=3)
     return panels
 
 
-def _draw_pieces(ax: Axes, table: Table, names: tuple[str, ...], color: Any, factor: float, shade: float) -> set[str]:
+def scale_walls(tables: Sequence[Table], names: Sequence[str] = SI_COLUMNS) -> tuple[list[float], list[str]]:
+    """The factors and the units in which stiffness and damping of some walls have few digits; normalized ones stay."""
+    units = ("N/m", "N s/m") if tuple(names) == SI_COLUMNS else ("1", "1")
+    found = [
+        style.si_unit(np.concatenate([np.asarray(table[name], float) for table in tables]), unit)
+        for name, unit in zip(names, units, strict=True)
+    ]
+    return [factor for factor, _ in found], [unit.removeprefix("1") for _, unit in found]
+
+
+def _draw_pieces(
+    ax: Axes, table: Table, names: tuple[str, ...], color: Any, factors: Sequence[float], shade: float
+) -> set[str]:
     """One device's outlines, what is stable and what is passive shaded; returns which kinds of them there are."""
     edges: dict[bool, list[Any]] = {False: [], True: []}
     found = curves(table, "number", "piece")
     for one in found:
-        path = np.stack([getattr(one, names[0]) * factor, getattr(one, names[1])], -1)
+        path = np.stack([getattr(one, name) for name in names], -1) * factors
         look = {"color": color, "linestyle": _DASHES[one.piece], "zorder": 3}
         ax.plot(*path.T, label=f"{one.piece} {one.number}", **look)
         edges[one.piece == "passive"].append((path, one.piece == "hole"))
@@ -222,11 +236,11 @@ def draw_recommendation(
     kinds = np.array(["stiffest", f"recommended ({100 * wall['stiffness_fraction']:.3g} %)"])
     walls = {name: np.array([row[key] for row in (maximum, wall)]) for name, key in zip(SI_COLUMNS, _WALL, strict=True)}
     draw_stable_set(outlines, {"label": np.array(["", ""]), "wall": kinds, **walls}, panels[:1])
-    factor, _ = style.si_unit(maximum["stiffness"], "N/m")
+    (spring, damper), _ = scale_walls([outlines, walls])
     # A bound that is not known is None in JSON.
     interval = np.array([wall["virtual_damping_lower"], wall["virtual_damping_upper"]], dtype=np.float64)
     look = {"color": style.GRAY, "linewidth": 1.0, "label": "virtual_damping_interval"}
-    panels[0].plot([wall["stiffness"] * factor] * 2, interval, **look)
+    panels[0].plot([wall["stiffness"] * spring] * 2, interval * damper, **look)
     if response is not None:
         for ax in panels[1:]:
             _draw_response(ax, found, response)

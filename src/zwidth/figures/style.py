@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from zwidth.words.errors import InputError
-from zwidth.words.rotation import is_rotary, own_unit
+from zwidth.words.rotation import own_unit
 
 # Okabe and Ito's palette, told apart with any color vision.
 BLACK, ORANGE, SKY, GREEN = "#000000", "#E69F00", "#56B4E9", "#009E73"
@@ -35,7 +35,9 @@ SOLID = "-"
 DASHED = (0, (5.0, 2.2))
 DASH_DOTTED = (0, (6.0, 1.8, 1.2, 1.8))
 DOTTED = (0, (1.2, 1.6))
-STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED)
+STYLES = (SOLID, DASHED, DASH_DOTTED, DOTTED, (0, (11.0, 2.5)), (0, (6.0, 1.8, 1.2, 1.8, 1.2, 1.8)))
+# What tells curves apart whose line styles have a meaning of their own.
+MARKERS = ("o", "s", "^", "v", "P", "X", "*")
 
 ALPHA_LABEL = r"normalized stiffness  $\alpha = K\,T^2\!/m$"
 BETA_LABEL = r"normalized virtual damping  $\beta = B\,T/m$"
@@ -271,7 +273,7 @@ def color_by_value(values: Sequence[float]) -> dict[float, Any]:
 
 
 def look(k: int) -> dict[str, Any]:
-    """Color and line style of one of several curves; in gray they differ in lightness from one to the next."""
+    """Color and line style of one of several curves; in gray their lines tell six of them apart."""
     return {"color": DISTINCT[k % len(DISTINCT)], "linestyle": STYLES[k % len(STYLES)]}
 
 
@@ -302,19 +304,14 @@ def spread(positions: Sequence[float], gap: float) -> np.ndarray:
 
 
 def add_si_axes(ax: Axes, scale: tuple[float, float]) -> None:
-    """Read the normalized axes of an (alpha, beta) plane in kN/m and N s/m as well, at the top and the right.
-
-    Those of a rotary device in N m/rad and N m s/rad.
-    """
+    """Read the normalized axes of an (alpha, beta) plane in SI units as well, at the top and the right."""
     ax.spines[["top", "right"]].set_visible(True)
-    stiffness, damping = (
-        ((lambda value, factor=factor: value * factor), (lambda value, factor=factor: value / factor))
-        for factor in (scale[0] / (1.0 if is_rotary() else 1e3), scale[1])
-    )
-    ax.secondary_xaxis("top", functions=stiffness).set_xlabel(
-        f"stiffness  $K$  in {own_unit('N/m') if is_rotary() else 'kN/m'}"
-    )
-    ax.secondary_yaxis("right", functions=damping).set_ylabel(f"virtual damping  $B$  in {own_unit('N s/m')}")
+    ends, units = (ax.get_xlim()[1], max(map(abs, ax.get_ylim()))), ("N/m", "N s/m")
+    places: Any = ((ax.secondary_xaxis, "top", "stiffness  $K$"), (ax.secondary_yaxis, "right", "virtual damping  $B$"))
+    for (add, side, words), one, end, unit in zip(places, scale, ends, units, strict=True):
+        factor, spelled = si_unit(one * end, unit)
+        both = (lambda value, by=one * factor: value * by), (lambda value, by=one * factor: value / by)
+        add(side, functions=both).set(**{"xlabel" if side == "top" else "ylabel": f"{words}  in {spelled}"})
 
 
 _PREFIXES = {-12: "p", -9: "n", -6: "µ", -3: "m", 0: "", 3: "k", 6: "M", 9: "G"}

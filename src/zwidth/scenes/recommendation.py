@@ -319,6 +319,8 @@ class SceneAdvice:
         """
         check_held(self)
         wanted = Wanted.check(stiffness_fraction, gain_margin, phase_margin, passive)
+        if wanted.passive and (obstacle := find_obstacle(**vars(self.device))):
+            raise InputError(f"passive: got True {obstacle}")
         bare = self.replace(wall=NoWall())
         top, notes = bare.max_stiffness(), describe_islands(bare)
         if top.status != Status.OK:

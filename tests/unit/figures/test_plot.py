@@ -202,7 +202,7 @@ def test_a_rotary_device_is_drawn_in_its_units():
     zwidth.plot.step(scene, ax=third)
     zwidth.plot.motion(scene.simulate(start_position="2 deg", periods=50), fourth)
     assert first.get_xlabel().endswith("in mN m/rad")
-    assert first.get_ylabel().endswith("in N m s/rad")
+    assert first.get_ylabel().endswith("in mN m s/rad")
     assert second.get_xlabel().endswith("in g cm$^2$")
     np.testing.assert_allclose(second.lines[0].get_xdata(), [10, 20])
     assert third.get_ylabel().endswith("rad for 1 N m")

@@ -1,0 +1,94 @@
+"""The workspace study: the stiffest wall of every pose, and a wall that is tried in all of them."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from sweeping import main_of
+
+import zwidth
+from zwidth.studies.document import load_config
+from zwidth.words.errors import ConfigError
+
+POSES = (
+    "shoulder [deg],elbow [deg],mass [g],damping [N s/m]\n0,30,240,1.6\n60,30,60,0.13\n0,90,150,1.2\n60,90,0.1 kg,1\n"
+)
+STUDY = "{kind: workspace, name: w, poses: {csv: arm.csv, across: shoulder, up: elbow}, period: 1 ms, delay: 1 periods}"
+
+
+def write(folder, study=STUDY, poses=POSES, scene=""):
+    (folder / "arm.csv").write_text(poses, encoding="utf-8")
+    file = folder / "w.yaml"
+    file.write_text(f"version: 1\nname: w\n{scene}studies:\n  - {study}\n", encoding="utf-8")
+    return file
+
+
+def test_every_pose_has_the_wall_of_its_own_device(tmp_path, capsys):
+    assert main_of("run", write(tmp_path), "--out", tmp_path / "out") == 0
+    said = capsys.readouterr().out
+    table = np.genfromtxt(tmp_path / "out" / "w.csv", delimiter=",", names=True)
+    assert table.dtype.names is not None
+    assert table.dtype.names[:3] == ("shoulder_deg", "elbow_deg", "mass_kg")
+    for row in table:
+        # A scene of its own, by the solver of one device.
+        device = zwidth.Device(row["mass_kg"], row["damping_N_s_per_m"])
+        top = zwidth.Scene(device, zwidth.Timing(1e-3, "1 periods")).max_stiffness()
+        assert row["stiffness_N_per_m"] == pytest.approx(float(top.stiffness), rel=1e-12)
+        assert row["virtual_damping_N_s_per_m"] == pytest.approx(float(top.virtual_damping), rel=1e-9)
+    assert "at shoulder 60 deg, elbow 30 deg" in said
+    assert "stable in 4 of 4 poses" in said
+
+
+def test_the_wall_is_tried_in_every_pose(tmp_path, capsys):
+    # The damping that suits the weakest pose, which is heavy, is too much for one that is light and damped.
+    poses = "a,b,mass [g],damping [N s/m]\n0,0,100,0\n1,0,10,25\n"
+    study = STUDY.replace("shoulder", "a").replace("elbow", "b")
+    assert main_of("run", write(tmp_path, study, poses), "--out", tmp_path / "out") == 0
+    stiffness, damping = 0.75 * np.array(
+        zwidth.Scene(zwidth.Device(0.1), zwidth.Timing(1e-3, 1e-3)).max_stiffness()[:2]
+    )
+    bears = [
+        bool(zwidth.Scene(device, zwidth.Timing(1e-3, 1e-3)).is_stable(stiffness, damping / 0.75))
+        for device in (zwidth.Device(0.1), zwidth.Device(0.01, 25.0))
+    ]
+    assert f"stable in {sum(bears)} of 2 poses" in capsys.readouterr().out
+    assert bears == [True, False]
+
+
+def test_the_scene_gives_period_and_delay(tmp_path):
+    scene = "scene: {mass: 1 kg, period: 2 ms, delay: 1 ms}\n"
+    study: Any
+    (study,) = load_config(write(tmp_path, STUDY.partition(", period")[0] + "}", scene=scene)).studies
+    assert (study.period, study.delay.value, study.delay.unit) == (2e-3, 1e-3, "s")
+
+
+@pytest.mark.parametrize(
+    "change, said",
+    [
+        (
+            ("shoulder, up", "sholder, up"),
+            "across: got 'sholder'; it names a column of the file; did you mean 'shoulder'",
+        ),
+        ((", up: elbow", ""), r"write {csv: arm.csv, across: shoulder, up: elbow}"),
+        (("arm.csv", "leg.csv"), "leg.csv"),
+    ],
+)
+def test_faults_are_told(change, said, tmp_path):
+    with pytest.raises(ConfigError) as error:
+        load_config(write(tmp_path, STUDY.replace(*change)))
+    assert said in str(error.value)
+    assert "studies[0].poses" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "poses, said",
+    [
+        (POSES.replace("mass [g]", "weight"), "give these two"),
+        (POSES.replace("0,90", "x,90"), "'x'"),
+        (POSES.splitlines()[0] + "\n0,30,240,1.6\n", "a map needs several"),
+    ],
+)
+def test_faults_of_the_file_are_told(poses, said, tmp_path):
+    with pytest.raises(ConfigError) as error:
+        load_config(write(tmp_path, poses=poses))
+    assert said in str(error.value)
