@@ -11,16 +11,11 @@ from zwidth.cli.commands import cli
 from zwidth.cli.options import Parsed, flag_of, json_option, read_share, scene_options
 from zwidth.pages.words import row, tell
 from zwidth.words.formatting import plain, with_unit
+from zwidth.words.quantities import PARAMETERS
 from zwidth.words.rotation import own_unit
 
-_FINDS = {
-    "damping": ("damping", "N s/m"),
-    "mass": ("mass", "kg"),
-    "period": ("period", "s"),
-    "rate": ("period", "s"),
-    "delay": ("delay", "s"),
-    "cutoff": ("velocity.cutoff", "Hz"),
-}
+_FINDS = {"damping": "damping", "mass": "mass", "period": "period", "rate": "period", "delay": "delay"}
+_FINDS["cutoff"] = "velocity.cutoff"
 _BOX = ("mass", "damping", "period", "delay")
 
 
@@ -82,7 +77,8 @@ def design(
 
 def _require(scene: Any, find: str) -> tuple[dict[str, Any], list[str]]:
     """The value of one property that is enough, and on which side of it there is enough."""
-    path, unit = _FINDS[find]
+    path = _FINDS[find]
+    unit = PARAMETERS[path].unit
     values = scene.parameters()
     if path not in values:
         raise click.UsageError(f"--find {find}: this scene has none; give {flag_of(path)} to start from")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import click
 
@@ -13,10 +13,12 @@ from zwidth.cli.options import (
     Parsed,
     figure_option,
     json_option,
+    log_options,
     number_or_text,
     quantity_type,
     read_period,
     read_share,
+    save_figure,
     tell_long_logs,
     velocity_options,
 )
@@ -24,10 +26,6 @@ from zwidth.pages.words import row, tell
 from zwidth.words.errors import UnusableValueError
 from zwidth.words.quantities import POSITIVE
 from zwidth.words.rotation import use_kind
-
-if TYPE_CHECKING:
-    from zwidth.fitting.device_fit import DeviceFit
-    from zwidth.fitting.words import AxisUnits
 
 # A letter, "=", and all up to the next letter with "=".
 _ENTRY = re.compile(r"([KBf])\s*=\s*(.*?)\s*(?=(?:[KBf]\s*=)|$)")
@@ -77,11 +75,7 @@ _SHARE = Parsed("SHARE", read_share, "write a share, as 2% or 0.02")
 @click.option("--period", type=quantity_type("s", POSITIVE), help="T, in s; of logs in place of --time.")
 @click.option("--rate", type=quantity_type("Hz", POSITIVE), help="1/T, in Hz; in place of the period.")
 @click.option("--noise", type=_SHARE, help="Relative noise of K and f of buzzing walls, as 2%.")
-@click.option("--time", help="Column of the time: its header, or HEADER:ms. Found by its name where left out.")
-@click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts, :deg.")
-@click.option("--force", help="Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.")
-@click.option("--resolution", metavar="QUANTITY", help="One count of the encoder, as 0.03mm or 0.09deg.")
-@click.option("--motor-constant", metavar="QUANTITY", help="What an ampere of a force in A makes, as 5N/A.")
+@log_options
 @click.option("--max-delay", type=quantity_type("s", POSITIVE), help="Longest delay looked for in a log, in s.")
 @click.option("--resample", is_flag=True, help="Take samples as even whose clock wavers.")
 @velocity_options
@@ -148,20 +142,15 @@ def fit(
         units = ROTARY if motions[0].rotary else LINEAR
         found = fit_motions(motions, period=period, velocity=velocity, max_delay=max_delay, resample=resample)
         source = " and ".join(log.name for log in logs)
+    wrote = []
     if figure is not None:
-        _draw(found, source, points, units, figure)
+        from zwidth.figures import draw_device_fit
+        from zwidth.fitting.evidence import gather_evidence
+
+        evidence: dict[str, Any] = gather_evidence(found, source, points, units)
+        wrote.append(save_figure(draw_device_fit(**evidence, step=found.resolution), figure))
     if as_yaml:
         lines = write_scene(found, source, units)
     else:
-        lines = [row(*each) for each in describe_fit(found, source, units)]
-        lines += [row("wrote", str(figure))] if figure is not None else []
+        lines = [*(row(*each) for each in describe_fit(found, source, units)), *wrote]
     tell({**found.as_dict(), "units": units._asdict()}, lines, as_json)
-
-
-def _draw(found: DeviceFit, source: str, points: tuple[Any, ...], units: AxisUnits, file: Path) -> None:
-    from zwidth import figures
-    from zwidth.fitting.evidence import gather_evidence
-
-    evidence: dict[str, Any] = gather_evidence(found, source, points, units)
-    drawn = figures.draw_device_fit(**evidence, step=found.resolution)
-    figures.save(drawn, file.with_suffix(""), (file.suffix[1:],))

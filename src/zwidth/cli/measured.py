@@ -8,7 +8,15 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import figure_option, json_option, quantity_type, tell_long_logs, velocity_options
+from zwidth.cli.options import (
+    figure_option,
+    json_option,
+    log_options,
+    quantity_type,
+    save_figure,
+    tell_long_logs,
+    velocity_options,
+)
 from zwidth.pages.words import row, tell
 from zwidth.words.formatting import with_unit
 from zwidth.words.quantities import POSITIVE
@@ -51,11 +59,7 @@ def excite(response: Path | None, out: Path, as_json: bool, **options: Any) -> N
 @click.argument("logs", metavar="LOG.csv...", nargs=-1, required=True, type=_FILE)
 @click.option("--period", type=_PERIOD, help="T, in s; in place of --time.")
 @click.option("--cycle", type=_PERIOD, help="Period of the force, in s; found from a force that repeats exactly.")
-@click.option("--time", help="Column of the time: its header, or HEADER:ms. Found by its name where left out.")
-@click.option("--position", help="Column of the position: its header, or HEADER:mm, :counts.")
-@click.option("--force", help="Column of the commanded force: its header, or HEADER:mN.")
-@click.option("--resolution", metavar="QUANTITY", help="One count of the encoder, as 0.03mm.")
-@click.option("--motor-constant", metavar="QUANTITY", help="What an ampere of a force in A makes, as 5N/A.")
+@log_options
 @click.option("--save", type=_FILE, metavar="FILE.csv", help="Keep the response.")
 @velocity_options
 @figure_option
@@ -109,8 +113,7 @@ def respond(
         device.save(save, f"from {source}, T = {with_unit(period, 's')}")
         lines.append(row("wrote", str(save)))
     if figure is not None:
-        _draw(scene, safe if safe.status == 0 else None, figure)
-        lines.append(row("wrote", str(figure)))
+        lines.append(save_figure(_draw(scene, safe if safe.status == 0 else None), figure))
     told = {"lines": device.frequency.size, "period": period, "maximum": _plain(top)}
     told |= {"safe_wall": _plain(safe) if given else None, "undecided": said, "doubts": list(doubts)}
     tell(told, lines, as_json)
@@ -130,7 +133,7 @@ def _plain(wall: Any) -> dict[str, float]:
     return {name: float(getattr(wall, name)) for name in ("stiffness", "virtual_damping", "frequency", "status")}
 
 
-def _draw(scene: Any, wall: Any, file: Path) -> None:
+def _draw(scene: Any, wall: Any) -> Any:
     """The response with its band, and the open loop of a wall."""
     from zwidth import figures
 
@@ -142,4 +145,4 @@ def _draw(scene: Any, wall: Any, file: Path) -> None:
     if wall is not None:
         loop = scene.frequency_response(wall.stiffness, wall.virtual_damping, device.frequency)
         table |= {"open_loop_real": loop.real, "open_loop_imag": loop.imag}
-    figures.save(figures.draw_response(table), file.with_suffix(""), (file.suffix[1:],))
+    return figures.draw_response(table)

@@ -68,7 +68,7 @@ def doubts_of(given: dict[str, Any]) -> list[str]:
         kind = name if name in _PLAUSIBLE and path != "coupling.stiffness" else _OF_UNIT.get(unit, "")
         number = value.value if isinstance(value, Span) and value.unit == "s" else value
         if isinstance(number, int | float) and kind in _PLAUSIBLE and not _is_plausible(kind, number):
-            flag = "--" + path.replace(".", "-").replace("_", "-")
+            flag = flag_of(path)
             meant = [
                 text.format(flag=flag, value=short(number))
                 for text, other, scale in _SLIPS.get(kind, ())
@@ -298,6 +298,31 @@ def _make_velocity(options: dict[str, Any]) -> Any:
 
 figure_option = click.option("--figure", type=Parsed("FILE.png", _read_figure), help="Draw it: FILE.png, .svg or .pdf.")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON for machines.")
+_LOG = {
+    "--time": "Column of the time: its header, or HEADER:ms. Found by its name where left out.",
+    "--position": "Column of the position: its header, or HEADER:mm, :counts, :deg.",
+    "--force": "Column of the commanded force: its header, or HEADER:mN; a torque with :mN m.",
+    "--resolution": "One count of the encoder, as 0.03mm or 0.09deg.",
+    "--motor-constant": "What an ampere of a force in A makes, as 5N/A.",
+}
+
+
+def log_options(command: Command) -> Command:
+    """What the columns of a log are, and what counts and amperes stand for."""
+    for flag, text in reversed(_LOG.items()):
+        command = click.option(flag, help=text)(command)
+    return command
+
+
+def save_figure(drawn: Any, file: Path) -> str:
+    """Write a picture to the file that an option names; returns the line that says so."""
+    from zwidth.figures import save
+    from zwidth.pages.words import row
+
+    save(drawn, file.with_suffix(""), (file.suffix[1:],))
+    return row("wrote", str(file))
+
+
 velocity_options = _take_options(
     "velocity", [path for path in _PARTS if path.startswith("velocity.")], (), _make_velocity
 )

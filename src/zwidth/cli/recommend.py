@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from zwidth.cli.commands import cli
-from zwidth.cli.options import Parsed, figure_option, json_option, read_share, scene_options
+from zwidth.cli.options import Parsed, figure_option, json_option, read_share, save_figure, scene_options
 from zwidth.pages import words
 from zwidth.pages.words import row
 
@@ -38,11 +38,11 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
     if code and as_json:
         raise click.UsageError("give --code or --json: each has all of the output")
     found = scene.recommend(**wanted)
+    wrote = []
     if figure is not None:
-        from zwidth.figures import save
         from zwidth.studies.recommend import draw
 
-        save(draw(found), figure.with_suffix(""), (figure.suffix[1:],))
+        wrote.append(save_figure(draw(found), figure))
     if code:
         click.echo(found.code(code), nl=False)
         return
@@ -51,5 +51,4 @@ def recommend(scene: Any, figure: Path | None, code: Any, as_json: bool, **wante
     if found.verdict is not None:
         lines += words.pole_lines(found.verdict)
     lines += [row("" if k else "what buys stiffness", step.spell()) for k, step in enumerate(found.steps)]
-    lines += [row("wrote", str(figure))] if figure is not None else []
-    words.tell(found.as_dict() | {"notes": notes}, lines + words.note_lines(notes), as_json)
+    words.tell(found.as_dict() | {"notes": notes}, [*lines, *wrote, *words.note_lines(notes)], as_json)

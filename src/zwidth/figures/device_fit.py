@@ -9,21 +9,13 @@ from matplotlib.axes import Axes
 
 from zwidth.figures import style
 from zwidth.figures.stable_set import MARKS, mark_wall, name_axes
-from zwidth.figures.table import Table, curves, draws_tables, select
-from zwidth.words.formatting import header
-from zwidth.words.rotation import ROTARY
+from zwidth.figures.table import SI_COLUMNS, Table, curves, draws_tables, select
 
 # Samples that one panel shows; of longer logs every n-th.
 _MOST = 4000
 _TEXT: dict[str, Any] = {"textcoords": "offset points", "fontsize": 8, "zorder": 6}
 _DOT: dict[str, Any] = {"linestyle": "", "marker": ".", "markersize": 2.0, "rasterized": True}
-_UNITS = {
-    **dict.fromkeys(("position", "modelled", "residual"), ("m", ROTARY["m"])),
-    **dict.fromkeys(("time", "lag"), ("s",)),
-    "stiffness": ("N/m", ROTARY["N/m"]),
-    "virtual_damping": ("N s/m", ROTARY["N s/m"]),
-    "frequency": ("Hz",),
-}
+_LOW, _HIGH = "stiffness_low_N_per_m", "stiffness_high_N_per_m"
 _FITS = ((style.BLUE, style.SKY, style.SOLID), (style.GREEN, style.GREEN, style.DASHED))
 _ROWS = ("position", "residuals", "autocorrelation", "walls")
 
@@ -81,24 +73,16 @@ def _make_panels(axes: style.AnyAxes | None, rows: int) -> Any:
     return [*(found[str(row)] for row in range(rows)), found["right"]]
 
 
-def _column(table: Table, name: str) -> tuple[np.ndarray, str]:
-    """A column and its unit, of a linear axis or a rotary one."""
-    known = next(units for kind, units in _UNITS.items() if name.startswith(kind))
-    return next((np.asarray(table[header(name, unit)]), unit) for unit in known if header(name, unit) in table)
-
-
 def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
     logs = np.asarray(motion["log"])
     first = select(motion, log=logs[0])
     thin = slice(None, None, max(1, -(-logs[logs == logs[0]].size // _MOST)))
-    (time, _), (place, unit), (model, _), (rest, _) = (
-        _column(first, name) for name in ("time", "position", "modelled", "residual")
-    )
+    time, place, model, rest = (first[name] for name in ("time_s", "position_m", "modelled_m", "residual_m"))
     clock, second = style.si_unit(time[-1] - time[0], "s")
     time = (time - time[0]) * clock
     if "position" in panels:
         ax = panels["position"]
-        factor, length = style.si_unit(np.ptp(place), unit)
+        factor, length = style.si_unit(np.ptp(place), "m")
         ax.plot(time[thin], place[thin] * factor, color=style.GRAY, linewidth=2.4, alpha=0.55, label="measured")
         ax.plot(time[thin], model[thin] * factor, color=style.VERMILION, linewidth=0.9, label="modelled")
         ax.set(ylabel=f"position  in {length}", xlim=(0.0, time[-1]))
@@ -108,7 +92,7 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
         ax.set_title(f"the first of {count} logs" if count > 1 else "")
     if "residuals" in panels:
         ax = panels["residuals"]
-        factor, length = style.si_unit(rest, unit)
+        factor, length = style.si_unit(rest, "m")
         ax.plot(time[thin], rest[thin] * factor, color=style.BLUE, label="residual", **_DOT)
         ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
         for end in (-0.5 * step, 0.5 * step) if step else ():
@@ -121,8 +105,8 @@ def _draw_motion(panels: dict[str, Axes], motion: Table, step: float) -> None:
 
 
 def _draw_correlation(ax: Axes, correlation: Table) -> None:
-    (lag, unit), band = _column(correlation, "lag"), np.asarray(correlation["band"])
-    factor, second = style.si_unit(lag, unit)
+    lag, band = (np.asarray(correlation[name]) for name in ("lag_s", "band"))
+    factor, second = style.si_unit(lag, "s")
     values = np.asarray(correlation["autocorrelation"])
     far = lag[-1] * factor * 1.02
     ax.axhspan(-band[0], band[0], color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 % of white noise")
@@ -143,10 +127,10 @@ def _put_above(ax: Axes, handles: Any = None) -> None:
 
 def _draw_onsets(ax: Axes, walls: Table) -> None:
     buzzing = select(walls, kind="buzzing")
-    damping, unit = _column(buzzing, "virtual_damping")
+    factor, unit = style.si_unit(buzzing[SI_COLUMNS[1]], "N s/m")
     for name, marker, color in (("stiffness", "o", style.VERMILION), ("frequency", "s", style.BLUE)):
         values = np.asarray(buzzing[f"{name}_residual"])
-        ax.plot(damping, values, marker, color=color, markersize=4.5, label=name, zorder=3)
+        ax.plot(buzzing[SI_COLUMNS[1]] * factor, values, marker, color=color, markersize=4.5, label=name, zorder=3)
     ax.axhspan(-1.96, 1.96, color=style.GRAY, alpha=0.22, linewidth=0.0, label="95 %")
     ax.axhline(0.0, color=style.GRAY, linewidth=0.6)
     far = max(
@@ -159,15 +143,14 @@ def _draw_onsets(ax: Axes, walls: Table) -> None:
 
 def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     """The stable walls: B over K."""
-    (every, spring), (high, _) = _column(walls, "stiffness"), _column(boundary, "stiffness_high")
-    dampings, damper = _column(boundary, "virtual_damping")
-    to_spring, spring = style.si_unit(every, spring)
-    to_damper, damper = style.si_unit(dampings, damper)
+    every, high, dampings = np.asarray(walls[SI_COLUMNS[0]]), np.asarray(boundary[_HIGH]), boundary[SI_COLUMNS[1]]
+    to_spring, spring = style.si_unit(every, "N/m")
+    to_damper, damper = style.si_unit(dampings, "N s/m")
     handles = []
     for fit, (color, shade, dash) in zip(curves(boundary, "fitted_to"), _FITS, strict=False):
         own, source = vars(fit), style.literal(fit.fitted_to)
-        K, low, up = (_column(own, name)[0] * to_spring for name in ("stiffness", "stiffness_low", "stiffness_high"))
-        B = _column(own, "virtual_damping")[0] * to_damper
+        K, low, up = (own[name] * to_spring for name in (SI_COLUMNS[0], _LOW, _HIGH))
+        B = own[SI_COLUMNS[1]] * to_damper
         ax.fill_betweenx(B, low, up, color=shade, alpha=0.4, linewidth=0.0, zorder=2, label=f"band, {source}")
         # Up to where it meets K = 0.
         ends = np.flatnonzero(K > 0)
@@ -178,7 +161,7 @@ def _draw_boundary(ax: Axes, boundary: Table, walls: Table) -> None:
     handles += _mark_walls(ax, walls, (to_spring, spring), (to_damper, damper))
     ax.set_xlim(0.0, 1.15 * max(float(np.nanmax(high, initial=0.0)), float(np.nanmax(every))) * to_spring)
     # Room for the legend.
-    highest = float(dampings.max()) * to_damper
+    highest = float(np.max(dampings)) * to_damper
     ax.set_ylim(-0.05 * highest, (0.98 + 0.045 * len(handles)) * highest)
     name_axes(ax, spring, damper)
     ax.legend(handles=handles, loc="upper right")
@@ -189,7 +172,7 @@ def _mark_walls(ax: Axes, walls: Table, stiffness: tuple[float, str], damping: t
     handles, kinds = [], {}
     for kind in ("stiffest", "set", "buzzing"):
         found = select(walls, kind=kind)
-        K, B = _column(found, "stiffness")[0] * stiffness[0], _column(found, "virtual_damping")[0] * damping[0]
+        K, B = found[SI_COLUMNS[0]] * stiffness[0], found[SI_COLUMNS[1]] * damping[0]
         kinds[kind] = found, K, B
     for kind, mark, words in (("stiffest", "stiffest", "stiffest wall"), ("set", "recommended", "wall to set")):
         _, K, B = kinds[kind]
@@ -202,10 +185,10 @@ def _mark_walls(ax: Axes, walls: Table, stiffness: tuple[float, str], damping: t
     found, K, B = kinds["buzzing"]
     if K.size:
         look = {"color": style.VERMILION, "markersize": 5.0, "marker": "X"}
-        reach = 1.96 * _column(found, "stiffness_error")[0] * stiffness[0]
+        reach = 1.96 * found["stiffness_error_N_per_m"] * stiffness[0]
         ax.errorbar(K, B, xerr=reach, linestyle="", zorder=5, capsize=2.0, label="buzzing", **look)
         middle = float(np.max(kinds["stiffest"][2]))
-        for x, y, heard in zip(K, B, _column(found, "frequency")[0], strict=True):
+        for x, y, heard in zip(K, B, found["frequency_Hz"], strict=True):
             # Outside of the stable walls.
             place = (11, -10) if y < middle else (11, 5)
             ax.annotate(f"{heard:.3g} Hz", (x, y), xytext=place, color=style.VERMILION, **_TEXT)

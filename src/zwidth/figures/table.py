@@ -40,10 +40,11 @@ def draws_tables(function: Callable[Parameters, Result]) -> Callable[Parameters,
 
     @wraps(function)
     def within(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
-        read: Any = [_name_as_linear(each) for each in args]
-        turned = any(new is not old for new, old in zip(read, args, strict=True))
+        given: Any = [*args, *kwargs.values()]
+        read: Any = [_name_as_linear(each) for each in given]
+        turned = any(new is not old for new, old in zip(read, given, strict=True))
         with house_style(), use_kind(turned or is_rotary()):
-            return function(*read, **kwargs)
+            return function(*read[: len(args)], **dict(zip(kwargs, read[len(args) :], strict=True)))  # pyright: ignore
 
     return within
 

@@ -207,11 +207,12 @@ def contours(scene: Scene, across: Range, up: Range) -> dict[str, list[Any]]:
     x, y, values = radius_map(scene, across, up)
     generator = contour_generator(x, y, np.ma.masked_invalid(values))
     found: dict[str, list[Any]] = {"xs": [], "ys": [], "x": [], "y": [], "text": []}
-    for level in LEVELS:
+    for k, level in enumerate(LEVELS):
         lines: Any = generator.lines(level)
         for line in sorted(lines, key=len, reverse=True):
-            # Below the ridge, where no other line runs; of several pieces the longest one has the name.
-            named = line[np.argmax(line[:, 0] / np.ptp(across) - 0.7 * line[:, 1] / np.ptp(up))]
+            # Below the ridge, where no other line runs, each further down than the last one, so that names part; of
+            # several pieces the longest one has the name.
+            named = line[np.argmax(line[:, 0] / np.ptp(across) - (0.4 + 0.3 * k) * line[:, 1] / np.ptp(up))]
             text = f"{level:g}" if line is max(lines, key=len) else ""
             for name, value in zip(found, (line[:, 0], line[:, 1], *named, text), strict=True):
                 found[name].append(value)
